@@ -10,13 +10,16 @@ from numpy.typing import NDArray
 from vslam.camera import DepthImage, Image, ImageMap
 from vslam.features import Extracted, Features, Pyramid, Side
 from vslam.frontend.depth import columns_of_depth
-from vslam.frontend.orb import Extraction, build_pyramid
+from vslam.frontend.orb import Extraction, build_pyramid, with_keypoints
 from vslam.frontend.pose_alignment import coarse_levels
 from vslam.frontend.side_delay import row_offsets
 from vslam.frontend.sides import Sides, balanced, compare_sides
 from vslam.frontend.stereo import match_stereo
 from vslam.frontend.tracking import TrackingContext
 from vslam.frontend.weak_images import extract_in_any_light
+
+Keypoints = tuple[NDArray[np.float32], NDArray[np.uint8]]
+"""``(N, 2)`` positions at full resolution (pixels), and ``(N,)`` pyramid levels."""
 
 
 class FrameImages:
@@ -52,6 +55,10 @@ class FrameImages:
         """The features."""
         return self._extract()
 
+    def extracted_with(self, keypoints: Keypoints) -> Extracted:
+        """The features, and others at given positions of the left image."""
+        return self._extract(keypoints=keypoints)
+
     @property
     def image(self) -> Image:
         """``(H, W)`` uint8 that the features are extracted from."""
@@ -66,6 +73,7 @@ def extract_features(
     context: TrackingContext,
     image_map: ImageMap = map,
     sides: Sides | None = None,
+    keypoints: Keypoints | None = None,
 ) -> Extracted:
     """ORB features of the left image with their columns in the right image. If the left image is
     black, the features are extracted from the right image and have no columns in the other one.
@@ -78,10 +86,11 @@ def extract_features(
             float32; None for a single image, whose features have no column in a right image.
         image_map: applies a function to both images, in turn or in parallel.
         sides: the result of ``compare_sides``; None computes it.
+        keypoints: positions at which the left image gets features, too (``with_keypoints``).
     """
     camera, config = context.camera, context.config
     if second is None:
-        return _extract_alone(left, context, Side.LEFT)
+        return _extract_alone(left, context, Side.LEFT, keypoints)
     if camera.depth:
         (found,) = extract_in_any_light([left], config)
         scale, depth = context.scales[found.octave], np.asarray(second, np.float32)
@@ -95,14 +104,20 @@ def extract_features(
         return _extract_alone(right_image, context, Side.RIGHT)
     pair = balanced(left, right_image, config.stereo, sides)
     found, right = extract_in_any_light(pair, config, image_map)
+    if keypoints is not None:
+        found = with_keypoints(found, *keypoints)
     u_right = match_stereo(found, right, camera, config.stereo)
     rows = row_offsets(found, right, u_right, config.stereo)
     return Extracted(_features(found, u_right), found.pyramid, rows)
 
 
-def _extract_alone(image: NDArray[np.uint8], context: TrackingContext, side: Side) -> Extracted:
+def _extract_alone(
+    image: Image, context: TrackingContext, side: Side, keypoints: Keypoints | None = None
+) -> Extracted:
     """Features of a single image, without columns in a second one."""
     (found,) = extract_in_any_light([image], context.config)
+    if keypoints is not None:
+        found = with_keypoints(found, *keypoints)
     u_right = np.full(len(found.xy), np.nan, np.float32)
     return Extracted(_features(found, u_right), found.pyramid, side=side)
 

@@ -24,6 +24,10 @@ class FeatureSource(Protocol):
     @property
     def extracted(self) -> Extracted: ...
 
+    def extracted_with(self, keypoints: tuple[NDArray[np.float32], NDArray[np.uint8]]) -> Extracted:
+        """The features, and others at given positions and levels of the left image."""
+        ...
+
     @property
     def image(self) -> Image: ...
 
@@ -112,10 +116,17 @@ class Frame:
 
     def extract(self, camera: Camera) -> None:
         """Extract the features of the images, if that has not been done. They replace the landmarks
-        that were found by their patches, and track nothing yet; the pose stays."""
+        that were found by their patches, and track nothing yet; the pose stays. Where a landmark
+        was found, there is a feature, even if it is no corner for the detector."""
         if self.source is None:
             return
-        new = Frame.of(self.source.extracted, camera, image=self.source.image)
+        source, features = self.source, self.features
+        if len(features):
+            extracted = source.extracted_with((features.xy, features.octave))
+            image = self.image
+        else:
+            extracted, image = source.extracted, source.image
+        new = Frame.of(extracted, camera, image=image)
         for name in _OF_FEATURES:
             setattr(self, name, getattr(new, name))
         self.source = None

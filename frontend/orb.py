@@ -23,6 +23,7 @@ from vslam.kernels import kernel
 PATCH_RADIUS = 15  # of the disc of the intensity centroid, pixels (Rublee et al., section 3.2)
 LANES = 32  # pixels read per row of the disc: its 31 columns and one of weight 0
 SPARE = 64  # unused bytes at the end of a pyramid
+KEYPOINT_REACH = 2.0  # pixels of a level; features that are nearer show the same corner
 MARGIN = 19  # largest distance of a rotated test point from its keypoint (13 sqrt 2), rounded up
 PATTERN: NDArray[np.int8] = np.load(Path(__file__).with_name("orb_pattern.npy"))
 
@@ -60,6 +61,38 @@ def extract(image: NDArray[np.uint8], config: OrbConfig) -> Extraction:
         PATTERN,
     )
     return Extraction(xy, octave, angle, descriptors, pyramid)
+
+
+def with_keypoints(
+    found: Extraction, xy: NDArray[np.float32], octave: NDArray[np.uint8]
+) -> Extraction:
+    """Add features at given positions, where the image has none within ``KEYPOINT_REACH``.
+
+    Args:
+        found: the features of the image.
+        xy: ``(N, 2)`` full-resolution pixels; the nearest pixels of the levels are taken.
+        octave: ``(N,)`` pyramid levels.
+    """
+    shapes = found.pyramid.shapes
+    columns = [[found.xy], [found.octave], [found.angle], [found.descriptors]]
+    for level in np.unique(octave).tolist():
+        ratio = shapes[0, ::-1] / shapes[level, ::-1]
+        pixel = np.rint((xy[octave == level] + 0.5) / ratio - 0.5)
+        inside = (pixel >= MARGIN) & (pixel < shapes[level, ::-1] - MARGIN)
+        pixel = pixel[inside.all(axis=1)]
+        near = np.abs(found.octave.astype(np.int64) - level) <= 1
+        there = (found.xy[near] + 0.5) / ratio - 0.5
+        apart = np.abs(pixel[:, None] - there[None]).max(axis=2)
+        corners = pixel[(apart > KEYPOINT_REACH).all(axis=1)].astype(np.float32)
+        image = found.pyramid.level(level)
+        angles = orientations(image, corners, DISC)
+        columns[0].append(((corners + 0.5) * ratio - 0.5).astype(np.float32))
+        columns[1].append(np.full(len(corners), level, np.uint8))
+        columns[2].append(angles)
+        columns[3].append(describe(smoothed(image), corners, angles, PATTERN))
+    whole = [np.concatenate(column) for column in columns]
+    order = np.argsort(whole[1], kind="stable")
+    return Extraction(*(column[order] for column in whole), found.pyramid)
 
 
 def scale_factors(config: OrbConfig) -> NDArray[np.float64]:

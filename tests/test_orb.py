@@ -20,6 +20,7 @@ from vslam.frontend.orb import (
     extract,
     features_per_level,
     orientations,
+    with_keypoints,
 )
 from vslam.frontend.smoothing import smoothed
 
@@ -338,3 +339,26 @@ def test_extraction_leaves_its_image_alone():
     before = image.copy()
     extract(image, OrbConfig())
     assert np.array_equal(image, before)
+
+
+def test_features_are_added_where_there_are_none():
+    rng = np.random.default_rng(5)
+    image = cv2.GaussianBlur(rng.integers(0, 256, (160, 480), np.uint8), (0, 0), 2.0)
+    config = OrbConfig(n_features=200)
+    found = extract(image, config)
+    near = found.xy[:5] + np.float32(0.4)  # of features that are there
+    far = np.array([[30.0, 40.0], [240.3, 80.6], [2.0, 80.0]], np.float32)  # the last at the border
+    free = np.abs(found.xy[:, None] - far[None]).max(axis=2).min(axis=0) > 6.0
+    xy, octave = np.concatenate([near, far]), np.zeros(8, np.uint8)
+    octave[:5] = found.octave[:5]
+    more = with_keypoints(found, xy, octave)
+    assert len(more.xy) == len(found.xy) + np.count_nonzero(free[:2])
+    assert np.count_nonzero(free[:2]) > 0
+    assert (np.diff(more.octave.astype(int)) >= 0).all()
+    for position in np.rint(far[:2][free[:2]]):
+        (k,) = np.flatnonzero((more.xy == position).all(axis=1))
+        assert more.octave[k] == 0
+        assert more.descriptors[k].any()
+    again = with_keypoints(found, found.xy, found.octave)
+    np.testing.assert_array_equal(again.xy, found.xy)
+    np.testing.assert_array_equal(again.descriptors, found.descriptors)

@@ -74,7 +74,12 @@ def with_keypoints(
         octave: ``(N,)`` pyramid levels.
     """
     shapes = found.pyramid.shapes
-    columns = [[found.xy], [found.octave], [found.angle], [found.descriptors]]
+    columns: list[list[NDArray]] = [
+        [found.xy],
+        [found.octave],
+        [found.angle],
+        [found.descriptors],
+    ]
     for level in np.unique(octave).tolist():
         ratio = shapes[0, ::-1] / shapes[level, ::-1]
         pixel = np.rint((xy[octave == level] + 0.5) / ratio - 0.5)
@@ -92,7 +97,8 @@ def with_keypoints(
         columns[3].append(describe(smoothed(image), corners, angles, PATTERN))
     whole = [np.concatenate(column) for column in columns]
     order = np.argsort(whole[1], kind="stable")
-    return Extraction(*(column[order] for column in whole), found.pyramid)
+    xy, octave, angle, descriptors = (column[order] for column in whole)
+    return Extraction(xy, octave, angle, descriptors, found.pyramid)
 
 
 def scale_factors(config: OrbConfig) -> NDArray[np.float64]:

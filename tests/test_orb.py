@@ -346,19 +346,20 @@ def test_features_are_added_where_there_are_none():
     image = cv2.GaussianBlur(rng.integers(0, 256, (160, 480), np.uint8), (0, 0), 2.0)
     config = OrbConfig(n_features=200)
     found = extract(image, config)
-    near = found.xy[:5] + np.float32(0.4)  # of features that are there
-    far = np.array([[30.0, 40.0], [240.3, 80.6], [2.0, 80.0]], np.float32)  # the last at the border
-    free = np.abs(found.xy[:, None] - far[None]).max(axis=2).min(axis=0) > 6.0
-    xy, octave = np.concatenate([near, far]), np.zeros(8, np.uint8)
-    octave[:5] = found.octave[:5]
-    more = with_keypoints(found, xy, octave)
-    assert len(more.xy) == len(found.xy) + np.count_nonzero(free[:2])
-    assert np.count_nonzero(free[:2]) > 0
+    corners = found.xy[found.octave <= 1]
+    grid = np.stack(np.meshgrid(np.arange(25, 455), np.arange(25, 135)), axis=-1).reshape(-1, 2)
+    apart = np.abs(grid[:, None] - corners[None]).max(axis=2).min(axis=1)
+    free = grid[[apart.argmax()]].astype(np.float32)
+    assert apart.max() > 5.0
+    there = found.xy[:5] + np.float32(0.4)
+    border = np.array([[2.0, 80.0]], np.float32)
+    octave = np.concatenate([[0], found.octave[:5], [0]]).astype(np.uint8)
+    more = with_keypoints(found, np.concatenate([free + 0.3, there, border]), octave)
+    assert len(more.xy) == len(found.xy) + 1
     assert (np.diff(more.octave.astype(int)) >= 0).all()
-    for position in np.rint(far[:2][free[:2]]):
-        (k,) = np.flatnonzero((more.xy == position).all(axis=1))
-        assert more.octave[k] == 0
-        assert more.descriptors[k].any()
+    (k,) = np.flatnonzero((more.xy == free).all(axis=1))
+    assert more.octave[k] == 0
+    assert more.descriptors[k].any()
     again = with_keypoints(found, found.xy, found.octave)
     np.testing.assert_array_equal(again.xy, found.xy)
     np.testing.assert_array_equal(again.descriptors, found.descriptors)

@@ -87,8 +87,9 @@ def with_keypoints(
         pixel = pixel[inside.all(axis=1)]
         near = np.abs(found.octave.astype(np.int64) - level) <= 1
         there = (found.xy[near] + 0.5) / ratio - 0.5
-        apart = np.abs(pixel[:, None] - there[None]).max(axis=2)
-        corners = pixel[(apart > KEYPOINT_REACH).all(axis=1)].astype(np.float32)
+        corners = pixel[_is_free(pixel, there)].astype(np.float32)
+        if not len(corners):
+            continue
         image = found.pyramid.level(level)
         angles = orientations(image, corners, DISC)
         columns[0].append(((corners + 0.5) * ratio - 0.5).astype(np.float32))
@@ -99,6 +100,19 @@ def with_keypoints(
     order = np.argsort(whole[1], kind="stable")
     xy, octave, angle, descriptors = (column[order] for column in whole)
     return Extraction(xy, octave, angle, descriptors, found.pyramid)
+
+
+@kernel
+def _is_free(pixel, there):
+    """``(N,)`` bool: whether none of the ``(M, 2)`` positions ``there`` is near a pixel."""
+    free = np.ones(len(pixel), np.bool_)
+    for i in range(len(pixel)):
+        x, y = pixel[i, 0], pixel[i, 1]
+        for k in range(len(there)):
+            if abs(there[k, 0] - x) <= KEYPOINT_REACH and abs(there[k, 1] - y) <= KEYPOINT_REACH:
+                free[i] = False
+                break
+    return free
 
 
 def scale_factors(config: OrbConfig) -> NDArray[np.float64]:

@@ -169,13 +169,16 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--data .", ["the folder is empty", "--data"]),
         ("nowhere", ["nowhere", "no such file or folder", "--data"]),
         ("nowhere --data .", ["nowhere: --data also names what to read"]),
-        ("--data ..", ["no known data set", "sequences", "mav0", "rgb.txt"]),
+        ("--data other", ["no known data set", "sequences", "mav0", "rgb.txt"]),
         ("--data 77 --sensor mono", ["camera 77", "no such device"]),
         ("--dataset images --data . --fps 0", ["--fps 0", "positive"]),
         ("--dataset kitti --topics /a,/b", ["--topics", "only for --dataset bag"]),
     ],
 )
-def test_run_refuses_without_data(call, words, parts):
+def test_run_refuses_without_data(call, words, parts, tmp_path):
+    if "other" in words:
+        (tmp_path / "other").mkdir()
+        (tmp_path / "other" / "notes.txt").write_text("nothing to run on")
     refused(call("run", *words.split()), *parts)
     assert not Path("runs").exists()
 

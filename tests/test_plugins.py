@@ -142,7 +142,7 @@ def test_a_run_with_reader_perturbation_and_detector(target: Path, corridor, tmp
         "frames": 10,
     }
     assert (report["lost_frames"], report["skipped_frames"]) == (0, 0)
-    shown = vslam("run", "--help")
+    shown = vslam("run", "--help") + vslam("perturb", "--list")
     assert all(name in shown for name in ("thumbnail", "frames", "haze"))
     assert "vslam-example 1.0" in vslam("info", "--data", str(data))
 

@@ -154,7 +154,7 @@ def run_everything() -> None:
     wall. This reaches all branches of tracking, triangulation, fusion and bundle adjustment."""
     every_frame = KeyframeConfig(max_interval_s=0.05, merge_after_frames=1)
     run_slam(Config(keyframes=every_frame), FRAMES)
-    run_slam(Config(tracking=TrackingConfig(method="patches")), FRAMES)
+    compile_patches()
     decode_image()
 
 
@@ -163,6 +163,11 @@ def compile_tracking() -> None:
     decode_image()
     no_other = KeyframeConfig(max_interval_s=1e9, max_tracked_ratio=1e-6, min_tracked_close=0)
     run_slam(Config(keyframes=no_other), 3)
+
+
+def compile_patches() -> None:
+    """Compile tracking by patches with a few images of a wall."""
+    run_slam(Config(tracking=TrackingConfig(method="patches")), FRAMES)
 
 
 def decode_image() -> None:
@@ -315,6 +320,7 @@ COMPILE_SHARES: dict[str, tuple[Callable[[], None], ...]] = {
         compile_local_mapping,
         compile_correction,
         compile_learned_matching,
+        compile_patches,
     ),
 }
 EVERYTHING: tuple[Callable[[], None], ...] = (

@@ -135,3 +135,15 @@ def test_images_in_colour_are_refused_with_the_way_to_grey():
         check_images(colour, colour, CAMERA)
     with pytest.raises(ValueError, match="colour"):
         check_images(colour, None, CAMERA.left_camera())
+
+
+def test_images_that_are_missing_or_too_many_are_named():
+    grey = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+    with pytest.raises(ValueError, match="the left image is None; was its file read"):
+        check_images(None, None, CAMERA)
+    with pytest.raises(ValueError, match="the right image is None, but the camera is stereo"):
+        check_images(grey, None, CAMERA)
+    with pytest.raises(ValueError, match="the depth image is None, but the camera is rgbd"):
+        check_images(grey, None, replace(CAMERA, depth=True))
+    with pytest.raises(ValueError, match="the camera is monocular: pass None"):
+        check_images(grey, grey, CAMERA.left_camera())

@@ -159,7 +159,7 @@ def test_a_step_takes_depth_in_metres_and_nothing_else(corridor):
         Slam(camera).step(left, depth.astype(np.uint16), 0.0)
     with pytest.raises(ValueError, match="the camera's"):
         Slam(camera).step(left, depth[1:], 0.0)
-    with pytest.raises(ValueError, match="depth image belongs"):
+    with pytest.raises(ValueError, match="the depth image is None"):
         Slam(camera).step(left, None, 0.0)
     with pytest.raises(ValueError, match="uint8 and float32, not of uint8"):
         Slam(corridor.camera).step(left, depth, 0.0)

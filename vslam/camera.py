@@ -197,9 +197,13 @@ def check_images(left: Image, second: Image | DepthImage | None, camera: Camera)
     Raises:
         ValueError: the sizes, types or number of the images are wrong; the message says which.
     """
-    if (second is None) != camera.monocular:
-        what = "depth" if camera.depth else "right"
-        raise ValueError(f"a {what} image belongs to a camera of {camera.sensor}")
+    other = "depth" if camera.depth else "right"
+    if left is None:
+        raise ValueError("the left image is None; was its file read?")
+    if second is None and not camera.monocular:
+        raise ValueError(f"the {other} image is None, but the camera is {camera.sensor}")
+    if second is not None and camera.monocular:
+        raise ValueError("a second image was given, but the camera is monocular: pass None")
     expected = (camera.height, camera.width)
     images = [left] if second is None else [left, second]
     if any(image.shape[:2] == expected and image.ndim == 3 for image in images):

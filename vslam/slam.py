@@ -122,7 +122,7 @@ class Slam:
         """Continue in a map that ``save`` or a run wrote.
 
         Args:
-            path: the map file.
+            path: the map file, or the folder of a run.
             config: as for a new map.
             detector: the detector that the map was made with, as a name or an object; None uses
                 the shipped detector of that name.

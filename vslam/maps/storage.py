@@ -68,10 +68,13 @@ def load_map(path: Path | str) -> StoredMap:
 def load_checkpoint(path: Path | str) -> StoredMap:
     """Read a map like ``load_map``, but leave one with a checkpoint as it was written.
 
+    Args:
+        path: a map file, or the folder of a run that has one.
+
     Raises:
         InputError: as ``load_map``.
     """
-    path = Path(path)
+    path = map_file_of(path)
     data, header = _read(path)
     with _as_damage(path):
         return checked_map(data, header)

@@ -130,7 +130,7 @@ def test_a_camera_that_stands_still_begins_no_map():
 
 def test_images_must_be_those_of_the_camera():
     image = np.zeros((LEFT_CAMERA.height, LEFT_CAMERA.width), np.uint8)
-    with pytest.raises(ValueError, match="right image"):
+    with pytest.raises(ValueError, match="the camera is monocular"):
         Slam(LEFT_CAMERA).step(image, image, 0.0)
     with pytest.raises(ValueError, match="right image"):
         Slam(CAMERA).step(image, None, 0.0)

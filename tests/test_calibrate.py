@@ -124,6 +124,7 @@ def test_checkerboard_filmed_by_one_camera(call, tmp_path):
     assert (code, "calibration.yaml: exists already" in err) == (2, True)
 
 
+@pytest.mark.slow
 def test_charuco_board_in_a_side_by_side_video(call, tmp_path):
     views = poses(CHARUCO, PINHOLE, 14)
     right = [np.linalg.inv(T_LEFT_RIGHT) @ T for T in views]
@@ -136,6 +137,7 @@ def test_charuco_board_in_a_side_by_side_video(call, tmp_path):
     check_pair(read_calibration(["stereo.yaml"]), PINHOLE)
 
 
+@pytest.mark.slow
 def test_aprilgrid_of_kalibr_in_euroc_layout_by_fisheye_cameras(call, tmp_path):
     views = poses(APRILGRID, FISHEYE, 14)
     right = [np.linalg.inv(T_LEFT_RIGHT) @ T for T in views]
@@ -178,6 +180,7 @@ def test_views_that_do_not_fit_are_dropped_and_named():
     assert "dropped because they do not fit: 5 (" in found[0].measured
 
 
+@pytest.mark.slow
 def test_pairs_that_were_not_taken_together_are_dropped():
     views = poses(CHECKERBOARD, PINHOLE, 14)
     right = [np.linalg.inv(T_LEFT_RIGHT) @ T for T in views]
@@ -272,6 +275,7 @@ def test_video_that_breaks_off_is_used_up_to_there(capsys):
         list(_frames(source(0), 300))
 
 
+@pytest.mark.slow
 def test_images_without_the_board_are_an_error_that_says_what_was_looked_for(call, tmp_path):
     blank = np.full((288, 384), 128, np.uint8)
     images = rendered(CHECKERBOARD, PINHOLE, poses(CHECKERBOARD, PINHOLE, 2), 0)

@@ -95,6 +95,7 @@ def test_leaving_stops_the_workers_runs(cluster, stub: Path, tmp_path: Path):
     wait_for(lambda: not any(w.children() for w in workers))
 
 
+@pytest.mark.slow
 def test_no_scheduler_is_one_sentence(tmp_path: Path, monkeypatch):
     monkeypatch.setattr("vslam.lab.bench.cluster._CONNECT_S", 1)
     options = execute.RunOptions(None, CONFIG, 1)

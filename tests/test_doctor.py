@@ -158,6 +158,7 @@ def test_what_the_calibration_says_of_lengths_is_shown(clean, baseline, verdict)
     assert re.search(r"480x160 pixels see 90 x 37 degrees", finding.measured)
 
 
+@pytest.mark.slow
 def test_a_calibration_of_larger_images(clean):
     c = clean.camera
     twice = replace(clean, camera=replace(c, cx=2 * c.cx, cy=2 * c.cy, fx=2 * c.fx, fy=2 * c.fy))

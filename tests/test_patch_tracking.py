@@ -114,6 +114,7 @@ def test_a_frame_that_shows_something_else_is_lost_and_the_next_is_not(corridor)
     assert states[:10] + states[11:] == [TrackingState.OK] * (len(corridor) - 1)
 
 
+@pytest.mark.slow
 def test_the_same_bytes_with_two_threads_and_after_a_resume(corridor, tmp_path):
     whole, _ = driven(corridor)
     expected = whole.trajectory().T_wc.tobytes()

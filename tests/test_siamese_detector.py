@@ -134,6 +134,7 @@ def test_neighbours_of_a_candidate_do_not_crowd_out_other_places():
     assert matches[1] in (4, 5, 6)
 
 
+@pytest.mark.slow
 def test_the_threshold_holds_for_loops_and_not_for_relocalisation():
     one = detector(SiameseConfig(recent_keyframes=0, threshold=1.0), list(range(6)))
     map_ = a_map(6)

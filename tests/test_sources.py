@@ -128,6 +128,7 @@ def test_a_video_that_loses_stays_close(corridor, tmp_path):
         assert np.abs(error).mean() < 4.0
 
 
+@pytest.mark.slow
 def test_a_bag_in_real_time_has_every_frame(folder):
     outcome = run_source(opened(folder, "ros1"), realtime=True)
     assert len(outcome.tracks) == FRAMES

@@ -335,6 +335,7 @@ def test_same_seed_same_bytes_on_any_number_of_threads(route, rendered, tmp_path
     assert tree(again) == tree(rendered)
 
 
+@pytest.mark.slow
 def test_views_are_the_left_images_of_the_drive(route, town, rendered, tmp_path, monkeypatch):
     monkeypatch.setattr(views, "build_town", lambda *_: town)
     seen = []

@@ -215,6 +215,7 @@ def test_pruned_views_are_masked_views(network):
     assert torch.allclose(pruned(network, drop).embed(x), masked(network, drop).embed(x), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_network_learns_with_views_and_is_read_again(tmp_path):
     collection = wide_views(20)
     shape = SMALL.model_copy(update=WIDE)

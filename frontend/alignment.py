@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import AlignmentConfig
-from vslam.features import PATCH_RADIUS, PATCH_SIDE, LandmarkPatches
+from vslam.features import PATCH_RADIUS, PATCH_SIDE, LandmarkPatches, Pyramid
 from vslam.frontend.frame import Frame
 from vslam.frontend.patches import patches_around
 from vslam.kernels import inner_kernel, kernel
@@ -56,18 +56,52 @@ def align_frame(
     same = known.ids[at] == landmark
     at, matched = at[same], matched[same]
     octave = features.octave[matched]
-    size = scales[octave]
-    warp = warps(
+    found = find_patches(
+        frame.pyramid,
+        features.xy[matched],
+        octave,
         frame.T_camera_w,
         frame.xyz[matched],
-        known.T_cw,
-        known.view[at],
-        known.size[at],
-        size,
+        known,
+        at,
+        scales,
         intrinsics,
+        config,
     )
-    found = align(
-        patches_around(frame.pyramid, features.xy[matched], octave),
+    shift = np.full((len(features), 2), np.nan, np.float32)
+    shift[matched] = found * scales[octave][:, None]
+    return shift
+
+
+def find_patches(
+    pyramid: Pyramid,
+    xy: NDArray[np.float32],
+    octave: NDArray[np.uint8],
+    T_cw: NDArray[np.float64],
+    xyz: NDArray[np.float64],
+    known: LandmarkPatches,
+    at: NDArray[np.int64],
+    scales: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    config: AlignmentConfig,
+) -> NDArray[np.float32]:
+    """Find the patches of N landmarks near where they are expected in an image.
+
+    Args:
+        pyramid: of the image.
+        xy: ``(N, 2)`` expected positions, full-resolution pixels, and ``(N,)`` ``octave``.
+        T_cw: ``(4, 4)`` pose of the camera of the image.
+        xyz: ``(N, 3)`` the landmarks, in the world.
+        known: their patches, in the rows ``at`` ``(N,)``.
+        scales: full-resolution pixels per pixel of each octave.
+
+    Returns:
+        ``(N, 2)`` shift from the nearest pixel of the octave, in its pixels; NaN if not found.
+    """
+    view, size = known.view[at], known.size[at]
+    warp = warps(T_cw, xyz, known.T_cw, view, size, scales[octave], intrinsics)
+    return align(
+        patches_around(pyramid, xy, octave),
         known.pixels,
         known.shift,
         known.where[at],
@@ -76,9 +110,6 @@ def align_frame(
         config.max_shift,
         config.min_correlation,
     )
-    shift = np.full((len(features), 2), np.nan, np.float32)
-    shift[matched] = found * size[:, None]
-    return shift
 
 
 @kernel

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import DepthImage, Image, ImageMap
-from vslam.features import Extracted, Features, Pyramid, Side
+from vslam.features import Extracted, Features, Keypoints, Pyramid, Side
 from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.orb import Extraction, build_pyramid, with_keypoints
 from vslam.frontend.pose_alignment import coarse_levels
@@ -17,9 +17,6 @@ from vslam.frontend.sides import Sides, balanced, compare_sides
 from vslam.frontend.stereo import match_stereo
 from vslam.frontend.tracking import TrackingContext
 from vslam.frontend.weak_images import extract_in_any_light
-
-Keypoints = tuple[NDArray[np.float32], NDArray[np.uint8]]
-"""``(N, 2)`` positions at full resolution (pixels), and ``(N,)`` pyramid levels."""
 
 
 class FrameImages:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera, Image
-from vslam.features import Extracted, FeatureGrid, Features, Pyramid, Side
+from vslam.features import Extracted, FeatureGrid, Features, Keypoints, Pyramid, Side
 from vslam.geometry import Matrix, inverse
 
 
@@ -24,7 +24,7 @@ class FeatureSource(Protocol):
     @property
     def extracted(self) -> Extracted: ...
 
-    def extracted_with(self, keypoints: tuple[NDArray[np.float32], NDArray[np.uint8]]) -> Extracted:
+    def extracted_with(self, keypoints: Keypoints) -> Extracted:
         """The features, and others at given positions and levels of the left image."""
         ...
 

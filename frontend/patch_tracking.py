@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.features import PATCH_RADIUS, Features, Pyramid
-from vslam.frontend.alignment import align, warps
+from vslam.frontend.alignment import find_patches
 from vslam.frontend.matching import predict_view
-from vslam.frontend.patches import patches_around
 from vslam.frontend.pose import optimise_pose
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import Matrix, orthonormalised
@@ -70,28 +69,12 @@ def track_patches(
     tried = np.flatnonzero((radius > 0) & inside.all(axis=1))
     level = octave[tried].astype(np.uint8)
     xy = _whole_pixels(uvr[tried, :2], pyramid, level)
-    scale = scales[level]
-    warp = warps(
-        T_cw,
-        xyz[tried],
-        known.T_cw,
-        known.view[tried],
-        known.size[tried],
-        scale,
-        camera.intrinsics,
-    )
-    shift = align(
-        patches_around(pyramid, xy, level),
-        known.pixels,
-        known.shift,
-        known.where[tried],
-        warp,
-        config.iterations,
-        config.max_shift,
-        config.min_correlation,
+    shift = find_patches(
+        pyramid, xy, level, T_cw, xyz[tried], known, tried, scales, camera.intrinsics, config
     )
     found = np.isfinite(shift[:, 0])
-    seen, scale, level = tried[found], scale[found], level[found]
+    seen, level = tried[found], level[found]
+    scale = scales[level]
     xy = xy[found] + shift[found] * scale[:, None].astype(np.float32)
     uvr = np.full((len(seen), 3), np.nan)
     uvr[:, :2] = xy

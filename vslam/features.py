@@ -82,6 +82,10 @@ class Features:
         )
 
 
+Keypoints = tuple[NDArray[np.float32], NDArray[np.uint8]]
+"""``(N, 2)`` positions at full resolution (pixels), and ``(N,)`` pyramid levels."""
+
+
 class Side(StrEnum):
     """One camera of a stereo pair. A camera without a second one counts as the left one."""
 

@@ -1,7 +1,9 @@
-"""Fixtures that several test files share: a rendered stereo world and a checker of maps."""
+"""Fixtures that several test files share: a rendered stereo world, a checker of maps, the command
+line."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 
 from vslam.camera import Camera
+from vslam.cli import main as cli
 from vslam.geometry import se3_exp
 from vslam.map import Map
 from vslam.trajectory import write_kitti
@@ -217,3 +220,22 @@ def corridor_depth(camera: Camera, T_wc: np.ndarray) -> np.ndarray:
         nearer = (along > 0.05) & (along < depth) & (hit[..., 1] > CEILING)
         depth[nearer] = along[nearer]
     return np.where(np.isfinite(depth), depth, 0.0)
+
+
+@pytest.fixture
+def call(monkeypatch, capsys, tmp_path):
+    """Run ``vslam`` with the given words in an empty folder: (exit code, stdout, stderr)."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("KITTI_ROOT", raising=False)
+
+    def run(*words: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["vslam", *map(str, words)])
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        output = capsys.readouterr()
+        return code, output.out, output.err
+
+    return run

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -16,7 +16,6 @@ from vslam.calibration.boards import Board, Corners, board_points, read_board, s
 from vslam.calibration.files import read_calibration, write_calibration
 from vslam.calibration.models import Calibration, CameraModel, project, unproject
 from vslam.calibration.solve import View, diverse, fit_camera, fit_pair
-from vslam.cli import main as cli
 from vslam.cli.calibrate import _frames
 from vslam.datasets.frames import RawSource, TimedFrame
 from vslam.doctor.calibration_page import Calibrated, findings_of
@@ -74,21 +73,9 @@ def exact_views(board: Board, model: CameraModel, views: list[np.ndarray]) -> li
 
 
 @pytest.fixture
-def call(monkeypatch, capsys, tmp_path):
+def calibrate(call):
     """Run ``vslam calibrate`` in an empty folder: (exit code, stdout, stderr)."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*words: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["vslam", "calibrate", *map(str, words)])
-        try:
-            cli.main()
-            code = 0
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-        output = capsys.readouterr()
-        return code, output.out, output.err
-
-    return run
+    return partial(call, "calibrate")
 
 
 def check_camera(found: CameraModel, truth: CameraModel) -> None:
@@ -108,10 +95,10 @@ def check_pair(found: Calibration, truth: CameraModel) -> None:
     assert np.linalg.norm(turn) < 2e-3
 
 
-def test_checkerboard_filmed_by_one_camera(call, tmp_path):
+def test_checkerboard_filmed_by_one_camera(calibrate, tmp_path):
     images = rendered(CHECKERBOARD, PINHOLE, poses(CHECKERBOARD, PINHOLE, 14), 0)
     write_images(tmp_path, {"board": images}, [f"{k}.png" for k in range(14)])
-    code, out, _ = call("board", "--board", "checkerboard", "--size", "9x6")
+    code, out, _ = calibrate("board", "--board", "checkerboard", "--size", "9x6")
     assert code == 0, out
     # One is cut off by the border of the image.
     assert out.startswith("The checkerboard of 9x6 inner corners is seen in 13 of 14 images.\n")
@@ -120,25 +107,25 @@ def test_checkerboard_filmed_by_one_camera(call, tmp_path):
     page = Path("calibration.html").read_text()
     assert "checkerboard of 9x6 inner corners" in page
     assert page.count("<svg") == 2
-    code, _, err = call("board", "--board", "checkerboard", "--size", "9x6")
+    code, _, err = calibrate("board", "--board", "checkerboard", "--size", "9x6")
     assert (code, "calibration.yaml: exists already" in err) == (2, True)
 
 
 @pytest.mark.slow
-def test_charuco_board_in_a_side_by_side_video(call, tmp_path):
+def test_charuco_board_in_a_side_by_side_video(calibrate, tmp_path):
     views = poses(CHARUCO, PINHOLE, 14)
     right = [np.linalg.inv(T_LEFT_RIGHT) @ T for T in views]
     sides = rendered(CHARUCO, PINHOLE, views, 1), rendered(CHARUCO, PINHOLE, right, 2)
     write_video(tmp_path / "pair.mkv", [np.hstack(pair) for pair in zip(*sides, strict=True)])
     sizes = ("--size", "7x5", "--square", 0.04, "--marker", 0.03, "--dictionary", "4X4_50")
     words = ("pair.mkv", "--side-by-side", "--board", "charuco", *sizes, "--out", "stereo.yaml")
-    code, out, _ = call(*words)
+    code, out, _ = calibrate(*words)
     assert code == 0, out
     check_pair(read_calibration(["stereo.yaml"]), PINHOLE)
 
 
 @pytest.mark.slow
-def test_aprilgrid_of_kalibr_in_euroc_layout_by_fisheye_cameras(call, tmp_path):
+def test_aprilgrid_of_kalibr_in_euroc_layout_by_fisheye_cameras(calibrate, tmp_path):
     views = poses(APRILGRID, FISHEYE, 14)
     right = [np.linalg.inv(T_LEFT_RIGHT) @ T for T in views]
     names = [f"{10**18 + 10**8 * k}.png" for k in range(14)]
@@ -150,7 +137,7 @@ def test_aprilgrid_of_kalibr_in_euroc_layout_by_fisheye_cameras(call, tmp_path):
     board = read_board(tmp_path / "april.yaml")
     assert (board.columns, board.rows) == (4, 3)
     assert (board.square, board.marker) == pytest.approx((APRILGRID.square, APRILGRID.marker))
-    code, out, _ = call(tmp_path, "--board", "april.yaml", "--lens", "fisheye")
+    code, out, _ = calibrate(tmp_path, "--board", "april.yaml", "--lens", "fisheye")
     assert code == 0, out
     check_pair(read_calibration(["calibration.yaml"]), FISHEYE)
 
@@ -276,7 +263,7 @@ def test_video_that_breaks_off_is_used_up_to_there(capsys):
 
 
 @pytest.mark.slow
-def test_images_without_the_board_are_an_error_that_says_what_was_looked_for(call, tmp_path):
+def test_images_without_the_board_are_an_error_that_says_what_was_looked_for(calibrate, tmp_path):
     blank = np.full((288, 384), 128, np.uint8)
     images = rendered(CHECKERBOARD, PINHOLE, poses(CHECKERBOARD, PINHOLE, 2), 0)
     write_images(tmp_path, {"blank": [blank] * 2, "board": images}, ["0.png", "1.png"])
@@ -296,6 +283,6 @@ def test_images_without_the_board_are_an_error_that_says_what_was_looked_for(cal
         (("pair", *rest, "9"), "--size 9: give columns and rows as 9x6."),
         (("pair", "--board", "none.yaml"), "--board none.yaml: neither checkerboard, charuco"),
     ):
-        code, _, err = call(*words)
+        code, _, err = calibrate(*words)
         message = err[err.index("error: ") :]
         assert (code, said in message, message.count("\n")) == (2, True, 1), message

@@ -67,25 +67,6 @@ def circle(n: int) -> np.ndarray:
     return T_wc
 
 
-@pytest.fixture
-def call(monkeypatch, capsys, tmp_path):
-    """Run ``vslam`` with the given words in an empty folder: (exit code, stdout, stderr)."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("KITTI_ROOT", raising=False)
-
-    def run(*words: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["vslam", *map(str, words)])
-        try:
-            cli.main()
-            code = 0
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-        output = capsys.readouterr()
-        return code, output.out, output.err
-
-    return run
-
-
 NOT_UTF8 = os.fsdecode(b"dir\xff")
 
 

@@ -237,8 +237,8 @@ def joined(
     first: tuple[NDArray[np.int32], NDArray[np.int32]],
     second: tuple[NDArray[np.int32], NDArray[np.int32]],
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Pairs of features and landmarks of the first list, followed by those pairs of the second list
-    that repeat neither a feature nor a landmark of the first."""
+    """All pairs of features and landmarks of the first list, followed by those pairs of the second
+    list whose feature and landmark both do not occur in the first."""
     new = ~(np.isin(second[0], first[0]) | np.isin(second[1], first[1]))
     return np.r_[first[0], second[0][new]], np.r_[first[1], second[1][new]]
 

@@ -58,7 +58,7 @@ class SiameseDetector:
         self._row = np.full(64, -1, np.int64)  # row of each keyframe, -1 without a descriptor
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
-        """Remember a keyframe. Without an image it can be neither a query nor a match."""
+        """Remember a keyframe. A keyframe without an image is never a query and never a match."""
         if keyframe >= len(self._row):
             more = max(keyframe + 1 - len(self._row), len(self._row) // 2)
             self._row = np.pad(self._row, (0, more), constant_values=-1)

@@ -202,7 +202,7 @@ def crop(
         str,
         typer.Option(
             metavar="FIRST:LAST",
-            help="Keep the keyframes --within a distance of those of these frames.",
+            help="Keep the keyframes --within a distance of the keyframes made in these frames.",
         ),
     ] = "",
     drive: Annotated[

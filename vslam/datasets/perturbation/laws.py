@@ -126,8 +126,8 @@ def contact_sheet(
     start: int = 0,
     every: int = 1,
 ) -> Image:
-    """A grey image with a row for each frame: left image as it is, both images perturbed, and the
-    amplified change of one of them.
+    """A grey image with a row for each frame. A row shows the unperturbed left image, the two
+    perturbed images, and the change of one of them, amplified.
 
     Args:
         indices: frames of the sequence.
@@ -147,8 +147,9 @@ def contact_sheet(
 
 
 def sheet_of_laws(sequence: Source, specs: Collection[str], index: int, seed: int) -> Image:
-    """A grey image with a row for each perturbation: a frame as it is, both its images perturbed,
-    and the amplified change of one of them. Several rows stand in two columns.
+    """A grey image with a row for each perturbation of one frame. A row shows the unperturbed left
+    image, the two perturbed images, and the change of one of them, amplified. The rows are arranged
+    in two columns if there are several.
 
     Raises:
         InputError: the sequence lacks what a law needs.

@@ -252,12 +252,28 @@ def test_a_value_out_of_range_is_told_in_our_words(call, words, part):
     [
         ('{"orb": {"n_feature": 500}}', "orb.n_feature: unknown key (did you mean n_features?)"),
         ('{"orb": {"n_features": -1}}', "orb.n_features: must be at least 100."),
-        ('{"orb": ', "the configuration is no JSON object; correct the file."),
+        ('{"orb.n_features": -1}', "orb.n_features: must be at least 100."),
+        ('{"orb": 5}', "orb must map names to values"),
+        ("[]", "the configuration must map names to values"),
+        ("orb:\n  n_features: 900\n", "the configuration is not JSON (expected value at line 1 "),
+        (
+            '{"orb": {\n "n_features": 900,\n}}',
+            "the configuration is not JSON (trailing comma at l",
+        ),
     ],
 )
 def test_a_wrong_configuration_is_told_in_our_words(call, text, part):
     Path("config.json").write_text(text)
     refused(call("run", "--config", "config.json", "--data", "."), f"config.json: {part}")
+
+
+def test_thresholds_are_given_as_values_too(call, tmp_path):
+    found = options.read_thresholds("orb.n_features=1000, tracking.method=patches")
+    assert (found.orb.n_features, found.tracking.method) == (1000, "patches")
+    refused(call("run", "--config", "orb.n_feature=9", "--data", "."), "(did you mean n_features?)")
+    file = tmp_path / "a=b.json"
+    file.write_text('{"tracking.method": "patches"}')
+    assert options.read_thresholds(str(file)).tracking.method == "patches"
 
 
 def commands(group: Any, words: str = "vslam") -> Iterator[tuple[str, Any]]:

@@ -4,6 +4,7 @@ cannot be."""
 from __future__ import annotations
 
 import json
+import traceback
 from dataclasses import replace
 from pathlib import Path
 
@@ -71,11 +72,35 @@ def test_data_and_settings_are_read_by_strings(tmp_path, kitti_tree):
     config = tmp_path / "config.json"
     config.write_text("{}")
     assert load_config(str(config)) == Config()
+    config.write_text('{"tracking.method": "patches", "tracking": {"min_inliers": 40}}')
+    found = load_config(config).tracking
+    assert (found.method, found.min_inliers) == ("patches", 40)
     calib = tmp_path / "one.yaml"
     calib.write_text("left: {lens: pinhole, size: [640, 240], focal: [9, 9], centre: [320, 120]}")
     assert read_calibration([str(calib)]).left.width == 640
     save_ply(str(tmp_path / "map.ply"), np.zeros((1, 3)))
     assert (tmp_path / "map.ply").stat().st_size
+
+
+def test_thresholds_are_given_as_a_dictionary():
+    config = {"orb": {"n_features": 900}, "tracking.method": "patches"}
+    found = Slam(CAMERA, config, "none", threads=1).context.config
+    assert (found.orb.n_features, found.tracking.method) == (900, "patches")
+
+
+@pytest.mark.parametrize(
+    ("config", "words"),
+    [
+        ({"orb": {"n_feature": 9}}, r"orb.n_feature: unknown key \(did you mean n_features\?\); "),
+        ({"orb": {"n_features": 9}}, "orb.n_features: must be at least 100.$"),
+        ({"orb.n_features": 900, "orb": 5}, "orb must map names to values"),
+        ("config.json", "the configuration must map names to values"),
+    ],
+)
+def test_wrong_thresholds_are_refused_in_one_sentence(config, words):
+    with pytest.raises(InputError, match=f"^config: {words}") as refused:
+        Slam(CAMERA, config, "none", threads=1)
+    assert "pydantic" not in "".join(traceback.format_exception(refused.value))
 
 
 @pytest.mark.parametrize("dataset", ["kitti", "euroc", "tum"])

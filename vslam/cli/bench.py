@@ -21,6 +21,7 @@ from vslam.cli.options import (
     kind_of_source,
     names_in,
     open_given,
+    read_thresholds,
     reads_source,
     sequences,
 )
@@ -167,21 +168,19 @@ def absolute(given: SourceOptions) -> SourceOptions:
 def cell_options(
     kind: str,
     given: SourceOptions,
-    config: Path | None,
+    config: str | None,
     threads: int | None,
     jobs: int,
     scheduler: str | None,
     out: Path,
 ) -> RunOptions:
     """The settings that all cells of a benchmark share."""
-    from vslam.config import Config, load_config
     from vslam.lab.bench.execute import RunOptions, scratch_folder
     from vslam.machine import available_cores
 
-    thresholds = Config() if config is None else load_config(config)
     return RunOptions(
         data=Path(given.data) if kind != "synthetic" else None,
-        config=thresholds.model_dump_json(indent=2) + "\n",  # as a run writes it
+        config=read_thresholds(config).model_dump_json(indent=2) + "\n",  # as a run writes it
         threads=threads or max(1, min(available_cores() // jobs, 4)),
         scratch=None if scheduler else scratch_folder(out),
         source=tuple(_words_of(given)),

@@ -21,6 +21,7 @@ from vslam.cli.options import (
     Threads,
     Thresholds,
     ViewerName,
+    read_thresholds,
     reads_source,
 )
 from vslam.errors import InputError
@@ -215,7 +216,6 @@ def run(
             "out --realtime."
         )
 
-    from vslam.config import Config, load_config
     from vslam.machine import available_cores
     from vslam.run.options import RunOptions
 
@@ -227,7 +227,7 @@ def run(
         detector=detector,
         weights=weights,
         local_weights=local_weights,
-        thresholds=Config() if config is None else load_config(config),
+        thresholds=read_thresholds(config),
         map_file=map_file,
         localize=localize,
         compare=beside,

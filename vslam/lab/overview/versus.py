@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from vslam.evaluation.loops import LoopLimits
+from vslam.lab.overview.collect import without_settings
 from vslam.lab.overview.schema import Comparison, Drive, OverviewJson, Row, Spread
 from vslam.lab.overview.summary import COMPARED, ROTATION
 from vslam.report.page import Bullets, Section, Table
@@ -58,7 +59,7 @@ def _without_revisits(report: OverviewJson) -> str:
     """Why loop detectors do not differ, or hardly; empty where a drive has a revisit or nobody
     could judge it."""
     judged = [row for row in report.rows if row.measures["loops_found"] is not None]
-    names = {row.system for row in judged}
+    names = {row.system for row in judged if row.system == without_settings(row.system)}
     counts = [row.measures[name] for row in judged for name in ("loops_found", "loops_missed")]
     if len(names) < 2 or any(count.greatest for count in counts if count is not None):
         return ""

@@ -92,7 +92,7 @@ def bench(
     from vslam.cli.console import console
     from vslam.lab.bench import execute
     from vslam.lab.bench.estimate import check_disk, duration, estimate, size
-    from vslam.lab.bench.grid import make_grid, parse_perturbations
+    from vslam.lab.bench.grid import make_grid, parse_perturbations, thresholds_digest
     from vslam.lab.bench.table import GridProgress, shown_live
     from vslam.loopclosure.registry import parse_weights, require_detector
 
@@ -111,6 +111,7 @@ def bench(
     cells = make_grid(
         kind, frames, laws, chosen, seeds, given.max_frames, files,
         sensor=given.sensor, calib=tuple(map(str, given.calib)),
+        thresholds=thresholds_digest(options.config),
     )  # fmt: skip
     execute.prepare(out, identity_of(kind, given))
     finished = execute.finished_cells(cells, out, options.config)

@@ -26,6 +26,8 @@ from vslam.loopclosure.registry import DETECTORS
 from vslam.loopclosure.siamese.weights import NETWORKS
 from vslam.loops import LoopEdge
 from vslam.report import figures
+from vslam.report.finished_run import read_report
+from vslam.report.run_page import option_rows
 from vslam.run import pipeline as run_pipeline
 from vslam.run import recorder, warmup
 from vslam.run.moments import MomentRecorder
@@ -439,6 +441,22 @@ def test_run_writes_its_folder_and_a_summary(call, root, pipeline):
     assert pipeline.recorder == str(Path("runs") / folder.name / "recording.rrd")
     assert pipeline.evaluation.ate_rmse_m < 1e-9
     assert len(read_kitti_poses(folder / "ground_truth_kitti.txt")) == 10
+
+
+def test_changed_thresholds_are_in_the_name_of_the_folder_and_the_summary(call, root, pipeline):
+    config = "orb.n_features=1000,orb.n_levels=7,tracking.method=patches,depth.min_metres=0.5"
+    code, out, err = call("run", "--data", root, "--max-frames", 10, "--config", config)
+    assert code == 0, err
+    assert (
+        "· thresholds orb.n_features=1000, orb.n_levels=7, depth.min_metres=0.5, 1 more in" in out
+    )
+    folder = Path("runs/latest").resolve()
+    assert folder.name.endswith("-kitti-00-none-both-orb.n_features=1000+3more")
+    report = read_report(folder)
+    assert report.thresholds["tracking.method"] == "patches"
+    row = dict(option_rows(report))["thresholds"]
+    assert row == ", ".join(f"{name}={value}" for name, value in report.thresholds.items())
+    assert "thresholds" not in dict(option_rows(report.model_copy(update={"thresholds": {}})))
 
 
 CLOSED = LoopEdge(3, 0, 0.6, True, "closed", 80, 60)  # no pose: neither right nor wrong

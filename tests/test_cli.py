@@ -21,6 +21,7 @@ import pytest
 from vslam import machine
 from vslam.cli import main as cli
 from vslam.cli import options, train
+from vslam.datasets import open_sequence
 from vslam.features import TrackingState, TrackResult
 from vslam.loopclosure.registry import DETECTORS
 from vslam.loopclosure.siamese.weights import NETWORKS
@@ -32,6 +33,7 @@ from vslam.run import pipeline as run_pipeline
 from vslam.run import recorder, warmup
 from vslam.run.moments import MomentRecorder
 from vslam.run.outcome import RunOutcome
+from vslam.slam import Slam
 from vslam.trajectory import (
     Trajectory,
     read_kitti_poses,
@@ -457,6 +459,16 @@ def test_changed_thresholds_are_in_the_name_of_the_folder_and_the_summary(call, 
     row = dict(option_rows(report))["thresholds"]
     assert row == ", ".join(f"{name}={value}" for name, value in report.thresholds.items())
     assert "thresholds" not in dict(option_rows(report.model_copy(update={"thresholds": {}})))
+
+
+def test_a_map_is_continued_with_its_own_thresholds_by_default(call, root, pipeline):
+    camera = open_sequence("kitti", root, "00", max_frames=10).camera
+    Slam(camera, {"orb.n_features": 900}, "none", threads=1).save("map.npz")
+    words = ("run", "--data", root, "--max-frames", 10, "--map", "map.npz")
+    for given, n in (((), 900), (("--config", "orb.n_features=800"), 800)):
+        code, _, err = call(*words, *given)
+        assert code == 0, err
+        assert pipeline.settings.config.orb.n_features == n
 
 
 CLOSED = LoopEdge(3, 0, 0.6, True, "closed", 80, 60)  # no pose: neither right nor wrong

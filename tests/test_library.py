@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import traceback
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +82,23 @@ def test_data_and_settings_are_read_by_strings(tmp_path, kitti_tree):
     assert (tmp_path / "map.ply").stat().st_size
 
 
+def test_a_map_is_continued_with_the_thresholds_that_it_was_made_with(tmp_path):
+    file = tmp_path / "map.npz"
+    Slam(CAMERA, {"orb.n_features": 900}, "none", threads=1).save(file)
+    again = Slam.load(file, threads=1)
+    assert again.context.config.orb.n_features == 900
+    assert Slam.load(file, {}, threads=1).context.config == Config()
+    again.save(file)
+    assert made_with(file).thresholds == {"orb.n_features": 900}
+    write_header(file, thresholds={"orb.retired": 3})
+    with pytest.raises(InputError, match=r"map.npz: orb.retired: unknown key"):
+        Slam.load(file)
+    assert Slam.load(file, Config(), threads=1).context.config == Config()
+    write_header(file, thresholds=5)
+    with pytest.raises(InputError, match="the map is damaged"):
+        Slam.load(file)
+
+
 def test_thresholds_are_given_as_a_dictionary():
     config = {"orb": {"n_features": 900}, "tracking.method": "patches"}
     found = Slam(CAMERA, config, "none", threads=1).context.config
@@ -141,15 +158,19 @@ def test_a_calibration_of_a_camera_that_cannot_be_is_named():
         rectify(Calibration(model, source="mine.yaml"))
 
 
+def write_header(file: Path, **entries: object) -> None:
+    """Replace entries of the header of a map file."""
+    with np.load(file) as saved:
+        arrays = dict(saved)
+    header = json.loads(arrays["header"].tobytes()) | entries
+    arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    np.savez(file, **arrays)
+
+
 def test_the_camera_of_a_map_file_is_checked(tmp_path):
     file = tmp_path / "map.npz"
     Slam(CAMERA, detector="none", threads=1).save(file)
-    with np.load(file) as saved:
-        arrays = dict(saved)
-    header = json.loads(arrays["header"].tobytes())
-    header["camera"]["cx"] = 6000.0
-    arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
-    np.savez(file, **arrays)
+    write_header(file, camera=asdict(CAMERA) | {"cx": 6000.0})
     with pytest.raises(InputError, match=r"map.npz: .*principal point \(6000.0, 120.0\)"):
         load_map(file)
 

@@ -116,7 +116,7 @@ class Slam:
     def load(
         cls,
         path: Path | str,
-        config: Config | None = None,
+        config: Config | Mapping[str, Any] | None = None,
         detector: LoopDetector | str | None = None,
         *,
         resume: bool = False,
@@ -126,7 +126,7 @@ class Slam:
 
         Args:
             path: the map file, or the folder of a run.
-            config: as for a new map.
+            config: as for a new map; None uses the thresholds that the map was made with.
             detector: the detector that the map was made with, as a name or an object; None uses
                 the shipped detector of that name.
             resume: as for a new map.
@@ -138,6 +138,7 @@ class Slam:
         """
         stored = load_checkpoint(path) if resume else load_map(path)
         detector = stored.detector.name if detector is None else detector
+        config = as_config(stored.thresholds, str(path)) if config is None else config
         try:
             return cls(stored.camera, config, detector, start=stored, resume=resume, **options)
         except (ValueError, KeyError) as error:

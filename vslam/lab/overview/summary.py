@@ -117,7 +117,7 @@ def systems(runs: Iterable[RunEntry | Row], baseline: str | None = None) -> list
 
 def _is_called(system: str, name: str | None) -> bool:
     """Whether ``--baseline`` may call a system so: with its settings or without."""
-    return name in (one.removesuffix(MONOCULAR) for one in (system, without_settings(system)))
+    return name in {one.removesuffix(MONOCULAR) for one in (system, without_settings(system))}
 
 
 def make_rows(runs: list[RunEntry]) -> list[Row]:

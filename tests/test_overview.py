@@ -305,6 +305,17 @@ def test_the_table_of_a_short_name_fits_a_terminal_of_80_columns(two_conditions,
     assert "- RPE over all conditions, both against bow: a tie on all 6 sequences." in printed
 
 
+def test_long_names_take_more_tables_instead_of_wider_ones(two_conditions, capsys):
+    runs = [
+        run.model_copy(update={"system": "bow (orb.n_features=1000, tracking.method=patches)"})
+        if run.system == "both"
+        else run
+        for run in two_conditions
+    ]
+    show(versus(summarize(Found(runs, []))), Console(width=80))
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
+
+
 def test_one_condition_is_not_called_all(two_conditions):
     runs = [run for run in two_conditions if run.drive.perturb == "none"]
     report = summarize(Found(runs, []))
@@ -601,7 +612,7 @@ FIGURES = {
 def test_html_has_every_figure_and_loads_nothing(written):
     html = (written[1] / "report.html").read_text()
     assert set(re.findall('<figure class="card ([^"]*)"', html)) == FIGURES
-    assert html.count("<table>") == 7
+    assert html.count("<table>") == 8
     assert not re.search("<(script|iframe|object|embed|img)", html)
 
 

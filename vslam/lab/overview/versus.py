@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 from vslam.evaluation.loops import LoopLimits
@@ -13,7 +14,8 @@ from vslam.report.page import Bullets, Section, Table
 _TEXTS = ("sequence", "perturbation")
 _SHOWN = {**COMPARED, **ROTATION}
 _MEASURES = ("lost_frames", *_SHOWN, "loops_found")
-_COLUMNS = 10  # at most so many columns of figures, which fit a terminal of 80 characters
+_WIDTH = 60  # characters for all columns of figures, so that a table fits a terminal of 80
+_COLUMN = 6  # characters of a column of figures at least
 _NOTES = {
     "lost_frames": "Lost: number of lost frames.",
     "rpe_m": "RPE: error of the motion from one frame to the next.",
@@ -78,7 +80,9 @@ def _is_tie(one: Comparison) -> bool:
 
 def _section(report: OverviewJson, rows: Rows, names: list[str]) -> Section:
     order = {(row.drive, row.alignment): None for row in report.rows if row.system in names}
-    each = max(1, _COLUMNS // len(names))  # measures of one table
+    words = [re.split(", | ", name) for name in names]  # a heading breaks between them
+    width = sum(max(_COLUMN, *(1 + len(word) for word in parts)) for parts in words)
+    each = max(1, _WIDTH // width)  # measures of one table
     tables = []
     for k in range(0, len(_MEASURES), each):
         measures = _MEASURES[k : k + each]

@@ -455,7 +455,7 @@ def test_thresholds_do_not_make_loop_detectors_differ():
     ]
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"orb": 3}'])
+@pytest.mark.parametrize("text", ["{", "[]", '{"orb": 3}', "[" * 9999])
 def test_a_run_with_damaged_thresholds_is_left_out(thresholds: Path, text: str):
     (thresholds / "0" / "config.json").write_text(text)
     found = collect([thresholds], [])

@@ -78,7 +78,7 @@ def _fault(model: type[BaseModel], error: ValidationError, what: str) -> str:
         name = ".".join(place) or f"the {what}"
         return f'{name} must map names to values, as in {{"name": 1}}'
     why = plain_reason(first["msg"])
-    if first["type"] == "extra_forbidden":
+    if first["type"] in ("extra_forbidden", "invalid_key"):
         meant = did_you_mean(place[-1], _keys(model, place[:-1]))
         why = f"unknown key{meant}; correct or remove it"
     return f"{'.'.join(place)}: {why}"

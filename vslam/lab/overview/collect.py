@@ -171,7 +171,7 @@ def _settings(report: ReportJson, folder: Path) -> dict[str, Any]:
     path = folder / "config.json"
     try:
         changed = changed_thresholds(json.loads(path.read_bytes())) if path.exists() else {}
-    except (OSError, ValueError, AttributeError) as error:
+    except (OSError, ValueError, AttributeError, RecursionError) as error:
         raise InputError(f"{path.name} is damaged") from error
     options = {name: getattr(report, name) for name in _OPTIONS}
     return changed | {name: str(value) for name, value in options.items() if value}

@@ -185,7 +185,8 @@ class Slam:
             RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
         """
         check_images(left, second, self.context.camera)
-        return self.step_images(FrameImages(np.array(left), second, self.context), timestamp)
+        images = FrameImages(np.array(left), lambda: second, self.context)
+        return self.step_images(images, timestamp)
 
     def step_images(
         self, images: FrameImages, timestamp: float, stage_ms: dict[str, float] | None = None
@@ -253,8 +254,8 @@ class Slam:
         else:
             tracker.accept(frame, found, mapper.frames)
             placed = mapper.append_pose(frame, tracked=True, near=found.keyframe)
-            self.rig.observe(frame, frame.twist)
             is_keyframe = self._mode.update_map(placed, found)
+            self.rig.observe(frame, frame.twist)
         clock.lap("keyframe")
         return result_of(frame, found, is_keyframe, clock.ms)
 
@@ -301,6 +302,12 @@ class Slam:
         return self._session.opened.world
 
     @property
+    def next_keyframe(self) -> int:
+        """Index of the frame that is to become a keyframe; -1 if none is planned. Its
+        ``FrameImages.find_corners`` may be called ahead, in another thread."""
+        return self._mode.due
+
+    @property
     def is_mapping(self) -> bool:
         """Whether a keyframe is being mapped."""
         return self._mapper.is_mapping
@@ -317,9 +324,9 @@ class Slam:
 
     @property
     def problems(self) -> list[str]:
-        """What failed so far without harm to the map, a sentence each: looking for loops, or a
-        global bundle adjustment."""
-        return self._closing.problems
+        """What failed so far without harm to the map, a sentence each: looking for loops, a
+        global bundle adjustment, or reading a right image."""
+        return [*self._closing.problems, *self.rig.problems]
 
     @property
     def corrections(self) -> list[LoopCorrection]:

@@ -43,7 +43,7 @@ def _closed(report: ReportJson) -> Table:
         (
             *_evidence(loop),
             _right(loop),
-            number(loop.moved_m, "{:.2f} m"),
+            number(loop.moved_m, "{:.2f}" if report.sensor == "mono" else "{:.2f} m"),
             number(loop.correction_s, "{:.2f} s"),
         )
         for loop in closed[:_MAX_CLOSED]
@@ -54,6 +54,8 @@ def _closed(report: ReportJson) -> Table:
         "matches give the relative pose, ORB's or those that the network learned. Pose: compared "
         "with the ground truth. Moved: the largest distance that the correction moved a keyframe."
     )
+    if report.sensor == "mono":
+        note = f"{note.rstrip('.')}, in the unit of the map."
     if len(closed) > _MAX_CLOSED:
         note += f" {len(closed) - _MAX_CLOSED} more are in report.json."
     return Table(head, rows, ("pose",), note)

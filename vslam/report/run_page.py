@@ -51,7 +51,8 @@ def headlines(report: ReportJson) -> list[Tile]:
         Tile(
             "Lost frames",
             str(lost),
-            f"{share} {report.frames}; {report.weak_frames} weak, {report.skipped_frames} skipped",
+            f"{share} {report.frames}{_before_map(report)}; {report.weak_frames} weak, "
+            f"{report.skipped_frames} skipped",
             "bad" if lost else "good",
         ),
         *_in_map(report),
@@ -78,6 +79,13 @@ def headlines(report: ReportJson) -> list[Tile]:
         Tile("Map", f"{report.landmarks:,}", _map_note(report)),
         _loops(report),
     ]
+
+
+def _before_map(report: ReportJson) -> str:
+    if not (count := report.lost_before_map):
+        return ""
+    why = ": a monocular map needs the camera to move sideways first" * (report.sensor == "mono")
+    return f", {count} of them before the map began{why}"
 
 
 def _together(report: ReportJson) -> str:

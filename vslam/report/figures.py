@@ -89,8 +89,8 @@ def _drawings(
     if outcome.tracks:
         yield (
             "tracked_points",
-            f"{_usable_features(outcome)[0].capitalize()}, those that were matched to landmarks, and "
-            "inliers of the pose.",
+            f"{_usable_features(outcome)[0].capitalize()}, those that were matched to landmarks, "
+            "and inliers of the pose.",
             _tracked_points(outcome),
         )
     if stage_names(outcome.tracks):

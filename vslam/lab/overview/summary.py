@@ -261,10 +261,7 @@ def _words(found: Comparison, better: list[Pair], worse: list[Pair]) -> str:
     text += f"{second} minus {first}: median {median} {shown.unit}"
     text += f" ({least} to {greatest}). " if n > 1 else ". "
     if found.p_value is None:
-        return text + (
-            f"Too few sequences differ ({untied}) for Wilcoxon's test, which takes {least_pairs()} "
-            f"to reach p < {ALPHA:g}: no claim about others."
-        )
+        return text.rstrip()
     chance = "unlikely to be chance" if found.winner else "may be chance"
     return text + f"Wilcoxon's signed-rank test on {untied}: p = {found.p_value:.3g}, {chance}."
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from vslam.evaluation.loops import LoopLimits
 from vslam.lab.overview.schema import Comparison, Drive, OverviewJson, Row, Spread
-from vslam.lab.overview.summary import COMPARED, ROTATION
+from vslam.lab.overview.summary import ALPHA, COMPARED, ROTATION, least_pairs
 from vslam.report.page import Bullets, Section, Table
 
 _TEXTS = ("sequence", "perturbation")
@@ -149,6 +149,7 @@ def _points(report: OverviewJson, rows: Rows, names: list[str]) -> Iterator[str]
         yield f"Lost frames: {', '.join(lost)}."
     if loops:
         yield f"Revisits in these runs: {'; '.join(loops)}."
+    shown = []
     for k, name in enumerate(names):
         sharing = (other for other in names[:k] if rows[other].keys() & rows[name].keys())
         baseline = next(sharing, None)
@@ -159,4 +160,10 @@ def _points(report: OverviewJson, rows: Rows, names: list[str]) -> Iterator[str]
                 if (one.first, one.second, one.measure) == (baseline, name, measure)
             ]
             if found_:
-                yield found_[-1].words  # over all conditions where there are several
+                shown.append(found_[-1])  # over all conditions where there are several
+    yield from (one.words for one in shown)
+    if any(one.p_value is None and one.first_better + one.second_better for one in shown):
+        yield (
+            f"Where fewer than {least_pairs()} sequences differ, Wilcoxon's test cannot reach "
+            f"p < {ALPHA:g}: the figures say nothing about other sequences."
+        )

@@ -437,7 +437,7 @@ def test_rejected_loops_do_not_drown_the_table(looped: tuple[RunOutcome, Path]) 
     assert [cell.strip() for cell in reasons[0].rsplit("|", 4)[1:4]] == ["299", "13", "n/a"]
     assert [cell.strip() for cell in reasons[1].rsplit("|", 4)[1:4]] == ["1", "84", "1 of 1"]
     assert text.count("needed") <= 14
-    assert "1 of 1 revisits found, 0 missed, 1 wrong, 300 candidates rejected" in text
+    assert "1 of 1 revisit found, 0 missed, 1 wrong, 300 candidates rejected" in text
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from vslam.cli.options import OUTPUT, Quiet
+from vslam.errors import counted
 
 _EXAMPLES = """
 [b]Examples[/b]
@@ -106,4 +107,4 @@ def write_overview_of(
         show_sections(versus(written))
         for note in written.notes:
             typer.echo(f"note: {note}", err=True)
-        typer.echo(f"\n{out / 'report.html'}: {len(written.runs)} runs")
+        typer.echo(f"\n{out / 'report.html'}: {counted(len(written.runs), 'run')}")

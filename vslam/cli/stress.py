@@ -241,7 +241,7 @@ def stress(
     write_report(out, report, {name: first_frames(source) for name, source in opened.items()})
     if not quiet:
         show_sections(boundary_sections(report))
-        ended = f"{len(report.boundaries)} of {len(searches)} searches finished"
+        ended = f"finished {len(report.boundaries)} of {len(searches)} searches"
         typer.echo(f"{out / 'report.html'}: {ended}")
     if stopped or len(report.boundaries) < len(searches):
         raise typer.Exit(1)

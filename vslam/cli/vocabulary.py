@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vslam.cli.options import OUTPUT, Quiet, Seed
-from vslam.errors import InputError, UnreadableImageError
+from vslam.errors import InputError, UnreadableImageError, counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -73,7 +73,7 @@ def train(
                 descriptors.append(found)
             advance()
     n = sum(map(len, descriptors))
-    shown.announce(f"{n} descriptors of {len(descriptors)} images")
+    shown.announce(f"{n} descriptors of {counted(len(descriptors), 'image')}")
 
     def on_level(level: int, nodes: int) -> None:
         shown.announce(f"level {level}: {nodes} nodes")
@@ -86,8 +86,8 @@ def train(
         ) from error
     write_vocabulary(trained, out)
     typer.echo(
-        f"{out}: {trained.n_words} words from {n} descriptors of {len(descriptors)} images, "
-        f"k {k}, levels {levels}, seed {seed}"
+        f"{out}: {trained.n_words} words from {n} descriptors of "
+        f"{counted(len(descriptors), 'image')}, k {k}, levels {levels}, seed {seed}"
     )
 
 

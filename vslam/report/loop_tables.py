@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 
+from vslam.errors import counted
 from vslam.report.page import Row, Section, Table, number
 from vslam.report.schema import LoopEntry, ReportJson
 
@@ -72,7 +73,7 @@ def _reasons(report: ReportJson) -> Table:
         for reason, loops in ordered
     ]
     head = ("reason", "candidates", "most inliers", "pose right")
-    note = f"{report.loops_rejected} candidates; each of them is in report.json."
+    note = f"{counted(report.loops_rejected, 'candidate')} in all; report.json lists each."
     return Table(head, rows, ("reason",), note)
 
 

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from itertools import combinations
 from typing import NamedTuple
 
-from vslam.errors import InputError, did_you_mean
+from vslam.errors import InputError, counted, did_you_mean
 from vslam.lab.overview.collect import MONOCULAR, Found
 from vslam.lab.overview.schema import (
     ALL,
@@ -253,7 +253,7 @@ def _words(found: Comparison, better: list[Pair], worse: list[Pair]) -> str:
     if not untied:
         return f"{beginning} a tie on {f'all {n} sequences' if n > 1 else 'the only sequence'}."
     verdict = f"{found.winner} wins" if found.winner else "no winner"
-    text = f"{beginning} {verdict}. Of {n} sequence{'s' if n > 1 else ''}, "
+    text = f"{beginning} {verdict}. Of {counted(n, 'sequence')}, "
     text += "; ".join(counts) + ". "
     differences = sorted(pair.difference for pair in found.pairs)
     least, greatest = (shown.text(differences[k], "+") for k in (0, -1))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from vslam.errors import counted
 from vslam.evaluation.loops import LoopLimits
 from vslam.lab.overview.schema import Comparison, Drive, OverviewJson, Row, Spread
 from vslam.lab.overview.summary import ALPHA, COMPARED, ROTATION, least_pairs
@@ -139,7 +140,7 @@ def _points(report: OverviewJson, rows: Rows, names: list[str]) -> Iterator[str]
     for name in names if shared else ():
         frames, n = total(name, "lost_frames"), len(runs[name])
         count = "n/a" if frames is None else f"{frames:.0f}"
-        lost.append(f"{name} {count} in {n} run{'s' if n != 1 else ''}")
+        lost.append(f"{name} {count} in {counted(n, 'run')}")
         found, missed, wrong = (
             total(name, measure) for measure in ("loops_found", "loops_missed", "loops_wrong")
         )

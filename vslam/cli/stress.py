@@ -264,7 +264,7 @@ def foreign(
     no_report: Annotated[bool, typer.Option("--no-report")] = False,
     quiet: Annotated[bool, typer.Option("--quiet")] = False,
 ) -> None:
-    """Run another system in the way [b]vslam run[/b] runs vslam, for [b]vslam stress[/b]."""
+    """Run another system on a sequence and write a run's report; used by [b]vslam stress[/b]."""
     from vslam.cli.console import console
     from vslam.config import load_config
     from vslam.datasets.perturbation import parse_perturbation

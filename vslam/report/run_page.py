@@ -91,7 +91,7 @@ def _before_map(report: ReportJson) -> str:
 
 def _together(report: ReportJson) -> str:
     """A remark on speed and memory where several detectors were run."""
-    return f", all {len(report.detectors)} detectors together" if report.detectors else ""
+    return f", {len(report.detectors)} detectors together" if report.detectors else ""
 
 
 def advice(report: ReportJson) -> str:

@@ -176,7 +176,7 @@ def g2o(
         save_g2o(file, ids, inverses(graph.T_cw), graph.edges, graph.T_i_j, graph.sigmas)
     if not quiet:
         loops = np.count_nonzero(graph.kind == LOOP)
-        typer.echo(f"{target}: {len(ids)} vertices, {len(graph.edges)} edges, {loops} of loops")
+        typer.echo(f"{target}: {len(ids)} vertices, {len(graph.edges)} edges, {loops} from loops")
 
 
 @commands.command(epilog="[b]Example[/b]\n  vslam export euroc runs/latest")

@@ -77,10 +77,10 @@ def _contents(map_: Map, reconstruction: Reconstruction) -> Rows:
     r = reconstruction
     path = np.linalg.norm(np.diff(r.T_wc[:, :3, 3], axis=0), axis=1).sum()
     unit = "units" if r.camera.monocular else "m"
-    observations = f"{len(r.xy)} by {map_.n_rows} keypoints"
+    observations = f"{len(r.xy)}, {map_.n_rows} keypoints in all"
     if len(r.xy):
         observations += (
-            f", {len(r.xy) / len(r.xyz):.1f} of a landmark, "
+            f", {len(r.xy) / len(r.xyz):.1f} per landmark, "
             f"reprojection median {np.median(r.reprojection_errors()):.2f} px"
         )
     return [

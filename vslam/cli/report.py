@@ -34,8 +34,8 @@ def report(
         typer.Option(
             metavar="NAME=FILE",
             help="Trajectory of another system, in the format of KITTI or TUM. "
-            "NAME@SEQ@PERTURB says of which sequence and perturbation. It is aligned as the runs "
-            "of its sequence are; a name that ends in ', mono' also fits the scale.",
+            "NAME@SEQ@PERTURB also names its sequence and perturbation. It is aligned like the "
+            "runs of its sequence; a name that ends in ', mono' also fits the scale.",
         ),
     ] = None,
     baseline: Annotated[

@@ -120,7 +120,7 @@ def stress(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Detector or system that the errors of a preset are divided by.",
+            help="Detector or system whose errors are the unit of the errors with --preset.",
             show_default="the first",
             rich_help_panel=METHOD,
         ),
@@ -199,15 +199,16 @@ def stress(
             f"{', '.join(names)}."
         )
     if given.sensor == "mono" and others:
-        raise InputError("--sensor mono: only vslam runs so; other systems read both cameras.")
+        raise InputError("--sensor mono: only vslam supports it; other systems need both cameras.")
     out = out.absolute()
     kind = kind_of_source(given)
     given = absolute(given)
     opened = open_all(kind, given, seqs, shown=not quiet)
     if others and not all(source.seekable for source in opened.values()):
         raise InputError(
-            f"--systems {next(iter(others))}: other systems read KITTI's format, which is written "
-            "from data sets and folders of images alone; extract the images, or test vslam alone."
+            f"--systems {next(iter(others))}: other systems read KITTI's format, which vslam can "
+            "write only from data sets and folders of images; extract the images, or test vslam "
+            "alone."
         )
     options = replace(
         cell_options(kind, given, config, threads, jobs, scheduler, out),

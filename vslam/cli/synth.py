@@ -45,7 +45,7 @@ def synth(
         str,
         typer.Option(
             metavar="00-02|03|04-12",
-            help="KITTI sequences whose cameras drive along --trajectory.",
+            help="Use the cameras of these KITTI sequences with --trajectory.",
             rich_help_panel=_DRIVE,
         ),
     ] = "00-02",
@@ -113,7 +113,7 @@ def synth(
         bool,
         typer.Option(
             "--rgbd",
-            help="Write images with depth in TUM's layout, and the stereo pairs beside.",
+            help="Write images with depth in TUM's layout, and the stereo pairs beside them.",
             rich_help_panel=OUTPUT,
         ),
     ] = False,
@@ -224,7 +224,8 @@ def synth(
     for option, given in (("--fisheye", fisheye), ("--rgbd", rgbd)):
         if given and (depth or pairs or verify or fisheye == rgbd):
             raise InputError(
-                f"{option}: leave out --depth, --pairs, --verify and every other form."
+                f"{option}: leave out --depth, --pairs and --verify, and one of --fisheye and "
+                "--rgbd."
             )
     variation = Variation(
         seed or town.seed, aliased or town.aliased, change or town.change, dynamic or town.moving

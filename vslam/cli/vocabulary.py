@@ -129,7 +129,7 @@ def info(
     rows = [
         ("file", f"{file}: {file.stat().st_size / 1e6:.2f} MB, read in {elapsed * 1e3:.0f} ms"),
         ("tree", f"{v.branching} children at most, {v.levels} levels, {len(v.word)} nodes"),
-        ("words", f"{v.n_words}, of which {np.count_nonzero(v.weight == 0)} weigh nothing"),
+        ("words", f"{v.n_words}, of which {np.count_nonzero(v.weight == 0)} have no weight"),
         ("by level", ", ".join(f"{k}: {n}" for k, n in enumerate(np.bincount(depth)) if n)),
         ("idf", "least, 5 %, median, 95 %, most: " + ", ".join(f"{x:.2f}" for x in idf)),
     ]

@@ -461,7 +461,7 @@ def test_map_info(corridor_run, tmp_path):
     reconstruction = reconstruction_of(finished.map, finished.camera)
     assert f"keyframes {len(reconstruction.frames)}, frames 0 to " in out
     assert f"\nlandmarks {len(reconstruction.xyz)}\n" in out
-    assert f"observations {len(reconstruction.xy)} by " in out
+    assert f"observations {len(reconstruction.xy)}, " in out
     assert "sub-maps 1\n" in out
     assert "stereo, 480x160" in out
 

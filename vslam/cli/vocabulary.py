@@ -52,7 +52,7 @@ def train(
     ] = Path("vocabulary.npz"),
     quiet: Quiet = False,
 ) -> None:
-    """Train a vocabulary on images, best of many different places."""
+    """Train a vocabulary on images, preferably of many different places."""
     from vslam.cli.console import console
     from vslam.config import OrbConfig
     from vslam.loopclosure import vocabulary_training

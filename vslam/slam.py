@@ -320,8 +320,8 @@ class Slam:
 
     @property
     def problems(self) -> list[str]:
-        """What failed so far without harm to the map, a sentence each: looking for loops, or a
-        global bundle adjustment."""
+        """One sentence for each failure that did not harm the map: a search for loops or a global
+        bundle adjustment that failed."""
         return self._closing.problems
 
     @property

@@ -178,7 +178,7 @@ def test_other_images_do_not_resume_a_run(kitti_tree, tmp_path, moved_s, frames,
     times = open_sequence("kitti", kitti_tree, "00").timestamps[:frames].copy()
     times[7] += moved_s
     unfinished = find_unfinished(tmp_path)
-    with pytest.raises(InputError, match=rf"frame {named} had the time .* put those back"):
+    with pytest.raises(InputError, match=rf"frame {named} had the time .* restore them"):
         drive(kitti_tree, tmp_path, unfinished, change=lambda source: with_times(source, times))
     assert len(find_unfinished(tmp_path).progress.tracks) == 13
 

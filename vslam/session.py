@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,8 @@ from vslam.mapping import Mapper
 from vslam.maps.stored_map import StoredMap, World
 from vslam.modes import Mode
 from vslam.states import Checkpoint
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -155,7 +158,13 @@ class Session:
             self.tracker.resume()
         if self.opened.checkpoint is not None:
             self.restore(self.opened.checkpoint)
-        elif len(frames.tracked) > 1 and frames.tracked[-2:].all():
+            return
+        if self.mapper.n_keyframes:
+            _log.warning(
+                "the map was saved without the state of tracking (resumable=True): the drive "
+                "continues, but its poses will differ from those of an uninterrupted one"
+            )
+        if len(frames.tracked) > 1 and frames.tracked[-2:].all():
             self.mapper.refer_to(int(frames.reference[-1]))
             poses = self.mapper.frames
             step = se3_log(orthonormalised(poses.pose(-1) @ inverse(poses.pose(-2))))

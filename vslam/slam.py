@@ -86,7 +86,8 @@ class Slam:
                 changed in place. ``Slam.load`` reads one from a file.
             localize: only track in that map, without changing it.
             resume: continue the map's last drive; otherwise a new drive begins, whose timestamps
-                are independent of those before.
+                are independent of those before. The poses equal those of an uninterrupted drive
+                only if the map was saved with ``resumable=True``.
 
         Raises:
             ValueError: the map cannot be continued; the message gives the reason in a few words.
@@ -130,10 +131,12 @@ class Slam:
             options: ``threads``, ``images`` and ``localize``, as for a new map.
 
         Raises:
-            InputError: the file is not a map or is damaged, or the map was made with another
-                detector or pyramid.
+            InputError: the file is not a map or is damaged, the map was made with another detector
+                or pyramid, or it has no drive to resume.
         """
         stored = load_checkpoint(path) if resume else load_map(path)
+        if resume and stored.frames is None:
+            raise InputError(f"{path}: the map has no drive to continue; load it without resume.")
         detector = stored.detector.name if detector is None else detector
         try:
             return cls(stored.camera, config, detector, start=stored, resume=resume, **options)
@@ -324,8 +327,8 @@ class Slam:
 
     @property
     def problems(self) -> list[str]:
-        """What failed so far without harm to the map, a sentence each: looking for loops, a
-        global bundle adjustment, or reading a right image."""
+        """One sentence for each failure that did not harm the map: a search for loops or a global
+        bundle adjustment that failed, or a right image that could not be read."""
         return [*self._closing.problems, *self.rig.problems]
 
     @property

@@ -1,8 +1,9 @@
-"""From frames yet to be read to features: decoded, perturbed and extracted a few frames ahead.
+"""Decodes and perturbs frames and extracts their features, a few frames ahead of tracking.
 
-All of that is a pure function of a frame, done by a small pool. The order is kept, so that the
-result does not depend on the number of threads. In real time frames are prepared when they come,
-both images at once, and those that come too soon are dropped; then it depends on the machine.
+Each frame is prepared independently of the others by a small thread pool, and the order is kept, so
+that the result does not depend on the number of threads. In real time, a frame is prepared when it
+arrives, its two images in parallel. Frames that arrive too fast are dropped; which ones depends on
+the machine.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from vslam.run.realtime import Played, play
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """A frame ready to be tracked, or the reason why it cannot be read; ``dropped`` by a
-    perturbation."""
+    """A frame ready to be tracked, or the reason why it cannot be read; ``dropped`` tells
+    whether a perturbation dropped it."""
 
     images: FrameImages | None
     stage_ms: dict[str, float]
@@ -42,7 +43,7 @@ def in_their_time(
     begin: int = 0,
     next_keyframe: Callable[[], int] = lambda: -1,
 ) -> Iterator[Played[PreparedFrame]]:
-    """Prepared frames and when they came: all of them at the start, or each in its time.
+    """Prepared frames with their arrival times: at once, or in real time each at its own time.
 
     Args:
         begin, next_keyframe: see ``prepared_frames``; not used in real time.

@@ -30,7 +30,7 @@ class Perturbation:
     laws: tuple[PairLaw | SceneLaw, ...] = ()
 
     def bound_to(self, source: Source) -> Perturbation:
-        """The same perturbation for one source: some laws need its depth, poses or other frames.
+        """Prepare the perturbation for one source, because some laws need its depth or poses.
 
         Raises:
             InputError: the source lacks what a law needs.

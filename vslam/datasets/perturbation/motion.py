@@ -34,7 +34,7 @@ def neighbours(scene: Scene, frame: int) -> tuple[int, int]:
 
 
 def image_velocity(scene: Scene, frame: int) -> NDArray[np.float64]:
-    """``(2,)`` velocity of the image in its middle due to rotation, pixels per second.
+    """``(2,)`` velocity of the image's centre due to rotation, pixels per second.
 
     It is computed from the true rotation if known. Otherwise it is the median optical flow to the
     next frame, which also contains the flow from driving ahead.

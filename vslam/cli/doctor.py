@@ -17,7 +17,7 @@ from vslam.cli.options import (
     reads_source,
     require_data,
 )
-from vslam.errors import InputError
+from vslam.errors import InputError, counted
 
 if TYPE_CHECKING:
     from vslam.datasets.sources import SourceOptions
@@ -70,7 +70,7 @@ def doctor(
     # The page comes after the findings, because a disk may be full.
     write_page(diagnosis, f"Doctor: {given.data or given.dataset}", page)
     n = len(diagnosis.faults)
-    typer.echo(f"{page}: {n or 'no'} fault{'' if n == 1 else 's'}")
+    typer.echo(f"{page}: {counted(n, 'fault') if n else 'no faults'}")
     if diagnosis.faults:
         raise typer.Exit(1)
 

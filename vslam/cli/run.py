@@ -130,7 +130,7 @@ def run(
         bool,
         typer.Option(
             "--realtime",
-            help="Play the frames at their times and drop those that come too fast.",
+            help="Play the frames in real time and drop those that come too fast.",
             rich_help_panel=EXECUTION,
         ),
     ] = False,

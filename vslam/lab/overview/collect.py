@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vslam.config import changed_thresholds
-from vslam.errors import InputError
+from vslam.errors import InputError, counted
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.lab.overview.schema import MEASURES, Drive, OverviewJson, RunEntry
 from vslam.report.schema import ReportJson
@@ -162,7 +162,8 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
         frames=report.frames,
         measures={name: getattr(report, name) for name, *_ in MEASURES},
         source=str(folder),
-        machine=f"{report.machine.cpu}, {report.machine.cores} cores, {report.threads} threads",
+        machine=f"{report.machine.cpu}, {counted(report.machine.cores, 'core')}, "
+        f"{counted(report.threads, 'thread')}",
     )
 
 

@@ -11,7 +11,6 @@ from vslam.camera import same_camera
 from vslam.closing import LoopClosing
 from vslam.frame_poses import FrameTable
 from vslam.frontend.rig import RigCalibration
-from vslam.frontend.side_delay import DelayState
 from vslam.frontend.tracker import Tracker
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, orthonormalised, se3_log
@@ -131,7 +130,7 @@ class Session:
             self.mapper.state(),
             policy,
             self.closing.state(),
-            self.rig.state().numbers(),
+            self.rig.state(),
         )
 
     def restore(self, state: Checkpoint) -> None:
@@ -139,7 +138,7 @@ class Session:
         self.mapper.restore(state.mapper)
         self.mode.restore(state.policy)
         self.closing.restore(state.closing)
-        self.rig.restore(DelayState.of_numbers(state.rig))
+        self.rig.restore(state.rig)
         landmark = state.tracker.landmark
         xyz = np.full((len(landmark), 3), np.nan)
         xyz[landmark >= 0] = self.mapper.map.arrays.xyz[landmark[landmark >= 0]]

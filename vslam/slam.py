@@ -188,7 +188,8 @@ class Slam:
             RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
         """
         check_images(left, second, self.context.camera)
-        return self.step_images(FrameImages(np.array(left), second, self.context), timestamp)
+        images = FrameImages(np.array(left), lambda: second, self.context)
+        return self.step_images(images, timestamp)
 
     def step_images(
         self, images: FrameImages, timestamp: float, stage_ms: dict[str, float] | None = None
@@ -256,8 +257,8 @@ class Slam:
         else:
             tracker.accept(frame, found, mapper.frames)
             placed = mapper.append_pose(frame, tracked=True, near=found.keyframe)
-            self.rig.observe(frame, frame.twist)
             is_keyframe = self._mode.update_map(placed, found)
+            self.rig.observe(frame, frame.twist)
         clock.lap("keyframe")
         return result_of(frame, found, is_keyframe, clock.ms)
 
@@ -304,6 +305,12 @@ class Slam:
         return self._session.opened.world
 
     @property
+    def next_keyframe(self) -> int:
+        """Index of the frame that is to become a keyframe; -1 if none is planned. Its
+        ``FrameImages.find_corners`` may be called ahead, in another thread."""
+        return self._mode.due
+
+    @property
     def is_mapping(self) -> bool:
         """Whether a keyframe is being mapped."""
         return self._mapper.is_mapping
@@ -321,8 +328,8 @@ class Slam:
     @property
     def problems(self) -> list[str]:
         """One sentence for each failure that did not harm the map: a search for loops or a global
-        bundle adjustment that failed."""
-        return self._closing.problems
+        bundle adjustment that failed, or a right image that could not be read."""
+        return [*self._closing.problems, *self.rig.problems]
 
     @property
     def corrections(self) -> list[LoopCorrection]:

@@ -21,7 +21,6 @@ from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.errors import BrokenSourceError, InputError
 from vslam.features import TrackingState, TrackResult
-from vslam.frontend.sides import Sides
 from vslam.loopclosure.registry import detector_with_images, problem_of
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.machine import give_back_memory, peak_memory_mb, process_age
@@ -95,7 +94,14 @@ def run_sequence(
         frames = perturbed(_until_broken(sequence.frames(), broken), perturbation)
         frames = _following(frames, main.before.tracks.timestamps)
         try:
-            for played in in_their_time(frames, slam.context, settings, live=sequence.live):
+            for played in in_their_time(
+                frames,
+                slam.context,
+                settings,
+                live=sequence.live,
+                begin=len(main.tracks),
+                next_keyframe=lambda: slam.next_keyframe,
+            ):
                 result = main.step(played)
                 if (frame := played.made) is not None and frame.problem and not frame.dropped:
                     _log.warning("frame %d skipped: %s", result.index, frame.problem)
@@ -156,7 +162,6 @@ class _Run:
     def __init__(self, slam: Slam, settings: RunSettings, before: Progress) -> None:
         self.slam, self.settings, self.before = slam, settings, before
         self.tracks = before.tracks.results()
-        self.sides = before.tracks.sides()
         self.skipped = list(before.skipped)
         self.latency_ms = list(before.latency_ms)
         self.startup_s = process_age()
@@ -211,20 +216,17 @@ class _Run:
         start = time.perf_counter()
         timestamp, frame = played.timestamp, played.made
         if frame is None or frame.dropped:
-            result, sides = self.slam.skip(timestamp, dropped=True), None
+            result = self.slam.skip(timestamp, dropped=True)
         elif frame.images is None:
-            result, sides = self.slam.skip(timestamp), frame.sides
+            result = self.slam.skip(timestamp)
             self.skipped.append(f"frame {len(self.tracks)}: {frame.problem}")
         else:
             result = self.slam.step_images(frame.images, timestamp, frame.stage_ms)
-            sides = frame.sides
             if self.settings.realtime:
                 self.latency_ms.append(1e3 * (time.perf_counter() - played.came))
         self.step_s += time.perf_counter() - start
         self.tracks.append(result)
-        self._log.append(result, sides or Sides())
-        if sides is not None:
-            self.sides.append(sides)
+        self._log.append(result)
         return result
 
     def finish(self) -> None:
@@ -334,7 +336,7 @@ def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
         warnings=[
             *calibration_warnings(camera, settings.calib, outcome.sequence.name),
             *slam.problems,
-            *rig_warnings(run.sides),
+            *rig_warnings(slam.rig.sides),
             *_map_warnings(slam, camera),
         ],
         n_keyframes=len(slam.map.living_keyframes()),

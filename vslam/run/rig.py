@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera, calibration_doubts
 from vslam.frontend.side_delay import SideDelay
-from vslam.frontend.sides import Sides
+from vslam.frontend.sides import ComparedSides
 from vslam.geometry import compose, inverse, orthonormalised, se3_log
 from vslam.map import Map
 
@@ -152,24 +152,26 @@ def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
     return said
 
 
-def rig_warnings(sides: Sequence[Sides]) -> list[str]:
+def rig_warnings(sides: ComparedSides) -> list[str]:
     """Warnings about a side that was black or darker than the other one during a run."""
     found = []
-    for side, other in (("left", "right"), ("right", "left")):
-        black = sum(pair.black == side for pair in sides)
+    for side, other, black in (
+        ("left", "right", sides.n_black_left),
+        ("right", "left", sides.n_black_right),
+    ):
         if black >= _FEWEST:
             found.append(
-                f"The {side} side was black in {black} of {len(sides)} frames while the {other} "
+                f"The {side} side was black in {black} of {sides.n} frames while the {other} "
                 f"one was not: they were tracked with the {other} side alone. Check its cable, "
                 "shutter and lens cap."
             )
-    darker = [pair.darker_stops for pair in sides if pair.darker_stops]
+    darker = sides.darker_stops
     if len(darker) >= _FEWEST:
         stops = statistics.median(darker)
         side, other = ("right", "left") if stops > 0 else ("left", "right")
         found.append(
             f"The {side} side was {abs(stops):.1f} stops darker than the {other} one in "
-            f"{len(darker)} of {len(sides)} frames: it was brightened to match. Check exposure, "
+            f"{len(darker)} of {sides.n} frames: it was brightened to match. Check exposure, "
             "gain and aperture of both."
         )
     return found

@@ -501,10 +501,12 @@ class RerunRecorder(Recorder):
         T_wc = np.array([pose for _, pose in frames])
         poses = rr.Transform3D.columns(translation=T_wc[:, :3, 3], mat3x3=T_wc[:, :3, :3])
         self._recording.send_columns("world/camera", _times(results), poses)
+        extracted = [result for result in results if result.n_features]
         for name in self._points:
-            counts = np.array([getattr(result, f"n_{name}") for result in results], np.float64)
+            of = results if name in ("matches", "inliers") else extracted
+            counts = np.array([getattr(result, f"n_{name}") for result in of], np.float64)
             scalars = rr.Scalars.columns(scalars=counts)
-            self._recording.send_columns(f"points/{name}", _times(results), scalars)
+            self._recording.send_columns(f"points/{name}", _times(of), scalars)
         for stage in dict.fromkeys(name for result in results for name in result.stage_ms):
             if stage not in self._stages:
                 color = _STAGE_COLORS[len(self._stages) % len(_STAGE_COLORS)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -28,3 +29,11 @@ class Finding:
 def judge(check: str, wrong: bool, measured: str, fix: str) -> Finding:
     """A ``fault`` with its fix, or ``good``."""
     return Finding(check, "fault", measured, fix) if wrong else Finding(check, "good", measured)
+
+
+def lines(findings: Iterable[Finding]) -> Iterator[str]:
+    """What a terminal shows of findings."""
+    for finding in findings:
+        yield f"{finding.verdict:<8} {finding.check:<16} {finding.measured}"
+        if finding.fix:
+            yield f"{'':<25} fix: {finding.fix}"

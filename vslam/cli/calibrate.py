@@ -17,7 +17,7 @@ from vslam.cli.options import reads_source
 from vslam.errors import BrokenSourceError, InputError
 
 if TYPE_CHECKING:
-    from vslam.calibration.boards import Board, Finder
+    from vslam.calibration.boards import Board
     from vslam.calibration.solve import View
     from vslam.camera import Image
     from vslam.datasets.frames import RawSource, TimedFrame
@@ -114,7 +114,7 @@ def calibrate(
 ) -> None:
     """Calibrate a camera or a stereo pair from images of a board; exit code 1 if the result is
     doubtful."""
-    from vslam.calibration.boards import corner_finder, other_board
+    from vslam.calibration.boards import other_board
     from vslam.calibration.files import write_calibration
     from vslam.calibration.models import Calibration
     from vslam.calibration.solve import fit_camera, fit_pair
@@ -129,7 +129,7 @@ def calibrate(
     if raw.live and given.max_frames is None:
         raise InputError(f"{given.data}: a camera never ends; give --max-frames, such as 300.")
     made = _board(board, size, square, marker, dictionary, stereo=len(raw.sizes) == 2)
-    n, seen, examined = _search(raw, corner_finder(made))
+    n, seen, examined = _search(raw, made)
     try:
         chosen = _choose(made, raw, seen, n)
         fits = tuple(
@@ -239,11 +239,13 @@ def _frames(raw: RawSource, most: int) -> Iterator[TimedFrame]:
         typer.echo(f"warning: {error}", err=True)
 
 
-def _search(raw: RawSource, find: Finder) -> tuple[int, list[tuple[View | None, ...]], list[Image]]:
+def _search(raw: RawSource, board: Board) -> tuple[int, list[tuple[View | None, ...]], list[Image]]:
     """How many images were searched, the views of each that shows the board to a camera, and a few
     left images."""
+    from vslam.calibration.boards import corner_finder, same_order
     from vslam.calibration.solve import View
 
+    find = corner_finder(board)
     total = min(raw.n_expected or _MOST_SEARCHED, _MOST_SEARCHED)
     seen: list[tuple[View | None, ...]] = []
     examined: list[Image] = []
@@ -253,6 +255,8 @@ def _search(raw: RawSource, find: Finder) -> tuple[int, list[tuple[View | None, 
             name = frame.file.name if frame.file else f"{frame.timestamp:.2f} s"
             images = [cast("Image", image) for image in frame.read(map) if image is not None]
             corners = [find(image) for image in images]
+            if len(corners) == 2 and corners[0] and corners[1]:
+                corners[1] = same_order(board, corners[0], corners[1])
             if any(corners):
                 seen.append(tuple(None if c is None else View(name, c) for c in corners))
             if n % max(1, total // _EXAMINED) == 0:

@@ -303,7 +303,7 @@ def test_swapped_cameras_are_a_fault():
 
 def test_too_few_views_and_another_board_are_errors():
     views = exact_views(APRILGRID, PINHOLE, poses(APRILGRID, PINHOLE, 8))
-    with pytest.raises(InputError, match="is found in 2 views that fit, where 3 are the least"):
+    with pytest.raises(InputError, match="is found in 2 images that fit, where 3 are the least"):
         fit_camera(APRILGRID, views[:2], (384, 288), "pinhole")
     other = replace(APRILGRID, columns=3, rows=4)
     with pytest.raises(InputError, match="do not fit a flat AprilGrid of 3x4 tags"):

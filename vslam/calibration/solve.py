@@ -120,15 +120,11 @@ def fit_camera(board: Board, views: Sequence[View], size: Size, lens: Lens) -> C
     points = board_points(board)
 
     def fit(kept: Sequence[View]) -> tuple[CameraFit, Array]:
-        if len(kept) < FEWEST_VIEWS:
-            raise InputError(
-                f"the {board} is found in {len(kept)} views that fit, where {FEWEST_VIEWS} are the "
-                "least; film it in 20 or more different places and directions."
-            )
         found = _fit(points, kept, size, lens)
         return found, found.errors
 
-    found, dropped = _without_outliers(views, fit)
+    fix = "film it in 20 or more different places and directions"
+    found, dropped = _without_outliers(views, fit, f"the {board} is found", fix)
     error = rms(np.concatenate(found.residuals))
     if not error <= _NO_FIT * size[0]:
         raise InputError(
@@ -158,17 +154,13 @@ def fit_pair(board: Board, left: CameraFit, right: CameraFit) -> PairFit:
                 pairs.append(_Pair(view.name, points[ids], other.xy[seen], T_left_board, start))
 
     def fit(kept: Sequence[_Pair]) -> tuple[PairFit, Array]:
-        if len(kept) < FEWEST_VIEWS:
-            raise InputError(
-                f"the {board} is seen by both cameras in {len(kept)} frames that fit, where "
-                f"{FEWEST_VIEWS} are the least; film it where the views of both overlap."
-            )
         T = _transformation(right.model, kept)
         errors = np.array([rms(pair.residuals(right.model, T)) for pair in kept])
         T_left_right = np.asarray(np.linalg.inv(T).round(9), np.float64)
         return PairFit(T_left_right, tuple(pair.name for pair in kept), errors, ()), errors
 
-    found, dropped = _without_outliers(pairs, fit)
+    fix = "film it where both cameras see it"
+    found, dropped = _without_outliers(pairs, fit, f"both cameras see the {board}", fix)
     return replace(found, dropped=dropped)
 
 
@@ -192,18 +184,25 @@ _F = TypeVar("_F", CameraFit, PairFit)
 
 
 def _without_outliers(
-    views: Sequence[_V], fit: Callable[[Sequence[_V]], tuple[_F, Array]]
+    views: Sequence[_V], fit: Callable[[Sequence[_V]], tuple[_F, Array]], seen: str, fix: str
 ) -> tuple[_F, tuple[tuple[str, float], ...]]:
     """What ``fit`` makes of the views without those whose error is large, and their names and
-    errors; ``fit`` returns its result and the error of each view."""
+    errors; ``fit`` returns its result and the error of each view.
+
+    Raises:
+        InputError: too few views are left; ``seen`` and ``fix`` are parts of the sentence.
+    """
     kept, dropped = list(views), []
-    while True:
+    while len(kept) >= FEWEST_VIEWS:
         found, errors = fit(kept)
         out = ~(errors <= _OUTLIER * np.nanmedian(errors))  # NaN: a board behind the camera
         if not out.any():
             return found, tuple(dropped)
         dropped += [(kept[k].name, float(errors[k])) for k in np.flatnonzero(out)]
         kept = [view for view, bad in zip(kept, out, strict=True) if not bad]
+    raise InputError(
+        f"{seen} in {len(kept)} images that fit, where {FEWEST_VIEWS} are the least; {fix}."
+    )
 
 
 def _fit(points: Array, views: Sequence[View], size: Size, lens: Lens) -> CameraFit:

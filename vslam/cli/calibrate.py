@@ -214,11 +214,14 @@ def _board(
     found = re.fullmatch(r"(\d+)x(\d+)", size)
     if found is None:
         raise InputError(f"--size {size or 'is missing'}: give columns and rows, such as 9x6.")
-    if square is None and (stereo or kind != "checkerboard"):
-        raise InputError("--square is missing: measure the board and give it in metres.")
-    if marker is None and kind != "checkerboard":
-        raise InputError("--marker is missing: measure a marker and give its side in metres.")
-    if marker is not None and kind == "checkerboard":
+    has_markers = kind != "checkerboard"
+    for option, missing in (
+        ("--square", square is None and (stereo or has_markers)),
+        ("--marker", marker is None and has_markers),
+    ):
+        if missing:
+            raise InputError(f"{option} is missing: measure the board and give metres.")
+    if marker is not None and not has_markers:
         raise InputError("--marker: leave it out, because a checkerboard has no markers.")
     side = 0.1 if square is None else square
     columns, rows = int(found[1]), int(found[2])

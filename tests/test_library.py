@@ -4,7 +4,8 @@ cannot be."""
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+import traceback
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,17 @@ def test_a_map_is_saved_into_the_working_folder(tmp_path, monkeypatch):
     assert load_map("map.npz").camera == CAMERA
 
 
+def test_a_map_that_cannot_be_saved_is_named_by_its_own_path(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    slam = Slam(CAMERA, detector="none", threads=1)
+    with pytest.raises(FileNotFoundError, match=r"there is no folder nodir: 'nodir/map\.npz'$"):
+        slam.save("nodir/map.npz")
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(IsADirectoryError, match=r"Is a directory: 'taken'$"):
+        slam.save("taken")
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
 def test_trajectories_are_written_and_read_by_strings(tmp_path):
     kitti, tum, euroc = (str(tmp_path / name) for name in ("kitti.txt", "tum.txt", "euroc.csv"))
     drive = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
@@ -71,11 +83,53 @@ def test_data_and_settings_are_read_by_strings(tmp_path, kitti_tree):
     config = tmp_path / "config.json"
     config.write_text("{}")
     assert load_config(str(config)) == Config()
+    config.write_text('{"tracking.method": "patches", "tracking": {"min_inliers": 40}}')
+    found = load_config(config).tracking
+    assert (found.method, found.min_inliers) == ("patches", 40)
     calib = tmp_path / "one.yaml"
     calib.write_text("left: {lens: pinhole, size: [640, 240], focal: [9, 9], centre: [320, 120]}")
     assert read_calibration([str(calib)]).left.width == 640
     save_ply(str(tmp_path / "map.ply"), np.zeros((1, 3)))
     assert (tmp_path / "map.ply").stat().st_size
+
+
+def test_a_map_is_continued_with_the_thresholds_that_it_was_made_with(tmp_path):
+    file = tmp_path / "map.npz"
+    Slam(CAMERA, {"orb.n_features": 900}, "none", threads=1).save(file)
+    again = Slam.load(file, threads=1)
+    assert again.context.config.orb.n_features == 900
+    assert Slam.load(file, {}, threads=1).context.config == Config()
+    again.save(file)
+    assert made_with(file).thresholds == {"orb.n_features": 900}
+    write_header(file, thresholds={"orb.retired": 3})
+    with pytest.raises(InputError, match=r"map.npz: orb.retired: unknown key"):
+        Slam.load(file)
+    assert Slam.load(file, Config(), threads=1).context.config == Config()
+    write_header(file, thresholds=5)
+    with pytest.raises(InputError, match="the map is damaged"):
+        Slam.load(file)
+
+
+def test_thresholds_are_given_as_a_dictionary():
+    config = {"orb": {"n_features": 900}, "tracking.method": "patches"}
+    found = Slam(CAMERA, config, "none", threads=1).context.config
+    assert (found.orb.n_features, found.tracking.method) == (900, "patches")
+
+
+@pytest.mark.parametrize(
+    ("config", "words"),
+    [
+        ({"orb": {"n_feature": 9}}, r"orb.n_feature: unknown key \(did you mean n_features\?\); "),
+        ({"orb": {"n_features": 9}}, "orb.n_features: must be at least 100.$"),
+        ({"orb.n_features": 900, "orb": 5}, "orb must map names to values"),
+        ({1: 900}, "1: unknown key; correct or remove it."),
+        ("config.json", "the configuration must map names to values"),
+    ],
+)
+def test_wrong_thresholds_are_refused_in_one_sentence(config, words):
+    with pytest.raises(InputError, match=f"^config: {words}") as refused:
+        Slam(CAMERA, config, "none", threads=1)
+    assert "pydantic" not in "".join(traceback.format_exception(refused.value))
 
 
 @pytest.mark.parametrize("dataset", ["kitti", "euroc", "tum"])
@@ -116,15 +170,19 @@ def test_a_calibration_of_a_camera_that_cannot_be_is_named():
         rectify(Calibration(model, source="mine.yaml"))
 
 
+def write_header(file: Path, **entries: object) -> None:
+    """Replace entries of the header of a map file."""
+    with np.load(file) as saved:
+        arrays = dict(saved)
+    header = json.loads(arrays["header"].tobytes()) | entries
+    arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    np.savez(file, **arrays)
+
+
 def test_the_camera_of_a_map_file_is_checked(tmp_path):
     file = tmp_path / "map.npz"
     Slam(CAMERA, detector="none", threads=1).save(file)
-    with np.load(file) as saved:
-        arrays = dict(saved)
-    header = json.loads(arrays["header"].tobytes())
-    header["camera"]["cx"] = 6000.0
-    arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
-    np.savez(file, **arrays)
+    write_header(file, camera=asdict(CAMERA) | {"cx": 6000.0})
     with pytest.raises(InputError, match=r"map.npz: .*principal point \(6000.0, 120.0\)"):
         load_map(file)
 
@@ -135,6 +193,13 @@ def test_images_in_colour_are_refused_with_the_way_to_grey():
         check_images(colour, colour, CAMERA)
     with pytest.raises(ValueError, match="colour"):
         check_images(colour, None, CAMERA.left_camera())
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.uint16])
+def test_images_of_another_type_are_refused_with_their_conversion(dtype):
+    image = np.zeros((CAMERA.height, CAMERA.width), dtype)
+    with pytest.raises(ValueError, match=r"not of uint8; .*of 0 to 1 with \(255 \* image\)"):
+        check_images(image, None, CAMERA.left_camera())
 
 
 def test_images_that_are_missing_or_too_many_are_named():

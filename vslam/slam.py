@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera, DepthImage, Image, check_images
 from vslam.closing import LoopClosing
-from vslam.config import Config
+from vslam.config import Config, as_config
 from vslam.errors import InputError
 from vslam.features import Extracted, TrackingState, TrackResult
 from vslam.frontend.extraction import FrameImages
@@ -61,7 +62,7 @@ class Slam:
     def __init__(
         self,
         camera: Camera,
-        config: Config | None = None,
+        config: Config | Mapping[str, Any] | None = None,
         detector: LoopDetector | str = DEFAULT_DETECTOR,
         *,
         threads: int = 2,
@@ -74,7 +75,8 @@ class Slam:
         Args:
             camera: the rectified camera that the images come from; ``camera.left_camera()`` for
                 monocular SLAM.
-            config: thresholds; None uses the defaults.
+            config: thresholds, also as a dictionary such as ``{"orb": {"n_features": 1000}}``;
+                those left out keep their defaults.
             detector: proposes loop candidates and places for relocalisation: a name
                 (``vslam.loopclosure.registry``; ``both`` is the capsule network together with the
                 bag of words, ``none`` is odometry only) or an object.
@@ -86,12 +88,14 @@ class Slam:
                 changed in place. ``Slam.load`` reads one from a file.
             localize: only track in that map, without changing it.
             resume: continue the map's last drive; otherwise a new drive begins, whose timestamps
-                are independent of those before.
+                are independent of those before. The poses equal those of an uninterrupted drive
+                only if the map was saved with ``resumable=True``.
 
         Raises:
             ValueError: the map cannot be continued; the message gives the reason in a few words.
+            InputError: a threshold is unknown or out of range.
         """
-        config = config or Config()
+        config = as_config({} if config is None else config)
         if isinstance(detector, str):
             detector, images = detector_with_images(detector, config)
         self.context = context = TrackingContext.create(camera, config)
@@ -113,7 +117,7 @@ class Slam:
     def load(
         cls,
         path: Path | str,
-        config: Config | None = None,
+        config: Config | Mapping[str, Any] | None = None,
         detector: LoopDetector | str | None = None,
         *,
         resume: bool = False,
@@ -123,18 +127,21 @@ class Slam:
 
         Args:
             path: the map file, or the folder of a run.
-            config: as for a new map.
+            config: as for a new map; None uses the thresholds that the map was made with.
             detector: the detector that the map was made with, as a name or an object; None uses
                 the shipped detector of that name.
             resume: as for a new map.
             options: ``threads``, ``images`` and ``localize``, as for a new map.
 
         Raises:
-            InputError: the file is not a map or is damaged, or the map was made with another
-                detector or pyramid.
+            InputError: the file is not a map or is damaged, the map was made with another detector
+                or pyramid, or it has no drive to resume.
         """
         stored = load_checkpoint(path) if resume else load_map(path)
+        if resume and stored.frames is None:
+            raise InputError(f"{path}: the map has no drive to continue; load it without resume.")
         detector = stored.detector.name if detector is None else detector
+        config = as_config(stored.thresholds, str(path)) if config is None else config
         try:
             return cls(stored.camera, config, detector, start=stored, resume=resume, **options)
         except (ValueError, KeyError) as error:
@@ -185,7 +192,8 @@ class Slam:
             RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
         """
         check_images(left, second, self.context.camera)
-        return self.step_images(FrameImages(np.array(left), second, self.context), timestamp)
+        images = FrameImages(np.array(left), lambda: second, self.context)
+        return self.step_images(images, timestamp)
 
     def step_images(
         self, images: FrameImages, timestamp: float, stage_ms: dict[str, float] | None = None
@@ -253,8 +261,8 @@ class Slam:
         else:
             tracker.accept(frame, found, mapper.frames)
             placed = mapper.append_pose(frame, tracked=True, near=found.keyframe)
-            self.rig.observe(frame, frame.twist)
             is_keyframe = self._mode.update_map(placed, found)
+            self.rig.observe(frame, frame.twist)
         clock.lap("keyframe")
         return result_of(frame, found, is_keyframe, clock.ms)
 
@@ -301,6 +309,12 @@ class Slam:
         return self._session.opened.world
 
     @property
+    def next_keyframe(self) -> int:
+        """Index of the frame that is to become a keyframe; -1 if none is planned. Its
+        ``FrameImages.find_corners`` may be called ahead, in another thread."""
+        return self._mode.due
+
+    @property
     def is_mapping(self) -> bool:
         """Whether a keyframe is being mapped."""
         return self._mapper.is_mapping
@@ -317,9 +331,9 @@ class Slam:
 
     @property
     def problems(self) -> list[str]:
-        """What failed so far without harm to the map, a sentence each: looking for loops, or a
-        global bundle adjustment."""
-        return self._closing.problems
+        """One sentence for each failure that did not harm the map: a search for loops or a global
+        bundle adjustment that failed, or a right image that could not be read."""
+        return [*self._closing.problems, *self.rig.problems]
 
     @property
     def corrections(self) -> list[LoopCorrection]:

@@ -26,9 +26,10 @@ _LEAST_SIDE = 64  # of an image: AlexNet's last pooling needs 63
 class ConvolutionalBranch(nn.Module):
     """Features, pooling, fully connected layers (none after a global average), a linear layer.
 
-    There is no dropout, because the network would not learn: at the start, dropout changes a
-    descriptor more (to a cosine of 0.5) than another image does (0.97). Weights are initialised as
-    in He et al., ICCV 2015; with torch's default, descriptors of images differ by only 0.003.
+    There is no dropout. With it the network does not learn, because at the start of training
+    dropout changes a descriptor more (cosine 0.5) than another image does (cosine 0.97). Weights
+    are initialised as in He et al., ICCV 2015; with torch's default, descriptors of images differ
+    by only 0.003.
 
     Attributes:
         width: input dimension of the last layer, as in the original classifier.

@@ -21,11 +21,12 @@ from vslam.cli.options import (
     kind_of_source,
     names_in,
     open_given,
+    read_thresholds,
     reads_source,
     sequences,
 )
 from vslam.cli.report import write_overview_of
-from vslam.errors import InputError
+from vslam.errors import InputError, counted
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -91,7 +92,7 @@ def bench(
     from vslam.cli.console import console
     from vslam.lab.bench import execute
     from vslam.lab.bench.estimate import check_disk, duration, estimate, size
-    from vslam.lab.bench.grid import make_grid, parse_perturbations
+    from vslam.lab.bench.grid import make_grid, parse_perturbations, thresholds_digest
     from vslam.lab.bench.table import GridProgress, shown_live
     from vslam.loopclosure.registry import parse_weights, require_detector
 
@@ -110,6 +111,7 @@ def bench(
     cells = make_grid(
         kind, frames, laws, chosen, seeds, given.max_frames, files,
         sensor=given.sensor, calib=tuple(map(str, given.calib)),
+        thresholds=thresholds_digest(options.config),
     )  # fmt: skip
     execute.prepare(out, identity_of(kind, given))
     finished = execute.finished_cells(cells, out, options.config)
@@ -118,8 +120,8 @@ def bench(
     needed = estimate(missing, progress.reports, frames, jobs)
     check_disk(needed, out)
     console(shown=not quiet).announce(
-        f"{len(cells)} cells, {len(missing)} to do: about {duration(needed.seconds)} with "
-        f"{jobs} at a time ({needed.basis}), {size(needed.kept)} in {out} and "
+        f"{counted(len(cells), 'run')}, {len(missing)} to do: about {duration(needed.seconds)} "
+        f"with {jobs} at a time ({needed.basis}), {size(needed.kept)} in {out} and "
         f"{size(needed.scratch)} while it runs"
     )
     stopped = False
@@ -141,7 +143,8 @@ def bench(
         baseline = next(name for name in chosen if name in done)
         write_overview_of([out], [], out, baseline=baseline, quiet=quiet)
     counts = (
-        f"{len(progress.reports)} of {len(cells)} cells finished, {len(progress.failed)} failed"
+        f"{len(progress.reports)} of {counted(len(cells), 'run')} finished, "
+        f"{len(progress.failed)} failed"
     )
     if not quiet:
         again = "; repeat the command to continue" if stopped or progress.failed else ""
@@ -167,21 +170,19 @@ def absolute(given: SourceOptions) -> SourceOptions:
 def cell_options(
     kind: str,
     given: SourceOptions,
-    config: Path | None,
+    config: str | None,
     threads: int | None,
     jobs: int,
     scheduler: str | None,
     out: Path,
 ) -> RunOptions:
     """The settings that all cells of a benchmark share."""
-    from vslam.config import Config, load_config
     from vslam.lab.bench.execute import RunOptions, scratch_folder
     from vslam.machine import available_cores
 
-    thresholds = Config() if config is None else load_config(config)
     return RunOptions(
         data=Path(given.data) if kind != "synthetic" else None,
-        config=thresholds.model_dump_json(indent=2) + "\n",  # as a run writes it
+        config=read_thresholds(config).model_dump_json(indent=2) + "\n",  # as a run writes it
         threads=threads or max(1, min(available_cores() // jobs, 4)),
         scratch=None if scheduler else scratch_folder(out),
         source=tuple(_words_of(given)),

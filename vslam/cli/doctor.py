@@ -9,8 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vslam.cli.console import console
-from vslam.cli.options import OUTPUT, Thresholds, open_given, reads_source, require_data
-from vslam.errors import InputError
+from vslam.cli.options import (
+    OUTPUT,
+    Thresholds,
+    open_given,
+    read_thresholds,
+    reads_source,
+    require_data,
+)
+from vslam.errors import InputError, counted
 
 if TYPE_CHECKING:
     from vslam.datasets.sources import SourceOptions
@@ -43,14 +50,13 @@ def doctor(
     ] = None,
 ) -> None:
     """Check images, calibration and times before a run; exit code 1 if there is a fault."""
-    from vslam.config import Config, load_config
     from vslam.datasets.frames import first_frames
     from vslam.doctor.examine import Diagnosis, examine
     from vslam.doctor.findings import Finding, lines
     from vslam.doctor.page import write_page
 
     require_data(given)
-    thresholds = Config() if config is None else load_config(config)
+    thresholds = read_thresholds(config)
     try:
         diagnosis = examine(first_frames(open_given(given, console(shown=True))), thresholds.orb)
     except InputError as error:
@@ -62,7 +68,7 @@ def doctor(
     # The page comes after the findings, because a disk may be full.
     write_page(diagnosis, f"Doctor: {given.data or given.dataset}", page)
     n = len(diagnosis.faults)
-    typer.echo(f"{page}: {n or 'no'} fault{'' if n == 1 else 's'}")
+    typer.echo(f"{page}: {counted(n, 'fault') if n else 'no faults'}")
     if diagnosis.faults:
         raise typer.Exit(1)
 

@@ -15,6 +15,7 @@ from vslam.errors import InputError
 
 if TYPE_CHECKING:
     from vslam.cli.console import Console
+    from vslam.config import Config
     from vslam.datasets.frames import Source
     from vslam.datasets.sources import SourceOptions
 
@@ -56,11 +57,12 @@ Seed = Annotated[
     typer.Option(min=0, metavar="N", help="Seed of the random numbers.", rich_help_panel=METHOD),
 ]
 Thresholds = Annotated[
-    Path | None,
+    str | None,
     typer.Option(
         "--config",
-        metavar="FILE",
-        help="JSON file with thresholds, such as the config.json of a run.",
+        metavar="FILE|NAME=VALUE",
+        help="Thresholds: a JSON file, such as the config.json of a run, or values separated by "
+        "commas, such as orb.n_features=1000 (docs/reference/thresholds.md).",
         rich_help_panel=METHOD,
     ),
 ]
@@ -135,10 +137,10 @@ AlignmentName = Literal["se3", "sim3", "none"]
 
 KITTI_ROOT = "data/kitti"  # unless $KITTI_ROOT names another folder
 
-_WITHOUT_DATA = """there is nothing to read; name some images, or take rendered ones:
+_WITHOUT_DATA = """there is nothing to read; name your images, or use rendered ones:
   --dataset synthetic    rendered drives, which need no download
   DATA --calib FILE      images, video, bag or camera (docs/howto/sources.md)
-  --data FOLDER          KITTI, also by $KITTI_ROOT (datasets.md)"""
+  --data FOLDER          KITTI; or set $KITTI_ROOT to its folder (datasets.md)"""
 
 
 def names_in(text: str) -> list[str]:
@@ -231,7 +233,7 @@ def _source_options(
         typer.Option(
             metavar="NUMBER",
             help="Value of a depth pixel at one metre.",
-            show_default="by the calibration, data set or encoding",
+            show_default="from the calibration, data set or encoding",
         ),
     ] = None,
     sensor: Annotated[
@@ -326,6 +328,23 @@ def kind_of_source(options: SourceOptions) -> str:
 
     require_data(options)
     return options.dataset or detect_dataset(options.data)
+
+
+def read_thresholds(given: str | None) -> Config:
+    """The thresholds of ``--config``, a file or values; the defaults for None.
+
+    Raises:
+        InputError: as `vslam.config.load_config`.
+    """
+    from vslam.config import Config, as_config, load_config
+
+    if given is None:
+        return Config()
+    if "=" not in given or Path(given).exists():
+        return load_config(given)
+    pairs = (pair.partition("=") for pair in given.split(","))
+    values = {name.strip(): value.strip() for name, _, value in pairs}
+    return as_config(values, f"--config {given}")
 
 
 def open_given(options: SourceOptions, told: Console) -> Source:

@@ -120,7 +120,7 @@ def stress(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Detector or system that the errors of a preset are divided by.",
+            help="Detector or system whose errors are the unit of the errors with --preset.",
             show_default="the first",
             rich_help_panel=METHOD,
         ),
@@ -177,6 +177,7 @@ def stress(
     from vslam.cli.tables import show_sections
     from vslam.datasets.frames import first_frames
     from vslam.lab.bench import execute
+    from vslam.lab.bench.grid import thresholds_digest
     from vslam.lab.stress.criterion import Criterion
     from vslam.lab.stress.plan import Plan, parse_laws
     from vslam.lab.stress.report import boundary_sections, write_report
@@ -199,15 +200,16 @@ def stress(
             f"{', '.join(names)}."
         )
     if given.sensor == "mono" and others:
-        raise InputError("--sensor mono: only vslam runs so; other systems read both cameras.")
+        raise InputError("--sensor mono: only vslam supports it; other systems need both cameras.")
     out = out.absolute()
     kind = kind_of_source(given)
     given = absolute(given)
     opened = open_all(kind, given, seqs, shown=not quiet)
     if others and not all(source.seekable for source in opened.values()):
         raise InputError(
-            f"--systems {next(iter(others))}: other systems read KITTI's format, which is written "
-            "from data sets and folders of images alone; extract the images, or test vslam alone."
+            f"--systems {next(iter(others))}: other systems read KITTI's format, which vslam can "
+            "write only from data sets and folders of images; extract the images, or test vslam "
+            "alone."
         )
     options = replace(
         cell_options(kind, given, config, threads, jobs, scheduler, out),
@@ -217,7 +219,7 @@ def stress(
     plan = Plan(
         kind, tuple(opened), tuple(fitting), tuple(names), seeds, steps, given.max_frames,
         baseline or names[0], Criterion(max_lost, ate_factor, ate_least), tuple(others), preset,
-        given.sensor, tuple(map(str, given.calib)),
+        given.sensor, tuple(map(str, given.calib)), thresholds_digest(options.config),
     )  # fmt: skip
     execute.prepare(out, identity_of(kind, given))
     searches, results = plan.searches(), Results(out, options.config)
@@ -241,7 +243,7 @@ def stress(
     write_report(out, report, {name: first_frames(source) for name, source in opened.items()})
     if not quiet:
         show_sections(boundary_sections(report))
-        ended = f"{len(report.boundaries)} of {len(searches)} searches finished"
+        ended = f"finished {len(report.boundaries)} of {len(searches)} searches"
         typer.echo(f"{out / 'report.html'}: {ended}")
     if stopped or len(report.boundaries) < len(searches):
         raise typer.Exit(1)
@@ -264,7 +266,7 @@ def foreign(
     no_report: Annotated[bool, typer.Option("--no-report")] = False,
     quiet: Annotated[bool, typer.Option("--quiet")] = False,
 ) -> None:
-    """Run another system in the way [b]vslam run[/b] runs vslam, for [b]vslam stress[/b]."""
+    """Run another system on a sequence and write a run's report; used by [b]vslam stress[/b]."""
     from vslam.cli.console import console
     from vslam.config import load_config
     from vslam.datasets.perturbation import parse_perturbation

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from vslam.cli.options import OUTPUT, Quiet, Threads
-from vslam.errors import InputError
+from vslam.errors import InputError, counted
 
 _EXAMPLES = """
 [b]Examples[/b]
@@ -45,7 +45,7 @@ def synth(
         str,
         typer.Option(
             metavar="00-02|03|04-12",
-            help="KITTI sequences whose cameras drive along --trajectory.",
+            help="Use the cameras of these KITTI sequences with --trajectory.",
             rich_help_panel=_DRIVE,
         ),
     ] = "00-02",
@@ -113,7 +113,7 @@ def synth(
         bool,
         typer.Option(
             "--rgbd",
-            help="Write images with depth in TUM's layout, and the stereo pairs beside.",
+            help="Write images with depth in TUM's layout, and the stereo pairs beside them.",
             rich_help_panel=OUTPUT,
         ),
     ] = False,
@@ -204,7 +204,9 @@ def synth(
         for found in store.list_stored(cache):
             state = "complete" if found.complete else "in part"
             folder = found.root / "sequences" / found.name
-            typer.echo(f"{folder}: {found.frames} frames, {found.size / 1e6:.0f} MB, {state}")
+            typer.echo(
+                f"{folder}: {counted(found.frames, 'frame')}, {found.size / 1e6:.0f} MB, {state}"
+            )
         return
     if clean:
         freed = store.clean(cache, route or None)
@@ -222,7 +224,8 @@ def synth(
     for option, given in (("--fisheye", fisheye), ("--rgbd", rgbd)):
         if given and (depth or pairs or verify or fisheye == rgbd):
             raise InputError(
-                f"{option}: leave out --depth, --pairs, --verify and every other form."
+                f"{option}: leave out --depth, --pairs and --verify, and one of --fisheye and "
+                "--rgbd."
             )
     variation = Variation(
         seed or town.seed, aliased or town.aliased, change or town.change, dynamic or town.moving
@@ -274,8 +277,10 @@ def synth(
 
         frames = open_kitti(root, drive.name, max_frames=max_frames)
         calibration_file = write_side_by_side(frames, side_by_side)
-        typer.echo(f"{side_by_side}: {len(frames)} frames, calibration in {calibration_file}")
-    typer.echo(f"{root}: " + (f"{pairs} pairs" if pairs else f"sequence {route}"))
+        typer.echo(
+            f"{side_by_side}: {counted(len(frames), 'frame')}, calibration in {calibration_file}"
+        )
+    typer.echo(f"{root}: " + (counted(pairs, "pair") if pairs else f"sequence {route}"))
 
 
 def _range(option: str, given: str, least: float) -> tuple[float, float]:

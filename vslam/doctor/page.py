@@ -8,7 +8,7 @@ import cv2
 
 from vslam.doctor.examine import Diagnosis, Picture
 from vslam.doctor.findings import sections
-from vslam.errors import ResultsError
+from vslam.errors import ResultsError, counted
 from vslam.report.page import Figure, Page, Section
 from vslam.report.render import html
 
@@ -26,7 +26,7 @@ def write_page(diagnosis: Diagnosis, title: str, path: Path) -> None:
     ]
     page = Page(
         title,
-        [f"{faults or 'no'} fault{'' if faults == 1 else 's'}"],
+        [counted(faults, "fault") if faults else "no faults"],
         [*sections(diagnosis.findings), Section("", figures)],
     )
     try:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import StringConstraints
+from pydantic import Field, StringConstraints
 
 from vslam.report.document import Document, Record
 
@@ -128,11 +128,14 @@ class Machine(Record):
 class ReportJson(Measures, Document):
     """One run in numbers.
 
+    ``thresholds`` are those that differ from the defaults, by dotted name.
     ``evaluation_remark`` says why there are no errors, or of how many frames they are.
     ``warnings`` are sentences about faults of the rig that the run has shown.
     ``detectors`` has a row for each detector, the run's own first, where others were run beside it
     (``--compare``): speed, CPU time and memory are then those of all together. It is empty in a run
     that was resumed, since the maps of the others are not saved.
+    ``lost_before_map`` counts those of the lost frames that came before the first tracked one, in a
+    run that began a new map.
     ``frames`` counts the frames that were processed; of them ``skipped_frames`` had an unreadable
     image and ``dropped_frames`` were overtaken by a newer one in a real-time run, whose
     ``latency_ms`` is from the time of an image to its pose (None in any other run).
@@ -142,6 +145,7 @@ class ReportJson(Measures, Document):
 
     schema_version: int = 5
 
+    lost_before_map: int = 0
     weak_frames: int
     skipped_frames: int
     skipped_messages: list[str]
@@ -189,6 +193,7 @@ class ReportJson(Measures, Document):
     map: Path | None = None
     localize: bool = False
     compare: tuple[str, ...] = ()
+    thresholds: dict[str, Any] = Field(default_factory=dict)
 
     machine: Machine
     versions: dict[str, str]

@@ -6,11 +6,13 @@ import platform
 from collections import Counter
 from dataclasses import asdict
 from datetime import UTC, datetime
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.config import changed_thresholds
 from vslam.errors import InputError
 from vslam.evaluation.loops import LoopEvaluation, evaluate_loops
 from vslam.evaluation.trajectories import Evaluation, evaluate_trajectory
@@ -49,9 +51,10 @@ def summarize(
     states = Counter(track.state for track in outcome.tracks)
     done = frames - states[TrackingState.DROPPED]
     options = asdict(outcome.settings)
-    del options["config"]
+    options["thresholds"] = changed_thresholds(options.pop("config").model_dump())
     loops = _loops(outcome, verdict)
     return ReportJson(
+        lost_before_map=_lost_before_map(outcome),
         weak_frames=states[TrackingState.WEAK],
         skipped_frames=len(outcome.skipped),
         skipped_messages=outcome.skipped,
@@ -84,6 +87,14 @@ def summarize(
         **_measures(outcome, evaluation, verdict),
         **options,
     )
+
+
+def _lost_before_map(outcome: RunOutcome) -> int:
+    if outcome.settings.map is not None or not outcome.n_tracked:
+        return 0
+    untracked = (TrackingState.LOST, TrackingState.DROPPED)
+    before = takewhile(lambda track: track.state in untracked, outcome.tracks)
+    return sum(track.state == TrackingState.LOST for track in before)
 
 
 def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:

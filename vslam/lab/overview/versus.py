@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
+from vslam.errors import counted
 from vslam.evaluation.loops import LoopLimits
+from vslam.lab.overview.collect import without_settings
 from vslam.lab.overview.schema import Comparison, Drive, OverviewJson, Row, Spread
-from vslam.lab.overview.summary import COMPARED, ROTATION
+from vslam.lab.overview.summary import ALPHA, COMPARED, ROTATION, least_pairs
 from vslam.report.page import Bullets, Section, Table
 
 _TEXTS = ("sequence", "perturbation")
 _SHOWN = {**COMPARED, **ROTATION}
 _MEASURES = ("lost_frames", *_SHOWN, "loops_found")
-_COLUMNS = 10  # at most so many columns of figures, which fit a terminal of 80 characters
+_WIDTH = 60  # characters for all columns of figures, so that a table fits a terminal of 80
+_COLUMN = 6  # characters of a column of figures at least
 _NOTES = {
     "lost_frames": "Lost: number of lost frames.",
     "rpe_m": "RPE: error of the motion from one frame to the next.",
@@ -58,7 +62,7 @@ def _without_revisits(report: OverviewJson) -> str:
     """Why loop detectors do not differ, or hardly; empty where a drive has a revisit or nobody
     could judge it."""
     judged = [row for row in report.rows if row.measures["loops_found"] is not None]
-    names = {row.system for row in judged}
+    names = {row.system for row in judged if row.system == without_settings(row.system)}
     counts = [row.measures[name] for row in judged for name in ("loops_found", "loops_missed")]
     if len(names) < 2 or any(count.greatest for count in counts if count is not None):
         return ""
@@ -77,7 +81,9 @@ def _is_tie(one: Comparison) -> bool:
 
 def _section(report: OverviewJson, rows: Rows, names: list[str]) -> Section:
     order = {(row.drive, row.alignment): None for row in report.rows if row.system in names}
-    each = max(1, _COLUMNS // len(names))  # measures of one table
+    words = [re.split(", | ", name) for name in names]  # a heading breaks between them
+    width = sum(max(_COLUMN, *(1 + len(word) for word in parts)) for parts in words)
+    each = max(1, _WIDTH // width)  # measures of one table
     tables = []
     for k in range(0, len(_MEASURES), each):
         measures = _MEASURES[k : k + each]
@@ -139,7 +145,7 @@ def _points(report: OverviewJson, rows: Rows, names: list[str]) -> Iterator[str]
     for name in names if shared else ():
         frames, n = total(name, "lost_frames"), len(runs[name])
         count = "n/a" if frames is None else f"{frames:.0f}"
-        lost.append(f"{name} {count} in {n} run{'s' if n != 1 else ''}")
+        lost.append(f"{name} {count} in {counted(n, 'run')}")
         found, missed, wrong = (
             total(name, measure) for measure in ("loops_found", "loops_missed", "loops_wrong")
         )
@@ -149,6 +155,7 @@ def _points(report: OverviewJson, rows: Rows, names: list[str]) -> Iterator[str]
         yield f"Lost frames: {', '.join(lost)}."
     if loops:
         yield f"Revisits in these runs: {'; '.join(loops)}."
+    shown = []
     for k, name in enumerate(names):
         sharing = (other for other in names[:k] if rows[other].keys() & rows[name].keys())
         baseline = next(sharing, None)
@@ -159,4 +166,10 @@ def _points(report: OverviewJson, rows: Rows, names: list[str]) -> Iterator[str]
                 if (one.first, one.second, one.measure) == (baseline, name, measure)
             ]
             if found_:
-                yield found_[-1].words  # over all conditions where there are several
+                shown.append(found_[-1])  # over all conditions where there are several
+    yield from (one.words for one in shown)
+    if any(one.p_value is None and one.first_better + one.second_better for one in shown):
+        yield (
+            f"Where fewer than {least_pairs()} sequences differ, Wilcoxon's test cannot reach "
+            f"p < {ALPHA:g}: the figures say nothing about other sequences."
+        )

@@ -82,6 +82,7 @@ class Plan:
         preset: ``kitti-c`` for fixed severities, or None.
         sensor: ``mono`` for the left camera alone, None for all images that the data has.
         calib: calibration files.
+        thresholds: as in `Cell`.
         baseline: the system to which the errors of a preset are compared.
     """
 
@@ -98,6 +99,7 @@ class Plan:
     preset: str | None = None
     sensor: str | None = None
     calib: tuple[str, ...] = ()
+    thresholds: str = ""
 
     def clean_cells(self) -> list[Cell]:
         """The runs of each system on clean images."""
@@ -111,14 +113,15 @@ class Plan:
                 self.max_frames,
                 sensor=self.sensor,
                 calib=self.calib,
+                thresholds=self.thresholds,
             )
             for sequence in self.sequences
             for system in self.systems
         ]
 
     def searches(self) -> list[Search]:
-        """All searches. A law without randomness is searched once, except for systems that are not
-        deterministic."""
+        """All searches, one for each seed. A law without random numbers is searched with one seed
+        only, unless the system itself gives different results each time."""
         return [
             Search(clean, law, seed, self.steps)
             for seed in range(self.seeds)

@@ -124,8 +124,8 @@ def test_second_try_keeps_the_result_of_the_first_and_refuses_other_files(calibr
     assert (code, "Next" in out) == (1, False)
     *_, ending = out.splitlines()
     assert ending == (
-        "Do not use this calibration, because it has faults; do what each fix says, with new "
-        "images if it asks so, and try again."
+        "Do not use this calibration, because it has faults; do what the fixes above say, and try "
+        "again."
     )
     first = Path("a.yaml").read_text(), Path("a.html").read_text()
     Path("a.yaml").write_text("left: of an earlier try\n")
@@ -156,7 +156,7 @@ def test_another_board_than_the_given_one_is_named_with_its_options(calibrate, t
     given = ("--board", "charuco", "--square", 0.04, "--marker", 0.03, "--size")
     grid = ("--board", "aprilgrid", "--square", 0.078, "--size", "4x3", "--marker")
     its = "the images show a ChArUco board of 7x5 squares with markers of 4X4_50: give --board "
-    its += "charuco --size 7x5 --dictionary 4X4_50, and measure --square and --marker (about 0.7"
+    its += "charuco --size 7x5 --dictionary 4X4_50, and measure --square and --marker (about 0.7 of"
     kalibr = "the images show an AprilGrid of 4x3 tags: give --board aprilgrid --size 4x3, and "
     for words in (
         ("charuco", "--board", "checkerboard", "--size", "6x4"),
@@ -303,7 +303,7 @@ def test_swapped_cameras_are_a_fault():
 
 def test_too_few_views_and_another_board_are_errors():
     views = exact_views(APRILGRID, PINHOLE, poses(APRILGRID, PINHOLE, 8))
-    with pytest.raises(InputError, match="is found in 2 images that fit, where 3 are the least"):
+    with pytest.raises(InputError, match="is found in only 2 usable images, and 3 are the least"):
         fit_camera(APRILGRID, views[:2], (384, 288), "pinhole")
     other = replace(APRILGRID, columns=3, rows=4)
     with pytest.raises(InputError, match="do not fit a flat AprilGrid of 3x4 tags"):

@@ -76,14 +76,14 @@ class Board:
     def __post_init__(self) -> None:
         if not 0 <= self.marker < self.square <= _LARGEST_M:
             raise InputError(
-                f"the square of {self.square:g} m and the marker of {self.marker:g} m are no sizes "
-                "of a board; give both in metres, such as 0.025 for 25 mm, and the marker smaller."
+                f"a board has no squares of {self.square:g} m with markers of {self.marker:g} m; "
+                "give both in metres, such as 0.025 for 25 mm, and the marker smaller."
             )
         least = 1 if self.kind == "aprilgrid" else 3
         if not all(least <= n <= 100 for n in (self.columns, self.rows)):
             raise InputError(
-                f"the size {self.columns}x{self.rows} is that of no {self.kind}; give {least} to "
-                "100 columns and rows."
+                f"a {self.kind} has no size of {self.columns}x{self.rows}; give {least} to 100 "
+                "columns and rows."
             )
 
     def __str__(self) -> str:
@@ -210,7 +210,7 @@ def other_board(board: Board, images: Sequence[Image]) -> str:
     options = f"--board {found.kind} --size {found.columns}x{found.rows}"
     options += f" --dictionary {found.dictionary}" if found.kind == "charuco" else ""
     if found.marker:
-        options += f", and measure --square and --marker (about {ratio:.2f} of --square)"
+        options += f", and measure --square and --marker (about {ratio:.1f} of --square)"
     article = "an" if found.kind == "aprilgrid" else "a"
     return f"the images show {article} {found}: give {options}"
 
@@ -246,7 +246,7 @@ def _charuco_finder(board: Board) -> Finder:
     if len(markers.bytesList) < board.columns * board.rows // 2:
         raise InputError(
             f"--dictionary {board.dictionary}: has too few markers for {size[0]}x{size[1]} "
-            "squares; name the dictionary that is printed."
+            "squares; give the size and the dictionary that are printed."
         )
     detectors = []
     for legacy in (False, True):  # OpenCV before 4.6 began boards of even height with a marker

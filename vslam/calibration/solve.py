@@ -14,7 +14,7 @@ import numpy as np
 
 from vslam.calibration.boards import Board, Corners, board_points
 from vslam.calibration.models import Array, CameraModel, Lens, project
-from vslam.errors import InputError
+from vslam.errors import InputError, counted
 
 Size = tuple[int, int]
 
@@ -201,7 +201,8 @@ def _without_outliers(
         dropped += [(kept[k].name, float(errors[k])) for k in np.flatnonzero(out)]
         kept = [view for view, bad in zip(kept, out, strict=True) if not bad]
     raise InputError(
-        f"{seen} in {len(kept)} images that fit, where {FEWEST_VIEWS} are the least; {fix}."
+        f"{seen} in only {counted(len(kept), 'usable image')}, and {FEWEST_VIEWS} are the least; "
+        f"{fix}."
     )
 
 

@@ -14,7 +14,7 @@ import typer
 
 from vslam.cli.console import console
 from vslam.cli.options import reads_source
-from vslam.errors import BrokenSourceError, InputError
+from vslam.errors import BrokenSourceError, InputError, ResultsError
 
 if TYPE_CHECKING:
     from vslam.calibration.boards import Board
@@ -154,7 +154,7 @@ def calibrate(
     write_page(result, findings, out.read_text("utf-8"), page)
     typer.echo(f"{out}: the calibration; {page}: residuals and coverage.")
     if any(finding.verdict == "fault" for finding in findings):
-        fix = other_board(made, examined) or "do what each fix says, with new images if it asks so"
+        fix = other_board(made, examined) or "do what the fixes above say"
         typer.echo(f"Do not use this calibration, because it has faults; {fix}, and try again.")
         raise typer.Exit(1)
     options = " --side-by-side" if given.side_by_side else ""
@@ -184,7 +184,13 @@ def _keep_earlier(*files: Path) -> None:
             break
     for path, free in zip(files, kept, strict=True):
         if path.exists():
-            path.rename(free)
+            try:
+                path.rename(free)
+            except OSError as error:
+                raise ResultsError(
+                    f"{path}: cannot be renamed to {free.name} ({error.strerror}); name another "
+                    "file with --out."
+                ) from error
             typer.echo(f"{free}: the earlier {path.name}, which is replaced.")
 
 

@@ -12,7 +12,14 @@ import pytest
 from rendered_boards import Renderer
 from source_files import write_images, write_video
 
-from vslam.calibration.boards import Board, Corners, board_points, read_board, same_order
+from vslam.calibration.boards import (
+    Board,
+    Corners,
+    board_points,
+    other_board,
+    read_board,
+    same_order,
+)
 from vslam.calibration.files import read_calibration, write_calibration
 from vslam.calibration.models import Calibration, CameraModel, project, unproject
 from vslam.calibration.solve import View, diverse, fit_camera, fit_pair
@@ -107,8 +114,66 @@ def test_checkerboard_filmed_by_one_camera(calibrate, tmp_path):
     page = Path("calibration.html").read_text()
     assert "checkerboard of 9x6 inner corners" in page
     assert page.count("<svg") == 2
-    code, _, err = calibrate("board", "--board", "checkerboard", "--size", "9x6")
-    assert (code, "calibration.yaml: exists already" in err) == (2, True)
+
+
+def test_second_try_keeps_the_result_of_the_first_and_refuses_other_files(calibrate, tmp_path):
+    images = rendered(CHECKERBOARD, PINHOLE, poses(CHECKERBOARD, PINHOLE, 5), 0)
+    write_images(tmp_path, {"board": images}, [f"{k}.png" for k in range(5)])
+    words = ("board", "--board", "checkerboard", "--size", "9x6", "--out")
+    code, out, _ = calibrate(*words, "a.yaml")
+    assert (code, "Next" in out) == (1, False)
+    *_, ending = out.splitlines()
+    assert ending == (
+        "Do not use this calibration, because it has faults; do what the fixes above say, and try "
+        "again."
+    )
+    first = Path("a.yaml").read_text(), Path("a.html").read_text()
+    Path("a.yaml").write_text("left: of an earlier try\n")
+    code, out, _ = calibrate(*words, "a.yaml")
+    assert "a-1.yaml: the earlier a.yaml, which is replaced.\n" in out
+    assert Path("a-1.yaml").read_text() == "left: of an earlier try\n"
+    assert (Path("a.yaml").read_text(), Path("a-1.html").read_text()) == first
+    assert "a-2.html: the earlier a.html" in calibrate(*words, "a.yaml")[1]
+    Path("b.yaml").write_text("left_out: 1\n")
+    for name, said in (
+        ("b.yaml", "--out b.yaml: is another program's file; name a new one."),
+        ("none/a.yaml", "--out none/a.yaml: there is no folder none; create it first."),
+        ("board", "--out board: is a folder"),
+        ("a.html", "--out a.html: a calibration is YAML"),
+    ):
+        code, out, err = calibrate(*words, name)
+        assert (code, out, said in err) == (2, "", True), err
+
+
+@pytest.mark.slow
+def test_another_board_than_the_given_one_is_named_with_its_options(calibrate, tmp_path):
+    charuco = rendered(CHARUCO, PINHOLE, poses(CHARUCO, PINHOLE, 4), 0)
+    aprilgrid = rendered(APRILGRID, PINHOLE, poses(APRILGRID, PINHOLE, 4), 0)
+    write_images(
+        tmp_path, {"charuco": charuco, "aprilgrid": aprilgrid}, [f"{k}.png" for k in range(4)]
+    )
+    (tmp_path / "april.yaml").write_text(KALIBR.replace("Cols: 4", "Cols: 3"))
+    given = ("--board", "charuco", "--square", 0.04, "--marker", 0.03, "--size")
+    grid = ("--board", "aprilgrid", "--square", 0.078, "--size", "4x3", "--marker")
+    its = "the images show a ChArUco board of 7x5 squares with markers of 4X4_50: give --board "
+    its += "charuco --size 7x5 --dictionary 4X4_50, and measure --square and --marker (about 0.7 of"
+    kalibr = "the images show an AprilGrid of 4x3 tags: give --board aprilgrid --size 4x3, and "
+    for words in (
+        ("charuco", "--board", "checkerboard", "--size", "6x4"),
+        ("charuco", *given, "5x7", "--dictionary", "4x4_50"),  # columns and rows swapped
+        ("charuco", *given, "6x4", "--dictionary", "4X4_50"),  # inner corners
+        ("charuco", *given, "7x5", "--dictionary", "5X5_1000"),
+        ("aprilgrid", "--board", "april.yaml"),
+        ("aprilgrid", *grid, 0.04),
+    ):
+        code, _, err = calibrate(*words)
+        message = err[err.index("error: ") :]
+        said = its if words[0] == "charuco" else kalibr
+        assert (code, said in message, message.count("\n")) == (2, True, 1), message
+    street = [np.random.default_rng(k).integers(0, 256, (288, 384), np.uint8) for k in range(2)]
+    for board in (CHECKERBOARD, CHARUCO, APRILGRID):
+        assert other_board(board, street) == ""
+    assert other_board(CHARUCO, charuco) == other_board(APRILGRID, aprilgrid) == ""
 
 
 @pytest.mark.slow
@@ -238,7 +303,7 @@ def test_swapped_cameras_are_a_fault():
 
 def test_too_few_views_and_another_board_are_errors():
     views = exact_views(APRILGRID, PINHOLE, poses(APRILGRID, PINHOLE, 8))
-    with pytest.raises(InputError, match="is found in 2 views that fit, where 3 are the least"):
+    with pytest.raises(InputError, match="is found in only 2 usable images, and 3 are the least"):
         fit_camera(APRILGRID, views[:2], (384, 288), "pinhole")
     other = replace(APRILGRID, columns=3, rows=4)
     with pytest.raises(InputError, match="do not fit a flat AprilGrid of 3x4 tags"):
@@ -272,16 +337,16 @@ def test_images_without_the_board_are_an_error_that_says_what_was_looked_for(cal
     rest = ("--board", "checkerboard", "--size")
     for words, said in (
         (("blank", *rest, "9x6"), "blank: no checkerboard of 9x6 inner corners in any of 2 images"),
-        (("board", *rest, "10x7"), "a board of 9x6 inner corners is seen: give --size 9x6"),
+        (("board", *rest, "10x7"), "a checkerboard of 9x6 inner corners: give --board checker"),
         (
             ("pair", *rest, "9x6", "--square", 0.03),
             "the right camera never sees the checkerboard of 9x6 inner corners, which the other",
         ),
         (("mixed", *rest, "9x6"), "384x100 pixels where the first image has 384x288"),
-        (("pair", *rest, "9x6"), "--square: is missing"),
-        (("pair", *rest, "9x6", "--square", 30), "must be in metres (0.025 for 25 mm)"),
-        (("pair", *rest, "9"), "--size 9: give columns and rows as 9x6."),
-        (("pair", "--board", "none.yaml"), "--board none.yaml: neither checkerboard, charuco"),
+        (("pair", *rest, "9x6"), "--square is missing"),
+        (("pair", *rest, "9x6", "--square", 30), "give both in metres, such as 0.025 for 25 mm"),
+        (("pair", *rest, "9"), "--size 9: give columns and rows, such as 9x6."),
+        (("pair", "--board", "none.yaml"), "--board none.yaml: is no file; give"),
     ):
         code, _, err = calibrate(*words)
         message = err[err.index("error: ") :]

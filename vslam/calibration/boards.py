@@ -1,4 +1,5 @@
-"""Calibration boards, and the detection of their corners by OpenCV.
+"""Calibration boards, the detection of their corners by OpenCV, and the recognition of a board that
+is not the expected one.
 
 A board is flat. Its frame has x to the right, y down and z away from the viewer; an AprilGrid's is
 Kalibr's, with y up and z towards the viewer.
@@ -7,10 +8,12 @@ Kalibr's, with y up and z towards the viewer.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +27,27 @@ Kind = Literal["checkerboard", "charuco", "aprilgrid"]
 
 _FEWEST_CORNERS = 8  # of a view; a homography needs four
 _FEWEST_TAGS = 4
+_LARGEST_M = 0.5  # side of a square; larger numbers are usually millimetres
 _TAGS = "APRILTAG_36h11"
 _BORDERS = (2, 1)  # bits of black around a tag: Kalibr prints 2, most other programs 1
-_FAMILIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "ARUCO_ORIGINAL", _TAGS)
-_SEARCHED_PX = 960  # longer side of the image that a checkerboard is searched in
+_SEARCHED_PX = 960  # longer side of the image in which a checkerboard is searched
 _REACH_PX = (2, 6)  # of the refinement, to each side
+
+# For the recognition of a board. Houses and fences show a few false tags and small checkerboards;
+# more than these, or the same one twice, come from a board.
+_RECOGNISED_TAGS = 6
+_SMALLEST = (4, 3)
+_SIZES = (50, 100, 250, 1000)
+_FAMILIES = (
+    *((f"{bits}X{bits}_1000", 1) for bits in (4, 5, 6, 7)),
+    ("ARUCO_ORIGINAL", 1),
+    *((_TAGS, bits) for bits in _BORDERS),
+)  # the largest dictionary of each family, and the bits of black around its tags
+_TRIED_TAGS = 50
+_MOST_COLUMNS = 40
+_OFF_PLACE = 0.25  # distance of a tag from its place in the layout, in tag sides
+_TRIALS = 200  # of RANSAC; few tags are wrong
+_SAME_RATIO = 0.12  # relative error of marker / square, which blur makes too small
 
 
 @dataclass(frozen=True)
@@ -42,6 +61,9 @@ class Board:
         square: side of a square in metres; of an AprilGrid, the distance from one tag to the next.
         marker: side of the black marker or tag in metres; 0 for a checkerboard.
         dictionary: OpenCV's name of a ChArUco board's markers, without ``DICT_``.
+
+    Raises:
+        InputError: a size is impossible.
     """
 
     kind: Kind
@@ -51,15 +73,26 @@ class Board:
     marker: float = 0.0
     dictionary: str = "5X5_1000"
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.marker < self.square <= _LARGEST_M:
+            raise InputError(
+                f"a board has no squares of {self.square:g} m with markers of {self.marker:g} m; "
+                "give both in metres, such as 0.025 for 25 mm, and the marker smaller."
+            )
+        least = 1 if self.kind == "aprilgrid" else 3
+        if not all(least <= n <= 100 for n in (self.columns, self.rows)):
+            raise InputError(
+                f"a {self.kind} has no size of {self.columns}x{self.rows}; give {least} to 100 "
+                "columns and rows."
+            )
+
     def __str__(self) -> str:
-        counted = {"checkerboard": "inner corners", "charuco": "squares", "aprilgrid": "tags"}
-        kind = {
-            "checkerboard": "checkerboard",
-            "charuco": "ChArUco board",
-            "aprilgrid": "AprilGrid",
-        }
-        markers = f" with markers of {self.dictionary}" if self.kind == "charuco" else ""
-        return f"{kind[self.kind]} of {self.columns}x{self.rows} {counted[self.kind]}{markers}"
+        size = f"{self.columns}x{self.rows}"
+        return {
+            "checkerboard": f"checkerboard of {size} inner corners",
+            "charuco": f"ChArUco board of {size} squares with markers of {self.dictionary}",
+            "aprilgrid": f"AprilGrid of {size} tags",
+        }[self.kind]
 
 
 @dataclass(frozen=True)
@@ -82,31 +115,38 @@ def read_board(path: Path) -> Board:
     """Read a target of Kalibr: an ``aprilgrid`` or a ``checkerboard``.
 
     Raises:
-        InputError: the file is no such target, or a key is missing.
+        InputError: the file is no such target, a key is missing, or a size is impossible.
     """
     document = read_document(path)
     kind = document.text("target_type")
+    marker = 0.0
     if kind == "aprilgrid":
-        columns, rows = int(document.number("tagCols")), int(document.number("tagRows"))
-        tag = document.number("tagSize")
-        return Board("aprilgrid", columns, rows, tag * (1 + document.number("tagSpacing")), tag)
-    if kind == "checkerboard":
-        columns, rows = int(document.number("targetCols")), int(document.number("targetRows"))
+        names = "tagCols", "tagRows"
+        marker = document.number("tagSize")
+        square = marker * (1 + document.number("tagSpacing"))
+    elif kind == "checkerboard":
+        names = "targetCols", "targetRows"
         square = document.number("colSpacingMeters")
         if square != document.number("rowSpacingMeters"):
             raise InputError(f"{path}: the fields of the board are not square; use another board.")
-        return Board("checkerboard", columns, rows, square)
-    raise InputError(f"{path}: target_type {kind} is unknown; known are aprilgrid, checkerboard.")
+    else:
+        raise InputError(
+            f"{path}: the target_type {kind} is unknown; use an aprilgrid or a checkerboard."
+        )
+    columns, rows = (int(document.number(name)) for name in names)
+    try:
+        return Board(cast("Kind", kind), columns, rows, square, marker)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def board_points(board: Board) -> Array:
     """``(N, 3)`` float64, the corners of a board in its frame, in metres."""
-    if board.kind == "charuco":
-        return np.asarray(_charuco(board).getChessboardCorners(), np.float64)
-    across, down = np.meshgrid(np.arange(board.columns), np.arange(board.rows))
+    first = 1 if board.kind == "charuco" else 0  # its inner corners, counted from its outer one
+    across, down = np.meshgrid(np.arange(first, board.columns), np.arange(first, board.rows))
     flat = np.column_stack([across.ravel(), down.ravel(), np.zeros(across.size)])
     points = np.asarray(flat * board.square, np.float64)
-    if board.kind == "checkerboard":
+    if board.kind != "aprilgrid":
         return points
     # The corners of a tag clockwise, from the lower right one on: where OpenCV begins with a tag
     # that Kalibr prints.
@@ -119,7 +159,7 @@ def corner_finder(board: Board) -> Finder:
     for an image that does not show enough of the board.
 
     Raises:
-        InputError: OpenCV knows no such markers, or has too few of them for the board.
+        InputError: the dictionary has too few markers for the board.
     """
     finders = {
         "checkerboard": _checkerboard_finder,
@@ -151,12 +191,35 @@ def same_order(board: Board, left: Corners, right: Corners) -> Corners:
     return Corners(right.ids, numbered[int(np.argmin(off))])
 
 
+def other_board(board: Board, images: Sequence[Image]) -> str:
+    """What images show instead of ``board`` and the options that describe it, as a clause; empty if
+    they show this board, or none that is recognised."""
+    small = [_reduced(image)[0] for image in images]
+    found = _tagged_board(small) or _checkerboard(small)
+    if found is None:
+        return ""
+    if found.kind == board.kind and found.columns == board.columns:  # some rows may be out of sight
+        found = replace(found, rows=max(found.rows, board.rows))
+    family, given = (each.dictionary.rpartition("_")[0] for each in (found, board))
+    if found.kind != "charuco" or family == given:
+        found = replace(found, dictionary=board.dictionary)
+    ratio = found.marker / found.square
+    known = replace(found, square=board.square, marker=board.marker) == board
+    if known and abs(board.marker / board.square - ratio) <= _SAME_RATIO * ratio:
+        return ""
+    options = f"--board {found.kind} --size {found.columns}x{found.rows}"
+    options += f" --dictionary {found.dictionary}" if found.kind == "charuco" else ""
+    if found.marker:
+        options += f", and measure --square and --marker (about {ratio:.1f} of --square)"
+    article = "an" if found.kind == "aprilgrid" else "a"
+    return f"the images show {article} {found}: give {options}"
+
+
 def _checkerboard_finder(board: Board) -> Finder:
     import cv2
 
     def find(image: Image) -> Corners | None:
-        times = max(1.0, max(image.shape) / _SEARCHED_PX)
-        small = cv2.resize(image, None, None, 1 / times, 1 / times, cv2.INTER_AREA)
+        small, times = _reduced(image)
         found, xy = cv2.findChessboardCornersSB(
             small, (board.columns, board.rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE
         )
@@ -168,24 +231,26 @@ def _checkerboard_finder(board: Board) -> Finder:
     return find
 
 
-def _charuco(board: Board) -> Any:
+def _reduced(image: Image) -> tuple[Image, float]:
+    """An image in which a checkerboard is found quickly, and how many times smaller it is."""
     import cv2
 
-    size, markers = (board.columns, board.rows), _dictionary(board.dictionary)
-    if len(markers.bytesList) < board.columns * board.rows // 2:
-        raise InputError(
-            f"--dictionary {board.dictionary}: too few markers for {size[0]}x{size[1]} squares; "
-            "name a larger one."
-        )
-    return cv2.aruco.CharucoBoard(size, board.square, board.marker, markers)
+    times = max(1.0, max(image.shape) / _SEARCHED_PX)
+    return cv2.resize(image, None, None, 1 / times, 1 / times, cv2.INTER_AREA), times
 
 
 def _charuco_finder(board: Board) -> Finder:
     import cv2
 
+    size, markers = (board.columns, board.rows), _dictionary(board.dictionary)
+    if len(markers.bytesList) < board.columns * board.rows // 2:
+        raise InputError(
+            f"--dictionary {board.dictionary}: has too few markers for {size[0]}x{size[1]} "
+            "squares; give the size and the dictionary that are printed."
+        )
     detectors = []
     for legacy in (False, True):  # OpenCV before 4.6 began boards of even height with a marker
-        layout = _charuco(board)
+        layout = cv2.aruco.CharucoBoard(size, board.square, board.marker, markers)
         layout.setLegacyPattern(legacy)
         detectors.append(cv2.aruco.CharucoDetector(layout))
     points = board_points(board)
@@ -203,32 +268,50 @@ def _charuco_finder(board: Board) -> Finder:
 
 
 def _aprilgrid_finder(board: Board) -> Finder:
-    import cv2
-
-    detectors = []
-    for bits in _BORDERS:
-        parameters = cv2.aruco.DetectorParameters()
-        parameters.markerBorderBits = bits
-        detectors.append(cv2.aruco.ArucoDetector(_dictionary(_TAGS), parameters))
+    detectors = [_tag_detector(_TAGS, border) for border in _BORDERS]
     points = board_points(board)
 
     def find(image: Image) -> Corners | None:
-        for detector in detectors:
-            tags, found, _ = detector.detectMarkers(image)
-            if found is None:
-                continue
-            known = found.ravel() < board.columns * board.rows
+        for detect in detectors:
+            numbers, xy = detect(image)
+            known = numbers < board.columns * board.rows
             if np.count_nonzero(known) >= _FEWEST_TAGS:
-                numbers = found.ravel()[known].astype(np.int64)
-                ids = (4 * numbers[:, None] + np.arange(4)).ravel()
-                xy = np.concatenate(tags)[known].reshape(-1, 2).astype(np.float64)
+                ids = (4 * numbers[known, None] + np.arange(4)).ravel()
+                at = xy[known].reshape(-1, 2)
                 # Other programs than Kalibr do not print the tags upside down, which shows only in
                 # the grid as a whole.
-                ids = min(ids, ids ^ 2, key=lambda each: _off_plane(points[each], xy))
-                return Corners(ids, xy)
+                ids = min(ids, ids ^ 2, key=lambda each: _off_plane(points[each], at))
+                return Corners(ids, at)
         return None
 
     return find
+
+
+def _tag_detector(
+    name: str, border: int, most: int | None = None
+) -> Callable[[Image], tuple[NDArray[np.int64], Array]]:
+    """The function that finds the first tags of a dictionary, or all: ``(N,)`` their numbers and
+    ``(N, 4, 2)`` their corners."""
+    import cv2
+
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.markerBorderBits = border
+    dictionary = _dictionary(name)
+    dictionary.bytesList = dictionary.bytesList[:most]
+    detector = cv2.aruco.ArucoDetector(dictionary, parameters)
+
+    def detect(image: Image) -> tuple[NDArray[np.int64], Array]:
+        corners, numbers, _ = detector.detectMarkers(image)
+        found = np.empty(0) if numbers is None else numbers
+        return found.ravel().astype(np.int64), np.array(corners, np.float64).reshape(-1, 4, 2)
+
+    return detect
+
+
+def _dictionary(name: str) -> Any:
+    import cv2
+
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
 
 
 def _refined(board: Board, points: Array, image: Image, corners: Corners) -> Corners | None:
@@ -271,43 +354,74 @@ def _off_plane(points: Array, xy: Array) -> float:
     return float(np.linalg.norm(mapped - xy, axis=1).mean())
 
 
-def _dictionary(name: str) -> Any:
+def _checkerboard(images: Sequence[Image]) -> Board | None:
+    """The checkerboard that at least two images show, with squares of 0.1 m."""
     import cv2
 
-    number = getattr(cv2.aruco, f"DICT_{name}", None)
-    if number is None:
-        raise InputError(
-            f"--dictionary {name}: OpenCV has no such markers; known are 4X4_50, "
-            "5X5_100, 6X6_250, 7X7_1000, APRILTAG_36h11 and the like."
-        )
-    return cv2.aruco.getPredefinedDictionary(number)
-
-
-def seen_instead(board: Board, images: Iterable[Image]) -> str:
-    """What images show where the board is not found: the end of a sentence, or empty."""
-    import cv2
-
-    if board.kind == "checkerboard":
-        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
-        sizes: Counter[tuple[int, int]] = Counter()
-        for image in images:
-            found, _, meta = cv2.findChessboardCornersSBWithMeta(image, (3, 3), flags)
-            if found:
-                sizes[(max(meta.shape), min(meta.shape))] += 1
-        if not sizes:
-            return ""
-        columns, rows = sizes.most_common(1)[0][0]
-        return f"a board of {columns}x{rows} inner corners is seen: give --size {columns}x{rows}"
-    wanted = _TAGS if board.kind == "aprilgrid" else board.dictionary
-    seen: Counter[str] = Counter()
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+    sizes: Counter[tuple[int, int]] = Counter()
     for image in images:
-        for name in _FAMILIES:
-            ids = cv2.aruco.ArucoDetector(_dictionary(name)).detectMarkers(image)[1]
-            seen[name] += 0 if ids is None else len(ids)
-    name, n = seen.most_common(1)[0]
-    if n < _FEWEST_TAGS:
-        return ""
-    if name.rpartition("_")[0] == wanted.rpartition("_")[0]:
-        return "its markers are seen: check --size, --square and --marker"
-    of_board = "aprilgrid" if name == _TAGS else f"charuco --dictionary {name}"
-    return f"markers of {name} are seen: give --board {of_board}"
+        found, _, meta = cv2.findChessboardCornersSBWithMeta(image, _SMALLEST, flags)
+        if found:
+            sizes[max(meta.shape), min(meta.shape)] += 1
+    (size, n), *_ = sizes.most_common(1) or [((0, 0), 0)]
+    return Board("checkerboard", *size, 0.1) if n > 1 else None
+
+
+def _tagged_board(images: Sequence[Image]) -> Board | None:
+    """The ChArUco board or AprilGrid of which an image shows most tags, with squares of 0.1 m."""
+    # The first tags of every dictionary tell the family, in a twentieth of the time of all tags.
+    detectors = [(family, _tag_detector(*family, _TRIED_TAGS)) for family in _FAMILIES]
+    n, image, (name, border) = max(
+        (
+            (len(detect(image)[0]), image, family)
+            for image in images
+            for family, detect in detectors
+        ),
+        key=itemgetter(0),
+    )
+    if n < _RECOGNISED_TAGS:
+        return None
+    numbers, xy = _tag_detector(name, border)(image)
+    kinds: tuple[tuple[Kind, int], ...] = (("charuco", 1), ("charuco", 0))
+    if name == _TAGS:
+        kinds += (("aprilgrid", 0),)
+    layouts = [
+        _layout(kind, first, columns, name, numbers, xy)
+        for (kind, first), columns in product(kinds, range(3, _MOST_COLUMNS))
+    ]
+    _, found = max(layouts, key=itemgetter(0))
+    return found if found is not None and corner_finder(found)(image) is not None else None
+
+
+def _layout(
+    kind: Kind, first: int, columns: int, family: str, numbers: NDArray[np.int64], xy: Array
+) -> tuple[int, Board | None]:
+    """How many tags fit a board of so many columns, and the board; none of it if they are few.
+
+    Args:
+        first: the square of the first row that has the first tag.
+        family: dictionary of the tags.
+        numbers, xy: the tags that are seen, ``(N,)``, and their corners, ``(N, 4, 2)`` pixels.
+    """
+    import cv2
+
+    step = 2 if kind == "charuco" else 1  # tags are on every other square
+    squares = np.indices((step * numbers.max() // columns + 2, columns)).sum(axis=0)
+    at = np.argwhere(squares % step == first)[numbers, ::-1].astype(np.float64)
+    side = float(np.median(np.linalg.norm(xy - np.roll(xy, 1, axis=1), axis=2)))
+    H, mask = cv2.findHomography(
+        at, xy.mean(axis=1), cv2.RANSAC, _OFF_PLACE * side, maxIters=_TRIALS
+    )
+    if H is None or (n := np.count_nonzero(mask)) < _RECOGNISED_TAGS:
+        return 0, None
+    fits = mask.ravel() > 0
+    tags = cv2.perspectiveTransform(xy.reshape(1, -1, 2), np.linalg.inv(H)).reshape(-1, 4, 2)[fits]
+    ratio = float(np.median(np.linalg.norm(tags - np.roll(tags, 1, axis=1), axis=2)))
+    if not 0.0 < ratio < 1.0:
+        return 0, None
+    bits, _, size = family.rpartition("_")
+    if size == "1000":  # the smaller dictionaries are its first markers
+        family = f"{bits}_{next(n for n in _SIZES if n > numbers[fits].max())}"
+    rows = max(3, int(at[fits, 1].max()) + 1)
+    return n, Board(kind, columns, rows, 0.1, 0.1 * ratio, family)

@@ -6,25 +6,22 @@ with vslam's own camera models.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vslam.calibration.boards import Board, Corners, board_points, same_order
-from vslam.calibration.models import Array, CameraModel, Lens, project, unproject
-from vslam.errors import InputError
+from vslam.calibration.boards import Board, Corners, board_points
+from vslam.calibration.models import Array, CameraModel, Lens, project
+from vslam.errors import InputError, counted
 
 Size = tuple[int, int]
 
 FEWEST_VIEWS = 3  # an estimate has 8 unknowns of the camera and 6 of each view
 _OUTLIER = 3.0  # medians of the views' errors
-_ROUNDS = 5
 _NO_FIT = 0.01  # of the image width: RMS of a board that is another one
 _FEWEST_COMMON = 6  # corners that both images of a pair show
-_AHEAD = 0.2  # z of a unit ray: 78 degrees off the axis
 _SAME_VIEW = 0.02  # of the image size, by which the board's outline moved between two views
 
 
@@ -121,79 +118,92 @@ def fit_camera(board: Board, views: Sequence[View], size: Size, lens: Lens) -> C
         InputError: too few views, views that fix no camera, or corners that are not of this board.
     """
     points = board_points(board)
-    kept, dropped = list(views), []
-    for _ in range(_ROUNDS):
-        if len(kept) < FEWEST_VIEWS:
-            raise InputError(
-                f"the {board} is found in {len(kept)} views that fit, where {FEWEST_VIEWS} are the "
-                "least; film it in 20 or more different places and directions."
-            )
-        fit = _fit(points, kept, size, lens)
-        errors, out = fit.errors, _outliers(fit.errors)
-        if not out.any():
-            break
-        dropped += [(kept[k].name, float(errors[k])) for k in np.flatnonzero(out)]
-        kept = [view for view, bad in zip(kept, out, strict=True) if not bad]
-    else:
-        fit = _fit(points, kept, size, lens)
-    error = rms(np.concatenate(fit.residuals))
+
+    def fit(kept: Sequence[View]) -> tuple[CameraFit, Array]:
+        found = _fit(points, kept, size, lens)
+        return found, found.errors
+
+    fix = "film it in 20 or more different places and directions"
+    found, dropped = _without_outliers(views, fit, f"the {board} is found", fix)
+    error = rms(np.concatenate(found.residuals))
     if not error <= _NO_FIT * size[0]:
         raise InputError(
-            f"the corners do not fit a flat {board} ({error:.0f} px RMS); check its columns "
-            "and rows, --square and --marker, or try the other --lens."
+            f"the corners do not fit a flat {board} ({error:.0f} px RMS); check --size, --square "
+            "and --marker, or try the other --lens."
         )
-    return replace(fit, dropped=tuple(dropped))
+    return replace(found, dropped=dropped)
 
 
 def fit_pair(board: Board, left: CameraFit, right: CameraFit) -> PairFit:
-    """Estimate the transformation between two cameras from their views of the same names.
+    """Estimate the transformation between two cameras from their views of the same names, whose
+    corners are numbered alike (`vslam.calibration.boards.same_order`).
 
     Raises:
         InputError: fewer than three pairs.
     """
     points = board_points(board)
-    of_right = {view.name: view for view in right.views}
+    right_views = zip(right.views, right.T_camera_board, strict=True)
+    of_right = {view.name: (view.corners, T) for view, T in right_views}
     pairs = []
     for view, T_left_board in zip(left.views, left.T_camera_board, strict=True):
         if view.name in of_right:
-            other = same_order(board, view.corners, of_right[view.name].corners)
+            other, T_right_board = of_right[view.name]
             ids, _, seen = np.intersect1d(view.corners.ids, other.ids, return_indices=True)
             if len(ids) >= _FEWEST_COMMON:
-                pairs.append(_Pair(view.name, points[ids], other.xy[seen], T_left_board))
-    dropped: list[tuple[str, float]] = []
-    while True:
-        if len(pairs) < FEWEST_VIEWS:
-            raise InputError(
-                f"the {board} is seen by both cameras in {len(pairs)} frames that fit, where "
-                f"{FEWEST_VIEWS} are the least; film it where their views overlap."
-            )
-        T = _transformation(right.model, pairs)
-        errors = np.array([rms(pair.residuals(right.model, T)) for pair in pairs])
-        out = _outliers(errors)
-        if not out.any():
-            names = tuple(pair.name for pair in pairs)
-            return PairFit(
-                np.asarray(np.linalg.inv(T).round(9), np.float64), names, errors, tuple(dropped)
-            )
-        dropped += [(pairs[k].name, float(errors[k])) for k in np.flatnonzero(out)]
-        pairs = [pair for pair, bad in zip(pairs, out, strict=True) if not bad]
+                start = T_right_board @ np.linalg.inv(T_left_board)
+                pairs.append(_Pair(view.name, points[ids], other.xy[seen], T_left_board, start))
+
+    def fit(kept: Sequence[_Pair]) -> tuple[PairFit, Array]:
+        T = _transformation(right.model, kept)
+        errors = np.array([rms(pair.residuals(right.model, T)) for pair in kept])
+        T_left_right = np.asarray(np.linalg.inv(T).round(9), np.float64)
+        return PairFit(T_left_right, tuple(pair.name for pair in kept), errors, ()), errors
+
+    fix = "film it where both cameras see it"
+    found, dropped = _without_outliers(pairs, fit, f"both cameras see the {board}", fix)
+    return replace(found, dropped=dropped)
 
 
 @dataclass(frozen=True)
 class _Pair:
-    """A board's ``(N, 3)`` points, where the right camera sees them, and its pose in the left."""
+    """A board's ``(N, 3)`` points, where the right camera sees them, its pose in the left camera,
+    and the transformation that the fits of both cameras give."""
 
     name: str
     points: Array
     right: Array
     T_left_board: Array
+    T_right_left: Array
 
     def residuals(self, model: CameraModel, T_right_left: Array) -> Array:
         return self.right - project(model, _moved(T_right_left @ self.T_left_board, self.points))
 
 
-def _outliers(errors: Array) -> NDArray[np.bool_]:
-    return ~(errors <= _OUTLIER * np.nanmedian(errors))  # NaN: a board behind the camera
+_V = TypeVar("_V", View, _Pair)
+_F = TypeVar("_F", CameraFit, PairFit)
+
+
+def _without_outliers(
+    views: Sequence[_V], fit: Callable[[Sequence[_V]], tuple[_F, Array]], seen: str, fix: str
+) -> tuple[_F, tuple[tuple[str, float], ...]]:
+    """What ``fit`` makes of the views without those whose error is large, and their names and
+    errors; ``fit`` returns its result and the error of each view.
+
+    Raises:
+        InputError: too few views are left; ``seen`` and ``fix`` are parts of the sentence.
+    """
+    kept, dropped = list(views), []
+    while len(kept) >= FEWEST_VIEWS:
+        found, errors = fit(kept)
+        out = ~(errors <= _OUTLIER * np.nanmedian(errors))  # NaN: a board behind the camera
+        if not out.any():
+            return found, tuple(dropped)
+        dropped += [(kept[k].name, float(errors[k])) for k in np.flatnonzero(out)]
+        kept = [view for view, bad in zip(kept, out, strict=True) if not bad]
+    raise InputError(
+        f"{seen} in only {counted(len(kept), 'usable image')}, and {FEWEST_VIEWS} are the least; "
+        f"{fix}."
+    )
 
 
 def _fit(points: Array, views: Sequence[View], size: Size, lens: Lens) -> CameraFit:
@@ -250,17 +260,7 @@ def _transformation(right: CameraModel, pairs: Sequence[_Pair]) -> Array:
         T[:3, :3], T[:3, 3] = cv2.Rodrigues(x[:3])[0], x[3:]
         return T
 
-    starts = []
-    for pair in pairs:
-        rays = unproject(right, pair.right)
-        ahead = rays[:, 2] > _AHEAD
-        if np.count_nonzero(ahead) >= 4:
-            plane = rays[ahead, :2] / rays[ahead, 2:]
-            _, turn, shift = cv2.solvePnP(pair.points[ahead], plane, np.eye(3), None)
-            T_right_board = transformation(np.concatenate([turn.ravel(), shift.ravel()]))
-            starts.append(T_right_board @ np.linalg.inv(pair.T_left_board))
-    if not starts:
-        raise InputError("the right camera sees the board only at its border; film it again.")
+    starts = [pair.T_right_left for pair in pairs]
     start = min(starts, key=lambda T: float(np.median(np.linalg.norm(residuals(T), axis=1))))
     x = np.concatenate([cv2.Rodrigues(start[:3, :3])[0].ravel(), start[:3, 3]])
     return transformation(least_squares(lambda x: residuals(transformation(x)).ravel(), x).x)

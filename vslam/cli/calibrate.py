@@ -6,6 +6,7 @@ import re
 import shlex
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
 
@@ -13,10 +14,10 @@ import typer
 
 from vslam.cli.console import console
 from vslam.cli.options import reads_source
-from vslam.errors import BrokenSourceError, InputError
+from vslam.errors import BrokenSourceError, InputError, ResultsError
 
 if TYPE_CHECKING:
-    from vslam.calibration.boards import Board, Finder
+    from vslam.calibration.boards import Board
     from vslam.calibration.solve import View
     from vslam.camera import Image
     from vslam.datasets.frames import RawSource, TimedFrame
@@ -34,8 +35,17 @@ _EXAMPLES = """
 _MOST_SEARCHED = 300  # images, spread evenly; a minute or two
 _MOST_VIEWS = 60
 _ALONE = 20  # of these, views of one camera of a pair alone
-_LARGEST_M = 0.5  # side of a square; larger ones were meant in millimetres
 _EXAMINED = 10  # images in which another board is looked for
+if TYPE_CHECKING:
+    Dictionary = str
+else:
+    Dictionary = Literal[
+        (
+            *(f"{bits}X{bits}_{n}" for bits in (4, 5, 6, 7) for n in (50, 100, 250, 1000)),
+            *("ARUCO_ORIGINAL", "ARUCO_MIP_36h12"),
+            *(f"APRILTAG_{name}" for name in ("16h5", "25h9", "36h10", "36h11")),
+        )
+    ]
 
 
 def register(app: typer.Typer) -> None:
@@ -78,9 +88,11 @@ def calibrate(
         ),
     ] = None,
     dictionary: Annotated[
-        str,
+        Dictionary,
         typer.Option(
-            metavar="NAME", help="Markers of a ChArUco board, by OpenCV's name without DICT_."
+            metavar="NAME",
+            help="Markers of a ChArUco board, by OpenCV's name without DICT_.",
+            case_sensitive=False,
         ),
     ] = "5X5_1000",
     lens: Annotated[
@@ -94,28 +106,30 @@ def calibrate(
     out: Annotated[
         Path,
         typer.Option(
-            metavar="FILE", help="Calibration to write; the page beside it ends in .html."
+            metavar="FILE",
+            help="Calibration to write; the page beside it ends in .html. Those of an earlier try "
+            "are kept under another name.",
         ),
     ] = Path("calibration.yaml"),
 ) -> None:
     """Calibrate a camera or a stereo pair from images of a board; exit code 1 if the result is
     doubtful."""
-    from vslam.calibration.boards import corner_finder
+    from vslam.calibration.boards import other_board
     from vslam.calibration.files import write_calibration
     from vslam.calibration.models import Calibration
     from vslam.calibration.solve import fit_camera, fit_pair
     from vslam.datasets.sources import open_raw
     from vslam.doctor.calibration_page import Calibrated, findings_of, write_page
+    from vslam.doctor.findings import lines
 
     if given.sensor == "rgbd":
-        raise InputError("--sensor rgbd: depth is not calibrated; say mono or stereo.")
-    if out.exists():
-        raise InputError(f"{out}: exists already; name another file with --out, or remove it.")
+        raise InputError("--sensor rgbd: depth is not calibrated; give mono or stereo.")
+    _check_place(out)
     raw = open_raw(given)
     if raw.live and given.max_frames is None:
-        raise InputError(f"{given.data}: a camera never ends; give --max-frames, 300 for example.")
+        raise InputError(f"{given.data}: a camera never ends; give --max-frames, such as 300.")
     made = _board(board, size, square, marker, dictionary, stereo=len(raw.sizes) == 2)
-    n, seen = _search(raw, corner_finder(made))
+    n, seen, examined = _search(raw, made)
     try:
         chosen = _choose(made, raw, seen, n)
         fits = tuple(
@@ -123,27 +137,61 @@ def calibrate(
         )
         pair = fit_pair(made, *fits) if len(fits) == 2 else None
     except InputError as error:
-        raise InputError(f"{given.data}: {error}") from error
+        what, _, fix = str(error).rstrip(".").rpartition("; ")
+        fix = other_board(made, examined) or fix
+        raise InputError(f"{given.data}: {what}; {fix}.") from error
     calibration = Calibration(fits[0].model, source=str(out))
     if pair is not None:
         calibration = replace(calibration, right=fits[1].model, T_left_right=pair.T_left_right)
     result = Calibrated(made, calibration, fits, pair, (len(seen), n))
     findings = findings_of(result)
-    write_calibration(out, calibration)
     typer.echo(f"The {made} is seen in {len(seen)} of {n} images.")
-    for finding in findings:
-        typer.echo(f"{finding.verdict:<8} {finding.check:<16} {finding.measured}")
-        if finding.fix:
-            typer.echo(f"{'':<8} {'':<16} fix: {finding.fix}")
+    for line in lines(findings):
+        typer.echo(line)
     page = out.with_suffix(".html")
+    _keep_earlier(out, page)
+    write_calibration(out, calibration)
     write_page(result, findings, out.read_text("utf-8"), page)
+    typer.echo(f"{out}: the calibration; {page}: residuals and coverage.")
+    if any(finding.verdict == "fault" for finding in findings):
+        fix = other_board(made, examined) or "do what the fixes above say"
+        typer.echo(f"Do not use this calibration, because it has faults; {fix}, and try again.")
+        raise typer.Exit(1)
     options = " --side-by-side" if given.side_by_side else ""
     options += " --sensor mono" if pair is None else ""
-    typer.echo(f"{out}: the calibration; {page}: residuals and coverage. Next, with a drive:")
-    typer.echo(f"  vslam doctor DRIVE{options} --calib {shlex.quote(str(out))}")
-    typer.echo(f"  vslam run DRIVE{options} --calib {shlex.quote(str(out))}")
-    if any(finding.verdict == "fault" for finding in findings):
-        raise typer.Exit(1)
+    typer.echo("Next, with a drive:")
+    for command in ("doctor", "run"):
+        typer.echo(f"  vslam {command} DRIVE{options} --calib {shlex.quote(str(out))}")
+
+
+def _check_place(out: Path) -> None:
+    """Refuse, before any work, a file that cannot be written or that another program made."""
+    from vslam.calibration.documents import read_document
+    from vslam.maps.new_output import require_place
+
+    require_place(out, "--out")
+    if out.suffix not in (".yaml", ".yml"):
+        raise InputError(f"--out {out}: a calibration is YAML; give a name that ends in .yaml.")
+    if out.exists() and "left" not in read_document(out):
+        raise InputError(f"--out {out}: is another program's file; name a new one.")
+
+
+def _keep_earlier(*files: Path) -> None:
+    """Rename the files of an earlier try to the first number that is free for all of them."""
+    for n in count(1):
+        kept = [path.with_stem(f"{path.stem}-{n}") for path in files]
+        if not any(path.exists() for path in kept):
+            break
+    for path, free in zip(files, kept, strict=True):
+        if path.exists():
+            try:
+                path.rename(free)
+            except OSError as error:
+                raise ResultsError(
+                    f"{path}: cannot be renamed to {free.name} ({error.strerror}); name another "
+                    "file with --out."
+                ) from error
+            typer.echo(f"{free}: the earlier {path.name}, which is replaced.")
 
 
 def _board(
@@ -161,32 +209,29 @@ def _board(
     if kind not in get_args(Kind):
         if not Path(kind).is_file():
             raise InputError(
-                f"--board {kind}: neither checkerboard, charuco or aprilgrid nor a file; name one."
+                f"--board {kind}: is no file; give checkerboard, charuco, aprilgrid or a target "
+                "of Kalibr."
             )
-        return _checked(read_board(Path(kind)))
+        if size or square is not None or marker is not None:
+            raise InputError(
+                f"--board {kind}: holds all sizes; leave out --size, --square and --marker."
+            )
+        return read_board(Path(kind))
     found = re.fullmatch(r"(\d+)x(\d+)", size)
     if found is None:
-        raise InputError(f"--size {size or 'is missing'}: give columns and rows as 9x6.")
-    if square is None and (stereo or kind != "checkerboard"):
-        raise InputError("--square: is missing; measure the board and give it in metres.")
-    if (marker is None) != (kind == "checkerboard"):
-        wanted = "of no use for a checkerboard; leave it out" if marker else "missing; measure it"
-        raise InputError(f"--marker: is {wanted}.")
+        raise InputError(f"--size {size or 'is missing'}: give columns and rows, such as 9x6.")
+    has_markers = kind != "checkerboard"
+    for option, missing in (
+        ("--square", square is None and (stereo or has_markers)),
+        ("--marker", marker is None and has_markers),
+    ):
+        if missing:
+            raise InputError(f"{option} is missing: measure the board and give metres.")
+    if marker is not None and not has_markers:
+        raise InputError("--marker: leave it out, because a checkerboard has no markers.")
     side = 0.1 if square is None else square
     columns, rows = int(found[1]), int(found[2])
-    return _checked(Board(cast("Kind", kind), columns, rows, side, marker or 0.0, dictionary))
-
-
-def _checked(board: Board) -> Board:
-    if not 0 <= board.marker < board.square <= _LARGEST_M:
-        raise InputError(
-            f"--square {board.square:g} and --marker {board.marker:g}: must be in metres (0.025 "
-            "for 25 mm), and the marker smaller."
-        )
-    least = 1 if board.kind == "aprilgrid" else 3
-    if not least <= min(board.columns, board.rows) <= max(board.columns, board.rows) <= 100:
-        raise InputError(f"--size {board.columns}x{board.rows}: give {least} to 100 of each.")
-    return board
+    return Board(cast("Kind", kind), columns, rows, side, marker or 0.0, dictionary)
 
 
 def _frames(raw: RawSource, most: int) -> Iterator[TimedFrame]:
@@ -203,22 +248,31 @@ def _frames(raw: RawSource, most: int) -> Iterator[TimedFrame]:
         typer.echo(f"warning: {error}", err=True)
 
 
-def _search(raw: RawSource, find: Finder) -> tuple[int, list[tuple[View | None, ...]]]:
-    """How many images were searched, and the views of each that shows the board to a camera."""
+def _search(raw: RawSource, board: Board) -> tuple[int, list[tuple[View | None, ...]], list[Image]]:
+    """How many images were searched, the views of each that shows the board to a camera, and a few
+    left images."""
+    from vslam.calibration.boards import corner_finder, same_order
     from vslam.calibration.solve import View
 
+    find = corner_finder(board)
     total = min(raw.n_expected or _MOST_SEARCHED, _MOST_SEARCHED)
     seen: list[tuple[View | None, ...]] = []
+    examined: list[Image] = []
     n = 0
     with console(shown=True).count_bar("images", total) as advance:
         for frame in _frames(raw, _MOST_SEARCHED):
             name = frame.file.name if frame.file else f"{frame.timestamp:.2f} s"
-            corners = [find(cast("Image", image)) for image in frame.read(map) if image is not None]
+            images = [cast("Image", image) for image in frame.read(map) if image is not None]
+            corners = [find(image) for image in images]
+            if len(corners) == 2 and corners[0] and corners[1]:
+                corners[1] = same_order(board, corners[0], corners[1])
             if any(corners):
                 seen.append(tuple(None if c is None else View(name, c) for c in corners))
+            if n % max(1, total // _EXAMINED) == 0:
+                examined.append(images[0])
             n += 1
             advance()
-    return n, seen
+    return n, seen, examined[:_EXAMINED]
 
 
 def _choose(
@@ -229,19 +283,20 @@ def _choose(
     Raises:
         InputError: the board is not seen, or not by both cameras.
     """
-    from vslam.calibration.boards import seen_instead
     from vslam.calibration.solve import diverse
 
     sides = [[s[k] for s in seen if s[k]] for k in range(len(raw.sizes))]
     if not any(sides):
-        images = (f.read(map)[0] for f in _frames(raw, _EXAMINED))
-        hint = seen_instead(board, images) or "check --board and --size, and that all of it is seen"
-        raise InputError(f"no {board} in any of {n} images; {hint}.")
+        raise InputError(
+            f"no {board} in any of {n} images; no other board is recognised either, so check that "
+            "this is the right video or folder, and that images show all of the board, sharp."
+        )
     for side, other, name in ((0, 1, "left"), (1, 0, "right")):
         if len(sides) == 2 and not sides[side]:
             raise InputError(
                 f"the {name} camera never sees the {board}, which the other one sees in "
-                f"{len(sides[other])} of {n} images; hold it where both do, or say --sensor mono."
+                f"{len(sides[other])} of {n} images; hold it where both cameras see it, or give "
+                "--sensor mono."
             )
     both = [tuple(v for v in s if v is not None) for s in seen if all(s)]
     chosen = [both[k] for k in diverse(board, both, raw.sizes, _MOST_VIEWS)]

@@ -52,7 +52,7 @@ def doctor(
     """Check images, calibration and times before a run; exit code 1 if there is a fault."""
     from vslam.datasets.frames import first_frames
     from vslam.doctor.examine import Diagnosis, examine
-    from vslam.doctor.findings import Finding
+    from vslam.doctor.findings import Finding, lines
     from vslam.doctor.page import write_page
 
     require_data(given)
@@ -62,10 +62,8 @@ def doctor(
     except InputError as error:
         measured, _, fix = str(error).rstrip(".").rpartition("; ")
         diagnosis = Diagnosis([Finding("input", "fault", measured or fix, fix if measured else "")])
-    for finding in diagnosis.findings:
-        typer.echo(f"{finding.verdict:<8} {finding.check:<16} {finding.measured}")
-        if finding.fix:
-            typer.echo(f"{'':<8} {'':<16} fix: {finding.fix}")
+    for line in lines(diagnosis.findings):
+        typer.echo(line)
     page = out or _free(Path("doctor.html"))
     # The page comes after the findings, because a disk may be full.
     write_page(diagnosis, f"Doctor: {given.data or given.dataset}", page)

@@ -13,20 +13,18 @@ from vslam.calibration.boards import Board
 from vslam.calibration.models import Array, Calibration
 from vslam.calibration.rectification import rectify
 from vslam.calibration.solve import CameraFit, PairFit
-from vslam.doctor.findings import Finding, judge
+from vslam.doctor.findings import Finding, judge, sections
 from vslam.errors import InputError
 from vslam.report.drawing import BLUE, GREY, LOW, RED, Drawing, draw, new_figure
-from vslam.report.page import Code, Page, Row, Section, Table, Tile, Tiles
+from vslam.report.page import Code, Page, Section, Tile, Tiles
 from vslam.report.render import html, write_files
 
 _FEW_VIEWS = 10
 _TILT, _FEW_TILTED = 15.0, 3  # degrees; a board that is never tilted fixes no focal length
 _CELLS = (8, 6)  # of the image, across and down
 _COVERED = 0.6  # share of the cells; corners hardly reach the outermost pixels
-_LARGE_PX, _COMMON_WIDTH = (
-    0.5,
-    640,
-)  # RMS, in images of this width or less; wider ones may have more
+_LARGE_PX = 0.5  # RMS, in images of the common width or less; wider ones may have more
+_COMMON_WIDTH = 640
 _APART_PX = 2.0  # RMS, between the cameras
 _SHARED = 0.2  # of the squared residuals, in neighbouring corners
 _MOST_DROPPED = 0.25
@@ -57,7 +55,7 @@ def findings_of(result: Calibrated) -> list[Finding]:
     found = [finding for side, fit in _sides(result) for finding in _camera(side, fit)]
     if result.pair is not None:
         n, error = len(result.pair.names), _total(result.pair.errors)
-        fix = "trigger both cameras together, or hold the board still"
+        fix = "trigger both cameras together, or film the board again while it stands still"
         found += [
             _kept("pairs", n, result.pair.dropped),
             judge("synchronisation", error > _APART_PX, f"{error:.2f} px between the cameras", fix),
@@ -79,32 +77,23 @@ def write_page(result: Calibrated, findings: Sequence[Finding], text: str, path:
     Raises:
         ResultsError: the file cannot be written.
     """
-    tiles = []
+    values: list[tuple[str, str, str]] = []
     for side, fit in _sides(result):
-        m = fit.model
-        tiles += [
-            Tile(
-                f"{side}focal length".capitalize(),
-                f"{m.fx:.2f}, {m.fy:.2f} px",
-                f"{m.width}x{m.height}",
-            ),
-            Tile(
-                f"{side}error".capitalize(),
-                f"{_total(fit.errors):.3f} px",
-                f"RMS of {len(fit.views)} views",
-            ),
+        m, n, error = fit.model, len(fit.views), _total(fit.errors)
+        values += [
+            (f"{side}focal length", f"{m.fx:.2f}, {m.fy:.2f} px", f"{m.width}x{m.height}"),
+            (f"{side}error", f"{error:.3f} px", f"RMS of {n} views"),
         ]
-    if result.calibration.T_left_right is not None:
-        baseline = float(np.linalg.norm(result.calibration.T_left_right[:3, 3]))
-        tiles.append(Tile("Baseline", f"{baseline:.4f} m"))
-    head = ("check", "verdict", "measured", "fix")
-    rows: list[Row] = [(f.check, f.verdict, f.measured, f.fix) for f in findings]
+    if result.pair is not None:
+        baseline = float(np.linalg.norm(result.pair.T_left_right[:3, 3]))
+        values.append(("baseline", f"{baseline:.4f} m", ""))
+    tiles = [Tile(name.capitalize(), value, note) for name, value, note in values]
     page = Page(
         "Calibration",
         [str(result.board), "the board is seen in {} of {} images".format(*result.n_seen)],
         [
             Section("", [Tiles(tiles)]),
-            Section("Verdicts", [Table(head, rows, head)]),
+            *sections(findings),
             Section("", draw(_drawings(result)), wide=False),
             Section("Calibration file", [Code(text)]),
         ],
@@ -139,7 +128,7 @@ def _camera(side: str, fit: CameraFit) -> list[Finding]:
         judge(
             f"{side}tilt", tilted < _FEW_TILTED,
             f"{tilted} views are tilted by more than {_TILT:.0f} degrees",
-            "tilt the board: without that, focal length and distance cannot be told apart",
+            "film the board tilted by 20 to 45 degrees in all directions",
         ),
         judge(
             f"{side}coverage", share < _COVERED, f"corners in {share:.0%} of the image",
@@ -147,7 +136,7 @@ def _camera(side: str, fit: CameraFit) -> list[Finding]:
         ),
         judge(
             f"{side}residuals", error > most, f"{error:.3f} px RMS",
-            "check that the board is flat, sharp and still, and its columns and rows",
+            "check --size, --square and --marker, and film the board flat, sharp and still",
         ),
         judge(
             f"{side}lens", shared > _SHARED,
@@ -162,7 +151,7 @@ def _kept(check: str, n: int, dropped: Sequence[tuple[str, float]]) -> Finding:
     if dropped:
         named = ", ".join(f"{name} ({error:.1f} px)" for name, error in dropped)
         measured += f"; dropped because they do not fit: {named}"
-    fix = "keep the board flat and still, and film it in good light"
+    fix = "film the board again in good light, flat and still"
     return judge(check, len(dropped) > _MOST_DROPPED * (n + len(dropped)), measured, fix)
 
 

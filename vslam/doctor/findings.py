@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from vslam.report.page import Alert, Section, Table
+
 Verdict = Literal["good", "fault", "unknown"]
+_HEAD = ("check", "verdict", "measured")
 
 
 @dataclass(frozen=True)
@@ -28,3 +32,23 @@ class Finding:
 def judge(check: str, wrong: bool, measured: str, fix: str) -> Finding:
     """A ``fault`` with its fix, or ``good``."""
     return Finding(check, "fault", measured, fix) if wrong else Finding(check, "good", measured)
+
+
+def lines(findings: Iterable[Finding]) -> Iterator[str]:
+    """What a terminal shows of findings."""
+    for finding in findings:
+        yield f"{finding.verdict:<8} {finding.check:<16} {finding.measured}"
+        if finding.fix:
+            yield f"{'':<25} fix: {finding.fix}"
+
+
+def sections(findings: Sequence[Finding]) -> list[Section]:
+    """What a page shows of findings: the faults with their fixes, then the other checks."""
+    faults = [
+        Alert(f"{f.check.capitalize()}: {f.measured}.", f.fix and f"Fix: {f.fix}.")
+        for f in findings
+        if f.verdict == "fault"
+    ]
+    rows = [(f.check, f.verdict, f.measured) for f in findings if f.verdict != "fault"]
+    title = "Other checks" if faults else "All checks"
+    return [Section("", faults), Section(title, [Table(_HEAD, rows, _HEAD)])]

@@ -7,11 +7,10 @@ from pathlib import Path
 import cv2
 
 from vslam.doctor.examine import Diagnosis, Picture
+from vslam.doctor.findings import sections
 from vslam.errors import ResultsError, counted
-from vslam.report.page import Alert, Figure, Page, Row, Section, Table
+from vslam.report.page import Figure, Page, Section
 from vslam.report.render import html
-
-HEAD = ("check", "verdict", "measured")
 
 
 def write_page(diagnosis: Diagnosis, title: str, path: Path) -> None:
@@ -20,11 +19,7 @@ def write_page(diagnosis: Diagnosis, title: str, path: Path) -> None:
     Raises:
         ResultsError: the file cannot be written.
     """
-    rows: list[Row] = [(f.check, f.verdict, f.measured) for f in diagnosis.findings if not f.fix]
     faults = len(diagnosis.faults)
-    alerts = [
-        Alert(f"{f.check.capitalize()}: {f.measured}.", f"Fix: {f.fix}.") for f in diagnosis.faults
-    ]
     figures = [
         Figure(f"picture-{k}", picture.caption, _jpeg(picture))
         for k, picture in enumerate(diagnosis.pictures)
@@ -32,11 +27,7 @@ def write_page(diagnosis: Diagnosis, title: str, path: Path) -> None:
     page = Page(
         title,
         [counted(faults, "fault") if faults else "no faults"],
-        [
-            Section("", alerts),
-            Section("Other checks" if alerts else "All checks", [Table(HEAD, rows, HEAD)]),
-            Section("", figures),
-        ],
+        [*sections(diagnosis.findings), Section("", figures)],
     )
     try:
         path.write_text(html(page), encoding="utf-8")

@@ -23,6 +23,7 @@ from vslam.frontend.tracking import (
 from vslam.geometry import Matrix, inverse, orthonormalised, se3_exp, se3_log
 from vslam.map_view import MapView
 from vslam.states import TrackerState
+from vslam.uncertainty import PoseUncertainty
 
 
 class TrackerStatus(Enum):
@@ -150,6 +151,7 @@ class Tracker:
             return Found(TrackingState.LOST, track.n_matches, n_inliers)
         frame.T_cw, frame.features = track.T_cw, track.features
         frame.landmark, frame.xyz = track.ids, track.xyz
+        frame.covariance = track.covariance
         return Found(TrackingState.OK, track.n_matches, n_inliers, track.visible)
 
     def match_features(self, frame: Frame, view: MapView) -> bool:
@@ -299,7 +301,11 @@ class Tracker:
 
 
 def result_of(
-    frame: Frame, found: Found, is_keyframe: bool, stage_ms: dict[str, float]
+    frame: Frame,
+    found: Found,
+    is_keyframe: bool,
+    stage_ms: dict[str, float],
+    uncertainty: PoseUncertainty,
 ) -> TrackResult:
     """The result that a caller of the library gets for a frame; ``stage_ms`` holds the
     milliseconds of each stage."""
@@ -315,4 +321,5 @@ def result_of(
         is_keyframe=is_keyframe,
         relocalised=found.relocalised,
         stage_ms=stage_ms,
+        uncertainty=uncertainty,
     )

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.kernels import inner_kernel, kernel
+from vslam.uncertainty import PoseUncertainty
 
 MIN_DISPARITY = 0.01  # pixels; farther points are clamped to the depth of this disparity
 PATCH_RADIUS = 8  # half width of the patch kept around a feature, in pixels of its octave
@@ -249,6 +250,7 @@ class TrackResult:
         is_keyframe: whether the frame became a keyframe.
         relocalised: whether the frame was searched for in the whole map and found there.
         stage_ms: wall time of each stage of the pipeline, in milliseconds.
+        uncertainty: how sure the pose is; None in the results of older files.
     """
 
     index: int
@@ -262,3 +264,4 @@ class TrackResult:
     is_keyframe: bool
     relocalised: bool = False
     stage_ms: dict[str, float] = field(default_factory=dict)
+    uncertainty: PoseUncertainty | None = None

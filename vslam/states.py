@@ -136,10 +136,15 @@ class RigState:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The states of all parts."""
+    """The states of all parts.
+
+    Attributes:
+        uncertainty: of the pose of the last frame (``UncertaintyModel``).
+    """
 
     tracker: TrackerState
     mapper: MapperState
     policy: PolicyState
     closing: ClosingState
     rig: RigState = field(default_factory=RigState)
+    uncertainty: tuple[float, ...] = (0.0,) * 44

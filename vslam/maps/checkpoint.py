@@ -21,6 +21,7 @@ from vslam.states import (
     TrackerState,
     VerifierState,
 )
+from vslam.uncertainty import N_NUMBERS
 
 # N features of the last tracked frame; M keyframes with patches, which have R rows in total.
 ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
@@ -68,6 +69,7 @@ def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
         },
         "mapper": {name: getattr(checkpoint.mapper, name) for name in _OF_MAPPER},
         "policy": asdict(checkpoint.policy),
+        "uncertainty": checkpoint.uncertainty,
         "rig": {"delay": checkpoint.rig.delay, "sides": checkpoint.rig.sides},
         "closing": {
             "places": [[sorted(one.keyframes), one.length, one.age] for one in consistency.places],
@@ -151,6 +153,7 @@ def checked_checkpoint(
             _count(policy["due"], -1),
         ),
         closing=_closing_of(entry["closing"], map_.n_keyframes),
+        uncertainty=tuple(_numbers(entry["uncertainty"], N_NUMBERS + 1).tolist()),
         rig=RigState(
             **{name: tuple(_numbers(entry["rig"][name]).tolist()) for name in ("delay", "sides")}
         ),

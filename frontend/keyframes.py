@@ -30,7 +30,7 @@ class KeyframeEvidence:
         gained_close: number of close points that the first frame after a keyframe tracks, a running
             mean over the last keyframes; infinite if unknown.
         first_close: how many the first frame after the last keyframe tracks.
-        lost_close: by how many the number falls from frame to frame since then.
+        close_ratio: ratio of this number from one frame to the next since then.
     """
 
     seconds_since_keyframe: float
@@ -41,17 +41,14 @@ class KeyframeEvidence:
     mapping_idle: bool
     gained_close: float = np.inf
     first_close: int = 0
-    lost_close: float = 0.0
+    close_ratio: float = 1.0
 
     def ahead(self, frames: int) -> KeyframeEvidence:
-        """The evidence that is expected some frames later: close points leave the view as before.
-        A point that is close is tracked, so the inliers fall with them."""
-        falls = round(frames * self.lost_close)
-        return replace(
-            self,
-            tracked_close=self.tracked_close - falls,
-            n_inliers=self.n_inliers - falls,
-        )
+        """The evidence that is expected some frames later, if as large a share of the tracked close
+        points is lost from frame to frame as before."""
+        close = round(self.tracked_close * self.close_ratio**frames)
+        n_inliers = self.n_inliers + close - self.tracked_close
+        return replace(self, tracked_close=close, n_inliers=n_inliers)
 
 
 def needs_keyframe(
@@ -142,6 +139,13 @@ class CloseGain:
             self.mean += self._weight * (tracked_close - self.mean)
             self.latest, self.frame, self.awaited = tracked_close, frame, False
 
+    def ratio(self, tracked_close: int, frame: int) -> float:
+        """By which factor the number falls from frame to frame, since the first one after the last
+        keyframe, if ``frame`` tracks ``tracked_close``."""
+        if not 0 < tracked_close < self.latest:
+            return 1.0
+        return float((tracked_close / self.latest) ** (1 / max(1, frame - self.frame)))
+
 
 @dataclass(frozen=True)
 class PlaceEvidence:
@@ -212,7 +216,7 @@ class KeyframePolicy:
             mapping_idle=mapping_idle,
             gained_close=gain.mean,
             first_close=gain.latest,
-            lost_close=max(0, gain.latest - tracked_close) / max(1, frame.index - gain.frame),
+            close_ratio=gain.ratio(tracked_close, frame.index),
         )
 
     def wants_keyframe(self, evidence: KeyframeEvidence) -> bool:

@@ -308,7 +308,7 @@ def result_of(
         timestamp=frame.timestamp,
         T_wc=inverse(frame.T_cw),
         state=found.state,
-        n_features=len(frame.features),
+        n_features=len(frame.features) if frame.source is None else 0,
         n_stereo=frame.n_stereo,
         n_matches=found.n_matches,
         n_inliers=found.n_inliers,

@@ -48,9 +48,12 @@ class TrackingContext:
 
     @property
     def tracks_patches(self) -> bool:
-        """Whether frames are tracked by patches where that is possible. The cameras of RGB-D
-        sensors have a rolling shutter, which moves points by more than alignment corrects."""
-        return self.config.tracking.method == "patches" and not self.camera.depth
+        """Whether frames are tracked by patches where that is possible. With RGB-D cameras patches
+        are less accurate and no faster (docs/research/performance.md)."""
+        method, camera = self.config.tracking.method, self.camera
+        if method == "auto":
+            return camera.sensor == "stereo"
+        return method == "patches" and not camera.depth
 
     @property
     def close_depth(self) -> float:

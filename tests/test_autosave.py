@@ -193,10 +193,10 @@ def test_warnings_of_the_rig_cover_both_parts(kitti_tree, tmp_path):
 
     drive(kitti_tree, tmp_path, on_frame=interrupt, change=change)
     whole = drive(kitti_tree, tmp_path, find_unfinished(tmp_path), change=change)
-    assert [line for line in whole.warnings if "black" in line] == [
-        f"The right side was black in 5 of {FRAMES} frames while the left one was not: they were "
-        "tracked with the left side alone. Check its cable, shutter and lens cap."
-    ]
+    uninterrupted = drive(kitti_tree, None, change=change)
+    (told,) = (line for line in whole.warnings if "black" in line)
+    assert told in uninterrupted.warnings
+    assert "The right side was black in 5 of " in told
 
 
 @pytest.mark.slow

@@ -220,29 +220,33 @@ def test_only_the_first_frame_after_a_keyframe_tells_what_keyframes_gain():
 
 
 def test_a_keyframe_is_planned_for_the_frame_that_will_have_lost_too_many_close_points():
+    """0.4 of the 1,000 close points are 400; a frame tracks 0.8 of those of the one before."""
     one = policy()
     losing = replace(
-        CONTENT, untracked_close=None, first_close=600, tracked_close=400, n_inliers=600
+        CONTENT, untracked_close=None, first_close=1000, n_inliers=900, close_ratio=0.8
     )
-    # At 100 a frame, 200 are left after two more frames, 100 after three: 0.3 of 600 are 180.
-    assert not one.is_due(10, replace(losing, lost_close=100.0))
+    assert not one.is_due(10, replace(losing, tracked_close=640))
     assert one.due == -1
-    assert not one.is_due(11, replace(losing, lost_close=100.0, tracked_close=300))
+    assert not one.is_due(11, replace(losing, tracked_close=610))
     assert one.due == 13
     assert not one.is_due(12, CONTENT)
     assert one.is_due(13, CONTENT)
     assert one.due == -1
-    assert one.is_due(14, replace(losing, tracked_close=170))  # there is no time to plan
+    assert not one.is_due(14, replace(losing, tracked_close=490))
+    assert one.due == 15
+    one.keyframe_made()
+    assert one.is_due(16, replace(losing, tracked_close=390))  # there is no time to plan
 
 
 def test_close_points_are_lost_from_the_first_frame_after_a_keyframe_on():
     one = policy()
     one.keyframe_made()
     seen = frame(close=20)
-    observe(one, seen)
-    seen = frame(close=12)
-    seen.index += 4
-    assert observe(one, seen).lost_close == pytest.approx(2.0)
+    assert observe(one, seen).close_ratio == 1.0
+    seen = frame(close=5)
+    seen.index += 2
+    assert observe(one, seen).close_ratio == pytest.approx(0.5)
+    assert observe(one, frame(close=0)).close_ratio == 1.0  # that one is no share
 
 
 @pytest.mark.parametrize("awaited", [True, False])

@@ -24,6 +24,7 @@ from vslam.run.recorder import Recorder
 from vslam.slam import Slam
 
 CONFIG = Config.model_validate({"tracking": {"method": "patches"}})
+FEATURES = Config.model_validate({"tracking": {"method": "orb"}})
 FIRST, SECOND = 12, 13  # frames in the turn
 OFF = np.array([0.05, -0.03, 0.1, 0.01, 0.035, -0.01])  # of a prediction: two degrees, 12 cm
 
@@ -102,7 +103,7 @@ def test_few_frames_need_features_and_the_pose_is_as_good(corridor):
     keyframes = [result.index for result in results if result.is_keyframe]
     assert len(results) > 2 * len(extracted)
     assert len(keyframes) > 2
-    by_features, _ = driven(corridor, Config())
+    by_features, _ = driven(corridor, FEATURES)
     error, usual = (
         np.linalg.norm(one.trajectory().T_wc[:, :3, 3] - corridor.T_wc[:, :3, 3], axis=1).max()
         for one in (slam, by_features)
@@ -203,4 +204,6 @@ def test_depth_cameras_are_tracked_by_features(corridor):
     camera = replace(corridor.camera, depth=True)
     assert not TrackingContext.create(camera, CONFIG).tracks_patches
     assert TrackingContext.create(corridor.camera.left_camera(), CONFIG).tracks_patches
-    assert not TrackingContext.create(corridor.camera, Config()).tracks_patches
+    assert TrackingContext.create(corridor.camera, Config()).tracks_patches
+    assert not TrackingContext.create(corridor.camera.left_camera(), Config()).tracks_patches
+    assert not TrackingContext.create(corridor.camera, FEATURES).tracks_patches

@@ -174,7 +174,7 @@ def test_ctrl_c_ends_compared_detectors_at_the_same_frame(kitti_tree):
 def test_unreadable_frames_are_told_once_and_counted_by_each_detector(kitti_tree, tmp_path, caplog):
     root = tmp_path / "kitti"
     shutil.copytree(kitti_tree, root)
-    image = root / "sequences" / "00" / "image_1" / "000004.png"
+    image = root / "sequences" / "00" / "image_0" / "000004.png"
     image.write_bytes(image.read_bytes()[:2000])
     outcome = run(root, compare=("bow",), max_frames=6)
     assert [len(one.skipped) for one in (outcome, *outcome.compared)] == [1, 1]
@@ -185,7 +185,7 @@ def test_unreadable_frames_are_told_once_and_counted_by_each_detector(kitti_tree
 def test_truncated_image_is_skipped_and_counted(kitti_tree, tmp_path):
     root = tmp_path / "kitti"
     shutil.copytree(kitti_tree, root)
-    image = root / "sequences" / "00" / "image_1" / "000014.png"
+    image = root / "sequences" / "00" / "image_0" / "000014.png"
     image.write_bytes(image.read_bytes()[:2000])
     outcome = run(root)
     assert len(outcome.trajectory) == 28

@@ -38,7 +38,7 @@ def frames_at(times):
 def test_no_frame_comes_before_its_time_and_the_last_one_always_comes(threads):
     times = 100.0 + 0.02 * np.arange(20)
     begin, seen = time.perf_counter(), []
-    for played in play(frames_at(times), lambda f: (f.timestamp, time.perf_counter()), threads):
+    for played in play(frames_at(times), lambda n, f: (f.timestamp, time.perf_counter()), threads):
         seen.append(played)
         if played.made is not None:
             index = round((played.timestamp - 100.0) / 0.02)
@@ -59,7 +59,7 @@ def test_who_is_late_gets_the_newest_frame(threads):
         sent.set()
 
     seen = []
-    for played in play(film(), lambda frame: frame, threads, live=True):
+    for played in play(film(), lambda n, frame: frame, threads, live=True):
         seen.append(played)
         assert played.made is None or sent.wait(60)
     assert [played.timestamp for played in seen] == [*range(10)]
@@ -72,7 +72,7 @@ def test_who_is_late_gets_the_newest_frame(threads):
 def test_with_one_thread_a_frame_is_prepared_after_the_last_one_was_used():
     used, order = [], []
 
-    def prepare(frame: TimedFrame) -> TimedFrame:
+    def prepare(number: int, frame: TimedFrame) -> TimedFrame:
         order.append(len(used))
         return frame
 
@@ -84,7 +84,7 @@ def test_with_one_thread_a_frame_is_prepared_after_the_last_one_was_used():
 
 
 def test_who_stops_listening_stops_the_camera():
-    frames = play(frames_at(10.0 * np.arange(5)), lambda frame: frame, 2)
+    frames = play(frames_at(10.0 * np.arange(5)), lambda n, frame: frame, 2)
     next(frames)
     assert cameras()
     frames.close()
@@ -92,7 +92,7 @@ def test_who_stops_listening_stops_the_camera():
 
 
 def test_an_error_of_the_preparation_is_the_listeners():
-    def fail(frame: TimedFrame) -> None:
+    def fail(number: int, frame: TimedFrame) -> None:
         raise OSError("no such image")
 
     with pytest.raises(OSError, match="no such image"):
@@ -105,7 +105,7 @@ def test_an_error_of_the_camera_comes_after_its_frames():
         yield from frames_at(0.05 * np.arange(3))
         raise OSError("unplugged")
 
-    frames = play(unplugged(), lambda frame: frame, 2)
+    frames = play(unplugged(), lambda n, frame: frame, 2)
     assert [next(frames).timestamp for _ in range(3)] == [0.0, 0.05, 0.1]
     with pytest.raises(OSError, match="unplugged"):
         next(frames)
@@ -127,7 +127,7 @@ def test_a_live_camera_sets_the_pace_and_dropped_frames_are_let_go():
             time.sleep(0.005)
 
     seen = []
-    for played in play(film(), lambda frame: True, 2, live=True):
+    for played in play(film(), lambda n, frame: True, 2, live=True):
         seen.append(played.timestamp)
         time.sleep(0.02)
     assert seen == [1000.0 * k for k in range(40)]
@@ -168,7 +168,7 @@ def test_an_unreadable_image_in_real_time(kitti_tree, threads, tmp_path):
     """Of the last frame, the one that is never dropped: the run ends all the same."""
     root = tmp_path / "kitti"
     shutil.copytree(kitti_tree, root)
-    image = root / "sequences" / "00" / "image_1" / "000005.png"
+    image = root / "sequences" / "00" / "image_0" / "000005.png"
     image.write_bytes(image.read_bytes()[:2000])
     sequence = open_sequence("kitti", root, "00", max_frames=6)
     settings = RunSettings(

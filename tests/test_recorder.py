@@ -87,14 +87,14 @@ def _features(rng: np.random.Generator, n: int = 2000) -> Features:
     )
 
 
-def record(recorder: Recorder, frames: int = FRAMES) -> None:
+def record(recorder: Recorder, frames: int = FRAMES, camera: Camera = CAMERA) -> None:
     """Play a run into a recorder as the pipeline does."""
     rng = np.random.default_rng(0)
     image = _image(rng)
     poses = np.array([_pose(frame) for frame in range(frames)])
     offset = np.eye(4)
     offset[:3, 3] = [100.0, 0.0, 50.0]
-    recorder.begin(CAMERA, Trajectory(0.1 * np.arange(frames), offset @ poses))
+    recorder.begin(camera, Trajectory(0.1 * np.arange(frames), offset @ poses))
     map_ = Map(np.ones(8))
     for frame in range(frames):
         result = _result(frame)
@@ -158,6 +158,12 @@ def test_entities_and_their_frames(recording: Path) -> None:
         "state": 3,
     }
     assert {entity: len(rows(recording, entity)) for entity in expected} == expected
+
+
+def test_a_monocular_recording_counts_features_in_place_of_stereo_matches(tmp_path: Path) -> None:
+    record(RerunRecorder(tmp_path / "mono.rrd"), 4, CAMERA.left_camera())
+    assert len(rows(tmp_path / "mono.rrd", "points/features")) == 5
+    assert not rows(tmp_path / "mono.rrd", "points/stereo")
 
 
 def test_size_budget(recording: Path) -> None:

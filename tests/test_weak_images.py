@@ -202,7 +202,7 @@ def test_what_the_frame_before_did_not_see_is_matched_around_the_prediction(
     but the map has both. Without a search around the prediction, the second frame is lost."""
     slam = Slam(
         corridor.camera,
-        Config(orb=ORB, tracking=TrackingConfig(predicted_window=window)),
+        Config(orb=ORB, tracking=TrackingConfig(method="orb", predicted_window=window)),
         threads=1,
     )
     half = corridor.camera.width // 2

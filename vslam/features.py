@@ -242,9 +242,9 @@ class TrackResult:
         T_wc: ``(4, 4)`` float64 pose (camera to world) as tracked; ``Slam.trajectory()`` returns
             the final poses, after later bundle adjustments.
         state: OK, WEAK, LOST or DROPPED.
-        n_features: features extracted from the left image.
+        n_features: features extracted from the left image; 0 if the frame was tracked by patches.
         n_stereo: of these, features with a stereo match.
-        n_matches: landmark matches before the last pose optimisation.
+        n_matches: landmarks matched or found by their patches, before the last pose optimisation.
         n_inliers: matches that are inliers of it.
         is_keyframe: whether the frame became a keyframe.
         relocalised: whether the frame was searched for in the whole map and found there.

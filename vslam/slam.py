@@ -57,6 +57,8 @@ class Slam:
         context: camera, thresholds and pyramid scales, for ``extract_features``.
         detector: proposes loop candidates and places for relocalisation.
         rig: what has been measured of the stereo pair, such as the delay of its right camera.
+        next_extraction: index of a coming frame whose features will probably be needed, so that
+            its ``FrameImages.find_corners`` may be called ahead, in another thread; -1 if none.
     """
 
     def __init__(
@@ -112,6 +114,7 @@ class Slam:
         self._mode = Localising(mapper) if localize else MapBuilding(context, mapper, tracker)
         self._session = Session(context, closing, mapper, tracker, rig, self._mode, opened)
         self._session.resume()
+        self.next_extraction = -1
 
     @classmethod
     def load(
@@ -250,6 +253,7 @@ class Slam:
             T_predicted = tracker.predict(frame.timestamp, mapper.frames, mapper.view)
             tracked = tracker.track(frame, T_predicted, mapper.view, mapper.frames)
         clock.lap("track")
+        by_patches = frame.source is not None
         found = self._relocaliser.relocalise_if_needed(frame, tracked, mapper)
         if found is not tracked:
             clock.lap("relocalise")
@@ -263,6 +267,8 @@ class Slam:
             placed = mapper.append_pose(frame, tracked=True, near=found.keyframe)
             is_keyframe = self._mode.update_map(placed, found)
             self.rig.observe(frame, frame.twist)
+        # Where patches failed, they probably fail again.
+        self.next_extraction = self._mode.due if by_patches else frame.index + 2
         clock.lap("keyframe")
         return result_of(frame, found, is_keyframe, clock.ms)
 
@@ -307,12 +313,6 @@ class Slam:
     def world(self) -> World | None:
         """The place of the loaded map in the world of a ground truth; None if unknown."""
         return self._session.opened.world
-
-    @property
-    def next_keyframe(self) -> int:
-        """Index of the frame that is to become a keyframe; -1 if none is planned. Its
-        ``FrameImages.find_corners`` may be called ahead, in another thread."""
-        return self._mode.due
 
     @property
     def is_mapping(self) -> bool:

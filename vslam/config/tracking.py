@@ -12,10 +12,11 @@ from vslam.config.section import Section
 class TrackingConfig(Section):
     """Frame-to-map tracking."""
 
-    method: Literal["orb", "patches"] = "orb"
+    method: Literal["auto", "orb", "patches"] = "auto"
     """How frames are tracked: `orb` matches ORB features in every frame; `patches` looks for image
     patches of the landmarks, and extracts features only where a keyframe is due or patches fail
-    (Forster et al., T-RO 2017). RGB-D cameras are always tracked by features. [own]"""
+    (Forster et al., T-RO 2017); `auto` takes `patches` for stereo cameras and `orb` for the others.
+    RGB-D cameras are never tracked by patches. [own]"""
     patch_min_inliers: int = Field(40, ge=10)
     """Features are extracted for a frame in which fewer patches than this are found. [own]"""
     patch_min_inlier_ratio: float = Field(0.5, ge=0, le=1)

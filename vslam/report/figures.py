@@ -148,14 +148,17 @@ def _tracked_points(outcome: RunOutcome) -> Figure:
     figure, axes = new_figure("Tracked points", "frame", "points", LOW)
     tracks = outcome.tracks
     frame = np.array([track.index for track in tracks])
+    extracted = np.array([track.n_features > 0 for track in tracks])
+    every = np.ones(len(tracks), np.bool_)
     series = [
-        (*_usable_features(outcome), GREY, 1.1),
-        ("matches", [track.n_matches for track in tracks], AMBER, 1.1),
-        ("inliers", [track.n_inliers for track in tracks], BLUE, 1.6),
+        (*_usable_features(outcome), extracted, GREY, 1.1),
+        ("matches", [track.n_matches for track in tracks], every, AMBER, 1.1),
+        ("inliers", [track.n_inliers for track in tracks], every, BLUE, 1.6),
     ]
-    for label, values, color, width in series:
-        marker = "o" if len(tracks) == 1 else ""
-        axes.plot(frame, values, color=color, linewidth=width, marker=marker, label=label)
+    for label, values, shown, color, width in series:
+        marker = "o" if np.count_nonzero(shown) == 1 else ""
+        y = np.array(values)[shown]
+        axes.plot(frame[shown], y, color=color, linewidth=width, marker=marker, label=label)
     for state, color in STATE_COLORS.items():
         at = np.array([track.state == state for track in tracks])
         for first, last in _intervals(at):

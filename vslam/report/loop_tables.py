@@ -14,7 +14,7 @@ _MAX_REJECTED = 12
 
 
 def loop_sections(report: ReportJson) -> list[Section]:
-    """Revisits, closed loops, why candidates were rejected, and which of them came near."""
+    """Closed loops, revisits, reasons of rejections, and the candidates nearest to acceptance."""
     return [
         Section("Loops closed", [_closed(report)]),
         Section("Revisits", [_revisits(report)], wide=False),

@@ -100,7 +100,7 @@ def run_sequence(
                 settings,
                 live=sequence.live,
                 begin=len(main.tracks),
-                next_keyframe=lambda: slam.next_keyframe,
+                next_extraction=lambda: slam.next_extraction,
             ):
                 result = main.step(played)
                 if (frame := played.made) is not None and frame.problem and not frame.dropped:

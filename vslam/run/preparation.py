@@ -41,25 +41,28 @@ def in_their_time(
     *,
     live: bool,
     begin: int = 0,
-    next_keyframe: Callable[[], int] = lambda: -1,
+    next_extraction: Callable[[], int] = lambda: -1,
 ) -> Iterator[Played[PreparedFrame]]:
     """Prepared frames with their arrival times: at once, or in real time each at its own time.
 
     Args:
-        begin, next_keyframe: see ``prepared_frames``; not used in real time.
+        begin: index of the first frame.
+        next_extraction: ``Slam.next_extraction``: the features of this frame are extracted ahead.
     """
     if settings.realtime:
         with ThreadPoolExecutor(2, "side") as pool:
             image_map = map if settings.threads == 1 else pool.map
-            yield from play(
-                frames,
-                lambda frame: prepare_frame(frame, context, image_map),
-                settings.threads,
-                live=live,
-            )
+
+            def prepare(number: int, frame: TimedFrame) -> PreparedFrame:
+                prepared = prepare_frame(frame, context, image_map)
+                if prepared.images is not None and 0 <= next_extraction() <= begin + number:
+                    prepared.images.find_corners()
+                return prepared
+
+            yield from play(frames, prepare, settings.threads, live=live)
         return
     start = time.perf_counter()
-    ahead = prepared_frames(frames, context, settings.threads, begin, next_keyframe)
+    ahead = prepared_frames(frames, context, settings.threads, begin, next_extraction)
     for timestamp, prepared in ahead:
         yield Played(timestamp, prepared, start)
 
@@ -68,15 +71,10 @@ def prepared_frames(
     frames: Iterator[TimedFrame],
     context: TrackingContext,
     threads: int,
-    begin: int = 0,
-    next_keyframe: Callable[[], int] = lambda: -1,
+    begin: int,
+    next_extraction: Callable[[], int],
 ) -> Iterator[tuple[float, PreparedFrame]]:
-    """Frames in order with their times; with more than one thread, prepared a few frames ahead.
-
-    Args:
-        begin: index of the first frame.
-        next_keyframe: ``Slam.next_keyframe``: the features of this frame are extracted ahead.
-    """
+    """Frames in order with their times; with more than one thread, prepared a few frames ahead."""
     if threads == 1:
         for frame in frames:
             yield frame.timestamp, prepare_frame(frame, context)
@@ -90,7 +88,7 @@ def prepared_frames(
                     timestamp, prepared = ahead.popleft()
                     yield timestamp, prepared.result()
                     begin += 1
-                    if 0 <= (due := next_keyframe() - begin) < len(ahead):
+                    if 0 <= (due := next_extraction() - begin) < len(ahead):
                         pool.submit(_find_corners, ahead[due][1])
             for timestamp, prepared in ahead:
                 yield timestamp, prepared.result()

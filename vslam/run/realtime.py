@@ -38,7 +38,7 @@ class _Arrival:
 
 def play(
     frames: Iterator[TimedFrame],
-    prepare: Callable[[TimedFrame], T],
+    prepare: Callable[[int, TimedFrame], T],
     threads: int,
     *,
     live: bool = False,
@@ -50,7 +50,8 @@ def play(
 
     Args:
         frames: frames to play; the first one arrives at once, the others at their timestamps.
-        prepare: function that prepares a frame after its arrival, called in a separate thread.
+        prepare: function that prepares a frame after its arrival, called in a separate thread. Its
+            first argument is the number of frames that arrived before, dropped ones included.
         threads: with 1, a frame is prepared only after the previous one was used.
         live: each frame arrives when ``frames`` yields it.
 
@@ -83,6 +84,7 @@ def play(
             mailbox.end(error)
 
     def hand_on(pool: ThreadPoolExecutor) -> None:
+        n = 0
         try:
             while True:
                 free.acquire()
@@ -91,7 +93,9 @@ def play(
                     coming.put(mailbox.error)
                     return
                 missed = [Played[T](timestamp, None, newest.came) for timestamp in dropped]
-                coming.put((missed, newest, pool.submit(prepare, newest.frame)))
+                n += len(dropped)
+                coming.put((missed, newest, pool.submit(prepare, n, newest.frame)))
+                n += 1
         except Exception as error:  # otherwise the consumer would wait for ever
             coming.put(error)
 

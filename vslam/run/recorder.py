@@ -60,7 +60,6 @@ _FAINT_RED = (239, 68, 68, 80)
 _VIOLET, _PINK, _CYAN, _LIME = (139, 92, 246), (236, 72, 153), (6, 182, 212), (132, 204, 22)
 _STAGE_COLORS = (_BLUE, _AMBER, _GREEN, _VIOLET, _PINK, _CYAN, _LIME, _RED, _GREY)
 _STATE_COLORS = {TrackingState.OK: _GREEN, TrackingState.WEAK: _AMBER, TrackingState.LOST: _RED}
-_POINT_SERIES = {"stereo": _GREY, "matches": _AMBER, "inliers": _BLUE}
 
 
 @dataclass(frozen=True)
@@ -308,6 +307,7 @@ class RerunRecorder(Recorder):
         self._recording = rr.RecordingStream("vslam")
         self._open = True
         self._state: TrackingState | None = None
+        self._points: dict[str, tuple[int, int, int]] = {}  # counts of a frame, with their colours
         self._index = 0  # of the last frame
         self._frames: list[tuple[TrackResult, NDArray[np.float64]]] = []
         self._stages: list[str] = []  # each has a colour of its own
@@ -347,7 +347,9 @@ class RerunRecorder(Recorder):
             style = rr.Points2D.from_fields(colors=[color], radii=[radius])  # < 0: screen units
             log(f"world/camera/image/{name}", style)
         log("world/landmarks", rr.Points3D.from_fields(colors=[_GREY], radii=[-1.2]))
-        for name, color in _POINT_SERIES.items():
+        usable = "features" if camera.monocular else "stereo"
+        self._points = {usable: _GREY, "matches": _AMBER, "inliers": _BLUE}
+        for name, color in self._points.items():
             log(f"points/{name}", rr.SeriesLines(colors=[color], names=[name]))
         log("world/trajectory", rr.LineStrips3D.from_fields(colors=[_BLUE], radii=[-1.0]))
         if ground_truth is not None and len(ground_truth):
@@ -499,10 +501,12 @@ class RerunRecorder(Recorder):
         T_wc = np.array([pose for _, pose in frames])
         poses = rr.Transform3D.columns(translation=T_wc[:, :3, 3], mat3x3=T_wc[:, :3, :3])
         self._recording.send_columns("world/camera", _times(results), poses)
-        for name in _POINT_SERIES:
-            counts = np.array([getattr(result, f"n_{name}") for result in results], np.float64)
+        extracted = [result for result in results if result.n_features]
+        for name in self._points:
+            of = results if name in ("matches", "inliers") else extracted
+            counts = np.array([getattr(result, f"n_{name}") for result in of], np.float64)
             scalars = rr.Scalars.columns(scalars=counts)
-            self._recording.send_columns(f"points/{name}", _times(results), scalars)
+            self._recording.send_columns(f"points/{name}", _times(of), scalars)
         for stage in dict.fromkeys(name for result in results for name in result.stage_ms):
             if stage not in self._stages:
                 color = _STAGE_COLORS[len(self._stages) % len(_STAGE_COLORS)]

@@ -109,11 +109,7 @@ RULES = {
         ),
     ),
     "docs/howto/calibrate.md": Rules(not_run=(("vslam calibrate", BOARDS),)),
-    "docs/howto/cameras.md": Rules(
-        not_run=(
-            ("vslam synth block --fisheye", AGAIN),
-        )
-    ),
+    "docs/howto/cameras.md": Rules(not_run=(("vslam synth block --fisheye", AGAIN),)),
     "docs/explanation/design.md": Rules(),
     "docs/howto/exports.md": Rules(
         (
@@ -197,7 +193,6 @@ RULES = {
         (("demo --rgbd", f"demo --rgbd --max-frames {N}"),),
         (("vslam synth block", AGAIN), ("vslam run --data block", AGAIN)),
     ),
-    "docs/research/rivals.md": Rules(not_run=(("python tools/", HOURS),)),
     "docs/howto/sources.md": Rules(
         not_run=(
             ("vslam run --dataset synthetic --seq demo", "test_site.py runs it"),

@@ -34,7 +34,7 @@ _EXAMPLES = """
 [b]Examples[/b]
   vslam loops bench --detectors bow,capsule
   vslam loops bench --data "kitti:~/kitti\\[seq=00,truth=kitti00.mat]"
-  vslam loops bench --detectors capsule,alexnet --weights alexnet=alexnet.onnx
+  vslam loops bench --detectors bow,capsule --weights capsule=capsule.onnx
   vslam loops bench --protocol online --detectors bow,capsule,ibow
 """
 DATA = ("town:demo[seed=101]", "town:05[seed=102]", "town:demo[seed=103,aliased=1]")

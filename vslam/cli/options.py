@@ -27,12 +27,8 @@ def _with_plugins(names: tuple[str, ...], group: str) -> tuple[str, ...]:
 _DATASETS = _with_plugins(("kitti", "euroc", "tum", "synthetic"), plugins.READERS)
 _SOURCES = ("images", "video", "bag", "camera")
 DETECTOR_NAMES = _with_plugins(
-    (
-        "none", "bow", "both", "capsule", "capsule-pruned", "capsule-paper", "alexnet", "vgg16",
-        "darknet19", "googlenet", "mobilenet", "squeezenet", "pcanet",
-    ),
-    plugins.DETECTORS,
-)  # fmt: skip
+    ("none", "bow", "both", "capsule", "capsule-pruned", "capsule-paper"), plugins.DETECTORS
+)
 if TYPE_CHECKING:
     SourceName = str
     DetectorName = str

@@ -254,15 +254,9 @@ def _refuse_beside_resume(context: typer.Context) -> None:
 def _compared(names: str, detector: str) -> tuple[str, ...]:
     """The detectors of ``--compare``, without repetitions."""
     from vslam.loopclosure.registry import require_detector
-    from vslam.loopclosure.siamese.weights import NETWORKS, SHIPPED
 
     found = tuple(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
     for name in found:
-        if name in NETWORKS and not (SHIPPED / f"{name}.onnx").exists():
-            raise InputError(
-                f"--compare {name}: vslam ships no weights for it; name it with --detector and "
-                "--weights, and compare it with another."
-            )
         require_detector(name, option="--compare")
     if detector in found:
         raise InputError(

@@ -43,12 +43,9 @@ def register(app: typer.Typer) -> None:
     app.command(epilog=_TRAIN_EXAMPLES)(train)
 
 
-NetworkName = Literal[
-    "capsule", "capsule-pruned", "capsule-paper", "alexnet", "vgg16", "darknet19", "googlenet",
-    "mobilenet", "squeezenet", "pcanet",
-]  # fmt: skip
+NetworkName = Literal["capsule", "capsule-pruned", "capsule-paper"]
 NETWORK_NAMES = get_args(NetworkName)
-PresetName = Literal["paper", "best", "pretrained", "rivals"]
+PresetName = Literal["paper", "best", "pretrained"]
 DeviceName = Literal["cpu", "cuda"]
 FitName = Literal["squash", "crop"]
 DataSources = Annotated[
@@ -77,8 +74,8 @@ def train(
         PresetName,
         typer.Option(
             metavar="NAME",
-            help="Settings: [b]paper[/b] as published, [b]best[/b], [b]pretrained[/b], or "
-            "[b]rivals[/b], one recipe for all networks (docs/research/rivals.md).",
+            help="Settings: [b]paper[/b] as published, [b]best[/b], or [b]pretrained[/b], which "
+            "starts from ImageNet weights.",
             rich_help_panel=METHOD,
         ),
     ] = "paper",
@@ -124,8 +121,7 @@ def train(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Network to start from: the one to prune for capsule-pruned and capsule-paper, "
-            "a file of torchvision for alexnet and vgg16.",
+            help="Network to start from; for capsule-pruned and capsule-paper, the one to prune.",
             rich_help_panel=METHOD,
         ),
     ] = None,
@@ -197,16 +193,12 @@ def train(
     _require_libraries("train")
     from vslam.loopclosure.siamese.images import parse_size
     from vslam.loopclosure.siamese.source_registry import open_source
-    from vslam.loopclosure.training.branches import CapsuleBranch
     from vslam.loopclosure.training.data import load, refuse_test_data
     from vslam.loopclosure.training.runtime import set_threads
     from vslam.loopclosure.training.settings import PRESETS, load_settings
     from vslam.loopclosure.training.siamese import load_network
     from vslam.machine import available_cores
 
-    if network == "pcanet":
-        _refuse_of_pcanet({"--epochs": epochs, "--pairs": pairs, "--max-minutes": max_minutes,
-                           "--resume": resume or None})  # fmt: skip
     began = time.monotonic()
     sources = [source for spec in data for source in open_source(spec)]
     if not allow_test_data:
@@ -217,12 +209,7 @@ def train(
     chosen = chosen.model_copy(update={k: v for k, v in given.items() if v is not None})
     shape = chosen.shape
     if weights is not None and weights.suffix == ".safetensors" and settings is None:
-        given_network, _ = load_network(weights)
-        branch = given_network.branch
-        if isinstance(branch, CapsuleBranch):
-            shape = branch.shape
-        else:
-            shape = shape.with_layout(branch.layout)
+        shape = load_network(weights)[0].branch.shape
     if pixels is not None:
         shape = shape.for_images_of(parse_size(pixels))
     chosen = chosen.model_copy(update={"shape": shape})
@@ -262,16 +249,6 @@ def _require_libraries(command: str) -> None:
             )
 
 
-def _refuse_of_pcanet(given: dict[str, object]) -> None:
-    """Refuse options that need several steps of training; ``given`` has their values or None."""
-    from vslam.errors import InputError
-
-    for option in (name for name, value in given.items() if value is not None):
-        raise InputError(
-            f"vslam train pcanet: learns in one step, without epochs; leave out {option}."
-        )
-
-
 def _train(
     collection: Collection,
     settings: TrainSettings,
@@ -287,7 +264,6 @@ def _train(
 ) -> TrainingOutcome:
     from vslam.cli.console import console
     from vslam.loopclosure.training.checkpoint import CHECKPOINT
-    from vslam.loopclosure.training.component_training import learn_components
     from vslam.loopclosure.training.export import export_onnx
     from vslam.loopclosure.training.initial_network import starting_network
     from vslam.loopclosure.training.model_card import describe, write_card
@@ -299,15 +275,12 @@ def _train(
     )
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "settings.json").write_text(settings.model_dump_json(indent=1) + "\n")
-    if settings.network == "pcanet":
-        outcome = learn_components(collection, settings, folder, device=device)
-    else:
-        with console(shown=not quiet).training_bar() as on_step:
-            outcome = run(
-                collection, settings, folder, device=device, threads=threads, resume=resume,
-                start=start, on_step=on_step,
-                should_stop=None if until is None else lambda: time.monotonic() > until,
-            )  # fmt: skip
+    with console(shown=not quiet).training_bar() as on_step:
+        outcome = run(
+            collection, settings, folder, device=device, threads=threads, resume=resume,
+            start=start, on_step=on_step,
+            should_stop=None if until is None else lambda: time.monotonic() > until,
+        )  # fmt: skip
     if outcome.weights.exists():
         network, about = load_network(outcome.weights)
         export_onnx(network, outcome.weights.with_suffix(".onnx"), about)

@@ -211,7 +211,7 @@ def test_choices_are_checked_by_the_parser(call, words, parts):
         ("perturb --dataset eurok", "euroc"),
         ("train capsul --data photos:x", "capsule"),
         ("stress --laws rian", "rain"),
-        ("loops bench --detectors thumbnai", "thumbnail"),
+        ("loops bench --detectors capsle", "capsule"),
         ("loops bench --perturb blurr:0.5", "blur"),
         ("bench --detectors capsul", "capsule"),
         ("run --compare bwo --detector none", "bow"),

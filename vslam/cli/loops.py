@@ -35,7 +35,7 @@ _EXAMPLES = """
   vslam loops bench --detectors bow,capsule
   vslam loops bench --data "kitti:~/kitti\\[seq=00,truth=kitti00.mat]"
   vslam loops bench --detectors bow,capsule --weights capsule=capsule.onnx
-  vslam loops bench --protocol online --detectors bow,capsule,ibow
+  vslam loops bench --protocol online --detectors bow,capsule
 """
 DATA = ("town:demo[seed=101]", "town:05[seed=102]", "town:demo[seed=103,aliased=1]")
 DRIVES = ("drive:05[seed=102]", "drive:demo[seed=103,aliased=1,every=5]")
@@ -121,14 +121,14 @@ def bench(
 ) -> None:
     """Measure precision and recall of loop detectors on images of places or drives."""
     from vslam.lab.loopbench.conditions import parse_conditions
+    from vslam.lab.loopbench.detectors import require_comparable
     from vslam.lab.loopbench.online import parse_window
-    from vslam.lab.loopbench.registry import require_comparable
     from vslam.loopclosure.registry import parse_weights
 
     names = names_in(detectors)
     files = parse_weights(weights or [], names)
     for name in names or [""]:
-        require_comparable(name, files.get(name), protocol)
+        require_comparable(name, files.get(name))
     conditions, youngest = parse_conditions(perturb, strengths), parse_window(window)
     if protocol == "online" and (perturb, strengths, seed) != (PERTURB, STRENGTHS, 0):
         raise InputError(
@@ -177,11 +177,11 @@ def _on_drives(
 ) -> str:
     """Measure in the online protocol of the literature; returns what was measured on."""
     from vslam.datasets.synthetic import store
+    from vslam.lab.loopbench.detectors import open_scorer
     from vslam.lab.loopbench.drives import open_drives
     from vslam.lab.loopbench.measure_online import measure_drive
-    from vslam.lab.loopbench.registry import online_detector
 
-    starts = [online_detector(one, asked.files.get(one), asked.vocabulary) for one in asked.names]
+    scorers = [open_scorer(one, asked.files.get(one), asked.vocabulary) for one in asked.names]
     threads, bar = asked.threads, asked.progress_bar
     drives = [
         drive
@@ -190,10 +190,7 @@ def _on_drives(
     ]
     scores: list[OnlineScore] = []
     for drive in drives:
-        scores += measure_drive(
-            drive, starts, window, asked.vocabulary,
-            threads=threads, progress_bar=bar,
-        )  # fmt: skip
+        scores += measure_drive(drive, scorers, window, asked.vocabulary, threads=threads)
         write(online=scores)
     return f"{len(drives)} drives"
 
@@ -210,14 +207,11 @@ def _on_sets(
     from vslam.cli.console import console
     from vslam.datasets.synthetic import store
     from vslam.lab.loopbench.cost import cost
-    from vslam.lab.loopbench.detectors import DetectorSet
+    from vslam.lab.loopbench.detectors import DetectorSet, open_scorer
     from vslam.lab.loopbench.measure import measure
-    from vslam.lab.loopbench.registry import comparable_scorer
     from vslam.lab.loopbench.sets import open_set
 
-    scorers = [
-        comparable_scorer(one, asked.files.get(one), asked.vocabulary) for one in asked.names
-    ]
+    scorers = [open_scorer(one, asked.files.get(one), asked.vocabulary) for one in asked.names]
     threads, bar = asked.threads, asked.progress_bar
     sets = [
         found

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vslam.cli.console import console
-from vslam.cli.options import OUTPUT, Thresholds, open_given, reads_source, require_data
+from vslam.cli.options import OUTPUT, Thresholds, open_given, option, reads_source, require_data
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
@@ -34,11 +34,11 @@ def doctor(
     config: Thresholds = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="HTML page to write; replaces an earlier one.",
-            show_default="doctor.html, or doctor-2.html and so on",
-            rich_help_panel=OUTPUT,
+        option(
+            OUTPUT,
+            "FILE",
+            "HTML page to write; replaces an earlier one.",
+            unset="doctor.html, or doctor-2.html and so on",
         ),
     ] = None,
 ) -> None:

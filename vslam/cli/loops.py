@@ -20,6 +20,7 @@ from vslam.cli.options import (
     Seed,
     Weights,
     names_in,
+    option,
 )
 from vslam.errors import InputError
 
@@ -58,65 +59,55 @@ def _group() -> None:
 def bench(
     protocol: Annotated[
         Literal["retrieval", "online"],
-        typer.Option(
-            metavar="retrieval|online",
-            help="[b]retrieval[/b] searches a gallery for every query; [b]online[/b] decides once "
+        option(
+            METHOD,
+            "retrieval|online",
+            "[b]retrieval[/b] searches a gallery for every query; [b]online[/b] decides once "
             "per image of a drive, searching the images before it.",
-            rich_help_panel=METHOD,
         ),
     ] = "retrieval",
     data: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="SOURCE",
-            help="Images: rendered places, [b]town:ROUTE\\[seed=101,aliased=1,places=150][/b], "
+        option(
+            INPUT,
+            "SOURCE",
+            "Images: rendered places, [b]town:ROUTE\\[seed=101,aliased=1,places=150][/b], "
             "or a source of [b]vslam train[/b]. With online: a rendered drive, "
             "[b]drive:ROUTE\\[seed=101,aliased=1,change=0.5,every=10][/b], kitti:DIR or "
             "fabmap:DIR. Repeat for more.",
-            show_default="three towns, or two drives",
-            rich_help_panel=INPUT,
+            unset="three towns, or two drives",
         ),
     ] = None,
     detectors: Annotated[
         str,
-        typer.Option(
-            metavar="NAMES",
-            help="Loop detectors, separated by commas; the first is the baseline.",
-            rich_help_panel=METHOD,
-        ),
+        option(METHOD, "NAMES", "Loop detectors, separated by commas; the first is the baseline."),
     ] = "bow,capsule,capsule-pruned",
     weights: Weights = None,
     perturb: Annotated[
         str,
-        typer.Option(
-            metavar="NAMES",
-            help="Changes of the query images: light, clipping, viewpoint, occlusion, noise, blur, "
+        option(
+            METHOD,
+            "NAMES",
+            "Changes of the query images: light, clipping, viewpoint, occlusion, noise, blur, "
             "change (rendered towns only), all.",
-            rich_help_panel=METHOD,
         ),
     ] = PERTURB,
     strengths: Annotated[
         str,
-        typer.Option(
-            metavar="NUMBERS",
-            help="Strengths of these changes, from 0 to 1, separated by commas.",
-            rich_help_panel=METHOD,
-        ),
+        option(METHOD, "NUMBERS", "Strengths of these changes, from 0 to 1, separated by commas."),
     ] = STRENGTHS,
     window: Annotated[
         str,
-        typer.Option(
-            metavar="AGE",
-            help="With online: search images that are at least this much older than the query, in "
+        option(
+            METHOD,
+            "AGE",
+            "With online: search images that are at least this much older than the query, in "
             "seconds (20s) or images (200).",
-            rich_help_panel=METHOD,
         ),
     ] = WINDOW,
     seed: Seed = 0,
     threads: AllThreads = None,
-    out: Annotated[
-        Path, typer.Option(metavar="FOLDER", help="Folder to write to.", rich_help_panel=OUTPUT)
-    ] = Path("loops-bench"),
+    out: Annotated[Path, option(OUTPUT, "FOLDER", "Folder to write to.")] = Path("loops-bench"),
     quiet: Quiet = False,
 ) -> None:
     """Measure precision and recall of loop detectors on images of places or drives."""

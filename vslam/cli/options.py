@@ -38,93 +38,77 @@ else:  # installed packages add names
 # Panels of --help.
 INPUT, METHOD, MAP, OUTPUT, EXECUTION = "Input", "Method", "Map", "Output", "Execution"
 
+
+def option(
+    panel: str, metavar: str, text: str, *names: str, unset: str | bool = True, **more: Any
+) -> Any:
+    """An option in a panel of ``--help``; ``unset`` says what it means to leave it out."""
+    return typer.Option(
+        *names, metavar=metavar, help=text, show_default=unset, rich_help_panel=panel, **more
+    )
+
+
+def flag(panel: str, text: str, *names: str) -> Any:
+    """An option without a value."""
+    return typer.Option(*names, help=text, rich_help_panel=panel)
+
+
 Perturb = Annotated[
     str,
-    typer.Option(
-        metavar="LAWS",
-        help="Perturbations, each with a strength, such as [b]fog:60,blur:0.5[/b]; [b]vslam "
+    option(
+        METHOD,
+        "LAWS",
+        "Perturbations, each with a strength, such as [b]fog:60,blur:0.5[/b]; [b]vslam "
         "perturb --list[/b] shows them all.",
-        rich_help_panel=METHOD,
     ),
 ]
-Seed = Annotated[
-    int,
-    typer.Option(min=0, metavar="N", help="Seed of the random numbers.", rich_help_panel=METHOD),
-]
+Seed = Annotated[int, option(METHOD, "N", "Seed of the random numbers.", min=0)]
 Thresholds = Annotated[
     Path | None,
-    typer.Option(
-        "--config",
-        metavar="FILE",
-        help="JSON file with thresholds, such as the config.json of a run.",
-        rich_help_panel=METHOD,
+    option(
+        METHOD, "FILE", "JSON file with thresholds, such as the config.json of a run.", "--config"
     ),
 ]
 Weights = Annotated[
     list[str] | None,
-    typer.Option(
-        metavar="NAME=FILE",
-        help="Weights of a detector in place of the shipped ones; repeat for more.",
-        rich_help_panel=METHOD,
+    option(
+        METHOD, "NAME=FILE", "Weights of a detector in place of the shipped ones; repeat for more."
     ),
 ]
-Seeds = Annotated[
-    int,
-    typer.Option(
-        min=1, metavar="N", help="Seeds of each random perturbation.", rich_help_panel=METHOD
-    ),
-]
+Seeds = Annotated[int, option(METHOD, "N", "Seeds of each random perturbation.", min=1)]
 Jobs = Annotated[
     int,
-    typer.Option(
-        min=1,
-        metavar="N",
-        help="Runs at a time. Only with 1 are the frames per second comparable.",
-        rich_help_panel=EXECUTION,
+    option(
+        EXECUTION, "N", "Runs at a time. Only with 1 are the frames per second comparable.", min=1
     ),
 ]
 Threads = Annotated[
     int | None,
-    typer.Option(
+    option(
+        EXECUTION,
+        "N",
+        "Threads; they do not change the result.",
         min=1,
-        metavar="N",
-        help="Threads; they do not change the result.",
-        show_default="all cores, at most 4",
-        rich_help_panel=EXECUTION,
+        unset="all cores, at most 4",
     ),
 ]
 AllThreads = Annotated[
     int | None,
-    typer.Option(
-        min=1,
-        metavar="N",
-        help="Threads; they do not change the result.",
-        show_default="all cores",
-        rich_help_panel=EXECUTION,
-    ),
+    option(EXECUTION, "N", "Threads; they do not change the result.", min=1, unset="all cores"),
 ]
 ThreadsOfRun = Annotated[
     int | None,
-    typer.Option(
-        min=1,
-        metavar="N",
-        help="Threads of each run.",
-        show_default="the cores shared by --jobs, at most 4",
-        rich_help_panel=EXECUTION,
+    option(
+        EXECUTION, "N", "Threads of each run.", min=1, unset="the cores shared by --jobs, at most 4"
     ),
 ]
 Scheduler = Annotated[
     str | None,
-    typer.Option(
-        metavar="ADDRESS",
-        help="Dask scheduler, such as tcp://HOST:8786, whose workers do the runs.",
-        rich_help_panel=EXECUTION,
+    option(
+        EXECUTION, "ADDRESS", "Dask scheduler, such as tcp://HOST:8786, whose workers do the runs."
     ),
 ]
-Quiet = Annotated[
-    bool,
-    typer.Option("--quiet", help="Show no progress and no summary.", rich_help_panel=OUTPUT),
-]
+Quiet = Annotated[bool, flag(OUTPUT, "Show no progress and no summary.", "--quiet")]
 SensorName = Literal["stereo", "mono", "rgbd"]
 ViewerName = Literal["native", "web"]
 AlignmentName = Literal["se3", "sim3", "none"]
@@ -149,11 +133,11 @@ def kitti_root() -> str:
 
 def sequences(default: str) -> Any:
     """The option ``--seqs`` of a command whose default is ``default``."""
-    return typer.Option(
-        metavar="LIST",
-        help="Sequences of a data set, such as 00-05 or 00,demo.",
-        show_default=f"{default}; the only one of EuRoC and TUM",
-        rich_help_panel=INPUT,
+    return option(
+        INPUT,
+        "LIST",
+        "Sequences of a data set, such as 00-05 or 00,demo.",
+        unset=f"{default}; the only one of EuRoC and TUM",
     )
 
 

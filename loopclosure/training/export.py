@@ -110,7 +110,7 @@ def to_onnx(
     module: nn.Module, inputs: tuple[Tensor, ...], names: list[str], outputs: list[str],
     dynamic_shapes: Any = None,
 ) -> onnx.ModelProto:  # fmt: skip
-    """Convert a module to an ONNX graph without unused inputs. Tensors that half precision
+    """Convert a module to an ONNX graph. Tensors that half precision
     represents exactly are stored in it."""
     log = logging.getLogger("torch.onnx")
     level = log.level
@@ -127,10 +127,6 @@ def to_onnx(
     assert program is not None
     model = program.model_proto
     _halve(model.graph)
-    read = {name for node in model.graph.node for name in node.input}
-    used = [one for one in model.graph.input if one.name in read]
-    del model.graph.input[:]
-    model.graph.input.extend(used)
     for node in model.graph.node:  # remove the source paths of this machine
         del node.metadata_props[:]
     del model.graph.metadata_props[:]

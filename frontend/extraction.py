@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from functools import cached_property, partial
+from collections.abc import Callable
+from functools import cached_property
+from threading import Lock
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import DepthImage, Image, ImageMap
+from vslam.errors import UnreadableImageError
 from vslam.features import Extracted, Features, Keypoints, Pyramid, Side
 from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.orb import Extraction, build_pyramid, with_keypoints
@@ -19,58 +23,105 @@ from vslam.frontend.tracking import TrackingContext
 from vslam.frontend.weak_images import extract_in_any_light
 
 
+class Corners(NamedTuple):
+    """What was found in the images of one moment, before stereo matching.
+
+    Attributes:
+        found: the features of the image of ``side``.
+        right: those of the right image, to be matched with; None if there is nothing to match.
+        depth: ``(H, W)`` float32 metres, of an RGB-D camera; else None.
+        side: see ``Extracted``.
+    """
+
+    found: Extraction
+    right: Extraction | None = None
+    depth: DepthImage | None = None
+    side: Side = Side.LEFT
+
+
 class FrameImages:
-    """The images of one moment. Their features are extracted when they are first asked for: a frame
-    that is tracked by patches needs none.
+    """The images of one moment. The second image is read, and features are extracted, when they are
+    first asked for: a frame that is tracked by patches needs neither.
 
     Attributes:
         left: ``(H, W)`` uint8.
         pyramid: of the left image; None if frames are not tracked by patches.
         coarse: ``coarse_levels`` of that pyramid, or None.
+        sides: the comparison of the left and the right image; None without a right image, or if it
+            has not been read.
+        problem: why the second image cannot be read, so that the left one is used alone; None if it
+            can, or has not been asked for.
     """
 
     def __init__(
         self,
         left: Image,
-        second: Image | DepthImage | None,
+        read_second: Callable[[], Image | DepthImage | None],
         context: TrackingContext,
         image_map: ImageMap = map,
-        sides: Sides | None = None,
     ) -> None:
-        """For the arguments see ``extract_features``."""
+        """
+        Args:
+            left: ``(H, W)`` uint8.
+            read_second: gives the second image, or raises UnreadableImageError.
+            context, image_map: see ``extract_features``.
+        """
         self.left = left
         self.pyramid: Pyramid | None = None
         self.coarse: Pyramid | None = None
-        self._second = second
-        self._extract = partial(extract_features, left, second, context, image_map, sides)
+        self.sides: Sides | None = None
+        self.problem: str | None = None
+        self._read_second = read_second
+        self._context = context
+        self._image_map = image_map
+        self._second: Image | DepthImage | None = None
+        self._corners: Corners | None = None
+        self._lock = Lock()
         if context.tracks_patches:
             self.pyramid = build_pyramid(left, context.config.orb)
             self.coarse = coarse_levels(self.pyramid)
 
+    def find_corners(self) -> Corners:
+        """Read the second image, and do all of the extraction that does not depend on tracking.
+        Another thread may call this ahead of the one that needs the features."""
+        with self._lock:
+            if self._corners is None:
+                self._corners = self._found()
+            return self._corners
+
     @cached_property
     def extracted(self) -> Extracted:
         """The features."""
-        return self._extract()
+        return matched(self.find_corners(), self._context)
 
     def extracted_with(self, keypoints: Keypoints) -> Extracted:
         """The features, and others at given positions of the left image."""
-        return self._extract(keypoints=keypoints)
+        return matched(self.find_corners(), self._context, keypoints)
 
     @property
     def image(self) -> Image:
         """``(H, W)`` uint8 that the features are extracted from."""
-        if self.extracted.side == Side.LEFT:
+        if self.find_corners().side == Side.LEFT:
             return self.left
         return np.array(self._second, np.uint8)  # a copy: the right image is the caller's
 
+    def _found(self) -> Corners:
+        try:
+            self._second = self._read_second()
+        except UnreadableImageError as error:
+            self.problem = str(error)
+        context = self._context
+        if self._second is not None and not context.camera.depth:
+            right = np.asarray(self._second, np.uint8)
+            self.sides = compare_sides(self.left, right, context.config.stereo)
+        return find_corners(self.left, self._second, context, self._image_map, self.sides)
+
 
 def extract_features(
-    left: NDArray[np.uint8],
-    second: NDArray[np.uint8] | NDArray[np.float32] | None,
+    left: Image,
+    second: Image | DepthImage | None,
     context: TrackingContext,
     image_map: ImageMap = map,
-    sides: Sides | None = None,
-    keypoints: Keypoints | None = None,
 ) -> Extracted:
     """ORB features of the left image with their columns in the right image. If the left image is
     black, the features are extracted from the right image and have no columns in the other one.
@@ -82,41 +133,66 @@ def extract_features(
         second: ``(H, W)``: the right image, uint8; for an RGB-D camera the depth in metres,
             float32; None for a single image, whose features have no column in a right image.
         image_map: applies a function to both images, in turn or in parallel.
+    """
+    return matched(find_corners(left, second, context, image_map), context)
+
+
+def find_corners(
+    left: Image,
+    second: Image | DepthImage | None,
+    context: TrackingContext,
+    image_map: ImageMap = map,
+    sides: Sides | None = None,
+) -> Corners:
+    """The first step of ``extract_features``: the features of each image alone.
+
+    Args:
         sides: the result of ``compare_sides``; None computes it.
-        keypoints: positions at which the left image gets features, too (``with_keypoints``).
     """
     camera, config = context.camera, context.config
     if second is None:
-        return _extract_alone(left, context, Side.LEFT, keypoints)
+        return _corners_alone(left, context, Side.LEFT)
     if camera.depth:
         (found,) = extract_in_any_light([left], config)
-        scale, depth = context.scales[found.octave], np.asarray(second, np.float32)
+        return Corners(found, depth=np.asarray(second, np.float32))
+    right_image = np.asarray(second, np.uint8)
+    sides = sides or compare_sides(left, right_image, config.stereo)
+    if sides.black == "left":
+        return _corners_alone(right_image, context, Side.RIGHT)
+    pair = balanced(left, right_image, config.stereo, sides)
+    found, right = extract_in_any_light(pair, config, image_map)
+    return Corners(found, right)
+
+
+def matched(
+    corners: Corners, context: TrackingContext, keypoints: Keypoints | None = None
+) -> Extracted:
+    """The second step of ``extract_features``: stereo matching.
+
+    Args:
+        keypoints: positions at which the left image gets features, too (``with_keypoints``).
+    """
+    camera, config = context.camera, context.config
+    found, right, depth, side = corners
+    if depth is not None:
+        scale = context.scales[found.octave]
         u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
         # No pyramid, so the frame is not aligned: depth cameras have a rolling shutter, which
         # moves points by more than alignment corrects.
         return Extracted(_features(found, u_right))
-    right_image = np.asarray(second, np.uint8)
-    sides = sides or compare_sides(left, right_image, config.stereo)
-    if sides.black == "left":
-        return _extract_alone(right_image, context, Side.RIGHT)
-    pair = balanced(left, right_image, config.stereo, sides)
-    found, right = extract_in_any_light(pair, config, image_map)
-    if keypoints is not None:
+    if keypoints is not None and side == Side.LEFT:
         found = with_keypoints(found, *keypoints)
+    if right is None:
+        u_right = np.full(len(found.xy), np.nan, np.float32)
+        return Extracted(_features(found, u_right), found.pyramid, side=side)
     u_right = match_stereo(found, right, camera, config.stereo)
     rows = row_offsets(found, right, u_right, config.stereo)
     return Extracted(_features(found, u_right), found.pyramid, rows)
 
 
-def _extract_alone(
-    image: Image, context: TrackingContext, side: Side, keypoints: Keypoints | None = None
-) -> Extracted:
-    """Features of a single image, without columns in a second one."""
+def _corners_alone(image: Image, context: TrackingContext, side: Side) -> Corners:
     (found,) = extract_in_any_light([image], context.config)
-    if keypoints is not None:
-        found = with_keypoints(found, *keypoints)
-    u_right = np.full(len(found.xy), np.nan, np.float32)
-    return Extracted(_features(found, u_right), found.pyramid, side=side)
+    return Corners(found, side=side)
 
 
 def _features(found: Extraction, u_right: NDArray[np.float32]) -> Features:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera, Image
 from vslam.features import Extracted, FeatureGrid, Features, Keypoints, Pyramid, Side
+from vslam.frontend.sides import Sides
 from vslam.geometry import Matrix, inverse
 
 
@@ -19,7 +20,13 @@ class FeatureSource(Protocol):
     Attributes:
         extracted: the features.
         image: ``(H, W)`` uint8 that they are extracted from.
+        sides: the comparison of the left and the right image; None without a right image, or if it
+            has not been read.
+        problem: why the right image cannot be read; None if it can, or has not been asked for.
     """
+
+    sides: Sides | None
+    problem: str | None
 
     @property
     def extracted(self) -> Extracted: ...

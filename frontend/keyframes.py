@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,6 +30,7 @@ class KeyframeEvidence:
         gained_close: number of close points that the first frame after a keyframe tracks, a running
             mean over the last keyframes; infinite if unknown.
         first_close: how many the first frame after the last keyframe tracks.
+        lost_close: by how many the number falls from frame to frame since then.
     """
 
     seconds_since_keyframe: float
@@ -40,6 +41,17 @@ class KeyframeEvidence:
     mapping_idle: bool
     gained_close: float = np.inf
     first_close: int = 0
+    lost_close: float = 0.0
+
+    def ahead(self, frames: int) -> KeyframeEvidence:
+        """The evidence that is expected some frames later: close points leave the view as before.
+        A point that is close is tracked, so the inliers fall with them."""
+        falls = round(frames * self.lost_close)
+        return replace(
+            self,
+            tracked_close=self.tracked_close - falls,
+            n_inliers=self.n_inliers - falls,
+        )
 
 
 def needs_keyframe(
@@ -108,12 +120,14 @@ class CloseGain:
     Attributes:
         mean: the moving average.
         latest: the number of the last keyframe.
+        frame: index of the first frame after it.
         awaited: whether the next frame is the first one after a keyframe.
     """
 
     def __init__(self, config: KeyframeConfig) -> None:
         self.mean = config.first_gain * config.min_tracked_close
         self.latest = 0
+        self.frame = -1
         self.awaited = False
         self._weight = config.gain_weight
 
@@ -121,12 +135,12 @@ class CloseGain:
         """Note that a keyframe was made."""
         self.awaited = True
 
-    def add(self, tracked_close: int) -> None:
-        """Add the number of close points that a frame tracks, if it is the first one after a
-        keyframe."""
+    def add(self, tracked_close: int, frame: int) -> None:
+        """Add the number of close points that frame ``frame`` tracks, if it is the first one after
+        a keyframe."""
         if self.awaited:
             self.mean += self._weight * (tracked_close - self.mean)
-            self.latest, self.awaited = tracked_close, False
+            self.latest, self.frame, self.awaited = tracked_close, frame, False
 
 
 @dataclass(frozen=True)
@@ -161,13 +175,18 @@ def is_known_place(evidence: PlaceEvidence, config: KeyframeConfig) -> bool:
 
 
 class KeyframePolicy:
-    """Decides whether a tracked frame becomes a keyframe. Only ``observe``, ``keyframe_made`` and
-    ``restore`` change its state."""
+    """Decides whether a tracked frame becomes a keyframe. Only ``observe``, ``is_due``,
+    ``keyframe_made`` and ``restore`` change its state.
+
+    Attributes:
+        due: index of the frame that is to become a keyframe; -1 if none is planned.
+    """
 
     def __init__(self, context: TrackingContext) -> None:
         self._context = context
         self._config = context.config.keyframes
         self._gain = CloseGain(self._config)
+        self.due = -1
 
     def observe(
         self, frame: Frame, view: MapView, *, seconds_since_keyframe: float, mapping_idle: bool
@@ -182,7 +201,8 @@ class KeyframePolicy:
             close = transform(frame.T_cw, frame.xyz)[:, 2] < self._context.close_depth
             untracked_close = None
         tracked_close = int(np.count_nonzero(close & tracked))
-        self._gain.add(tracked_close)
+        gain = self._gain
+        gain.add(tracked_close, frame.index)
         return KeyframeEvidence(
             seconds_since_keyframe=seconds_since_keyframe,
             n_inliers=int(np.count_nonzero(tracked)),
@@ -190,8 +210,9 @@ class KeyframePolicy:
             tracked_close=tracked_close,
             untracked_close=untracked_close,
             mapping_idle=mapping_idle,
-            gained_close=self._gain.mean,
-            first_close=self._gain.latest,
+            gained_close=gain.mean,
+            first_close=gain.latest,
+            lost_close=max(0, gain.latest - tracked_close) / max(1, frame.index - gain.frame),
         )
 
     def wants_keyframe(self, evidence: KeyframeEvidence) -> bool:
@@ -205,15 +226,30 @@ class KeyframePolicy:
         """Whether an old keyframe serves instead of a new one."""
         return is_known_place(evidence, self._config)
 
+    def is_due(self, index: int, evidence: KeyframeEvidence) -> bool:
+        """Whether frame ``index``, which was tracked by patches, is to become a keyframe. If one of
+        the next frames is expected to be the one that is wanted, it is planned as a keyframe, so
+        that its features can be extracted meanwhile."""
+        for ahead in range(self._config.patch_lead_frames + 1):
+            if self.due < 0 and self.wants_keyframe(evidence.ahead(ahead)):
+                self.due = index + ahead
+        if not 0 <= self.due <= index:
+            return False
+        self.due = -1
+        return True
+
     def keyframe_made(self) -> None:
         """Note that a keyframe was made."""
         self._gain.begin()
+        self.due = -1
 
     def state(self) -> PolicyState:
         """The state, for a saved map or a checkpoint."""
-        return PolicyState(self._gain.mean, self._gain.awaited, self._gain.latest)
+        gain = self._gain
+        return PolicyState(gain.mean, gain.awaited, gain.latest, gain.frame, self.due)
 
     def restore(self, state: PolicyState) -> None:
         """Continue from a state that ``state`` returned."""
         self._gain.mean, self._gain.awaited = state.gained_close, state.gain_awaited
-        self._gain.latest = state.first_close
+        self._gain.latest, self._gain.frame = state.first_close, state.first_frame
+        self.due = state.due

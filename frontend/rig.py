@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from vslam.camera import Camera
 from vslam.config import StereoConfig
 from vslam.features import shifted_columns
-from vslam.frontend.frame import Frame
+from vslam.frontend.frame import FeatureSource, Frame
 from vslam.frontend.side_delay import DelayState, SideDelay
+from vslam.frontend.sides import ComparedSides
 from vslam.geometry import Matrix
 from vslam.image_motion import columns_without_delay
+from vslam.states import RigState
 
 
 class RigCalibration:
@@ -29,6 +31,8 @@ class RigCalibration:
         disparity_offset: pixels to be added to every measured disparity. The owner of the map sets
             it to the map's disparity offset at each merge.
         delay: the measured delay of the right image.
+        sides: what the comparisons of both images showed.
+        problems: a sentence for each frame whose right image could not be read.
     """
 
     def __init__(self, camera: Camera, config: StereoConfig, scales: NDArray[np.float64]) -> None:
@@ -38,13 +42,29 @@ class RigCalibration:
         """
         self.disparity_offset = 0.0
         self.delay = SideDelay(camera, config)
+        self.sides = ComparedSides()
+        self.problems: list[str] = []
         self._camera = camera
         self._scales = scales
 
     def extract(self, frame: Frame, twist: Matrix | None) -> None:
-        """Extract the features of a frame, if that has not been done, and ``prepare`` it."""
+        """Extract the features of a frame, if that has not been done, ``compare`` its sides and
+        ``prepare`` it."""
+        source = frame.source
         frame.extract(self._camera)
+        self.compare(source, frame.index)
         self.prepare(frame, twist)
+
+    def compare(self, source: FeatureSource | None, index: int) -> None:
+        """Note what the images of frame ``index``, whose features were extracted, show."""
+        if source is None:
+            return
+        if source.sides is not None:
+            self.sides.add(source.sides)
+        if source.problem is not None:
+            self.problems.append(
+                f"Frame {index} has only its left image: {source.problem.rstrip('.')}."
+            )
 
     def prepare(self, frame: Frame, twist: Matrix | None) -> None:
         """Correct ``u_right`` of a frame for the disparity offset and, if the motion is known, for
@@ -87,10 +107,15 @@ class RigCalibration:
         """
         self.delay.add(frame.features, frame.row_offset, twist, self._scales)
 
-    def state(self) -> DelayState:
-        """The state of the measured delay; the disparity offset is part of the map."""
-        return self.delay.state()
+    def state(self) -> RigState:
+        """What was measured so far; the disparity offset is part of the map."""
+        return RigState(self.delay.state().numbers(), self.sides.numbers())
 
-    def restore(self, state: DelayState) -> None:
-        """Continue from a state that ``state`` returned."""
-        self.delay.restore(state)
+    def restore(self, state: RigState) -> None:
+        """Continue from a state that ``state`` returned.
+
+        Raises:
+            ValueError: the state is damaged.
+        """
+        self.delay.restore(DelayState.of_numbers(state.delay))
+        self.sides = ComparedSides.of_numbers(state.sides)

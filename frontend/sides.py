@@ -8,7 +8,7 @@ quantiles of all grey values.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import log2
 from typing import Literal
 
@@ -43,6 +43,44 @@ class Sides:
 
     darker_stops: float = 0.0
     black: Literal["", "left", "right"] = ""
+
+
+@dataclass
+class ComparedSides:
+    """What the comparisons of a drive showed.
+
+    Attributes:
+        n: number of comparisons.
+        n_black_left, n_black_right: in how many of them one side was black.
+        darker_stops: ``Sides.darker_stops`` where it was not 0.
+    """
+
+    n: int = 0
+    n_black_left: int = 0
+    n_black_right: int = 0
+    darker_stops: list[float] = field(default_factory=list)
+
+    def add(self, sides: Sides) -> None:
+        """Add a comparison."""
+        self.n += 1
+        self.n_black_left += sides.black == "left"
+        self.n_black_right += sides.black == "right"
+        if sides.darker_stops:
+            self.darker_stops.append(sides.darker_stops)
+
+    def numbers(self) -> tuple[float, ...]:
+        """The state as stored in a map file; ``of_numbers`` is the inverse."""
+        return (self.n, self.n_black_left, self.n_black_right, *self.darker_stops)
+
+    @classmethod
+    def of_numbers(cls, numbers: tuple[float, ...]) -> ComparedSides:
+        """The state that ``numbers`` returned.
+
+        Raises:
+            ValueError: ``numbers`` is too short.
+        """
+        n, left, right, *darker = numbers
+        return cls(int(n), int(left), int(right), darker)
 
 
 def compare_sides(left: Grey, right: Grey, config: StereoConfig) -> Sides:

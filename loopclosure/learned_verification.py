@@ -250,7 +250,8 @@ def nearest_features(
     scales: NDArray[np.float64],
     config: LearnedMatchingConfig,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Match pixels to the nearest features within ``config.fuse_pixels`` of their octave.
+    """Match pixels to the nearest features within ``config.fuse_pixels``, measured in pixels of the
+    feature's octave.
 
     Args:
         uv: ``(N, 2)`` pixels.

@@ -134,7 +134,10 @@ def create_detector(
     others = plugins.find_plugins(plugins.DETECTORS)
     if name in others:
         return open_plugin(others[name], config, weights)
-    raise ValueError(f"no loop detector {name!r}")
+    known = (*DETECTORS, *others)
+    raise ValueError(
+        f"no loop detector {name!r}{did_you_mean(name, known)}; choose one of {', '.join(known)}"
+    )
 
 
 def create_images(name: str, config: Config, weights: Path | None = None) -> KeyframeImages | None:

@@ -100,7 +100,7 @@ POINTS = (
     Point("global adjustment, merge", "vslam.closing.merge_solution", 1, MAPLESS),
     Point("image source", "faults.next_image", 200, EARLY),
     Point("image reader", "faults.read_image", 200, EARLY),
-    Point("features thread", "vslam.frontend.extraction.extract_features", 200, EARLY),
+    Point("features thread", "vslam.frontend.extraction.find_corners", 200, EARLY),
     Point("camera thread", "vslam.run.realtime._Mailbox.put", 8, EARLY, options=REALTIME),
     Point("handing thread", "vslam.run.realtime._Mailbox.take", 8, EARLY, options=REALTIME),
     Point("progress of a frame", "faults.on_frame", 200, EARLY),
@@ -234,7 +234,11 @@ def stage(*, learned: bool) -> None:
     from vslam.loopclosure.registry import create_images
     from vslam.run import pipeline
 
-    def see(left: np.ndarray, *_: object) -> Extracted:
+    def find(left: np.ndarray, *_: object) -> extraction.Corners:
+        return extraction.Corners(left)
+
+    def see(corners: extraction.Corners, *_: object) -> Extracted:
+        left = corners.found
         return Extracted(view(int(left[0, 0]) | int(left[0, 1]) << 8))
 
     def detector(*_: object, **__: object) -> tuple[Oracle, object]:
@@ -254,7 +258,7 @@ def stage(*, learned: bool) -> None:
     def progress_bar(total: object) -> Iterator[Callable[[object], None]]:
         yield lambda result: on_frame()
 
-    extraction.extract_features = see
+    extraction.find_corners, extraction.matched = find, see
     pipeline.detector_with_images = detector
     Source.frames = frames
     quiet.progress_bar = progress_bar

@@ -23,7 +23,6 @@ from vslam.datasets.perturbation import parse_perturbation
 from vslam.errors import InputError
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.features import TrackingState, TrackResult
-from vslam.frontend.sides import Sides
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.maps.storage import load_checkpoint, load_map
 from vslam.report.folder import write_results
@@ -179,7 +178,7 @@ def test_other_images_do_not_resume_a_run(kitti_tree, tmp_path, moved_s, frames,
     times = open_sequence("kitti", kitti_tree, "00").timestamps[:frames].copy()
     times[7] += moved_s
     unfinished = find_unfinished(tmp_path)
-    with pytest.raises(InputError, match=rf"frame {named} had the time .* put those back"):
+    with pytest.raises(InputError, match=rf"frame {named} had the time .* restore them"):
         drive(kitti_tree, tmp_path, unfinished, change=lambda source: with_times(source, times))
     assert len(find_unfinished(tmp_path).progress.tracks) == 13
 
@@ -279,9 +278,8 @@ def some_progress() -> Progress:
         TrackResult(3, 1.8, T, TrackingState.DROPPED, 0, 0, 0, 0, False),
     ]
     log = TrackLog(TrackTable())
-    sides = [Sides(), Sides(1.25), Sides(black="right"), Sides()]
-    for track, compared in zip(tracks, sides, strict=True):
-        log.append(track, compared)
+    for track in tracks:
+        log.append(track)
     early = LoopEdge(1, 0, 0.5, True, "closed", 40, 30, T)
     late = LoopEdge(2, -1, 0.25, False, "too few matches")
     correction = LoopCorrection(early, np.array([0, 1]), np.stack([T, T]), np.stack([T, T]), 0.125)
@@ -299,7 +297,6 @@ def test_progress_is_read_as_it_was_written(tmp_path):
         assert replace(was, T_wc=now.T_wc) == now
     assert [track.stage_ms for track in tracks] == [{"extract": 2.5}, {"relocalise": 1.25}, {}, {}]
     assert [track.state for track in tracks] == ["OK", "LOST", "OK", "DROPPED"]
-    assert read.tracks.sides() == [Sides(), Sides(1.25), Sides(black="right")]
     assert (read.skipped, read.latency_ms) == (progress.skipped, progress.latency_ms)
     assert (read.wall_s, read.cpu_s) == (60.5, 42.25)
     assert [vars(loop).keys() for loop in read.loops]

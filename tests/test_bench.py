@@ -263,7 +263,7 @@ def test_table_counts_cells(stub: Path, tmp_path: Path):
         "1 failed",
         "0 of 2",
         "finished runs",
-        "1 of 12 cells finished, 1 failed, about",
+        "1 of 12 runs finished, 1 failed, about",
         "left",
     ):
         assert part in text
@@ -284,8 +284,8 @@ def test_the_table_stays_only_if_cells_are_missing_or_failed(
                 progress.add(outcome)
         text = capsys.readouterr().err
         assert ("a line for logs" in text) is not color
-        last = text.rpartition("1 of 2 cells" if stays else "1 of 1 cells")[2]
-        assert (f"1 of {len(cells)} cells finished" in text) is (stays or color)
+        last = text.rpartition("1 of 2 runs" if stays else "1 of 1 run")[2]
+        assert (f"of {len(cells)} run{'s' * stays} finished" in text) is (stays or color)
         assert ("\x1b[2K" in last) is (color and not stays)  # erased again
 
 
@@ -317,8 +317,8 @@ def bench(stub: Path, kitti_tree: Path, tmp_path: Path, monkeypatch, capsys):
 def test_bench_runs_the_grid_and_writes_the_report(bench, stub: Path):
     code, out, err = bench("--jobs", 2)
     assert code == 0, err
-    assert "6 cells, 6 to do: about" in err
-    assert "6 of 6 cells finished, 0 failed" in out
+    assert "6 runs, 6 to do: about" in err
+    assert "6 of 6 runs finished, 0 failed" in out
     assert {p.name for p in Path("bench").iterdir() if p.is_file()} == {
         "data.txt",
         "report.html",
@@ -336,7 +336,7 @@ def test_bench_shows_the_detectors_beside_the_first_one(bench):
     code, out, err = bench("--detectors", "bow,none,both")
     assert code == 0, err
     first, second = out.index("none against bow"), out.index("both against bow")
-    assert first < second < out.index("9 of 9 cells finished")
+    assert first < second < out.index("9 of 9 runs finished")
     assert "Side by side: bow / none / both" in out
     rows = [line.split() for line in out.splitlines() if line.startswith("00 ")]
     assert [row[:2] for row in rows] == [["00", "none"], ["00", "brightness:1"]] * 2
@@ -370,7 +370,7 @@ def test_bench_counts_failures_and_ends_with_1(bench, stub: Path):
     code, out, err = bench()
     assert code == 1
     assert "failed: kitti-00-brightness1-bow-seed1: images of the moon" in err
-    assert "5 of 6 cells finished, 1 failed; repeat the command to continue" in out
+    assert "5 of 6 runs finished, 1 failed; repeat the command to continue" in out
     (stub / "fail-00-brightness:1-bow-1").unlink()
     assert bench()[0] == 0
     assert len(started(stub)) == 7
@@ -388,7 +388,7 @@ def test_bench_loses_nothing_to_an_interrupt(bench, stub: Path, monkeypatch):
     monkeypatch.setattr(table.GridProgress, "add", interrupted)
     code, out, _ = bench()
     assert code == 1
-    assert "stopped: 2 of 6 cells finished" in out
+    assert "stopped: 2 of 6 runs finished" in out
     kept = {path.name for path in Path("bench").glob("kitti-*")}
     assert len(kept) >= 3  # the one at hand, too
     monkeypatch.setattr(table.GridProgress, "add", add)
@@ -440,7 +440,7 @@ def test_a_real_grid_killed_and_resumed(kitti_tree: Path, tmp_path: Path):
 
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "2 cells, 1 to do" in done.stderr
+    assert "2 runs, 1 to do" in done.stderr
     assert (first / "report.json").stat().st_mtime_ns == before
     report = grid.read_report(second)
     assert report is not None
@@ -478,13 +478,13 @@ def test_a_video_is_a_grid_of_one_sequence(corridor, tmp_path: Path, monkeypatch
     monkeypatch.chdir(tmp_path)
     first = CliRunner().invoke(app, words)
     assert first.exit_code == 0, first.output
-    assert "1 of 1 cells finished" in first.output
+    assert "1 of 1 run finished" in first.output
     (report,) = (tmp_path / "grid").glob("*/report.json")
     found = json.loads(report.read_text())
     assert (found["dataset"], found["sequence"], found["frames"]) == ("video", "drive", 5)
     assert found["calib"] == [str(calib)]
     again = CliRunner().invoke(app, words)
-    assert "1 cells, 0 to do" in again.output
+    assert "1 run, 0 to do" in again.output
     other = CliRunner().invoke(app, [*words, "--fps", "20"])
     assert f"holds runs on {video} --side-by-side {calib}, not on {video}" in str(other.exception)
 

@@ -17,6 +17,7 @@ from typing import Any, get_args
 import cv2
 import numpy as np
 import pytest
+from test_report import make_outcome
 
 from vslam import machine
 from vslam.cli import main as cli
@@ -26,6 +27,7 @@ from vslam.loopclosure.registry import DETECTORS
 from vslam.loopclosure.siamese.weights import NETWORKS
 from vslam.loops import LoopEdge
 from vslam.report import figures
+from vslam.report.folder import write_results
 from vslam.run import pipeline as run_pipeline
 from vslam.run import recorder, warmup
 from vslam.run.moments import MomentRecorder
@@ -462,7 +464,7 @@ def test_compare_prints_a_row_for_each_detector(call, root, with_detector):
     code, out, err = call(*words, "--compare", "both, none,none")
     assert code == 0, err
     assert with_detector.settings.compare == ("both", "none")
-    assert re.search("5.0 fps .* all 3 detectors together", out)
+    assert re.search("5.0 fps .* 3 detectors together", out)
     head, *rows = detectors_in(out)
     assert head == [
         "detector", "lost", "ATE", "causal ATE", "RPE", "loops found", "missed", "wrong", "time",
@@ -589,9 +591,38 @@ def test_eval_of_two_formats_names_no_evo_command(call, tmp_path):
     assert "evo_ape" not in out  # evo compares files of one format only
 
 
+@pytest.mark.parametrize("sensor", ["stereo", "mono"])
+def test_eval_of_a_run(call, tmp_path, sensor):
+    scale = 1.0 if sensor == "stereo" else 3.0
+    outcome = make_outcome(60)
+    settings = replace(outcome.settings, sensor=sensor)
+    T_wc = outcome.trajectory.T_wc.copy()
+    T_wc[:, :3, 3] *= scale
+    outcome = replace(outcome, settings=settings, trajectory=replace(outcome.trajectory, T_wc=T_wc))
+    run = tmp_path / "run"
+    run.mkdir()
+    report = write_results(run, outcome, pages=False)
+    truth = Trajectory(outcome.sequence.timestamps, outcome.sequence.ground_truth)
+    write_tum(tmp_path / "gt.tum", truth)
+    np.savetxt(tmp_path / "times.txt", truth.timestamps)
+    for words in (
+        (),
+        ("--gt", "gt.tum"),
+        ("--gt", run / "ground_truth_kitti.txt"),
+        ("--gt", run / "ground_truth_kitti.txt", "--times", "times.txt"),
+    ):
+        code, out, err = call("eval", run, *words, "--json")
+        assert code == 0, err
+        assert json.loads(out)["ate_rmse_m"] == pytest.approx(report.ate_rmse_m, rel=1e-6)
+    (run / "ground_truth_kitti.txt").unlink()
+    refused(call("eval", run), "no ground truth", "--gt")
+
+
 def test_eval_refusals(call, tmp_path):
     write_kitti(tmp_path / "gt.txt", circle(50))
     refused(call("eval", "nothing.txt", "--gt", "gt.txt"), "nothing.txt", "cannot read")
+    refused(call("eval", "drive.mp4"), "drive.mp4", "--gt", "vslam run")
+    refused(call("eval", tmp_path), str(tmp_path), "folder of a run")
 
 
 def test_perturb_writes_a_contact_sheet(call, root):

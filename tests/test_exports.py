@@ -415,7 +415,7 @@ def test_export_colmap_and_nerfstudio(corridor_run, kitti_tree, tmp_path, link):
     out = vslam("export", "nerfstudio", corridor_run, "--out", tmp_path / "n", *options)
     finished = read_run(corridor_run)
     reconstruction = reconstruction_of(finished.map, finished.camera)
-    assert f"{len(reconstruction.xyz)} landmarks" in out
+    assert f"{len(reconstruction.xyz):,} landmarks" in out
     assert np.median(nerfstudio_errors(tmp_path / "n", reconstruction)) < 1.0
     model = read_binary(tmp_path / "c" / "sparse" / "0")
     assert np.median(model.errors()) < 1.0
@@ -461,7 +461,7 @@ def test_map_info(corridor_run, tmp_path):
     reconstruction = reconstruction_of(finished.map, finished.camera)
     assert f"keyframes {len(reconstruction.frames)}, frames 0 to " in out
     assert f"\nlandmarks {len(reconstruction.xyz)}\n" in out
-    assert f"observations {len(reconstruction.xy)} by " in out
+    assert f"observations {len(reconstruction.xy)}, " in out
     assert "sub-maps 1\n" in out
     assert "stereo, 480x160" in out
 

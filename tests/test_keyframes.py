@@ -51,11 +51,11 @@ def test_a_well_tracked_frame_is_no_keyframe():
 
 
 def test_a_frame_without_features_is_judged_by_the_close_points_that_are_left():
-    by_patches = {"untracked_close": None, "first_close": 300}
-    assert not decide(**by_patches)
-    assert decide(**by_patches, tracked_close=int(CONFIG.patch_kept_close * 300) - 1)
-    assert not decide(**by_patches, tracked_close=int(CONFIG.patch_kept_close * 300))
-    assert not decide(first_close=300, tracked_close=101)  # it has features
+    by_patches = {"untracked_close": None, "first_close": 900}
+    assert not decide(**by_patches, tracked_close=800)
+    assert decide(**by_patches, tracked_close=int(CONFIG.patch_kept_close * 900) - 1)
+    assert not decide(**by_patches, tracked_close=int(CONFIG.patch_kept_close * 900))
+    assert not decide(first_close=900, tracked_close=101)  # it has features
 
 
 @pytest.mark.parametrize("idle", [True, False])
@@ -102,8 +102,8 @@ def test_that_close_points_are_few_by_nature_takes_several_keyframes_to_show():
     means = []
     for _ in range(6):
         gain.begin()
-        gain.add(50)
-        gain.add(3)  # later frames do not count
+        gain.add(50, 1)
+        gain.add(3, 2)  # later frames do not count
         means.append(gain.mean)
     np.testing.assert_allclose(means, 50 + 150 * 0.8 ** np.arange(1, 7), rtol=1e-12)
     assert [mean < 100 for mean in means] == [False] * 4 + [True] * 2
@@ -217,6 +217,32 @@ def test_only_the_first_frame_after_a_keyframe_tells_what_keyframes_gain():
     # It counts at once: a fifth of the way from 200 to 10.
     assert observe(one, frame(close=10)).gained_close == pytest.approx(162.0)
     assert observe(one, frame(close=40)).gained_close == pytest.approx(162.0)
+
+
+def test_a_keyframe_is_planned_for_the_frame_that_will_have_lost_too_many_close_points():
+    one = policy()
+    losing = replace(
+        CONTENT, untracked_close=None, first_close=600, tracked_close=400, n_inliers=600
+    )
+    # At 100 a frame, 200 are left after two more frames, 100 after three: 0.3 of 600 are 180.
+    assert not one.is_due(10, replace(losing, lost_close=100.0))
+    assert one.due == -1
+    assert not one.is_due(11, replace(losing, lost_close=100.0, tracked_close=300))
+    assert one.due == 13
+    assert not one.is_due(12, CONTENT)
+    assert one.is_due(13, CONTENT)
+    assert one.due == -1
+    assert one.is_due(14, replace(losing, tracked_close=170))  # there is no time to plan
+
+
+def test_close_points_are_lost_from_the_first_frame_after_a_keyframe_on():
+    one = policy()
+    one.keyframe_made()
+    seen = frame(close=20)
+    observe(one, seen)
+    seen = frame(close=12)
+    seen.index += 4
+    assert observe(one, seen).lost_close == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("awaited", [True, False])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -149,9 +150,10 @@ def test_missing_root_says_where_to_get_the_data(tmp_path):
     )
 
 
-def test_missing_sequence_lists_those_found(root):
-    (root / "sequences/07").mkdir()
-    refused(root, "sequences/03: no such sequence", "00, 07", name="03")
+def test_missing_sequence_lists_those_with_images(root):
+    (root / "sequences/05").mkdir()
+    shutil.copytree(root / "sequences/00", root / "sequences/07")
+    refused(root, "sequences/03: no such sequence; choose one of 00, 07.", name="03")
     refused(root, "no such sequence", name="../sequences/00")
 
 

@@ -50,6 +50,17 @@ def test_a_map_is_saved_into_the_working_folder(tmp_path, monkeypatch):
     assert load_map("map.npz").camera == CAMERA
 
 
+def test_a_map_that_cannot_be_saved_is_named_by_its_own_path(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    slam = Slam(CAMERA, detector="none", threads=1)
+    with pytest.raises(FileNotFoundError, match=r"there is no folder nodir: 'nodir/map\.npz'$"):
+        slam.save("nodir/map.npz")
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(IsADirectoryError, match=r"Is a directory: 'taken'$"):
+        slam.save("taken")
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
 def test_trajectories_are_written_and_read_by_strings(tmp_path):
     kitti, tum, euroc = (str(tmp_path / name) for name in ("kitti.txt", "tum.txt", "euroc.csv"))
     drive = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
@@ -135,6 +146,13 @@ def test_images_in_colour_are_refused_with_the_way_to_grey():
         check_images(colour, colour, CAMERA)
     with pytest.raises(ValueError, match="colour"):
         check_images(colour, None, CAMERA.left_camera())
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.uint16])
+def test_images_of_another_type_are_refused_with_their_conversion(dtype):
+    image = np.zeros((CAMERA.height, CAMERA.width), dtype)
+    with pytest.raises(ValueError, match=r"not of uint8; .*of 0 to 1 with \(255 \* image\)"):
+        check_images(image, None, CAMERA.left_camera())
 
 
 def test_images_that_are_missing_or_too_many_are_named():

@@ -186,13 +186,26 @@ def test_a_resumed_drive_has_all_its_frames(ring, tmp_path):
         second.step_features(NOTHING, 5.0)
 
 
-def test_a_drive_without_a_detector_resumes_where_it_was(ring, tmp_path):
+def test_a_drive_without_a_detector_resumes_where_it_was(ring, tmp_path, caplog):
     first = Slam(CAMERA, CONFIG, threads=1)
     drive(first, ring, range(30), seed=9)
+    first.save(tmp_path / "whole.npz", resumable=True)
+    Slam.load(tmp_path / "whole.npz", threads=1, resume=True)
+    assert not caplog.messages
     first.save(tmp_path / "half.npz")
     second = Slam.load(tmp_path / "half.npz", threads=1, resume=True)
+    assert "poses will differ" in caplog.messages[0]
     assert states(drive(second, ring, range(30, 60), seed=9, start=3.0)) == "O" * 30
     assert off(second, ring, range(60)).max() < 0.3
+
+
+def test_a_part_of_a_map_has_no_drive_to_resume(ring, tmp_path):
+    slam = Slam(CAMERA, CONFIG, threads=1)
+    drive(slam, ring, range(30), seed=9)
+    save_map(tmp_path / "part.npz", slam.stored_map().select(np.arange(2)))
+    with pytest.raises(InputError, match="no drive to continue; load it without resume"):
+        Slam.load(tmp_path / "part.npz", threads=1, resume=True)
+    assert Slam.load(tmp_path / "part.npz", threads=1).map.n_keyframes == 2
 
 
 def test_a_drive_without_a_keyframe_yet_is_resumed(ring, tmp_path):

@@ -9,12 +9,18 @@ import numpy as np
 import pytest
 
 from vslam.config import Config
+from vslam.datasets import open_sequence
+from vslam.datasets.perturbation import Perturbation
+from vslam.errors import UnreadableImageError
 from vslam.features import TrackingState
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.orb import build_pyramid, level_shapes
 from vslam.frontend.pose_alignment import align_pose, coarse_levels, coarse_pyramid, coarse_shapes
 from vslam.frontend.tracking import TrackingContext, feature_depth
 from vslam.geometry import inverse, se3_exp, se3_log, transform
+from vslam.run.outcome import RunSettings
+from vslam.run.pipeline import run_sequence
+from vslam.run.recorder import Recorder
 from vslam.slam import Slam
 
 CONFIG = Config.model_validate({"tracking": {"method": "patches"}})
@@ -30,7 +36,7 @@ def coarse(image):
 def points(corridor):
     """Stereo points of the first frame, in the world."""
     context = TrackingContext.create(corridor.camera, CONFIG)
-    images = FrameImages(corridor.left[FIRST], corridor.right[FIRST], context)
+    images = FrameImages(corridor.left[FIRST], lambda: corridor.right[FIRST], context)
     features = images.extracted.features
     depth = feature_depth(features, corridor.camera)
     near = np.flatnonzero((depth > 0) & (depth < 15.0))
@@ -102,6 +108,65 @@ def test_few_frames_need_features_and_the_pose_is_as_good(corridor):
         for one in (slam, by_features)
     )
     assert error < max(0.03, 1.5 * usual)
+
+
+def run(kitti_tree, threads=1, sequence=None):
+    """A run over the corridor's files by patches; reads of the right image are counted."""
+    sequence = sequence or open_sequence("kitti", kitti_tree, "00")
+    reads = []
+
+    def counted(frame):
+        def right():
+            reads.append(frame.timestamp)
+            return frame.sides[1]()
+
+        return replace(frame, sides=(frame.sides[0], right))
+
+    sequence = replace(sequence, stored=tuple(map(counted, sequence.stored)))
+    settings = RunSettings("kitti", "00", "none", "none", "stereo", 0, threads, 0, 1, None, CONFIG)
+    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
+    return outcome, reads
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_right_image_is_read_for_keyframes_alone(corridor, kitti_tree, threads):
+    outcome, reads = run(kitti_tree, threads)
+    assert not any(track.state == TrackingState.LOST for track in outcome.tracks)
+    n_keyframes = sum(track.is_keyframe for track in outcome.tracks)
+    assert n_keyframes <= len(reads) < len(corridor) / 2
+    assert len(set(reads)) == len(reads)
+
+
+def test_a_right_image_that_cannot_be_read_costs_its_columns_alone(corridor, kitti_tree):
+    sequence = open_sequence("kitti", kitti_tree, "00")
+
+    def damaged():
+        raise UnreadableImageError("right.png", "cannot be decoded; download the file again.")
+
+    broken = [
+        frame if k < 6 else replace(frame, sides=(frame.sides[0], damaged))
+        for k, frame in enumerate(sequence.stored)
+    ]
+    sequence = replace(sequence, stored=tuple(broken))
+    outcome, reads = run(kitti_tree, sequence=sequence)
+    assert len(outcome.tracks) == len(corridor)
+    assert not any(track.state == TrackingState.LOST for track in outcome.tracks[:8])
+    tried = len([t for t in reads if t >= sequence.timestamps[6]])
+    told = [warning for warning in outcome.warnings if "right.png" in warning]
+    assert len(told) == tried > 0
+    assert "has only its left image: right.png: cannot be decoded" in told[0]
+
+
+def test_what_the_sides_show_is_told_of_the_frames_that_were_compared(corridor):
+    black = [np.zeros_like(image) for image in corridor.right]
+    slam = Slam(corridor.camera, CONFIG, "none", threads=1)
+    for k, left in enumerate(corridor.left):
+        slam.step(left, corridor.right[k] if k < 8 else black[k], corridor.timestamps[k])
+    assert slam.rig.sides.n_black_right > 0
+    assert slam.rig.sides.n < len(corridor)
+    state = slam.rig.state()
+    slam.rig.restore(state)
+    assert slam.rig.state() == state
 
 
 def test_a_frame_that_shows_something_else_is_lost_and_the_next_is_not(corridor):

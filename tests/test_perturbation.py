@@ -128,6 +128,28 @@ def test_dropped_frames_do_not_change_the_light(name):
         )
 
 
+@pytest.mark.parametrize(("spec", "apart"), [
+    ("none", True),
+    ("brightness,noise:2", True),
+    ("brightness,stereo_gain:1", False),
+])  # fmt: skip
+def test_a_side_alone_is_perturbed_as_in_the_pair(spec, apart):
+    pair = TEXTURE, RAMP
+    frames = [
+        TimedFrame(t, lambda image_map: pair, (lambda: TEXTURE, lambda: RAMP)) for t in TIMES[:3]
+    ]
+    last = list(perturbed(iter(frames), parse_perturbation(spec, 4)))[-1]
+    assert (last.sides is not None) == apart
+    if last.sides is not None:
+        for alone, together in zip(last.sides, last.read(map), strict=True):
+            np.testing.assert_array_equal(alone(), together)
+
+
+def test_a_side_is_not_offered_alone_where_the_source_reads_both():
+    frames = [TimedFrame(0.0, lambda image_map: (TEXTURE, RAMP))]
+    assert next(perturbed(iter(frames), parse_perturbation("brightness", 4))).sides is None
+
+
 def test_time_of_day_does_not_matter():
     def seen(times):
         frames = [TimedFrame(t, lambda image_map: (TEXTURE, RAMP)) for t in times.tolist()]

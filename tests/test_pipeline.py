@@ -229,6 +229,8 @@ def test_run_without_pages_is_enough_for_a_report_later(kitti_tree, tmp_path):
         "report.json", "run.json", "trajectory.tum", "trajectory_causal.tum",
         "trajectory_kitti.txt", "trajectory_online.tum",
     }  # fmt: skip
+    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    assert [path.name for path in folder.iterdir() if f"`{path.name}`" not in readme] == []
     with (folder / "frames.csv").open(newline="") as file:
         frames = list(csv.DictReader(file))
     assert [int(frame["frame"]) for frame in frames] == list(range(28))
@@ -238,7 +240,7 @@ def test_run_without_pages_is_enough_for_a_report_later(kitti_tree, tmp_path):
     assert "report.html" not in done.stdout
     later = vslam("report", folder, "--out", "later", cwd=tmp_path)
     assert later.returncode == 0, later.stderr
-    assert "1 runs" in later.stdout
+    assert "1 run" in later.stdout
     assert (tmp_path / "later" / "report.html").exists()
 
 

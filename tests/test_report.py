@@ -437,7 +437,7 @@ def test_rejected_loops_do_not_drown_the_table(looped: tuple[RunOutcome, Path]) 
     assert [cell.strip() for cell in reasons[0].rsplit("|", 4)[1:4]] == ["299", "13", "n/a"]
     assert [cell.strip() for cell in reasons[1].rsplit("|", 4)[1:4]] == ["1", "84", "1 of 1"]
     assert text.count("needed") <= 14
-    assert "1 of 1 revisits found, 0 missed, 1 wrong, 300 candidates rejected" in text
+    assert "1 of 1 revisit found, 0 missed, 1 wrong, 300 candidates rejected" in text
 
 
 @pytest.mark.slow
@@ -579,6 +579,42 @@ def test_before_is_drawn_in_the_frame_of_the_ground_truth() -> None:
         (before,) = (line for line in axes.lines if line.get_label() == "before")
         expected = scale * truth.T_wc[outcome.keyframe_frames[turned.keyframes]][:, [0, 2], 3]
         np.testing.assert_allclose(before.get_xydata(), expected, atol=1e-6)
+
+
+def monocular(outcome: RunOutcome) -> RunOutcome:
+    settings = replace(outcome.settings, sensor="mono")
+    tracks = [replace(track, n_stereo=0) for track in outcome.tracks]
+    return replace(outcome, settings=settings, tracks=tracks)
+
+
+@pytest.mark.parametrize("make", [make_outcome, two_laps])
+def test_a_monocular_report_speaks_of_no_stereo_and_no_metres(make, tmp_path: Path) -> None:
+    outcome = monocular(make())
+    without_truth = replace(outcome.sequence, ground_truth=None)
+    report_of(replace(outcome, sequence=without_truth, compared=()), tmp_path)
+    text = (tmp_path / "report.md").read_text()
+    assert "stereo" not in text.lower().replace("| stereo ", "")  # a stage of the made-up run
+    assert "in the unit of the map" in text or "Moved" not in text
+    assert not re.search(r"\d\.\d\d m\b", text)
+    assert top_view(outcome, None, None, None).axes[0].get_xlabel() == "x (map units)"
+
+
+def test_frames_lost_before_the_map_began_are_explained(tmp_path: Path) -> None:
+    outcome = monocular(make_outcome(40, lost=slice(0, 3)))
+    dropped = replace(outcome.tracks[1], state=TrackingState.DROPPED)
+    late = replace(outcome.tracks[20], state=TrackingState.LOST)
+    tracks = [outcome.tracks[0], dropped, *outcome.tracks[2:20], late, *outcome.tracks[21:]]
+    outcome = replace(outcome, tracks=tracks)
+    report = report_of(outcome, tmp_path)
+    assert (report.lost_frames, report.lost_before_map) == (3, 2)
+    assert headlines(report)[0].note.startswith(
+        "7.5 % of 40, 2 of them before the map began: a monocular map needs the camera to move "
+        "sideways first; "
+    )
+    stereo = headlines(report.model_copy(update={"sensor": "stereo"}))[0].note
+    assert "2 of them before the map began; " in stereo
+    continued = replace(outcome, settings=replace(outcome.settings, map=tmp_path / "map.npz"))
+    assert report_of(continued, tmp_path).lost_before_map == 0
 
 
 def test_without_ground_truth(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from vslam.camera import Camera
 from vslam.config import Config
 from vslam.frontend.extraction import extract_features
-from vslam.frontend.sides import Sides, balanced, compare_sides
+from vslam.frontend.sides import ComparedSides, Sides, balanced, compare_sides
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_exp
 from vslam.run.rig import RigResiduals, measure_rig, residual_warnings, rig_warnings
@@ -170,16 +170,23 @@ def test_drives_have_clocks_of_their_own():
     assert both.delay_s == pytest.approx(alone.delay_s, rel=0.1)
 
 
+def warned(each: list[Sides]) -> list[str]:
+    sides = ComparedSides()
+    for one in each:
+        sides.add(one)
+    return rig_warnings(ComparedSides.of_numbers(sides.numbers()))
+
+
 def test_warnings_say_what_was_seen_and_done():
     dark, black, fine = Sides(darker_stops=-1.5), Sides(black="right"), Sides()
-    assert rig_warnings([fine] * 100) == []
-    assert rig_warnings([fine] * 100 + [dark, black, black]) == []
-    (said,) = rig_warnings([dark] * 7 + [fine] * 3)
+    assert warned([fine] * 100) == []
+    assert warned([fine] * 100 + [dark, black, black]) == []
+    (said,) = warned([dark] * 7 + [fine] * 3)
     assert "left side was 1.5 stops darker than the right one in 7 of 10 frames" in said
-    (said,) = rig_warnings([black] * 4 + [fine] * 6)
+    (said,) = warned([black] * 4 + [fine] * 6)
     assert "right side was black in 4 of 10 frames" in said
     assert "left side alone" in said
-    (said,) = rig_warnings([Sides(black="left")] * 4)
+    (said,) = warned([Sides(black="left")] * 4)
     assert "right side alone" in said
 
 

@@ -507,7 +507,7 @@ def test_the_capsule_network_beside_the_bag_of_words_is_the_default(corridor):
     assert Slam(corridor.camera.left_camera()).detector.name == "both"
     assert Slam(corridor.camera, detector="bow").detector.name == "bow"
     assert Slam(corridor.camera, detector="none").detector.name == "none"
-    with pytest.raises(ValueError, match="no loop detector 'bwo'"):
+    with pytest.raises(ValueError, match=r"'bwo' \(did you mean bow\?\); choose one of none, bow"):
         Slam(corridor.camera, detector="bwo")
 
 

@@ -219,4 +219,10 @@ def check_images(left: Image, second: Image | DepthImage | None, camera: Camera)
     if any(image.dtype != dtype for image, dtype in zip(images, wanted, strict=False)):
         types = " and ".join(str(image.dtype) for image in images)
         expected_types = "uint8 and float32" if camera.depth else "uint8"
-        raise ValueError(f"images are of {types}, not of {expected_types}")
+        how = (
+            "convert a depth in millimetres with (depth / 1000).astype(np.float32)"
+            if camera.depth and left.dtype == np.uint8
+            else "convert grey values of 0 to 255 with image.astype(np.uint8), or those of 0 to 1 "
+            "with (255 * image).astype(np.uint8)"
+        )
+        raise ValueError(f"images are of {types}, not of {expected_types}; {how}")

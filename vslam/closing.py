@@ -79,7 +79,7 @@ class LoopClosing:
     def process(
         self, map_: Map, keyframe: int, features: Features, image: NDArray[np.uint8] | None
     ) -> None:
-        """Look for loops at a keyframe whose local mapping is done; close the first real one."""
+        """Look for loops at a keyframe after its local mapping; close the first verified one."""
         if self._is_due(keyframe):
             self.finish(map_)
         found = None

@@ -48,6 +48,11 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     return f" (did you mean {near[0]}?)" if near else ""
 
 
+def counted(number: int, noun: str) -> str:
+    """A number with its noun in the singular or plural, such as ``1 run`` or ``1,200 runs``."""
+    return f"{number:,} {noun}{'s' * (number != 1)}"
+
+
 def plain_reason(message: str) -> str:
     """What is wrong with a value, in our words instead of those of the library that checked it."""
     message = message.removeprefix("Value error, ").partition(", unable to parse")[0]

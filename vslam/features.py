@@ -220,7 +220,8 @@ def build_grid(xy, columns, rows):
 class TrackingState(StrEnum):
     """How a frame was tracked.
 
-    OK: with enough inliers. WEAK: the pose rests on few inliers. LOST: the pose is only predicted.
+    OK: with enough inliers. WEAK: the pose rests on few inliers. LOST: the pose is only predicted,
+    or no map has begun yet.
     DROPPED: the images arrived while earlier ones were being processed (``--realtime``); the pose
     is interpolated.
     """

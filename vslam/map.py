@@ -87,13 +87,13 @@ class KeyframeTable(NamedTuple):
     ``timestamp`` (K,) f8 seconds; ``frame`` (K,) i8 index of the frame that became the keyframe;
     ``parent`` (K,) i8 its parent in the spanning tree, or -1;
     ``session`` (K,) i8 the drive, counted from 0, that its timestamp and frame index belong to;
-    ``unit_scale`` (K,) f8 length in the map's present units, around the keyframe, of what was one
-    unit long when it was added: 1 in metric maps; loops of monocular maps change it;
+    ``unit_scale`` (K,) f8 present length, near the keyframe, of what was one unit long when the
+    keyframe was added: always 1 in metric maps, changed by the loops of monocular maps;
     ``T_c_parent`` (K, 4, 4) f8 the pose of a culled keyframe relative to its parent, identity while
     the keyframe is alive;
     ``restart`` (K,) u1 whether mapping restarted at this keyframe after the camera was lost, which
     makes it the root of a sub-map: 0 if not; ``PREDICTED`` if its pose relative to its parent is a
-    prediction; ``UNPREDICTED`` if it is not even that, because the speed of the camera was unknown.
+    prediction; ``UNPREDICTED`` if nothing was predicted because the camera's speed was unknown.
     """
 
     timestamp: NDArray[np.float64] = np.zeros(0)

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from vslam.frontend.frame import PlacedFrame
-from vslam.frontend.keyframes import KeyframePolicy, PlaceEvidence
+from vslam.frontend.keyframes import KeyframeEvidence, KeyframePolicy, PlaceEvidence
 from vslam.frontend.tracker import Found, Tracker
 from vslam.frontend.tracking import TrackingContext
 from vslam.mapping import Mapper
@@ -20,9 +20,13 @@ class Mode(Protocol):
 
     Attributes:
         changes_map: whether a drive in this mode changes the map.
+        due: index of the frame that is to become a keyframe; -1 if none is planned.
     """
 
     changes_map: bool
+
+    @property
+    def due(self) -> int: ...
 
     def begin(self, frame: PlacedFrame) -> bool:
         """Try to begin a map or sub-map with a frame that has a pose but was not tracked; returns
@@ -56,6 +60,7 @@ class Localising:
     """Leaves the map as it is."""
 
     changes_map = False
+    due = -1
 
     def __init__(self, mapper: Mapper) -> None:
         self._mapper = mapper
@@ -98,6 +103,10 @@ class MapBuilding:
         self._mapper = mapper
         self._tracker = tracker
 
+    @property
+    def due(self) -> int:
+        return self.policy.due
+
     def begin(self, frame: PlacedFrame) -> bool:
         start = self.starter.offer(frame)
         if start is None:
@@ -137,7 +146,7 @@ class MapBuilding:
             seconds_since_keyframe=frame.timestamp - self._mapper.last_timestamp,
             mapping_idle=self._mapper.is_merged,
         )
-        if not self.policy.wants_keyframe(evidence):
+        if not self._is_keyframe(frame, evidence):
             return False
         place = self._mapper.find_old_place(frame)
         if place is not None:
@@ -151,6 +160,11 @@ class MapBuilding:
         self.policy.keyframe_made()
         return True
 
+    def _is_keyframe(self, frame: PlacedFrame, evidence: KeyframeEvidence) -> bool:
+        if frame.source is None:
+            return self.policy.wants_keyframe(evidence)
+        return self.policy.is_due(frame.index, evidence)
+
     def _match_features(self, frame: PlacedFrame) -> bool:
         """Give a frame that was tracked by patches the features that a keyframe needs. Returns
         False, and leaves the frame as it is, if they do not match the map."""
@@ -158,7 +172,7 @@ class MapBuilding:
             return True
         before = frame.snapshot()
         self._mapper.rig.extract(frame, frame.twist)
-        if self._tracker.match_features(frame, self._mapper.view):
+        if frame.can_become_keyframe and self._tracker.match_features(frame, self._mapper.view):
             return True
         frame.restore(before)
         return False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,6 @@ from vslam.camera import same_camera
 from vslam.closing import LoopClosing
 from vslam.frame_poses import FrameTable
 from vslam.frontend.rig import RigCalibration
-from vslam.frontend.side_delay import DelayState
 from vslam.frontend.tracker import Tracker
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, orthonormalised, se3_log
@@ -19,6 +19,8 @@ from vslam.mapping import Mapper
 from vslam.maps.stored_map import StoredMap, World
 from vslam.modes import Mode
 from vslam.states import Checkpoint
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,7 @@ class Session:
             self.mapper.state(),
             policy,
             self.closing.state(),
-            self.rig.state().numbers(),
+            self.rig.state(),
         )
 
     def restore(self, state: Checkpoint) -> None:
@@ -136,7 +138,7 @@ class Session:
         self.mapper.restore(state.mapper)
         self.mode.restore(state.policy)
         self.closing.restore(state.closing)
-        self.rig.restore(DelayState.of_numbers(state.rig))
+        self.rig.restore(state.rig)
         landmark = state.tracker.landmark
         xyz = np.full((len(landmark), 3), np.nan)
         xyz[landmark >= 0] = self.mapper.map.arrays.xyz[landmark[landmark >= 0]]
@@ -156,7 +158,13 @@ class Session:
             self.tracker.resume()
         if self.opened.checkpoint is not None:
             self.restore(self.opened.checkpoint)
-        elif len(frames.tracked) > 1 and frames.tracked[-2:].all():
+            return
+        if self.mapper.n_keyframes:
+            _log.warning(
+                "the map was saved without the state of tracking (resumable=True): the drive "
+                "continues, but its poses will differ from those of an uninterrupted one"
+            )
+        if len(frames.tracked) > 1 and frames.tracked[-2:].all():
             self.mapper.refer_to(int(frames.reference[-1]))
             poses = self.mapper.frames
             step = se3_log(orthonormalised(poses.pose(-1) @ inverse(poses.pose(-2))))

@@ -86,7 +86,8 @@ class Slam:
                 changed in place. ``Slam.load`` reads one from a file.
             localize: only track in that map, without changing it.
             resume: continue the map's last drive; otherwise a new drive begins, whose timestamps
-                are independent of those before.
+                are independent of those before. The poses equal those of an uninterrupted drive
+                only if the map was saved with ``resumable=True``.
 
         Raises:
             ValueError: the map cannot be continued; the message gives the reason in a few words.
@@ -130,10 +131,12 @@ class Slam:
             options: ``threads``, ``images`` and ``localize``, as for a new map.
 
         Raises:
-            InputError: the file is not a map or is damaged, or the map was made with another
-                detector or pyramid.
+            InputError: the file is not a map or is damaged, the map was made with another detector
+                or pyramid, or it has no drive to resume.
         """
         stored = load_checkpoint(path) if resume else load_map(path)
+        if resume and stored.frames is None:
+            raise InputError(f"{path}: the map has no drive to continue; load it without resume.")
         detector = stored.detector.name if detector is None else detector
         try:
             return cls(stored.camera, config, detector, start=stored, resume=resume, **options)
@@ -185,7 +188,8 @@ class Slam:
             RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
         """
         check_images(left, second, self.context.camera)
-        return self.step_images(FrameImages(np.array(left), second, self.context), timestamp)
+        images = FrameImages(np.array(left), lambda: second, self.context)
+        return self.step_images(images, timestamp)
 
     def step_images(
         self, images: FrameImages, timestamp: float, stage_ms: dict[str, float] | None = None
@@ -253,8 +257,8 @@ class Slam:
         else:
             tracker.accept(frame, found, mapper.frames)
             placed = mapper.append_pose(frame, tracked=True, near=found.keyframe)
-            self.rig.observe(frame, frame.twist)
             is_keyframe = self._mode.update_map(placed, found)
+            self.rig.observe(frame, frame.twist)
         clock.lap("keyframe")
         return result_of(frame, found, is_keyframe, clock.ms)
 
@@ -301,6 +305,12 @@ class Slam:
         return self._session.opened.world
 
     @property
+    def next_keyframe(self) -> int:
+        """Index of the frame that is to become a keyframe; -1 if none is planned. Its
+        ``FrameImages.find_corners`` may be called ahead, in another thread."""
+        return self._mode.due
+
+    @property
     def is_mapping(self) -> bool:
         """Whether a keyframe is being mapped."""
         return self._mapper.is_mapping
@@ -317,9 +327,9 @@ class Slam:
 
     @property
     def problems(self) -> list[str]:
-        """What failed so far without harm to the map, a sentence each: looking for loops, or a
-        global bundle adjustment."""
-        return self._closing.problems
+        """One sentence for each failure that did not harm the map: a search for loops or a global
+        bundle adjustment that failed, or a right image that could not be read."""
+        return [*self._closing.problems, *self.rig.problems]
 
     @property
     def corrections(self) -> list[LoopCorrection]:

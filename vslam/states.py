@@ -68,11 +68,15 @@ class PolicyState:
         gained_close: mean number of close points that the first frame after a keyframe tracks.
         gain_awaited: whether the next frame is the first after a keyframe.
         first_close: how many close points the first frame after the last keyframe tracked.
+        first_frame: index of that frame; -1 before the first keyframe.
+        due: index of the frame that is to become a keyframe; -1 if none is planned.
     """
 
     gained_close: float
     gain_awaited: bool
     first_close: int = 0
+    first_frame: int = -1
+    due: int = -1
 
 
 @dataclass(frozen=True)
@@ -118,15 +122,24 @@ class ClosingState:
 
 
 @dataclass(frozen=True)
-class Checkpoint:
-    """The states of all parts.
+class RigState:
+    """What was measured of a stereo rig.
 
     Attributes:
-        rig: the estimate of the delay between the two cameras (``SideDelay``).
+        delay: the estimate of the delay between the two cameras (``DelayState``).
+        sides: what the comparisons of the two images showed (``ComparedSides``).
     """
+
+    delay: tuple[float, ...] = ()
+    sides: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """The states of all parts."""
 
     tracker: TrackerState
     mapper: MapperState
     policy: PolicyState
     closing: ClosingState
-    rig: tuple[float, ...] = ()
+    rig: RigState = field(default_factory=RigState)

@@ -107,7 +107,7 @@ class CapsuleShape(BaseModel):
 
     @property
     def layout(self) -> Layout:
-        """How it reads images."""
+        """The input size and the views that the branch cuts from an image."""
         return Layout(self.input, self.views, self.view_width, self.half_angle, self.middle)
 
     @property

@@ -26,7 +26,7 @@ from vslam.cli.options import (
     sequences,
 )
 from vslam.cli.report import write_overview_of
-from vslam.errors import InputError
+from vslam.errors import InputError, counted
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -113,8 +113,8 @@ def bench(
     needed = estimate(missing, progress.reports, frames, jobs)
     check_disk(needed, out)
     console(shown=not quiet).announce(
-        f"{len(cells)} cells, {len(missing)} to do: about {duration(needed.seconds)} with "
-        f"{jobs} at a time ({needed.basis}), {size(needed.kept)} in {out} and "
+        f"{counted(len(cells), 'run')}, {len(missing)} to do: about {duration(needed.seconds)} "
+        f"with {jobs} at a time ({needed.basis}), {size(needed.kept)} in {out} and "
         f"{size(needed.scratch)} while it runs"
     )
     stopped = False
@@ -136,7 +136,8 @@ def bench(
         baseline = next(name for name in chosen if name in done)
         write_overview_of([out], [], out, baseline=baseline, quiet=quiet)
     counts = (
-        f"{len(progress.reports)} of {len(cells)} cells finished, {len(progress.failed)} failed"
+        f"{len(progress.reports)} of {counted(len(cells), 'run')} finished, "
+        f"{len(progress.failed)} failed"
     )
     if not quiet:
         again = "; repeat the command to continue" if stopped or progress.failed else ""

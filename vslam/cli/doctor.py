@@ -10,7 +10,7 @@ import typer
 
 from vslam.cli.console import console
 from vslam.cli.options import OUTPUT, Thresholds, open_given, option, reads_source, require_data
-from vslam.errors import InputError
+from vslam.errors import InputError, counted
 
 if TYPE_CHECKING:
     from vslam.datasets.sources import SourceOptions
@@ -64,7 +64,7 @@ def doctor(
     # The page comes after the findings, because a disk may be full.
     write_page(diagnosis, f"Doctor: {given.data or given.dataset}", page)
     n = len(diagnosis.faults)
-    typer.echo(f"{page}: {n or 'no'} fault{'' if n == 1 else 's'}")
+    typer.echo(f"{page}: {counted(n, 'fault') if n else 'no faults'}")
     if diagnosis.faults:
         raise typer.Exit(1)
 

@@ -8,27 +8,45 @@ from typing import Annotated
 import typer
 
 from vslam.cli.options import AlignmentName
+from vslam.errors import InputError
 
-_EXAMPLE = "[b]Example[/b]\n  vslam eval runs/latest/trajectory.tum --gt groundtruth.tum"
+_EXAMPLES = """
+[b]Examples[/b]
+  vslam eval runs/latest
+  vslam eval runs/latest --gt groundtruth.tum
+  vslam eval orbslam3.txt --gt ~/kitti/poses/00.txt
+"""
 
 
 def register(app: typer.Typer) -> None:
     """Add the command to the application."""
-    app.command("eval", epilog=_EXAMPLE)(evaluate_files)
+    app.command("eval", epilog=_EXAMPLES)(evaluate_files)
 
 
 def evaluate_files(
-    estimate: Annotated[Path, typer.Argument(help="Trajectory in the format of KITTI or TUM.")],
-    gt: Annotated[
-        Path, typer.Option(metavar="FILE", help="Ground truth in the format of KITTI or TUM.")
+    estimate: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN|FILE",
+            help="Folder of a run, or a trajectory in the format of KITTI or TUM.",
+        ),
     ],
+    gt: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Ground truth in the format of KITTI or TUM.",
+            show_default="that of the run",
+        ),
+    ] = None,
     align: Annotated[
-        AlignmentName,
+        AlignmentName | None,
         typer.Option(
             metavar="se3|sim3|none",
             help="Alignment with the ground truth; [b]sim3[/b] also fits the scale.",
+            show_default="sim3 for a monocular run, else se3",
         ),
-    ] = "se3",
+    ] = None,
     times: Annotated[
         Path | None,
         typer.Option(
@@ -38,22 +56,31 @@ def evaluate_files(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Compare a trajectory with the ground truth: ATE, RPE and KITTI drift."""
+    """Compare the trajectory of a run or a file with the ground truth: ATE, RPE and KITTI drift."""
     import json
 
     from vslam.cli.tables import print_rows
     from vslam.evaluation.trajectories import evaluate_trajectory, evo_command, read_pair
     from vslam.trajectory import trajectory_format
 
+    alignment: str = align or "se3"
+    if estimate.is_dir():
+        estimate, gt, of_run = _files_of_run(estimate, gt, times)
+        alignment = align or of_run
+    elif gt is None:
+        raise InputError(
+            f"{estimate}: name its ground truth with --gt, or the folder of a run that had one, "
+            "such as runs/latest; a video or images need vslam run first."
+        )
     trajectory, ground_truth = read_pair(estimate, gt, times)
-    evaluation = evaluate_trajectory(trajectory, ground_truth, align)
+    evaluation = evaluate_trajectory(trajectory, ground_truth, alignment)
     if as_json:
         typer.echo(json.dumps(evaluation.summary(), indent=2))
         return
     matched = f"{evaluation.frames} of {len(trajectory)} have a ground truth"
     rows = [
         ("frames", matched),
-        ("alignment", align),
+        ("alignment", alignment),
         ("ATE RMSE", f"{evaluation.ate_rmse_m:.3f} m"),
         ("ATE mean, max", f"{evaluation.ate_mean_m:.3f} m, {evaluation.ate_max_m:.3f} m"),
         ("RPE per frame", f"{evaluation.rpe_m:.4f} m, {evaluation.rpe_deg:.4f} deg"),
@@ -66,5 +93,21 @@ def evaluate_files(
     # evo compares files of one format, and no straight lines.
     format_ = trajectory_format(gt)
     if format_ == trajectory_format(estimate) and not evaluation.on_one_line:
-        rows.append(("reproduce", evo_command(estimate, gt, align, format_)))
+        rows.append(("reproduce", evo_command(estimate, gt, alignment, format_)))
     print_rows(rows)
+
+
+def _files_of_run(folder: Path, gt: Path | None, times: Path | None) -> tuple[Path, Path, str]:
+    """The trajectory of a run, a ground truth that it can be compared with, and the alignment."""
+    from vslam.report.schema import ReportJson
+    from vslam.run.outcome import alignment_of
+    from vslam.trajectory import trajectory_format
+
+    report = ReportJson.read(folder / "report.json")
+    written = (folder / name for name in ("ground_truth_kitti.txt", "ground_truth.tum"))
+    gt = gt or next((file for file in written if file.exists()), None)
+    if gt is None:
+        raise InputError(f"{folder}: the run had no ground truth; name one with --gt.")
+    with_times = times is not None or trajectory_format(gt) == "tum"
+    name = "trajectory.tum" if with_times else "trajectory_kitti.txt"
+    return folder / name, gt, alignment_of(report.sensor)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vslam.cli.options import INPUT, OUTPUT, Quiet, flag, option
-from vslam.errors import InputError
+from vslam.errors import InputError, counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -163,7 +163,7 @@ def g2o(
         save_g2o(file, ids, inverses(graph.T_cw), graph.edges, graph.T_i_j, graph.sigmas)
     if not quiet:
         loops = np.count_nonzero(graph.kind == LOOP)
-        typer.echo(f"{target}: {len(ids)} vertices, {len(graph.edges)} edges, {loops} of loops")
+        typer.echo(f"{target}: {len(ids)} vertices, {len(graph.edges)} edges, {loops} from loops")
 
 
 @commands.command(epilog="[b]Example[/b]\n  vslam export euroc runs/latest")
@@ -184,7 +184,7 @@ def euroc(
     with new_file(target) as file:
         write_euroc(file, trajectory)
     if not quiet:
-        typer.echo(f"{target}: {len(trajectory)} poses")
+        typer.echo(f"{target}: {counted(len(trajectory), 'pose')}")
 
 
 def _beside(run: Path, name: str) -> Path:
@@ -283,6 +283,7 @@ def _own_file(frame: TimedFrame, finished: FinishedRun) -> Path:
 def _say(target: Path, reconstruction: Reconstruction, *, quiet: bool) -> None:
     if not quiet:
         typer.echo(
-            f"{target}: {len(reconstruction.frames)} keyframes, {len(reconstruction.xyz)} "
-            f"landmarks, {len(reconstruction.xy)} observations"
+            f"{target}: {counted(len(reconstruction.frames), 'keyframe')}, "
+            f"{counted(len(reconstruction.xyz), 'landmark')}, "
+            f"{counted(len(reconstruction.xy), 'observation')}"
         )

@@ -22,7 +22,7 @@ from vslam.cli.options import (
     names_in,
     option,
 )
-from vslam.errors import InputError
+from vslam.errors import InputError, counted
 
 if TYPE_CHECKING:
     from vslam.lab.loopbench.conditions import Condition
@@ -149,7 +149,7 @@ def bench(
     else:
         done = _on_sets(asked, data or DATA, conditions, write, quiet=quiet)
     if not quiet:
-        typer.echo(f"{out / 'loops.html'}: {len(names)} detectors on {done}")
+        typer.echo(f"{out / 'loops.html'}: {counted(len(names), 'detector')} on {done}")
 
 
 class _Asked(NamedTuple):
@@ -183,7 +183,7 @@ def _on_drives(
     for drive in drives:
         scores += measure_drive(drive, scorers, window, asked.vocabulary, threads=threads)
         write(online=scores)
-    return f"{len(drives)} drives"
+    return counted(len(drives), "drive")
 
 
 def _on_sets(
@@ -221,7 +221,7 @@ def _on_sets(
                 scores, gains = scores + more[0], gains + more[1]
                 advance()
         write(cells=scores, gains=gains, costs=costs)
-    return f"{len(sets)} sets of images"
+    return f"{counted(len(sets), 'set')} of images"
 
 
 def _require_writable(out: Path) -> None:
@@ -250,7 +250,7 @@ def _write(out: Path, seed: int, **found: object) -> None:
         "costs": [],
         **found,
         "seed": seed,
-        "machine": f"{here.cpu}, {here.cores} cores",
+        "machine": f"{here.cpu}, {counted(here.cores, 'core')}",
         "versions": versions(),
         "created": datetime.now(UTC),
     }

@@ -154,7 +154,7 @@ def main() -> None:
             raise
         typer.echo(
             f"error: {reason(error)}: this is a fault of vslam or of the machine; please report "
-            "it with what PYTHONDEVMODE=1 adds.",
+            "it with the output that PYTHONDEVMODE=1 adds.",
             err=True,
         )
         sys.exit(1)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vslam.cli.options import METHOD, OUTPUT, Quiet, Thresholds, option
-from vslam.errors import InputError, ResultsError
+from vslam.errors import InputError, ResultsError, counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -72,10 +72,10 @@ def _contents(map_: Map, reconstruction: Reconstruction) -> Rows:
     r = reconstruction
     path = np.linalg.norm(np.diff(r.T_wc[:, :3, 3], axis=0), axis=1).sum()
     unit = "units" if r.camera.monocular else "m"
-    observations = f"{len(r.xy)} by {map_.n_rows} keypoints"
+    observations = f"{len(r.xy)}, {map_.n_rows} keypoints in all"
     if len(r.xy):
         observations += (
-            f", {len(r.xy) / len(r.xyz):.1f} of a landmark, "
+            f", {len(r.xy) / len(r.xyz):.1f} per landmark, "
             f"reprojection median {np.median(r.reprojection_errors()):.2f} px"
         )
     return [
@@ -164,7 +164,7 @@ def merge(
     except ValueError as error:
         raise InputError(f"{files[0]} and the others cannot be merged: {error}.") from error
     for number in merged.joined:
-        typer.echo(f"{files[number]}: joined by {len(merged.loops[number])} loops")
+        typer.echo(f"{files[number]}: joined by {counted(len(merged.loops[number]), 'loop')}")
     for number in merged.left_out:
         typer.echo(f"{files[number]}: left out, no verified loop leads to it")
     if not merged.joined:
@@ -262,4 +262,5 @@ def _save(save_map: Callable[[Path, StoredMap], None], out: Path, stored: Stored
             "another place with --out."
         ) from error
     map_ = stored.map
-    typer.echo(f"{out}: {map_.n_keyframes} keyframes, {map_.n_landmarks} landmarks")
+    keyframes = counted(map_.n_keyframes, "keyframe")
+    typer.echo(f"{out}: {keyframes}, {counted(map_.n_landmarks, 'landmark')}")

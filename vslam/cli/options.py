@@ -115,10 +115,10 @@ AlignmentName = Literal["se3", "sim3", "none"]
 
 KITTI_ROOT = "data/kitti"  # unless $KITTI_ROOT names another folder
 
-_WITHOUT_DATA = """there is nothing to read; name some images, or take rendered ones:
+_WITHOUT_DATA = """there is nothing to read; name your images, or use rendered ones:
   --dataset synthetic    rendered drives, which need no download
   DATA --calib FILE      images, video, bag or camera (docs/howto/sources.md)
-  --data FOLDER          KITTI, also by $KITTI_ROOT (datasets.md)"""
+  --data FOLDER          KITTI; or set $KITTI_ROOT to its folder (datasets.md)"""
 
 
 def names_in(text: str) -> list[str]:
@@ -211,7 +211,7 @@ def _source_options(
         typer.Option(
             metavar="NUMBER",
             help="Value of a depth pixel at one metre.",
-            show_default="by the calibration, data set or encoding",
+            show_default="from the calibration, data set or encoding",
         ),
     ] = None,
     sensor: Annotated[

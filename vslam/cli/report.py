@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from vslam.cli.options import OUTPUT, Quiet, flag, option
+from vslam.errors import counted
 
 _EXAMPLES = """
 [b]Examples[/b]
@@ -33,8 +34,8 @@ def report(
         typer.Option(
             metavar="NAME=FILE",
             help="Trajectory of another system, in the format of KITTI or TUM. "
-            "NAME@SEQ@PERTURB says of which sequence and perturbation. It is aligned as the runs "
-            "of its sequence are; a name that ends in ', mono' also fits the scale.",
+            "NAME@SEQ@PERTURB also names its sequence and perturbation. It is aligned like the "
+            "runs of its sequence; a name that ends in ', mono' also fits the scale.",
         ),
     ] = None,
     baseline: Annotated[
@@ -96,4 +97,4 @@ def write_overview_of(
         show_sections(versus(written))
         for note in written.notes:
             typer.echo(f"note: {note}", err=True)
-        typer.echo(f"\n{out / 'report.html'}: {len(written.runs)} runs")
+        typer.echo(f"\n{out / 'report.html'}: {counted(len(written.runs), 'run')}")

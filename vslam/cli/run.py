@@ -103,7 +103,7 @@ def run(
         bool,
         flag(
             EXECUTION,
-            "Play the frames at their times and drop those that come too fast.",
+            "Play the frames in real time and drop those that come too fast.",
             "--realtime",
         ),
     ] = False,

@@ -105,7 +105,7 @@ def stress(
         option(
             METHOD,
             "NAME",
-            "Detector or system that the errors of a preset are divided by.",
+            "Detector or system whose errors are the unit of the errors with --preset.",
             unset="the first",
         ),
     ] = None,
@@ -168,15 +168,16 @@ def stress(
             f"{', '.join(names)}."
         )
     if given.sensor == "mono" and others:
-        raise InputError("--sensor mono: only vslam runs so; other systems read both cameras.")
+        raise InputError("--sensor mono: only vslam supports it; other systems need both cameras.")
     out = out.absolute()
     kind = kind_of_source(given)
     given = absolute(given)
     opened = open_all(kind, given, seqs, shown=not quiet)
     if others and not all(source.seekable for source in opened.values()):
         raise InputError(
-            f"--systems {next(iter(others))}: other systems read KITTI's format, which is written "
-            "from data sets and folders of images alone; extract the images, or test vslam alone."
+            f"--systems {next(iter(others))}: other systems read KITTI's format, which vslam can "
+            "write only from data sets and folders of images; extract the images, or test vslam "
+            "alone."
         )
     options = replace(
         cell_options(kind, given, config, threads, jobs, scheduler, out),
@@ -210,7 +211,7 @@ def stress(
     write_report(out, report, {name: first_frames(source) for name, source in opened.items()})
     if not quiet:
         show_sections(boundary_sections(report))
-        ended = f"{len(report.boundaries)} of {len(searches)} searches finished"
+        ended = f"finished {len(report.boundaries)} of {len(searches)} searches"
         typer.echo(f"{out / 'report.html'}: {ended}")
     if stopped or len(report.boundaries) < len(searches):
         raise typer.Exit(1)
@@ -233,7 +234,7 @@ def foreign(
     no_report: Annotated[bool, typer.Option("--no-report")] = False,
     quiet: Annotated[bool, typer.Option("--quiet")] = False,
 ) -> None:
-    """Run another system in the way [b]vslam run[/b] runs vslam, for [b]vslam stress[/b]."""
+    """Run another system on a sequence and write a run's report; used by [b]vslam stress[/b]."""
     from vslam.cli.console import console
     from vslam.config import load_config
     from vslam.datasets.perturbation import parse_perturbation

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from vslam.cli.options import OUTPUT, Quiet, Threads, flag, option
-from vslam.errors import InputError
+from vslam.errors import InputError, counted
 
 _EXAMPLES = """
 [b]Examples[/b]
@@ -39,7 +39,9 @@ def synth(
     ] = None,
     calibration: Annotated[
         str,
-        option(_DRIVE, "00-02|03|04-12", "KITTI sequences whose cameras drive along --trajectory."),
+        option(
+            _DRIVE, "00-02|03|04-12", "Use the cameras of these KITTI sequences with --trajectory."
+        ),
     ] = "00-02",
     max_frames: Annotated[
         int | None,
@@ -89,7 +91,7 @@ def synth(
         bool,
         flag(
             OUTPUT,
-            "Write images with depth in TUM's layout, and the stereo pairs beside.",
+            "Write images with depth in TUM's layout, and the stereo pairs beside them.",
             "--rgbd",
         ),
     ] = False,
@@ -152,7 +154,9 @@ def synth(
         for found in store.list_stored(cache):
             state = "complete" if found.complete else "in part"
             folder = found.root / "sequences" / found.name
-            typer.echo(f"{folder}: {found.frames} frames, {found.size / 1e6:.0f} MB, {state}")
+            typer.echo(
+                f"{folder}: {counted(found.frames, 'frame')}, {found.size / 1e6:.0f} MB, {state}"
+            )
         return
     if clean:
         freed = store.clean(cache, route or None)
@@ -169,7 +173,9 @@ def synth(
     )
     for form, given in (("--fisheye", fisheye), ("--rgbd", rgbd)):
         if given and (depth or pairs or verify or fisheye == rgbd):
-            raise InputError(f"{form}: leave out --depth, --pairs, --verify and every other form.")
+            raise InputError(
+                f"{form}: leave out --depth, --pairs and --verify, and one of --fisheye and --rgbd."
+            )
     variation = Variation(
         seed or town.seed, aliased or town.aliased, change or town.change, dynamic or town.moving
     )
@@ -220,8 +226,10 @@ def synth(
 
         frames = open_kitti(root, drive.name, max_frames=max_frames)
         calibration_file = write_side_by_side(frames, side_by_side)
-        typer.echo(f"{side_by_side}: {len(frames)} frames, calibration in {calibration_file}")
-    typer.echo(f"{root}: " + (f"{pairs} pairs" if pairs else f"sequence {route}"))
+        typer.echo(
+            f"{side_by_side}: {counted(len(frames), 'frame')}, calibration in {calibration_file}"
+        )
+    typer.echo(f"{root}: " + (counted(pairs, "pair") if pairs else f"sequence {route}"))
 
 
 def _range(option: str, given: str, least: float) -> tuple[float, float]:

@@ -15,6 +15,7 @@ import typer
 
 from vslam.cli.export import commands as export
 from vslam.cli.options import EXECUTION, INPUT, METHOD, OUTPUT, AllThreads, Quiet, flag, option
+from vslam.errors import counted
 
 if TYPE_CHECKING:
     from vslam.loopclosure.training.data import Collection
@@ -306,4 +307,6 @@ def places(
 
     sources = [source for spec in data for source in open_source(spec)]
     write_pack(sources, out, parse_size(pixels), fit)
-    typer.echo(f"{out}: {sum(map(len, sources))} images, {out.stat().st_size / 1e6:.1f} MB")
+    typer.echo(
+        f"{out}: {counted(sum(map(len, sources)), 'image')}, {out.stat().st_size / 1e6:.1f} MB"
+    )

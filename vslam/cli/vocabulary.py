@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vslam.cli.options import OUTPUT, Quiet, Seed, option
-from vslam.errors import InputError, UnreadableImageError
+from vslam.errors import InputError, UnreadableImageError, counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -51,7 +51,7 @@ def train(
     ),
     quiet: Quiet = False,
 ) -> None:
-    """Train a vocabulary on images, best of many different places."""
+    """Train a vocabulary on images, preferably of many different places."""
     from vslam.cli.console import console
     from vslam.config import OrbConfig
     from vslam.loopclosure import vocabulary_training
@@ -72,7 +72,7 @@ def train(
                 descriptors.append(found)
             advance()
     n = sum(map(len, descriptors))
-    shown.announce(f"{n} descriptors of {len(descriptors)} images")
+    shown.announce(f"{n} descriptors of {counted(len(descriptors), 'image')}")
 
     def on_level(level: int, nodes: int) -> None:
         shown.announce(f"level {level}: {nodes} nodes")
@@ -85,8 +85,8 @@ def train(
         ) from error
     write_vocabulary(trained, out)
     typer.echo(
-        f"{out}: {trained.n_words} words from {n} descriptors of {len(descriptors)} images, "
-        f"k {k}, levels {levels}, seed {seed}"
+        f"{out}: {trained.n_words} words from {n} descriptors of "
+        f"{counted(len(descriptors), 'image')}, k {k}, levels {levels}, seed {seed}"
     )
 
 
@@ -128,7 +128,7 @@ def info(
     rows = [
         ("file", f"{file}: {file.stat().st_size / 1e6:.2f} MB, read in {elapsed * 1e3:.0f} ms"),
         ("tree", f"{v.branching} children at most, {v.levels} levels, {len(v.word)} nodes"),
-        ("words", f"{v.n_words}, of which {np.count_nonzero(v.weight == 0)} weigh nothing"),
+        ("words", f"{v.n_words}, of which {np.count_nonzero(v.weight == 0)} have no weight"),
         ("by level", ", ".join(f"{k}: {n}" for k, n in enumerate(np.bincount(depth)) if n)),
         ("idf", "least, 5 %, median, 95 %, most: " + ", ".join(f"{x:.2f}" for x in idf)),
     ]

@@ -30,9 +30,12 @@ class KeyframeConfig(Section):
     gain_weight: float = Field(0.2, gt=0, le=1)
     """Weight of the latest keyframe in the running mean of the number of close points that a
     keyframe adds. [own]"""
-    patch_kept_close: float = Field(0.5, ge=0, le=1)
+    patch_kept_close: float = Field(0.3, ge=0, le=1)
     """A keyframe is also inserted if patches find less than this share of the close points that
     were tracked in the first frame after the last keyframe. [own]"""
+    patch_lead_frames: int = Field(2, ge=0)
+    """A keyframe that was tracked by patches is planned this many frames ahead, so that its
+    features can be extracted meanwhile. [own]"""
     max_tracked_ratio: float = Field(0.75, gt=0, le=1)
     """A keyframe is inserted if the frame tracks less than this share of the points of the
     reference keyframe. [OS1 V-E, customary]"""

@@ -44,7 +44,7 @@ def stamp_of(message: Message) -> int:
 
 
 def grey_of(message: Message) -> Image:
-    """``(H, W)`` uint8 image of an ``Image`` or ``CompressedImage``; of 16 bits, the upper eight.
+    """``(H, W)`` uint8 image of an ``Image`` or ``CompressedImage``; of 16 bits the upper eight.
 
     Raises:
         ValueError: it cannot be decoded; the message gives the reason.

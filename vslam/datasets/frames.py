@@ -41,6 +41,9 @@ class TimedFrame:
             the left image's pixels, ``(H, W)`` float32 metres, 0 if unknown; or None (monocular).
             The argument is a map function over both images, which may decode them in parallel.
             Raises UnreadableImageError if a file is damaged or not of the calibration's size.
+        sides: decode the left and the right image alone, so that one of them need not be read;
+            they give the images of ``read``, and raise as it does. None if both are decoded
+            together, or if there is no right image.
         file: the left image's file, if its pixels need no rectification; else None.
         colour: decodes the left image as it was taken, ``(H, W, 3)`` uint8 red, green, blue, or
             ``(H, W)`` if it is grey; None for a source without colours. Raises as ``read``.
@@ -48,6 +51,7 @@ class TimedFrame:
 
     timestamp: float
     read: Callable[[ImageMap], Images]
+    sides: tuple[Callable[[], Image], Callable[[], Image]] | None = None
     file: Path | None = None
     colour: Callable[[], NDArray[np.uint8]] | None = None
 
@@ -282,4 +286,4 @@ def _held(frame: TimedFrame) -> TimedFrame:
             raise images
         return images
 
-    return replace(frame, read=read)
+    return replace(frame, read=read, sides=None)

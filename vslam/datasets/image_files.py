@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from collections.abc import Sequence as Several
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -41,11 +43,15 @@ def checked_files(
     def read(index: int, image_map: ImageMap) -> Images:
         return read_files([side[index] for side in sides], sizes, image_map)
 
+    stored = stored_frames(timestamps, read, sides[0], read_colour)
+    if len(sides) == 2:
+        pairs = zip(stored, *sides, strict=True)
+        stored = tuple(replace(frame, sides=_alone(files, sizes)) for frame, *files in pairs)
     return RawSource(
         dataset=dataset,
         name=name,
         sizes=sizes,
-        stored=stored_frames(timestamps, read, sides[0], read_colour),
+        stored=stored,
         ground_truth=ground_truth,
     )
 
@@ -60,6 +66,14 @@ def read_files(
     """
     left, *right = image_map(_read_file, list(zip(files, sizes, strict=True)))
     return left, right[0] if right else None
+
+
+def _alone(
+    files: Several[Path], sizes: Several[Size]
+) -> tuple[Callable[[], Image], Callable[[], Image]]:
+    """Functions that decode each image of a pair."""
+    left, right = (partial(_read_file, side) for side in zip(files, sizes, strict=True))
+    return left, right
 
 
 def _read_file(file: tuple[Path, Size]) -> Image:

@@ -77,7 +77,7 @@ class ImageFolders:
         """The images as a source.
 
         Args:
-                depth_scale: units of the depth images per metre; needed only for depth images.
+            depth_scale: units of the depth images per metre; needed only for depth images.
 
         Raises:
             InputError: there are depth images but no scale.

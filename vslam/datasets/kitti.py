@@ -181,9 +181,10 @@ def _find_root(root: Path | str) -> Path:
 
 def _find_sequence(base: Path, name: str) -> Path:
     folder = base / "sequences" / name
-    found = sorted(p.name for p in (base / "sequences").iterdir() if p.is_dir())
-    if name not in found:
-        choice = f"choose one of {', '.join(found)}" if found else "the folder is empty"
+    found = sorted(p for p in (base / "sequences").iterdir() if p.is_dir())
+    if name not in [p.name for p in found]:
+        there = [p.name for p in found if list_images(p / "image_0")]
+        choice = f"choose one of {', '.join(there)}" if there else "there are no images of others"
         raise InputError(f"{folder}: no such sequence; {choice}.")
     return folder
 

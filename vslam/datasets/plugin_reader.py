@@ -100,7 +100,7 @@ def _checked(plugin: PlugIn, root: Path, camera: Camera, frame: TimedFrame, at: 
             raise UnreadableImageError(root, f"{plugin} gave {wrong} at {at}.")
         return left, second
 
-    return replace(frame, read=read)
+    return replace(frame, read=read, sides=None)
 
 
 def _wrong_images(left: Image, second: Image | DepthImage | None, camera: Camera) -> str:

@@ -81,7 +81,15 @@ def _rectification_for(calibration: Calibration, sizes: Several[Size]) -> Rectif
 def _rectified_frame(rectification: Rectification, frame: TimedFrame) -> TimedFrame:
     file = frame.file if rectification.identity else None
     colour = None if frame.colour is None else partial(_read_colour, rectification, frame.colour)
-    return replace(frame, read=partial(_read, rectification, frame), file=file, colour=colour)
+    sides = None
+    if frame.sides is not None:
+        left, right = frame.sides
+        sides = (
+            lambda: np.asarray(rectification.left(left()), np.uint8),
+            lambda: np.asarray(rectification.right(right()), np.uint8),
+        )
+    read = partial(_read, rectification, frame)
+    return replace(frame, read=read, sides=sides, file=file, colour=colour)
 
 
 def _read(rectification: Rectification, frame: TimedFrame, image_map: ImageMap) -> Images:

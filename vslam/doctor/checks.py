@@ -18,6 +18,7 @@ from vslam.config import OrbConfig
 from vslam.doctor.findings import Finding, judge
 from vslam.doctor.focal_length import FocalFit
 from vslam.doctor.matching import Matches, count_views
+from vslam.errors import counted
 from vslam.frontend.orb import extract
 
 Times = NDArray[np.float64]
@@ -190,7 +191,7 @@ def check_synchronisation(rows_of_lag: Mapping[int, float]) -> tuple[Finding, in
         "synchronisation",
         wrong,
         measured,
-        f"the right image is {abs(best)} frame{'s' * (abs(best) > 1)} "
+        f"the right image is {counted(abs(best), 'frame')} "
         f"{'late' if best > 0 else 'early'}: trigger both together, or shift one side's times",
     )
     return finding, best if wrong else 0

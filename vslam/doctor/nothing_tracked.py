@@ -9,7 +9,7 @@ import numpy as np
 from vslam.datasets.frames import Source
 from vslam.doctor.checks import check_sides
 from vslam.doctor.matching import joined, match_images
-from vslam.errors import InputError
+from vslam.errors import InputError, counted
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
 
@@ -22,7 +22,7 @@ def why_nothing_was_tracked(outcome: RunOutcome, options: RunOptions) -> str | N
     n = len(outcome.tracks)
     if n == 0 or outcome.n_tracked:
         return None
-    said = f"nothing was tracked in {n} frame{'' if n == 1 else 's'}"
+    said = f"nothing was tracked in {counted(n, 'frame')}"
     if len(outcome.skipped) == n:
         return f"{said}: no image could be read ({outcome.skipped[0].rstrip('.')})"
     if options.localize:

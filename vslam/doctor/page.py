@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 
 from vslam.doctor.examine import Diagnosis, Picture
-from vslam.errors import ResultsError
+from vslam.errors import ResultsError, counted
 from vslam.report.page import Alert, Figure, Page, Row, Section, Table
 from vslam.report.render import html
 
@@ -31,7 +31,7 @@ def write_page(diagnosis: Diagnosis, title: str, path: Path) -> None:
     ]
     page = Page(
         title,
-        [f"{faults or 'no'} fault{'' if faults == 1 else 's'}"],
+        [counted(faults, "fault") if faults else "no faults"],
         [
             Section("", alerts),
             Section("Other checks" if alerts else "All checks", [Table(HEAD, rows, HEAD)]),

@@ -105,8 +105,8 @@ _DEFAULT_LIMITS = LoopLimits()
 
 
 def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
-    """Judge the loops of a run over its frames so far; None unless all of them have ground truth,
-    because revisits cannot be found on a path with gaps."""
+    """Judge the loops of a run by the ground truth of the frames done. None if a frame has no
+    ground truth, because revisits cannot be found on a path with gaps."""
     truth = ground_truth_of(outcome.sequence)
     if truth is None or not len(outcome.trajectory):
         return None

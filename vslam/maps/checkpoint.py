@@ -17,6 +17,7 @@ from vslam.states import (
     ConsistencyState,
     MapperState,
     PolicyState,
+    RigState,
     TrackerState,
     VerifierState,
 )
@@ -67,7 +68,7 @@ def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
         },
         "mapper": {name: getattr(checkpoint.mapper, name) for name in _OF_MAPPER},
         "policy": asdict(checkpoint.policy),
-        "rig": list(checkpoint.rig),
+        "rig": {"delay": checkpoint.rig.delay, "sides": checkpoint.rig.sides},
         "closing": {
             "places": [[sorted(one.keyframes), one.length, one.age] for one in consistency.places],
             "verified": [[turn, loop_entry(edge)] for turn, edge in consistency.verified],
@@ -143,10 +144,16 @@ def checked_checkpoint(
             patches=_patches_of(arrays, map_.arrays.first_row[: map_.n_keyframes + 1]),
         ),
         policy=PolicyState(
-            _number(policy["gained_close"]), policy["gain_awaited"], _count(policy["first_close"])
+            _number(policy["gained_close"]),
+            policy["gain_awaited"],
+            _count(policy["first_close"]),
+            _count(policy["first_frame"], -1),
+            _count(policy["due"], -1),
         ),
         closing=_closing_of(entry["closing"], map_.n_keyframes),
-        rig=tuple(_numbers(entry["rig"]).tolist()),
+        rig=RigState(
+            **{name: tuple(_numbers(entry["rig"][name]).tolist()) for name in ("delay", "sides")}
+        ),
     )
 
 

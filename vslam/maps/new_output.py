@@ -68,6 +68,12 @@ def replaced_file(path: Path) -> Iterator[BinaryIO]:
             file.flush()
             os.fsync(file.fileno())
         part.replace(path)
+    except OSError as error:
+        if error.filename != str(part):
+            raise
+        missing = not part.parent.is_dir()
+        why = f"there is no folder {path.parent}" if missing else error.strerror
+        raise OSError(error.errno, why, str(path)) from None  # the user knows no other name
     finally:
         part.unlink(missing_ok=True)
     if os.name == "posix":  # without this sync, a power cut may undo the renaming

@@ -21,7 +21,7 @@ _FIGURES = (
 _NOTE = (
     "All detectors saw the same frames. The time is that of tracking and mapping: images are read "
     "and features are extracted once for all detectors. It is wall time on cores that the "
-    "detectors share, and the first one waits longest; to compare costs, time separate runs."
+    "detectors share; to compare costs, time separate runs."
 )
 
 

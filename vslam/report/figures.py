@@ -89,7 +89,8 @@ def _drawings(
     if outcome.tracks:
         yield (
             "tracked_points",
-            "Stereo features, those that were matched to landmarks, and inliers of the pose.",
+            f"{_usable_features(outcome)[0].capitalize()}, those that were matched to landmarks, "
+            "and inliers of the pose.",
             _tracked_points(outcome),
         )
     if stage_names(outcome.tracks):
@@ -148,7 +149,7 @@ def _tracked_points(outcome: RunOutcome) -> Figure:
     tracks = outcome.tracks
     frame = np.array([track.index for track in tracks])
     series = [
-        ("stereo features", [track.n_stereo for track in tracks], GREY, 1.1),
+        (*_usable_features(outcome), GREY, 1.1),
         ("matches", [track.n_matches for track in tracks], AMBER, 1.1),
         ("inliers", [track.n_inliers for track in tracks], BLUE, 1.6),
     ]
@@ -167,6 +168,15 @@ def _tracked_points(outcome: RunOutcome) -> Figure:
     _frame_axis(axes, frame)
     add_legend(figure, axes)
     return figure
+
+
+def _usable_features(outcome: RunOutcome) -> tuple[str, list[int]]:
+    """The features that can give landmarks with this sensor, and their number in each frame."""
+    sensor = outcome.settings.sensor
+    if sensor == "mono":
+        return "features", [track.n_features for track in outcome.tracks]
+    name = "features with depth" if sensor == "rgbd" else "stereo features"
+    return name, [track.n_stereo for track in outcome.tracks]
 
 
 def _stage_times(outcome: RunOutcome) -> Figure:

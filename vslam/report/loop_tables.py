@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 
+from vslam.errors import counted
 from vslam.report.page import Row, Section, Table, number
 from vslam.report.schema import LoopEntry, ReportJson
 
@@ -43,7 +44,7 @@ def _closed(report: ReportJson) -> Table:
         (
             *_evidence(loop),
             _right(loop),
-            number(loop.moved_m, "{:.2f} m"),
+            number(loop.moved_m, "{:.2f}" if report.sensor == "mono" else "{:.2f} m"),
             number(loop.correction_s, "{:.2f} s"),
         )
         for loop in closed[:_MAX_CLOSED]
@@ -54,6 +55,8 @@ def _closed(report: ReportJson) -> Table:
         "matches give the relative pose, ORB's or those that the network learned. Pose: compared "
         "with the ground truth. Moved: the largest distance that the correction moved a keyframe."
     )
+    if report.sensor == "mono":
+        note = f"{note.rstrip('.')}, in the unit of the map."
     if len(closed) > _MAX_CLOSED:
         note += f" {len(closed) - _MAX_CLOSED} more are in report.json."
     return Table(head, rows, ("pose",), note)
@@ -70,7 +73,7 @@ def _reasons(report: ReportJson) -> Table:
         for reason, loops in ordered
     ]
     head = ("reason", "candidates", "most inliers", "pose right")
-    note = f"{report.loops_rejected} candidates; each of them is in report.json."
+    note = f"{counted(report.loops_rejected, 'candidate')} in all; report.json lists each."
     return Table(head, rows, ("reason",), note)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from html import escape
 
+from vslam.errors import counted
 from vslam.evaluation.loops import LoopLimits
 from vslam.loopclosure.registry import about
 from vslam.report.detector_table import detector_section
@@ -51,7 +52,8 @@ def headlines(report: ReportJson) -> list[Tile]:
         Tile(
             "Lost frames",
             str(lost),
-            f"{share} {report.frames}; {report.weak_frames} weak, {report.skipped_frames} skipped",
+            f"{share} {report.frames}{_before_map(report)}; {report.weak_frames} weak, "
+            f"{report.skipped_frames} skipped",
             "bad" if lost else "good",
         ),
         *_in_map(report),
@@ -66,7 +68,7 @@ def headlines(report: ReportJson) -> list[Tile]:
         Tile(
             "Speed",
             f"{report.fps:.1f} fps",
-            f"{report.threads} thread{'s' * (report.threads != 1)}{_together(report)}",
+            counted(report.threads, "thread") + _together(report),
         ),
         *_latency(report),
         Tile(
@@ -80,9 +82,16 @@ def headlines(report: ReportJson) -> list[Tile]:
     ]
 
 
+def _before_map(report: ReportJson) -> str:
+    if not (count := report.lost_before_map):
+        return ""
+    why = ": a monocular map needs the camera to move sideways first" * (report.sensor == "mono")
+    return f", {count} of them before the map began{why}"
+
+
 def _together(report: ReportJson) -> str:
     """A remark on speed and memory where several detectors were run."""
-    return f", all {len(report.detectors)} detectors together" if report.detectors else ""
+    return f", {len(report.detectors)} detectors together" if report.detectors else ""
 
 
 def advice(report: ReportJson) -> str:
@@ -96,7 +105,7 @@ def _in_map(report: ReportJson) -> list[Tile]:
     if (found := report.in_map) is None:
         return []
     fix = "no fix" if found.first_fix_s is None else f"first fix after {found.first_fix_s:.2f} s"
-    times = f"found at {found.found} of {found.sought} attempts"
+    times = f"found at {found.found} of {counted(found.sought, 'attempt')}"
     error = _number(found.error_m, "m")
     weak = f", {found.weak_percent:.1f} % by few inliers" if found.weak_percent else ""
     note = f"of the frames{weak}; {fix}, {times}"
@@ -117,7 +126,7 @@ def _latency(report: ReportJson) -> list[Tile]:
 
 def _map_note(report: ReportJson) -> str:
     submaps = f", {report.submaps} sub-maps" if report.submaps > 1 else ""
-    return f"landmarks, {report.keyframes:,} keyframes{submaps}"
+    return f"landmarks, {counted(report.keyframes, 'keyframe')}{submaps}"
 
 
 def _loops(report: ReportJson) -> Tile:
@@ -127,7 +136,7 @@ def _loops(report: ReportJson) -> Tile:
         notes += [_revisits(report), *missed, f"{report.loops_wrong} wrong"]
     if report.detector == "none":
         return Tile("Loops", "off", "no detector; " + ", ".join(notes[:1]) if notes else "")
-    notes.append(f"{report.loops_rejected} candidates rejected")
+    notes.append(f"{counted(report.loops_rejected, 'candidate')} rejected")
     tone = "bad" if report.loops_wrong else ""
     return Tile("Loops", f"{report.loops_closed} closed", ", ".join(notes), tone)
 
@@ -136,7 +145,7 @@ def _revisits(report: ReportJson) -> str:
     """How many stretches were found again. A right loop on a stretch that is too short to count is
     mentioned."""
     if report.revisit_stretches:
-        return f"{report.loops_found} of {report.revisit_stretches} revisits found"
+        return f"{report.loops_found} of {counted(report.revisit_stretches, 'revisit')} found"
     none = f"no revisit of {LoopLimits().min_length_m:.0f} m or more to be found"
     right = sum(loop.accepted and loop.right is True for loop in report.loops)
     return f"{none} ({right} right on shorter ones)" if right else none
@@ -161,7 +170,8 @@ def run_page(
         config: text of ``config.json``, which the HTML page shows as it is.
     """
     interrupted = f"Interrupted: {report.interrupted}."
-    alerts = [Alert(interrupted, f"The numbers are of the {report.frames} frames done.")]
+    done = counted(report.frames, "frame")
+    alerts = [Alert(interrupted, f"The numbers are of the {done} before it.")]
     if not report.interrupted:
         alerts = []
     alerts += [Alert(f"Warning: {warning}") for warning in report.warnings]
@@ -237,7 +247,7 @@ def machine_rows(report: ReportJson) -> list[tuple[str, str]]:
     machine = report.machine
     packages = {name: text for name, text in report.versions.items() if name != "python"}
     return [
-        ("CPU", f"{machine.cpu}, {machine.cores} cores"),
+        ("CPU", f"{machine.cpu}, {counted(machine.cores, 'core')}"),
         ("platform", machine.platform),
         ("Python", machine.python),
         ("packages", ", ".join(f"{name} {text}" for name, text in packages.items())),

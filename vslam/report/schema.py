@@ -133,6 +133,8 @@ class ReportJson(Measures, Document):
     ``detectors`` has a row for each detector, the run's own first, where others were run beside it
     (``--compare``): speed, CPU time and memory are then those of all together. It is empty in a run
     that was resumed, since the maps of the others are not saved.
+    ``lost_before_map`` counts those of the lost frames that came before the first tracked one, in a
+    run that began a new map.
     ``frames`` counts the frames that were processed; of them ``skipped_frames`` had an unreadable
     image and ``dropped_frames`` were overtaken by a newer one in a real-time run, whose
     ``latency_ms`` is from the time of an image to its pose (None in any other run).
@@ -142,6 +144,7 @@ class ReportJson(Measures, Document):
 
     schema_version: int = 5
 
+    lost_before_map: int = 0
     weak_frames: int
     skipped_frames: int
     skipped_messages: list[str]

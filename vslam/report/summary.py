@@ -6,6 +6,7 @@ import platform
 from collections import Counter
 from dataclasses import asdict
 from datetime import UTC, datetime
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,7 @@ def summarize(
     del options["config"]
     loops = _loops(outcome, verdict)
     return ReportJson(
+        lost_before_map=_lost_before_map(outcome),
         weak_frames=states[TrackingState.WEAK],
         skipped_frames=len(outcome.skipped),
         skipped_messages=outcome.skipped,
@@ -84,6 +86,14 @@ def summarize(
         **_measures(outcome, evaluation, verdict),
         **options,
     )
+
+
+def _lost_before_map(outcome: RunOutcome) -> int:
+    if outcome.settings.map is not None or not outcome.n_tracked:
+        return 0
+    untracked = (TrackingState.LOST, TrackingState.DROPPED)
+    before = takewhile(lambda track: track.state in untracked, outcome.tracks)
+    return sum(track.state == TrackingState.LOST for track in before)
 
 
 def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from itertools import cycle
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -30,6 +31,9 @@ from vslam.report.summary import evaluate_run
 from vslam.run.outcome import RunOutcome
 from vslam.trajectory import Trajectory
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 Points = NDArray[np.float64]
 
 
@@ -41,7 +45,7 @@ def top_view(
 ) -> Figure:
     """Estimate and truth, doubtful frames, closed loops, and revisits that were missed; dashed, the
     estimates of the detectors compared, each after an alignment of its own."""
-    figure, axes = new_figure("Top view", "x (m)", "z (m)", SQUARE)
+    figure, axes = _new_map("Top view", outcome, evaluation)
     path = _aligned(outcome, evaluation, outcome.trajectory.T_wc[:, :3, 3])
     x, z = path[:, 0], path[:, 2]
     if evaluation is not None and ground_truth is not None:
@@ -106,7 +110,7 @@ def loop_closing(
     Both go through the alignment of the final trajectory: before and after are drawn where the map
     had them, so that what moved is what loop closing moved.
     """
-    figure, axes = new_figure("Map before and after loop closing", "x (m)", "z (m)", SQUARE)
+    figure, axes = _new_map("Map before and after loop closing", outcome, evaluation)
     if evaluation is not None and ground_truth is not None:
         truth = ground_truth.T_wc[:, :3, 3]
         axes.plot(truth[:, 0], truth[:, 2], color=GREY, linewidth=3.4, alpha=0.65, label="truth")
@@ -136,6 +140,12 @@ def loop_closing(
         axes.plot(*lines, "o--", color=GREEN, linewidth=1.2, markersize=4, label=label, zorder=5)
     finish_map(figure, axes)
     return figure
+
+
+def _new_map(title: str, outcome: RunOutcome, evaluation: Evaluation | None) -> tuple[Figure, Axes]:
+    monocular = outcome.settings.sensor == "mono"
+    unit = "map units" if monocular and evaluation is None else "m"
+    return new_figure(title, f"x ({unit})", f"z ({unit})", SQUARE)
 
 
 def _centres(T_cw: NDArray[np.float64]) -> Points:

@@ -21,7 +21,6 @@ from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.errors import BrokenSourceError, InputError
 from vslam.features import TrackingState, TrackResult
-from vslam.frontend.sides import Sides
 from vslam.loopclosure.registry import detector_with_images, problem_of
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.machine import give_back_memory, peak_memory_mb, process_age
@@ -61,25 +60,27 @@ def run_sequence(
     """Run SLAM over a whole sequence, or over a stream until it ends.
 
     A frame that cannot be read is skipped: it gets a predicted pose, counts as lost and is listed
-    in the outcome. One that is dropped in a real-time run gets an interpolated pose. Ctrl-C ends
-    the run after the current frame, a source that breaks off after its last good one, a detector of
-    another package, and any other part, where it fails; all done so far is kept. If mapping failed,
-    the map is incomplete: the outcome then has no map, and its poses are those of tracking.
+    in the outcome. A frame that is dropped in a real-time run gets an interpolated pose.
 
-    The detectors of ``settings.compare`` run beside the main one. Images are read and features
-    extracted once; each detector has a map of its own, of which only trajectory, frames and loops
-    are kept. One that fails ends alone. A run that is resumed goes on without them, since their
-    maps were not saved.
+    The run ends early after Ctrl-C (after the current frame), when the source breaks off, and when
+    a part of the run fails, such as a detector of another package. Everything done so far is kept.
+    If mapping failed, the map is incomplete: the outcome then has no map, and its poses are those
+    of tracking.
+
+    The detectors of ``settings.compare`` run on the same frames as the main one. Images are read
+    and features extracted once. Each detector has its own map, of which only trajectory, frames and
+    loops are kept. If one of them fails, the others continue. A resumed run continues without them,
+    because their maps were not saved.
 
     Args:
-        autosave: saves what is done while the run goes on.
-        resume: what such a run left; this one goes on at the next frame, and its outcome covers
-            both.
-        slam: what ``begin`` gave for the same settings, if that was called before.
+        autosave: saves the state of the run at intervals.
+        resume: what an unfinished run left; this run continues at the next frame, and its outcome
+            covers both parts.
+        slam: the result of ``begin`` for the same settings, if it was called before.
 
     Raises:
-        InputError: before the first frame: the images are not those that the resumed run began
-            with, or cannot be read; as ``begin``.
+        InputError: raised only before the first frame: the images cannot be read, or are not those
+            of the resumed run; also as ``begin``.
     """
     cv2.setNumThreads(1)  # the pool uses the cores
     slam = slam or begin(sequence.camera, settings, None if resume is None else resume.map)
@@ -93,7 +94,14 @@ def run_sequence(
         frames = perturbed(_until_broken(sequence.frames(), broken), perturbation)
         frames = _following(frames, main.before.tracks.timestamps)
         try:
-            for played in in_their_time(frames, slam.context, settings, live=sequence.live):
+            for played in in_their_time(
+                frames,
+                slam.context,
+                settings,
+                live=sequence.live,
+                begin=len(main.tracks),
+                next_keyframe=lambda: slam.next_keyframe,
+            ):
                 result = main.step(played)
                 if (frame := played.made) is not None and frame.problem and not frame.dropped:
                     _log.warning("frame %d skipped: %s", result.index, frame.problem)
@@ -138,14 +146,14 @@ def run_sequence(
 
 
 def _compared(camera: Camera, settings: RunSettings) -> list[_Run]:
-    """The runs of ``settings.compare`` before their first frame; weights that were given are the
-    main detector's."""
+    """The runs of ``settings.compare`` before their first frame. ``settings.weights`` are those of
+    the main detector only."""
     each = [replace(settings, detector=name, weights=None, compare=()) for name in settings.compare]
     return [_Run(begin(camera, one), one, Progress()) for one in each]
 
 
 class _Run:
-    """One detector's SLAM, and what becomes of its frames, those before it was resumed included.
+    """The SLAM of one detector and its results, including those before the run was resumed.
 
     Attributes:
         step_s: wall time of its own steps (``RunOutcome.step_s``).
@@ -154,7 +162,6 @@ class _Run:
     def __init__(self, slam: Slam, settings: RunSettings, before: Progress) -> None:
         self.slam, self.settings, self.before = slam, settings, before
         self.tracks = before.tracks.results()
-        self.sides = before.tracks.sides()
         self.skipped = list(before.skipped)
         self.latency_ms = list(before.latency_ms)
         self.startup_s = process_age()
@@ -165,12 +172,12 @@ class _Run:
 
     @property
     def problem(self) -> str | None:
-        """What failed, in a few words, so that the run ends; None if nothing did."""
+        """The failure that ends the run, in a few words; None if nothing failed."""
         return self._failure or problem_of(self.slam.detector)
 
     @property
     def has_begun(self) -> bool:
-        """Whether a frame was done since the run began or was resumed."""
+        """Whether a frame was processed since the run began or was resumed."""
         return len(self.tracks) > len(self.before.tracks)
 
     @property
@@ -183,7 +190,7 @@ class _Run:
         return True
 
     def fail(self, what: str, error: Exception) -> None:
-        """Note what ended the run; what follows from it is not noted."""
+        """Record why the run ends. Only the first failure is kept, because it may cause others."""
         if self._failure is not None:
             return
         if sys.flags.dev_mode:
@@ -193,40 +200,37 @@ class _Run:
 
     @contextmanager
     def keeping_what_is_done(self, what: str) -> Iterator[None]:
-        """Let an exception end this run alone, so that all done before is kept."""
+        """Turn an exception into the failure of this run, so that its results so far are kept."""
         try:
             yield
         except Exception as error:
             self.fail(what, error)
 
     def trajectory(self) -> Trajectory:
-        """Pose of each frame done, as the map is now."""
-        # A frame that failed after it was placed is no frame of the run.
+        """The pose of each processed frame, according to the present map."""
+        # A frame that failed after its pose was added does not count.
         return self.slam.trajectory().select(np.arange(len(self.tracks)))
 
     def step(self, played: Played[PreparedFrame]) -> TrackResult:
-        """Track a frame that was prepared, or pass over one that was dropped or cannot be read."""
+        """Track a prepared frame, or skip one that was dropped or cannot be read."""
         start = time.perf_counter()
         timestamp, frame = played.timestamp, played.made
         if frame is None or frame.dropped:
-            result, sides = self.slam.skip(timestamp, dropped=True), None
+            result = self.slam.skip(timestamp, dropped=True)
         elif frame.images is None:
-            result, sides = self.slam.skip(timestamp), frame.sides
+            result = self.slam.skip(timestamp)
             self.skipped.append(f"frame {len(self.tracks)}: {frame.problem}")
         else:
             result = self.slam.step_images(frame.images, timestamp, frame.stage_ms)
-            sides = frame.sides
             if self.settings.realtime:
                 self.latency_ms.append(1e3 * (time.perf_counter() - played.came))
         self.step_s += time.perf_counter() - start
         self.tracks.append(result)
-        self._log.append(result, sides or Sides())
-        if sides is not None:
-            self.sides.append(sides)
+        self._log.append(result)
         return result
 
     def finish(self) -> None:
-        """Complete what is being mapped."""
+        """Complete all mapping."""
         start = time.perf_counter()
         self.slam.finish()
         self.step_s += time.perf_counter() - start
@@ -237,7 +241,7 @@ class _Run:
         return self.before.wall_s + wall, self.before.cpu_s + cpu
 
     def so_far(self) -> Progress:
-        """A copy of what is known, for an autosave."""
+        """A copy of the results so far, for an autosave."""
         slam, before = self.slam, self.before
         frames = _frames_of_this_run(slam.map)
         loops, corrections = in_frames(slam.loops, slam.corrections, frames)
@@ -260,7 +264,7 @@ def _show(
     played: Played[PreparedFrame],
     n_told: int,
 ) -> int:
-    """Show the recorder a frame, and the map while it can be read; returns the loops told."""
+    """Record a frame, and the map if nobody changes it; returns the number of recorded loops."""
     recorder.frame(result, result.T_wc)
     images = None if played.made is None else played.made.images
     if result.is_keyframe and slam.frame is not None and images is not None:
@@ -272,10 +276,10 @@ def _show(
 
 
 def _following(frames: Iterator[TimedFrame], before: NDArray[np.float64]) -> Iterator[TimedFrame]:
-    """The frames after those of a run that is resumed, whose times were ``before`` ``(N,)``.
+    """The frames after those of the resumed run, whose times were ``before`` ``(N,)``.
 
     Raises:
-        InputError: they are others.
+        InputError: the source's first frames have other times.
     """
     for index, timestamp in enumerate(before.tolist()):
         frame = next(frames, None)
@@ -283,7 +287,7 @@ def _following(frames: Iterator[TimedFrame], before: NDArray[np.float64]) -> Ite
             now = "there is none" if frame is None else f"it has {frame.timestamp:.6f} s"
             raise InputError(
                 f"--resume: frame {index} had the time {timestamp:.6f} s, now {now}: these are not "
-                "the images that the run began with; put those back, or run anew."
+                "the images of that run; restore them, or start a new run."
             )
     yield from frames
 
@@ -294,7 +298,7 @@ def _outcome(
     seconds: tuple[float, float],
     interrupted: str | None,
 ) -> RunOutcome:
-    """All that is known at the end; ``seconds`` of wall and CPU time of all frames."""
+    """The outcome of a run; ``seconds`` are the wall and the CPU time of all frames."""
     keyframes = [track for track in run.tracks if track.is_keyframe]
     outcome = RunOutcome(
         settings=run.settings,
@@ -322,7 +326,7 @@ def _outcome(
 
 
 def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
-    """An outcome with all that only a complete map tells."""
+    """Add the results that need a complete map."""
     slam, settings, camera = run.slam, run.settings, outcome.sequence.camera
     loops, corrections, keyframe_frames = _with_earlier(run.before, slam)
     return replace(
@@ -332,7 +336,7 @@ def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
         warnings=[
             *calibration_warnings(camera, settings.calib, outcome.sequence.name),
             *slam.problems,
-            *rig_warnings(run.sides),
+            *rig_warnings(slam.rig.sides),
             *_map_warnings(slam, camera),
         ],
         n_keyframes=len(slam.map.living_keyframes()),
@@ -350,7 +354,7 @@ def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
 
 
 def _map_warnings(slam: Slam, camera: Camera) -> list[str]:
-    """Faults of the rig that the map shows."""
+    """Warnings about faults of the rig that the map shows."""
     try:
         residuals = measure_rig(slam.map, camera)
         return delay_warnings(slam.rig.delay, camera) or residual_warnings(residuals, camera)
@@ -365,7 +369,7 @@ def _with_earlier(
 ) -> tuple[list[LoopEdge], list[LoopCorrection], NDArray[np.int64]]:
     """Loops and corrections of a whole run, and the frame of each keyframe that they name.
 
-    Those of before name frames. These get numbers after those of the map's keyframes.
+    Earlier loops name frames; these frames get numbers after those of the map's keyframes.
     """
     frames = _frames_of_this_run(slam.map)
     if not before.loops:
@@ -384,12 +388,14 @@ def _with_earlier(
 
 
 def begin(camera: Camera, settings: RunSettings, saved: Path | None = None) -> Slam:
-    """SLAM before its first frame, with the detector asked for, in a new map or in one of a file;
-    with ``saved``, the map that an unfinished run left, before the next frame of that run.
+    """Create the ``Slam`` of a run: with a new map, or with the map that ``settings.map`` names.
+
+    Args:
+        saved: the map that an unfinished run left; the ``Slam`` continues after its last frame.
 
     Raises:
-        InputError: no such map, one of another camera, detector or pyramid, or weights that cannot
-            be read.
+        InputError: the map does not exist or is of another camera, detector or pyramid, or the
+            weights cannot be read.
     """
     config, threads = settings.config, settings.threads
     late = not settings.realtime  # then nothing is loaded while the camera drives
@@ -407,17 +413,17 @@ def begin(camera: Camera, settings: RunSettings, saved: Path | None = None) -> S
 
 
 def require_camera(map_file: Path, camera: Camera) -> None:
-    """Refuse images of another camera than those that a map was made of.
+    """Refuse a map that was made with another camera.
 
     Raises:
-        InputError: it is another one, or there is no such map.
+        InputError: the cameras differ, or there is no such map.
     """
     of_map, _ = made_with(map_file)
     if not same_camera(of_map, camera):
         raise InputError(
             f"{map_file}: the map's camera is not that of the images ({of_map.sensor}, "
-            f"{of_map.width}x{of_map.height}, fx {of_map.fx:.1f}); go on with images of the same "
-            "camera, rectified alike."
+            f"{of_map.width}x{of_map.height}, fx {of_map.fx:.1f}); continue with images of the "
+            "same camera, rectified in the same way."
         )
 
 
@@ -426,7 +432,7 @@ def _frames_of_this_run(map_: Map) -> NDArray[np.int64]:
 
 
 def _until_broken(frames: Iterator[TimedFrame], broken: list[str]) -> Iterator[TimedFrame]:
-    """The frames of a source; where it breaks off, they end, and ``broken`` is told why."""
+    """The frames of a source until it breaks off; the reason is then appended to ``broken``."""
     try:
         yield from frames
     except BrokenSourceError as error:
@@ -438,7 +444,7 @@ def _until_broken(frames: Iterator[TimedFrame], broken: list[str]) -> Iterator[T
 
 
 def _tell_loops(recorder: Recorder, slam: Slam, n_told: int) -> int:
-    """Show the recorder the loops decided since it was told of ``n_told``; returns how many now."""
+    """Record the loops after the first ``n_told``; returns the number of recorded loops."""
     if len(slam.loops) > n_told:
         recorder.loops(slam.loops[n_told:], slam.map)
     return len(slam.loops)

@@ -1,25 +1,23 @@
-"""From frames yet to be read to features: decoded, perturbed and extracted a few frames ahead.
+"""Decodes and perturbs frames and extracts their features, a few frames ahead of tracking.
 
-All of that is a pure function of a frame, done by a small pool. The order is kept, so that the
-result does not depend on the number of threads. In real time frames are prepared when they come,
-both images at once, and those that come too soon are dropped; then it depends on the machine.
+Each frame is prepared independently of the others by a small thread pool, and the order is kept, so
+that the result does not depend on the number of threads. In real time, a frame is prepared when it
+arrives, its two images in parallel. Frames that arrive too fast are dropped; which ones depends on
+the machine.
 """
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
-
-import numpy as np
+from dataclasses import dataclass
 
 from vslam.camera import DepthImage, Image, ImageMap
 from vslam.datasets.frames import TimedFrame
 from vslam.errors import DroppedFrameError, UnreadableImageError
 from vslam.frontend.extraction import FrameImages
-from vslam.frontend.sides import Sides, compare_sides
 from vslam.frontend.tracking import TrackingContext
 from vslam.run.outcome import RunSettings
 from vslam.run.realtime import Played, play
@@ -27,20 +25,29 @@ from vslam.run.realtime import Played, play
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """A frame ready to be tracked, or the reason why it cannot be read; ``dropped`` by a
-    perturbation."""
+    """A frame ready to be tracked, or the reason why it cannot be read; ``dropped`` tells
+    whether a perturbation dropped it."""
 
     images: FrameImages | None
     stage_ms: dict[str, float]
     problem: str | None = None
     dropped: bool = False
-    sides: Sides = field(default_factory=Sides)
 
 
 def in_their_time(
-    frames: Iterator[TimedFrame], context: TrackingContext, settings: RunSettings, *, live: bool
+    frames: Iterator[TimedFrame],
+    context: TrackingContext,
+    settings: RunSettings,
+    *,
+    live: bool,
+    begin: int = 0,
+    next_keyframe: Callable[[], int] = lambda: -1,
 ) -> Iterator[Played[PreparedFrame]]:
-    """Prepared frames and when they came: all of them at the start, or each in its time."""
+    """Prepared frames with their arrival times: at once, or in real time each at its own time.
+
+    Args:
+        begin, next_keyframe: see ``prepared_frames``; not used in real time.
+    """
     if settings.realtime:
         with ThreadPoolExecutor(2, "side") as pool:
             image_map = map if settings.threads == 1 else pool.map
@@ -52,14 +59,24 @@ def in_their_time(
             )
         return
     start = time.perf_counter()
-    for timestamp, prepared in prepared_frames(frames, context, settings.threads):
+    ahead = prepared_frames(frames, context, settings.threads, begin, next_keyframe)
+    for timestamp, prepared in ahead:
         yield Played(timestamp, prepared, start)
 
 
 def prepared_frames(
-    frames: Iterator[TimedFrame], context: TrackingContext, threads: int
+    frames: Iterator[TimedFrame],
+    context: TrackingContext,
+    threads: int,
+    begin: int = 0,
+    next_keyframe: Callable[[], int] = lambda: -1,
 ) -> Iterator[tuple[float, PreparedFrame]]:
-    """Frames in order with their times; with more than one thread, prepared a few frames ahead."""
+    """Frames in order with their times; with more than one thread, prepared a few frames ahead.
+
+    Args:
+        begin: index of the first frame.
+        next_keyframe: ``Slam.next_keyframe``: the features of this frame are extracted ahead.
+    """
     if threads == 1:
         for frame in frames:
             yield frame.timestamp, prepare_frame(frame, context)
@@ -72,33 +89,45 @@ def prepared_frames(
                 if len(ahead) == 2 * threads:
                     timestamp, prepared = ahead.popleft()
                     yield timestamp, prepared.result()
+                    begin += 1
+                    if 0 <= (due := next_keyframe() - begin) < len(ahead):
+                        pool.submit(_find_corners, ahead[due][1])
             for timestamp, prepared in ahead:
                 yield timestamp, prepared.result()
         finally:
             pool.shutdown(cancel_futures=True)
 
 
+def _find_corners(prepared: Future[PreparedFrame]) -> None:
+    images = prepared.result().images
+    if images is not None:
+        images.find_corners()
+
+
 def prepare_frame(
     frame: TimedFrame, context: TrackingContext, image_map: ImageMap = map
 ) -> PreparedFrame:
-    """Read one frame and extract its features."""
+    """Read one frame and extract its features. If frames are tracked by patches, features and the
+    right image wait until tracking asks for them."""
     start = time.perf_counter()
     try:
-        left, second = frame.read(image_map)
+        read_second: Callable[[], Image | DepthImage | None]
+        if context.tracks_patches and frame.sides is not None:
+            left, read_second = frame.sides[0](), frame.sides[1]
+        else:
+            left, second = frame.read(image_map)
+            read_second = _giving(second)
     except UnreadableImageError as error:
         dropped = isinstance(error, DroppedFrameError)
         return PreparedFrame(None, {}, str(error), dropped)
     read = time.perf_counter()
-    sides = _sides(left, second, context)
-    images = FrameImages(left, second, context, image_map, sides)
+    images = FrameImages(left, read_second, context, image_map)
     if not context.tracks_patches:
         images.extracted  # noqa: B018
     done = time.perf_counter()
     stage_ms = {"read": 1e3 * (read - start), "extract": 1e3 * (done - read)}
-    return PreparedFrame(images, stage_ms, sides=sides)
+    return PreparedFrame(images, stage_ms)
 
 
-def _sides(left: Image, second: Image | DepthImage | None, context: TrackingContext) -> Sides:
-    if second is None or second.dtype != np.uint8:
-        return Sides()
-    return compare_sides(left, np.asarray(second, np.uint8), context.config.stereo)
+def _giving(second: Image | DepthImage | None) -> Callable[[], Image | DepthImage | None]:
+    return lambda: second

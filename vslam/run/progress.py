@@ -17,15 +17,13 @@ from numpy.typing import NDArray
 
 from vslam.errors import InputError
 from vslam.features import TrackingState, TrackResult
-from vslam.frontend.sides import Sides
 from vslam.loops import LoopCorrection, LoopEdge, loop_entry, loop_of
 from vslam.maps.new_output import replaced_file
 from vslam.untrusted import ARCHIVE_ERRORS, read_json, read_npz
 
-SCHEMA = 2
+SCHEMA = 3
 _STATES = tuple(TrackingState)
-_BLACK = ("", "left", "right")
-_POSE, _NUMBERS = 16, 9  # columns of a frame: its pose, then the other numbers
+_POSE, _NUMBERS = 16, 7  # columns of a frame: its pose, then the other numbers
 
 
 @dataclass(frozen=True)
@@ -33,8 +31,8 @@ class TrackTable:
     """Tracking results of N frames, in order.
 
     Attributes:
-        rows: ``(N, 25)`` float64: ``T_wc`` row by row; time, state, features, stereo features,
-            matches, inliers, flags (1 keyframe, 2 relocalised), darker stops, black side.
+        rows: ``(N, 23)`` float64: ``T_wc`` row by row; time, state, features, stereo features,
+            matches, inliers, flags (1 keyframe, 2 relocalised).
         stages: names of the timed stages.
         stage_ms: ``(N, S)`` float64 milliseconds, NaN for a stage that a frame skipped.
     """
@@ -62,12 +60,6 @@ class TrackTable:
             for index, (row, ms) in enumerate(zip(self.rows, self.stage_ms.tolist(), strict=True))
         ]
 
-    def sides(self) -> list[Sides]:
-        """The comparison of left and right image, for each frame that was not dropped."""
-        came = self.rows[:, _POSE + 1] != _STATES.index(TrackingState.DROPPED)
-        told = self.rows[came, _POSE + 7 :].tolist()
-        return [Sides(stops, _BLACK[int(black)]) for stops, black in told]  # type: ignore[arg-type]
-
 
 class TrackLog:
     """A ``TrackTable`` to which frames can be appended."""
@@ -80,13 +72,12 @@ class TrackLog:
         }
         self._n = len(before)
 
-    def append(self, track: TrackResult, sides: Sides) -> None:
+    def append(self, track: TrackResult) -> None:
         """Append the next frame."""
         self._rows.extend(track.T_wc.ravel())
         self._rows.extend((
             track.timestamp, _STATES.index(track.state), track.n_features, track.n_stereo,
             track.n_matches, track.n_inliers, track.is_keyframe + 2 * track.relocalised,
-            sides.darker_stops, _BLACK.index(sides.black),
         ))  # fmt: skip
         for name in track.stage_ms:
             if name not in self._stage_ms:
@@ -238,12 +229,12 @@ def _checked_table(rows: NDArray, stages: list[str], stage_ms: NDArray) -> Track
     if stage_ms.dtype != np.float64 or stage_ms.shape != (len(rows), len(stages)):
         raise ValueError("the stages do not match the frames")
     table = TrackTable(rows, tuple(map(str, stages)), stage_ms)
-    table.results(), table.sides()  # raise an error for an unknown state or side
+    table.results()  # raises an error for an unknown state
     return table
 
 
 def _track(index: int, row: NDArray[np.float64], stage_ms: dict[str, float]) -> TrackResult:
-    timestamp, state, *counts, flags, _, _ = row[_POSE:].tolist()
+    timestamp, state, *counts, flags = row[_POSE:].tolist()
     n_features, n_stereo, n_matches, n_inliers = map(int, counts)
     return TrackResult(
         index=index,

@@ -1,8 +1,7 @@
-"""The recording of a run, to be replayed offline in the Rerun viewer (``rerun recording.rrd``), and
-the same live in a viewer.
+"""The recording of a run, replayed offline in the Rerun viewer (``rerun recording.rrd``) or shown
+live.
 
-One file because it is the only one that imports rerun. A :class:`Recorder` is called from one
-thread.
+This is the only module that imports rerun. A :class:`Recorder` is called from one thread.
 """
 
 from __future__ import annotations
@@ -66,7 +65,8 @@ _POINT_SERIES = {"stereo": _GREY, "matches": _AMBER, "inliers": _BLUE}
 
 @dataclass(frozen=True)
 class _Pace:
-    """How often what is sent: frames at once, and keyframes between two maps, also corrected."""
+    """How often data is sent: the number of frames in a batch, and of keyframes between two maps,
+    ordinarily and after a correction of the map."""
 
     frames: int
     keyframes: int
@@ -78,13 +78,13 @@ _VIEWER_PACE = _Pace(5, 5, 2)  # nothing is kept for long there
 
 
 class Recorder:
-    """What the pipeline tells of a run; this one records nothing (``--no-record``).
+    """Interface to record a run; this base class records nothing (``--no-record``).
 
-    No method raises because a recording cannot be written.
+    No method raises an error if a recording cannot be written.
     """
 
     def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None:
-        """Log what does not change; once, before the first frame.
+        """Log what does not change during a run; called once, before the first frame.
 
         Args:
             camera: of the images given to :meth:`keyframe`.
@@ -111,14 +111,15 @@ class Recorder:
         """
 
     def map(self, map_: Map) -> None:
-        """Offer the map, whenever nobody writes it; the recorder decides which states to log."""
+        """Called whenever the map is not being changed; the recorder decides when to log it."""
 
     def loops(self, edges: Collection[LoopEdge], map_: Map) -> None:
-        """Log loops just decided, accepted or not, after :meth:`frame` while nobody writes the map.
+        """Log new loops, accepted or rejected. Called after :meth:`frame`, between two changes of
+        the map.
 
         Args:
-            edges: those decided since the last call.
-            map_: after their correction.
+            edges: the loops since the last call.
+            map_: the map after it was corrected by these loops.
         """
 
     def finish(self, trajectory: Trajectory, map_: Map | None) -> None:
@@ -127,8 +128,8 @@ class Recorder:
 
 
 class SeveralRecorders(Recorder):
-    """Tells each of several recorders. One that ends does not end the others; one that raises is
-    told no more, and a warning is logged."""
+    """Forwards every call to several recorders. If one raises an error, a warning is logged and the
+    others continue without it."""
 
     def __init__(self, recorders: Sequence[Recorder]) -> None:
         self.recorders = list(recorders)
@@ -172,8 +173,8 @@ class Viewer:
     """A viewer that has been started.
 
     Attributes:
-        address: where a person finds it, empty for a window.
-        sink: of rerun, where a recording is sent to.
+        address: URL of the viewer's page; empty for a window.
+        sink: rerun's object that a recording is sent to.
     """
 
     address: str
@@ -215,8 +216,8 @@ def open_viewer(kind: str) -> Viewer:
 
 
 def _start_viewer(port: int, words: list[str]) -> subprocess.Popen[bytes]:
-    """A viewer that this machine alone can reach; rerun's own functions let it listen on every
-    interface. It has a session of its own: Ctrl-C is for the run."""
+    """Start a viewer that only this machine can reach; rerun's own functions let it listen on every
+    interface. It has its own session, so that Ctrl-C ends the run and not the viewer."""
     command = [_executable(), "--bind=127.0.0.1", f"--port={port}", "--hide-welcome-screen", *words]
     nothing = subprocess.DEVNULL
     return subprocess.Popen(
@@ -242,7 +243,7 @@ def _listens(port: int) -> bool:
 
 
 def _free_port(wanted: int) -> int:
-    """This port, or any other where it is taken."""
+    """This port if it is free, otherwise any free port."""
     for port in (wanted, 0):
         with socket.socket() as probe:
             try:
@@ -281,23 +282,23 @@ class RerunRecorder(Recorder):
     loop on) and ``rejected`` (faint red, for 20 frames), ``loops/images`` (the two images of each
     closed loop with their matches, until the next loop), ``world/ground_truth`` (static),
     ``world/trajectory`` (the final one, up to the frame shown), ``points/*`` and ``stage_ms/*``
-    (every frame), ``state`` (on change) and ``state/loops`` (each with its reason). The world is
-    the one of the estimate: first frame of the run, x right, y down, z forward.
+    (every frame), ``state`` (on change) and ``state/loops`` (each with its reason). The origin of
+    the world is the estimated pose of the run's first frame: x right, y down, z forward.
 
-    Failing to write never ends a run. Rerun writes in a thread of its own, whose errors only a
-    later flush reports, and after an error waiting for that thread can last forever. Therefore the
-    recording ends, with a warning in the log, when the disk has less than 64 MB left: it is then
-    complete up to there. When a flush fails or takes longer than 5 s, the recording is given up
-    with a warning: its file may be cut off within a message. So is a viewer that has been closed.
+    A recording that cannot be written never ends a run. Rerun writes in its own thread. Errors of
+    that thread are reported only by a later flush, which may then never return. Therefore the
+    recording ends, with a warning in the log, when the disk has less than 64 MB left; everything up
+    to that frame is in the file. If a flush fails or takes longer than 5 s, or the viewer was
+    closed, the recording also ends with a warning, and the file may break off within a message.
     """
 
     def __init__(self, target: Path | Viewer, pictures: Sequence[LoopPicture] = ()) -> None:
-        """Open a file, replacing an old recording, or send to a viewer; where that fails, warn and
-        record nothing.
+        """Open a file, replacing an old recording, or connect to a viewer; if that fails, log a
+        warning and record nothing.
 
         Args:
-            pictures: of the loops that were closed. Those that another recorder has added, told of
-                loops before this one, are recorded.
+            pictures: a list to which a recorder that is called before this one adds pictures of the
+                closed loops; they are recorded too.
         """
         import rerun as rr
 
@@ -469,7 +470,7 @@ class RerunRecorder(Recorder):
     def _log_lines(
         self, name: str, edges: list[LoopEdge], map_: Map, color: tuple[int, ...]
     ) -> None:
-        """From the query to the match of each loop; a frame outside the map has no place yet."""
+        """A line from the query to the match of each loop, unless the query is not in the map."""
         import rerun as rr
 
         ends = [(edge.match, edge.query) for edge in edges if edge.query >= 0]
@@ -479,7 +480,7 @@ class RerunRecorder(Recorder):
         self._recording.log(f"world/loops/{name}", lines)
 
     def _log_pictures(self) -> None:
-        """The loops closed just now: if there are several, the last one stays in sight."""
+        """The pictures of new loops; if there are several, the last one stays visible."""
         import rerun as rr
 
         new = self._pictures[self._n_pictures :]

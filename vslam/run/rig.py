@@ -1,4 +1,4 @@
-"""Faults of a stereo rig that show in a run, said in sentences for its report."""
+"""Detects faults of a stereo rig during a run and describes them in sentences for the report."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera, calibration_doubts
 from vslam.frontend.side_delay import SideDelay
-from vslam.frontend.sides import Sides
+from vslam.frontend.sides import ComparedSides
 from vslam.geometry import compose, inverse, orthonormalised, se3_log
 from vslam.map import Map
 
@@ -30,12 +30,12 @@ _SUSPECT_DELAY_S, _SUSPECT_OFFSET_PX = 0.4e-3, 0.2
 
 @dataclass(frozen=True)
 class RigResiduals:
-    """What the final map leaves unexplained of the columns in right images.
+    """Systematic errors of the columns in right images, as the final map shows them.
 
     Attributes:
-        delay_s: by which the right side seems later, from residuals that grow with the speed of
-            the image; NaN where the camera hardly moved.
-        offset_px: of all disparities.
+        delay_s: how much later than the left image the right one seems to be, from residuals that
+            are proportional to the speed of the image; NaN if the camera hardly moved.
+        offset_px: constant error of all disparities.
     """
 
     delay_s: float
@@ -43,8 +43,8 @@ class RigResiduals:
 
 
 def measure_rig(map_: Map, camera: Camera) -> RigResiduals | None:
-    """Fit the stereo residuals of a map by a delay, an offset and a scale of disparities; None with
-    too few observations, or without two sides."""
+    """Fit the stereo residuals of a map by a delay, an offset and a scale of disparities; None if
+    there are too few observations or the camera is not stereo."""
     if camera.sensor != "stereo" or map_.n_keyframes < 3:
         return None
     arrays = map_.arrays
@@ -74,8 +74,8 @@ def measure_rig(map_: Map, camera: Camera) -> RigResiduals | None:
 def fit(
     residual: NDArray[np.float64], speed: NDArray[np.float64], disparity: NDArray[np.float64]
 ) -> tuple[float, float, float]:
-    """Delay (s), offset (px) and share of the disparity that explain ``(N,)`` residuals in pixels
-    best, by their Huber loss; ``speed`` in pixels a second."""
+    """Delay (s), offset (px) and relative error of the disparity that minimise the Huber loss of
+    ``(N,)`` residuals in pixels; ``speed`` in pixels per second."""
     A = np.stack([speed, np.ones_like(speed), disparity], axis=1)
     x = np.zeros(3)
     for _ in range(_ROUNDS):
@@ -85,8 +85,8 @@ def fit(
 
 
 def _twists(map_: Map) -> NDArray[np.float64]:
-    """``(K, 6)`` motion of each keyframe per second, NaN beside a gap. Each drive has a clock of
-    its own."""
+    """``(K, 6)`` twist of each keyframe per second, NaN beside a gap. Drives are treated
+    separately, because each has its own clock."""
     T_cw, times = map_.arrays.T_cw, map_.timestamps
     twists = np.full((map_.n_keyframes, 6), np.nan)
     living = map_.living_keyframes()
@@ -103,20 +103,20 @@ def _twists(map_: Map) -> NDArray[np.float64]:
 
 
 def calibration_warnings(camera: Camera, calib: Sequence[Path], name: str) -> list[str]:
-    """What is implausible about a calibration, nothing for a plausible one.
+    """Warnings about an implausible calibration.
 
     Args:
         camera: as calibrated.
         calib: the files of ``--calib``; if none was given, the data set has its own.
-        name: of the sequence.
+        name: name of the sequence.
     """
     source = ", ".join(map(str, calib)) or f"the calibration of {name}"
     return [f"{source}: {doubt}." for doubt in calibration_doubts(camera)]
 
 
 def delay_warnings(delay: SideDelay, camera: Camera) -> list[str]:
-    """What the rows of stereo matches say of the delay between the sides, nothing if it is that of
-    the calibration."""
+    """A warning if the delay between the sides, measured by the rows of stereo matches, is not that
+    of the calibration."""
     if not delay.is_wrong:
         return []
     known = camera.right_delay
@@ -131,7 +131,7 @@ def delay_warnings(delay: SideDelay, camera: Camera) -> list[str]:
 
 
 def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
-    """What residuals say of the rig, nothing of a sound one."""
+    """A warning if the residuals show a delay between the sides or an offset of disparities."""
     if found is None:
         return []
     said = []
@@ -152,24 +152,26 @@ def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
     return said
 
 
-def rig_warnings(sides: Sequence[Sides]) -> list[str]:
-    """What set the sides apart during a run, nothing for a rig without a fault."""
+def rig_warnings(sides: ComparedSides) -> list[str]:
+    """Warnings about a side that was black or darker than the other one during a run."""
     found = []
-    for side, other in (("left", "right"), ("right", "left")):
-        black = sum(pair.black == side for pair in sides)
+    for side, other, black in (
+        ("left", "right", sides.n_black_left),
+        ("right", "left", sides.n_black_right),
+    ):
         if black >= _FEWEST:
             found.append(
-                f"The {side} side was black in {black} of {len(sides)} frames while the {other} "
+                f"The {side} side was black in {black} of {sides.n} frames while the {other} "
                 f"one was not: they were tracked with the {other} side alone. Check its cable, "
                 "shutter and lens cap."
             )
-    darker = [pair.darker_stops for pair in sides if pair.darker_stops]
+    darker = sides.darker_stops
     if len(darker) >= _FEWEST:
         stops = statistics.median(darker)
         side, other = ("right", "left") if stops > 0 else ("left", "right")
         found.append(
             f"The {side} side was {abs(stops):.1f} stops darker than the {other} one in "
-            f"{len(darker)} of {len(sides)} frames: it was brightened to match. Check exposure, "
+            f"{len(darker)} of {sides.n} frames: it was brightened to match. Check exposure, "
             "gain and aperture of both."
         )
     return found

@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 
 from vslam.camera import Image
 from vslam.datasets.perturbation.kinds import (
+    EachSide,
     Law,
     LawKind,
     PairLaw,
     RandomStream,
     Scene,
-    each_side,
     to_8_bits,
 )
 
@@ -53,7 +53,7 @@ def _vignetting(stops: float, stream: RandomStream, scene: Scene) -> PairLaw:
     corner = x[0] ** 2 + y[0] ** 2
     share = (x[None, :] ** 2 + y[:, None] ** 2) / corner
     gain = (2.0 ** (-stops * share)).astype(np.float32)
-    return each_side(lambda frame, t, side, image: to_8_bits(image * gain))
+    return EachSide(lambda frame, t, side, image: to_8_bits(image * gain))
 
 
 def _dirt(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
@@ -63,7 +63,7 @@ def _dirt(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
     def law(frame: int, t: float, side: int, image: Image) -> Image:
         return to_8_bits(image + opacity[side] * (np.float32(_DIRT_GREY) - image))
 
-    return each_side(law)
+    return EachSide(law)
 
 
 def _blobs(share: float, seed: list[int], scene: Scene) -> NDArray[np.float32]:
@@ -94,7 +94,7 @@ def _flare(greys: float, stream: RandomStream, scene: Scene) -> PairLaw:
         radius = camera.width * rng.uniform(0.01, 0.05)
         veil[(x - at[0]) ** 2 + (y - at[1]) ** 2 < radius**2] += 0.5 * greys
     stray = veil.astype(np.float32)
-    return each_side(lambda frame, t, side, image: to_8_bits(image + stray))
+    return EachSide(lambda frame, t, side, image: to_8_bits(image + stray))
 
 
 def _cosine(

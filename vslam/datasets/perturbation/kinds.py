@@ -157,23 +157,24 @@ class LawKind:
     def law(self, name: str, strength: float, stream: RandomStream) -> PairLaw | SceneLaw:
         """The law of one strength and seed."""
         if not self.of_scene:
-            return each_side(self.make(strength, stream))  # type: ignore[arg-type]
+            return EachSide(self.make(strength, stream))  # type: ignore[arg-type]
         return SceneLaw(name, self.needs, partial(self._made, strength, stream))
 
     def _made(self, strength: float, stream: RandomStream, scene: Scene) -> PairLaw:
         return self.make(strength, stream, scene)  # type: ignore[return-value]
 
 
-def each_side(law: Law) -> PairLaw:
-    """Apply a law of one image to both sides; a depth image is not changed."""
+@dataclass(frozen=True)
+class EachSide:
+    """Applies a law of one image to both sides; a depth image is not changed."""
 
-    def applied(pair: Pair) -> Pair:
-        left = law(pair.index, pair.t, 0, pair.left)
+    law: Law
+
+    def __call__(self, pair: Pair) -> Pair:
+        left = self.law(pair.index, pair.t, 0, pair.left)
         if pair.right is None:
             return replace(pair, left=left)
-        return replace(pair, left=left, second=law(pair.index, pair.t, 1, pair.right))
-
-    return applied
+        return replace(pair, left=left, second=self.law(pair.index, pair.t, 1, pair.right))
 
 
 def to_8_bits(values: NDArray[Any]) -> Image:

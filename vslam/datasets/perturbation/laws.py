@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import partial
 from math import isfinite
@@ -12,7 +12,7 @@ import numpy as np
 
 from vslam.camera import DepthImage, Image, ImageMap
 from vslam.datasets.frames import Source, TimedFrame
-from vslam.datasets.perturbation.kinds import LawKind, Pair, PairLaw, Scene, SceneLaw
+from vslam.datasets.perturbation.kinds import EachSide, LawKind, Pair, PairLaw, Scene, SceneLaw
 from vslam.datasets.perturbation.registry import LAWS, all_laws
 from vslam.errors import DroppedFrameError, InputError, did_you_mean
 
@@ -30,7 +30,7 @@ class Perturbation:
     laws: tuple[PairLaw | SceneLaw, ...] = ()
 
     def bound_to(self, source: Source) -> Perturbation:
-        """The same perturbation for one source: some laws need its depth, poses or other frames.
+        """Prepare the perturbation for one source, because some laws need its depth or poses.
 
         Raises:
             InputError: the source lacks what a law needs.
@@ -104,7 +104,25 @@ def perturbed(frames: Iterator[TimedFrame], perturbation: Perturbation) -> Itera
     for index, frame in enumerate(frames):
         begin = frame.timestamp if begin is None else begin
         t = frame.timestamp - begin
-        yield TimedFrame(frame.timestamp, partial(_read_perturbed, frame, perturbation, index, t))
+        read = partial(_read_perturbed, frame, perturbation, index, t)
+        laws = [law for law in perturbation.laws if isinstance(law, EachSide)]
+        if frame.sides is None or len(laws) < len(perturbation.laws):
+            yield TimedFrame(frame.timestamp, read)
+            continue
+        left, right = (
+            partial(_read_side, read_side, laws, index, t, side)
+            for side, read_side in enumerate(frame.sides)
+        )
+        yield TimedFrame(frame.timestamp, read, (left, right))
+
+
+def _read_side(
+    read: Callable[[], Image], laws: list[EachSide], index: int, t: float, side: int
+) -> Image:
+    image = read()
+    for each in laws:
+        image = each.law(index, t, side, image)
+    return image
 
 
 def _read_perturbed(

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Image
-from vslam.datasets.perturbation.kinds import LawKind, PairLaw, RandomStream, Scene, each_side
+from vslam.datasets.perturbation.kinds import EachSide, LawKind, PairLaw, RandomStream, Scene
 
 _SHRINK = 2
 
@@ -34,7 +34,7 @@ def neighbours(scene: Scene, frame: int) -> tuple[int, int]:
 
 
 def image_velocity(scene: Scene, frame: int) -> NDArray[np.float64]:
-    """``(2,)`` velocity of the image in its middle due to rotation, pixels per second.
+    """``(2,)`` velocity of the image's centre due to rotation, pixels per second.
 
     It is computed from the true rotation if known. Otherwise it is the median optical flow to the
     next frame, which also contains the flow from driving ahead.
@@ -96,7 +96,7 @@ def _motion(shutter_ms: float, stream: RandomStream, scene: Scene) -> PairLaw:
             cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REPLICATE), np.uint8
         )
 
-    return each_side(law)
+    return EachSide(law)
 
 
 KINDS = {

@@ -33,7 +33,7 @@ def all_laws() -> dict[str, LawKind]:
 
 
 def law_kind(name: str) -> LawKind:
-    """The law of a name.
+    """The law with this name.
 
     Raises:
         KeyError: there is none.

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from vslam.camera import Camera, Image
 from vslam.datasets.perturbation.depth import dense_depths
 from vslam.datasets.perturbation.kinds import (
+    EachSide,
     LawKind,
     Pair,
     PairLaw,
     RandomStream,
     Scene,
-    each_side,
     to_8_bits,
 )
 from vslam.datasets.perturbation.motion import forward_speed
@@ -80,7 +80,7 @@ def _rain(mm_per_h: float, stream: RandomStream, scene: Scene) -> PairLaw:
         rng = np.random.default_rng([*stream, side, wiped, 1])
         return _drops_on_glass(to_8_bits(wet), mm_per_h, rng, camera)
 
-    return each_side(law)
+    return EachSide(law)
 
 
 def _streaks(

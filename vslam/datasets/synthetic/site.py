@@ -84,5 +84,5 @@ class Site:
         self.when.append(when)
 
     def changes(self, rng: Rng, rate: float) -> bool:
-        """Draw whether a thing has changed when its place is passed again."""
+        """Draw at random whether an object has changed when its place is passed again."""
         return bool(rng.random() < rate * self.variation.change)

@@ -1,4 +1,4 @@
-"""Rendered sequences on disk, as KITTI trees in the user's cache that can be resumed."""
+"""Rendered sequences as KITTI trees in the user's cache; rendering that stopped is resumed."""
 
 from __future__ import annotations
 

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from vslam.errors import counted
 from vslam.lab.bench.estimate import duration, estimate
 from vslam.lab.bench.execute import CellOutcome, Failed
 from vslam.lab.bench.grid import Cell, read_report
@@ -63,7 +64,7 @@ class GridProgress:
         of finished cells and their median ATE."""
         detectors = list(dict.fromkeys(cell.detector for cell in self.cells))
         caption = "Each entry: finished runs, and their median ATE.\n"
-        caption += f"{len(self.reports)} of {len(self.cells)} cells finished"
+        caption += f"{len(self.reports)} of {counted(len(self.cells), 'run')} finished"
         caption += f", {len(self.failed)} failed" if self.failed else ""
         if self.missing:
             left = estimate(self.missing, self.reports, self._frames, self._jobs).seconds

@@ -6,7 +6,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from vslam.errors import InputError
+from vslam.errors import InputError, counted
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.lab.overview.schema import MEASURES, Drive, OverviewJson, RunEntry
 from vslam.report.schema import ReportJson
@@ -163,7 +163,8 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
         frames=report.frames,
         measures={name: getattr(report, name) for name, *_ in MEASURES},
         source=str(folder),
-        machine=f"{report.machine.cpu}, {report.machine.cores} cores, {report.threads} threads",
+        machine=f"{report.machine.cpu}, {counted(report.machine.cores, 'core')}, "
+        f"{counted(report.threads, 'thread')}",
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
+from vslam.errors import counted
 from vslam.lab.overview.schema import DECIMALS, MEASURES, Measure, OverviewJson, RunEntry, Spread
 from vslam.lab.overview.summary import ALPHA
 from vslam.lab.overview.versus import median_text, versus
@@ -57,8 +58,8 @@ def title(report: OverviewJson) -> str:
     """The systems and the number of runs, in one line."""
     places = len({(row.drive.dataset, row.drive.place) for row in report.rows})
     return (
-        f"{', '.join(report.systems)}: {len(report.runs)} runs on {places} "
-        f"sequence{'s' if places > 1 else ''}"
+        f"{', '.join(report.systems)}: {counted(len(report.runs), 'run')} on "
+        f"{counted(places, 'sequence')}"
     )
 
 

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from itertools import combinations
 from typing import NamedTuple
 
-from vslam.errors import InputError, did_you_mean
+from vslam.errors import InputError, counted, did_you_mean
 from vslam.lab.overview.collect import MONOCULAR, Found
 from vslam.lab.overview.schema import (
     ALL,
@@ -253,7 +253,7 @@ def _words(found: Comparison, better: list[Pair], worse: list[Pair]) -> str:
     if not untied:
         return f"{beginning} a tie on {f'all {n} sequences' if n > 1 else 'the only sequence'}."
     verdict = f"{found.winner} wins" if found.winner else "no winner"
-    text = f"{beginning} {verdict}. Of {n} sequence{'s' if n > 1 else ''}, "
+    text = f"{beginning} {verdict}. Of {counted(n, 'sequence')}, "
     text += "; ".join(counts) + ". "
     differences = sorted(pair.difference for pair in found.pairs)
     least, greatest = (shown.text(differences[k], "+") for k in (0, -1))
@@ -261,10 +261,7 @@ def _words(found: Comparison, better: list[Pair], worse: list[Pair]) -> str:
     text += f"{second} minus {first}: median {median} {shown.unit}"
     text += f" ({least} to {greatest}). " if n > 1 else ". "
     if found.p_value is None:
-        return text + (
-            f"Too few sequences differ ({untied}) for Wilcoxon's test, which takes {least_pairs()} "
-            f"to reach p < {ALPHA:g}: no claim about others."
-        )
+        return text.rstrip()
     chance = "unlikely to be chance" if found.winner else "may be chance"
     return text + f"Wilcoxon's signed-rank test on {untied}: p = {found.p_value:.3g}, {chance}."
 

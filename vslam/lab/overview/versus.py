@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from vslam.errors import counted
 from vslam.evaluation.loops import LoopLimits
 from vslam.lab.overview.schema import Comparison, Drive, OverviewJson, Row, Spread
-from vslam.lab.overview.summary import COMPARED, ROTATION
+from vslam.lab.overview.summary import ALPHA, COMPARED, ROTATION, least_pairs
 from vslam.report.page import Bullets, Section, Table
 
 _TEXTS = ("sequence", "perturbation")
@@ -139,7 +140,7 @@ def _points(report: OverviewJson, rows: Rows, names: list[str]) -> Iterator[str]
     for name in names if shared else ():
         frames, n = total(name, "lost_frames"), len(runs[name])
         count = "n/a" if frames is None else f"{frames:.0f}"
-        lost.append(f"{name} {count} in {n} run{'s' if n != 1 else ''}")
+        lost.append(f"{name} {count} in {counted(n, 'run')}")
         found, missed, wrong = (
             total(name, measure) for measure in ("loops_found", "loops_missed", "loops_wrong")
         )
@@ -149,6 +150,7 @@ def _points(report: OverviewJson, rows: Rows, names: list[str]) -> Iterator[str]
         yield f"Lost frames: {', '.join(lost)}."
     if loops:
         yield f"Revisits in these runs: {'; '.join(loops)}."
+    shown = []
     for k, name in enumerate(names):
         sharing = (other for other in names[:k] if rows[other].keys() & rows[name].keys())
         baseline = next(sharing, None)
@@ -159,4 +161,10 @@ def _points(report: OverviewJson, rows: Rows, names: list[str]) -> Iterator[str]
                 if (one.first, one.second, one.measure) == (baseline, name, measure)
             ]
             if found_:
-                yield found_[-1].words  # over all conditions where there are several
+                shown.append(found_[-1])  # over all conditions where there are several
+    yield from (one.words for one in shown)
+    if any(one.p_value is None and one.first_better + one.second_better for one in shown):
+        yield (
+            f"Where fewer than {least_pairs()} sequences differ, Wilcoxon's test cannot reach "
+            f"p < {ALPHA:g}: the figures say nothing about other sequences."
+        )

@@ -117,8 +117,8 @@ class Plan:
         ]
 
     def searches(self) -> list[Search]:
-        """All searches. A law without randomness is searched once, except for systems that are not
-        deterministic."""
+        """All searches, one for each seed. A law without random numbers is searched with one seed
+        only, unless the system itself gives different results each time."""
         return [
             Search(clean, law, seed, self.steps)
             for seed in range(self.seeds)

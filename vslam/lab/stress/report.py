@@ -11,7 +11,7 @@ import numpy as np
 
 from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import law_kind, sheet_of_laws
-from vslam.errors import InputError
+from vslam.errors import InputError, counted
 from vslam.lab.stress.figures import draw_curves
 from vslam.lab.stress.schema import BoundaryEntry, StressJson
 from vslam.lab.stress.summary import mean_error
@@ -70,7 +70,7 @@ def title(report: StressJson) -> str:
     """The systems and sequences, in one line."""
     systems = list(dict.fromkeys(entry.system for entry in report.clean))
     places = list(dict.fromkeys(f"{entry.dataset} {entry.sequence}" for entry in report.clean))
-    excerpt = f", {report.max_frames} frames" if report.max_frames else ""
+    excerpt = f", {counted(report.max_frames, 'frame')}" if report.max_frames else ""
     does = "does" if len(systems) == 1 else "do"
     return f"Where {does} {', '.join(systems)} break? {', '.join(places)}{excerpt}"
 

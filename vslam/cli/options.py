@@ -144,89 +144,85 @@ def sequences(default: str) -> Any:
 def _source_options(
     source: Annotated[
         str | None,
-        typer.Argument(help="What to read; the same as [b]--data[/b].", show_default=False),
+        typer.Argument(
+            help="What to read; the same as [b]--data[/b].",
+            show_default=False,
+            rich_help_panel=INPUT,
+        ),
     ] = None,
     data: Annotated[
         str | None,
-        typer.Option(
-            metavar="DATA",
-            help="Data set, folder of images, video, bag, or a camera's number or URL "
+        option(
+            INPUT,
+            "DATA",
+            "Data set, folder of images, video, bag, or a camera's number or URL "
             "(docs/howto/sources.md).",
-            show_default="$KITTI_ROOT, else data/kitti",
+            unset="$KITTI_ROOT, else data/kitti",
         ),
     ] = None,
     dataset: Annotated[
         SourceName | None,
-        typer.Option(
-            metavar="KIND",
-            help=f"Kind of data: {', '.join((*_DATASETS, *_SOURCES))}.",
-            show_default="detected from the files",
+        option(
+            INPUT,
+            "KIND",
+            f"Kind of data: {', '.join((*_DATASETS, *_SOURCES))}.",
+            unset="detected from the files",
         ),
     ] = None,
     seq: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME",
-            help="Sequence of a data set.",
-            show_default="00; the only one of EuRoC and TUM",
-        ),
+        option(INPUT, "NAME", "Sequence of a data set.", unset="00; the only one of EuRoC and TUM"),
     ] = None,
     calib: Annotated[
         list[Path] | None,
-        typer.Option(
-            metavar="FILE",
-            help="Calibration of the cameras (docs/howto/cameras.md). Give it twice for one file "
+        option(
+            INPUT,
+            "FILE",
+            "Calibration of the cameras (docs/howto/cameras.md). Give it twice for one file "
             "per camera, the left one first.",
         ),
     ] = None,
     right: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER", help="Right images; [b]--data[/b] then names the left ones."
-        ),
+        option(INPUT, "FOLDER", "Right images; [b]--data[/b] then names the left ones."),
     ] = None,
     depth: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER", help="Depth images; [b]--data[/b] then names the grey or colour ones."
-        ),
+        option(INPUT, "FOLDER", "Depth images; [b]--data[/b] then names the grey or colour ones."),
     ] = None,
     fps: Annotated[
         float | None,
-        typer.Option(metavar="NUMBER", help="Frames per second where the data has no time stamps."),
+        option(INPUT, "NUMBER", "Frames per second where the data has no time stamps."),
     ] = None,
     side_by_side: Annotated[
-        bool,
-        typer.Option("--side-by-side", help="Each image holds the left and the right one."),
+        bool, flag(INPUT, "Each image holds the left and the right one.", "--side-by-side")
     ] = False,
     topics: Annotated[
         str,
-        typer.Option(
-            metavar="LEFT,RIGHT",
-            help="Image topics of a bag: one for mono, COLOUR,DEPTH for RGB-D.",
-        ),
+        option(INPUT, "LEFT,RIGHT", "Image topics of a bag: one for mono, COLOUR,DEPTH for RGB-D."),
     ] = "",
     depth_scale: Annotated[
         float | None,
-        typer.Option(
-            metavar="NUMBER",
-            help="Value of a depth pixel at one metre.",
-            show_default="from the calibration, data set or encoding",
+        option(
+            INPUT,
+            "NUMBER",
+            "Value of a depth pixel at one metre.",
+            unset="from the calibration, data set or encoding",
         ),
     ] = None,
     sensor: Annotated[
         SensorName | None,
-        typer.Option(
-            metavar="stereo|mono|rgbd",
-            help="Images to use. With [b]mono[/b], the left ones alone, the scale is arbitrary.",
-            show_default="all that the data has",
+        option(
+            INPUT,
+            "stereo|mono|rgbd",
+            "Images to use. With [b]mono[/b], the left ones alone, the scale is arbitrary.",
+            unset="all that the data has",
         ),
     ] = None,
-    start: Annotated[int, typer.Option(min=0, metavar="N", help="First frame.")] = 0,
-    every: Annotated[int, typer.Option(min=1, metavar="N", help="Use every N-th frame only.")] = 1,
+    start: Annotated[int, option(INPUT, "N", "First frame.", min=0)] = 0,
+    every: Annotated[int, option(INPUT, "N", "Use every N-th frame only.", min=1)] = 1,
     max_frames: Annotated[
-        int | None,
-        typer.Option(min=1, metavar="N", help="Stop after N frames.", show_default="all"),
+        int | None, option(INPUT, "N", "Stop after N frames.", min=1, unset="all")
     ] = None,
 ) -> SourceOptions:
     """The source that the options describe."""
@@ -262,8 +258,6 @@ def reads_source(
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         source = [p for p in _parameters(_source_options) if p.name not in without]
         own = [p for p in _parameters(command) if p.name != "given"]
-        for parameter in source:
-            parameter.annotation.__metadata__[0].rich_help_panel = INPUT
 
         def called(**values: Any) -> None:
             given = {parameter.name: values.pop(parameter.name) for parameter in source}

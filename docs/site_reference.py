@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import shutil
+from importlib.util import find_spec
 from pathlib import Path
 from typing import get_args
 
 MODULES = (
     "vslam.slam",
     "vslam.camera",
+    "vslam.config",
     "vslam.features",
     "vslam.trajectory",
     "vslam.map",
@@ -43,6 +46,18 @@ def write_reference(folder: Path) -> None:
         title = name.replace("_", r"\_")
         page = f"{title}\n{'=' * len(title)}\n\n.. automodule:: {name}\n"
         (generated / f"{name}.rst").write_text(page)
+
+
+def module_rows() -> list[str]:
+    """The table of docs/reference/modules.md: each module with the first sentence about it."""
+    rows = []
+    for name in MODULES:
+        origin = find_spec(name).origin
+        about = ast.get_docstring(ast.parse(Path(origin).read_text())).partition("\n\n")[0]
+        file = Path(origin).relative_to(Path(__file__).parents[1])
+        text = " ".join(about.replace("``", "`").split())
+        rows.append(f"| [`{name}`](../../{file.as_posix()}) | {text} |")
+    return rows
 
 
 def commands_page() -> str:

@@ -358,6 +358,22 @@ def test_bench_shows_what_is_left_when_all_runs_of_the_baseline_fail(bench, stub
     assert "against" not in out
 
 
+@pytest.mark.slow
+def test_other_thresholds_are_other_rows_and_overwrite_nothing(bench, stub: Path):
+    grid_of = ("--perturb", "none", "--detectors", "none,bow")
+    assert bench(*grid_of)[0] == 0
+    kept = {path: path.stat().st_mtime_ns for path in Path("bench").glob("kitti-*/report.json")}
+    code, out, err = bench(*grid_of, "--config", "orb.n_features=1000")
+    assert code == 0, err
+    assert len(started(stub)) == 4
+    assert len(kept) == 2
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    systems = "none / none (orb.n_features=1000) / bow / bow (orb.n_features=1000)"
+    assert f"Side by side: {systems}\n" in out
+    assert "2 runs, 0 to do" in bench(*grid_of, "--config", "orb.n_features=1000")[2]
+    assert "2 runs, 0 to do" in bench(*grid_of)[2]
+
+
 def test_help_begins_with_the_table_of_the_mission():
     text = CliRunner().invoke(app, ["bench", "--help"], env={"COLUMNS": "100"}).output
     examples = [line.split("(")[0].split() for line in text.splitlines() if "  vslam" in line]

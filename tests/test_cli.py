@@ -22,16 +22,20 @@ from test_report import make_outcome
 from vslam import machine
 from vslam.cli import main as cli
 from vslam.cli import options, train
+from vslam.datasets import open_sequence
 from vslam.features import TrackingState, TrackResult
 from vslam.loopclosure.registry import DETECTORS
 from vslam.loopclosure.siamese.weights import NETWORKS
 from vslam.loops import LoopEdge
 from vslam.report import figures
+from vslam.report.finished_run import read_report
 from vslam.report.folder import write_results
+from vslam.report.run_page import option_rows
 from vslam.run import pipeline as run_pipeline
 from vslam.run import recorder, warmup
 from vslam.run.moments import MomentRecorder
 from vslam.run.outcome import RunOutcome
+from vslam.slam import Slam
 from vslam.trajectory import (
     Trajectory,
     read_kitti_poses,
@@ -252,12 +256,28 @@ def test_a_value_out_of_range_is_told_in_our_words(call, words, part):
     [
         ('{"orb": {"n_feature": 500}}', "orb.n_feature: unknown key (did you mean n_features?)"),
         ('{"orb": {"n_features": -1}}', "orb.n_features: must be at least 100."),
-        ('{"orb": ', "the configuration is no JSON object; correct the file."),
+        ('{"orb.n_features": -1}', "orb.n_features: must be at least 100."),
+        ('{"orb": 5}', "orb must map names to values"),
+        ("[]", "the configuration must map names to values"),
+        ("orb:\n  n_features: 900\n", "the configuration is not JSON (expected value at line 1 "),
+        (
+            '{"orb": {\n "n_features": 900,\n}}',
+            "the configuration is not JSON (trailing comma at l",
+        ),
     ],
 )
 def test_a_wrong_configuration_is_told_in_our_words(call, text, part):
     Path("config.json").write_text(text)
     refused(call("run", "--config", "config.json", "--data", "."), f"config.json: {part}")
+
+
+def test_thresholds_are_given_as_values_too(call, tmp_path):
+    found = options.read_thresholds("orb.n_features=1000, tracking.method=patches")
+    assert (found.orb.n_features, found.tracking.method) == (1000, "patches")
+    refused(call("run", "--config", "orb.n_feature=9", "--data", "."), "(did you mean n_features?)")
+    file = tmp_path / "a=b.json"
+    file.write_text('{"tracking.method": "patches"}')
+    assert options.read_thresholds(str(file)).tracking.method == "patches"
 
 
 def commands(group: Any, words: str = "vslam") -> Iterator[tuple[str, Any]]:
@@ -423,6 +443,32 @@ def test_run_writes_its_folder_and_a_summary(call, root, pipeline):
     assert pipeline.recorder == str(Path("runs") / folder.name / "recording.rrd")
     assert pipeline.evaluation.ate_rmse_m < 1e-9
     assert len(read_kitti_poses(folder / "ground_truth_kitti.txt")) == 10
+
+
+def test_changed_thresholds_are_in_the_name_of_the_folder_and_the_summary(call, root, pipeline):
+    config = "orb.n_features=1000,orb.n_levels=7,tracking.method=patches,depth.min_metres=0.5"
+    code, out, err = call("run", "--data", root, "--max-frames", 10, "--config", config)
+    assert code == 0, err
+    assert (
+        "· thresholds orb.n_features=1000, orb.n_levels=7, depth.min_metres=0.5, 1 more in" in out
+    )
+    folder = Path("runs/latest").resolve()
+    assert folder.name.endswith("-kitti-00-none-both-orb.n_features=1000+3more")
+    report = read_report(folder)
+    assert report.thresholds["tracking.method"] == "patches"
+    row = dict(option_rows(report))["thresholds"]
+    assert row == ", ".join(f"{name}={value}" for name, value in report.thresholds.items())
+    assert "thresholds" not in dict(option_rows(report.model_copy(update={"thresholds": {}})))
+
+
+def test_a_map_is_continued_with_its_own_thresholds_by_default(call, root, pipeline):
+    camera = open_sequence("kitti", root, "00", max_frames=10).camera
+    Slam(camera, {"orb.n_features": 900}, "none", threads=1).save("map.npz")
+    words = ("run", "--data", root, "--max-frames", 10, "--map", "map.npz")
+    for given, n in (((), 900), (("--config", "orb.n_features=800"), 800)):
+        code, _, err = call(*words, *given)
+        assert code == 0, err
+        assert pipeline.settings.config.orb.n_features == n
 
 
 CLOSED = LoopEdge(3, 0, 0.6, True, "closed", 80, 60)  # no pose: neither right nor wrong

@@ -120,6 +120,14 @@ def test_the_table_of_drives_is_made_from_its_figures(monkeypatch, tmp_path):
     assert (tmp_path / "drives.json").read_text() == kept.read_text()
 
 
+def test_the_table_of_modules_is_made_from_their_docstrings(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    from site_reference import module_rows
+
+    page = (GENERATED / "modules.md").read_text()
+    assert [line for line in page.splitlines() if line.startswith("| [")] == module_rows()
+
+
 def test_citation_is_of_this_version():
     from vslam import __version__
 

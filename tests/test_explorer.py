@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 from base64 import b64decode
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -20,6 +21,7 @@ import pytest
 from browser import chromium, dumped
 from test_report import make_outcome
 
+from vslam.config import as_config
 from vslam.errors import InputError
 from vslam.features import Features
 from vslam.lab.overview.serve import list_runs, make_server
@@ -242,7 +244,9 @@ def server(run: Path, tmp_path: Path):
     write_results(second, make_outcome(20), pages=True)
     bare = tmp_path / "bare"
     bare.mkdir()
-    write_results(bare, make_outcome(20), pages=False)
+    outcome = make_outcome(20)
+    settings = replace(outcome.settings, config=as_config({"orb.n_levels": 7}))
+    write_results(bare, replace(outcome, settings=settings), pages=False)
     (tmp_path / "secret.html").write_text("secret")
     made = make_server([run.parent, tmp_path])
     threading.Thread(target=made.serve_forever, daemon=True).start()
@@ -266,6 +270,7 @@ def test_the_list_links_every_run_that_has_a_page(server):
     assert "&lt;b&gt;second" in text
     assert "<b>second" not in text
     assert ">bare<" in text
+    assert ">none, orb.n_levels=7<" in text
     for link in re.findall(r'href="(/run/\d+)"', text):
         status, page = ask(server, link)
         assert status == 200

@@ -4,7 +4,8 @@ cannot be."""
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+import traceback
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -82,11 +83,53 @@ def test_data_and_settings_are_read_by_strings(tmp_path, kitti_tree):
     config = tmp_path / "config.json"
     config.write_text("{}")
     assert load_config(str(config)) == Config()
+    config.write_text('{"tracking.method": "patches", "tracking": {"min_inliers": 40}}')
+    found = load_config(config).tracking
+    assert (found.method, found.min_inliers) == ("patches", 40)
     calib = tmp_path / "one.yaml"
     calib.write_text("left: {lens: pinhole, size: [640, 240], focal: [9, 9], centre: [320, 120]}")
     assert read_calibration([str(calib)]).left.width == 640
     save_ply(str(tmp_path / "map.ply"), np.zeros((1, 3)))
     assert (tmp_path / "map.ply").stat().st_size
+
+
+def test_a_map_is_continued_with_the_thresholds_that_it_was_made_with(tmp_path):
+    file = tmp_path / "map.npz"
+    Slam(CAMERA, {"orb.n_features": 900}, "none", threads=1).save(file)
+    again = Slam.load(file, threads=1)
+    assert again.context.config.orb.n_features == 900
+    assert Slam.load(file, {}, threads=1).context.config == Config()
+    again.save(file)
+    assert made_with(file).thresholds == {"orb.n_features": 900}
+    write_header(file, thresholds={"orb.retired": 3})
+    with pytest.raises(InputError, match=r"map.npz: orb.retired: unknown key"):
+        Slam.load(file)
+    assert Slam.load(file, Config(), threads=1).context.config == Config()
+    write_header(file, thresholds=5)
+    with pytest.raises(InputError, match="the map is damaged"):
+        Slam.load(file)
+
+
+def test_thresholds_are_given_as_a_dictionary():
+    config = {"orb": {"n_features": 900}, "tracking.method": "patches"}
+    found = Slam(CAMERA, config, "none", threads=1).context.config
+    assert (found.orb.n_features, found.tracking.method) == (900, "patches")
+
+
+@pytest.mark.parametrize(
+    ("config", "words"),
+    [
+        ({"orb": {"n_feature": 9}}, r"orb.n_feature: unknown key \(did you mean n_features\?\); "),
+        ({"orb": {"n_features": 9}}, "orb.n_features: must be at least 100.$"),
+        ({"orb.n_features": 900, "orb": 5}, "orb must map names to values"),
+        ({1: 900}, "1: unknown key; correct or remove it."),
+        ("config.json", "the configuration must map names to values"),
+    ],
+)
+def test_wrong_thresholds_are_refused_in_one_sentence(config, words):
+    with pytest.raises(InputError, match=f"^config: {words}") as refused:
+        Slam(CAMERA, config, "none", threads=1)
+    assert "pydantic" not in "".join(traceback.format_exception(refused.value))
 
 
 @pytest.mark.parametrize("dataset", ["kitti", "euroc", "tum"])
@@ -127,15 +170,19 @@ def test_a_calibration_of_a_camera_that_cannot_be_is_named():
         rectify(Calibration(model, source="mine.yaml"))
 
 
+def write_header(file: Path, **entries: object) -> None:
+    """Replace entries of the header of a map file."""
+    with np.load(file) as saved:
+        arrays = dict(saved)
+    header = json.loads(arrays["header"].tobytes()) | entries
+    arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    np.savez(file, **arrays)
+
+
 def test_the_camera_of_a_map_file_is_checked(tmp_path):
     file = tmp_path / "map.npz"
     Slam(CAMERA, detector="none", threads=1).save(file)
-    with np.load(file) as saved:
-        arrays = dict(saved)
-    header = json.loads(arrays["header"].tobytes())
-    header["camera"]["cx"] = 6000.0
-    arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
-    np.savez(file, **arrays)
+    write_header(file, camera=asdict(CAMERA) | {"cx": 6000.0})
     with pytest.raises(InputError, match=r"map.npz: .*principal point \(6000.0, 120.0\)"):
         load_map(file)
 

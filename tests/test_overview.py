@@ -15,6 +15,7 @@ from browser import chromium, dumped
 from rich.console import Console
 
 from vslam.cli import main as cli
+from vslam.config import Config
 from vslam.errors import InputError
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.lab.overview import write_overview
@@ -304,6 +305,17 @@ def test_the_table_of_a_short_name_fits_a_terminal_of_80_columns(two_conditions,
     assert "- RPE over all conditions, both against bow: a tie on all 6 sequences." in printed
 
 
+def test_long_names_take_more_tables_instead_of_wider_ones(two_conditions, capsys):
+    runs = [
+        run.model_copy(update={"system": "bow (orb.n_features=1000, tracking.method=patches)"})
+        if run.system == "both"
+        else run
+        for run in two_conditions
+    ]
+    show(versus(summarize(Found(runs, []))), Console(width=80))
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
+
+
 def test_one_condition_is_not_called_all(two_conditions):
     runs = [run for run in two_conditions if run.drive.perturb == "none"]
     report = summarize(Found(runs, []))
@@ -392,12 +404,63 @@ def test_a_label_has_the_true_number_of_frames(run_folder: Path, tmp_path: Path)
     assert {run.drive.excerpt for run in runs} == {"100 frames"}
 
 
-def test_runs_of_different_thresholds_are_noted(run_folder: Path, tmp_path: Path):
-    for name in ("a", "b"):
-        folder = copy_run(run_folder, tmp_path / name)
-        (folder / "config.json").write_text(name)
-    notes = collect([tmp_path], []).notes
-    assert any("2 different sets of thresholds" in note for note in notes)
+def thresholds_of(folder: Path, **values: object) -> None:
+    config = {"orb": Config().orb.model_dump() | values}
+    (folder / "config.json").write_text(json.dumps(config))
+
+
+@pytest.fixture
+def thresholds(run_folder: Path, tmp_path: Path) -> Path:
+    """Three sets of thresholds, one of them twice; all runs share a fourth threshold."""
+    for k, n in enumerate((2000, 1000, 1000, 1500)):
+        folder = copy_run(
+            run_folder, tmp_path / "runs" / str(k), detector="bow", seed=k, ate_rmse_m=1.0 + k
+        )
+        thresholds_of(folder, n_features=n, n_levels=7, retired=3)
+    return tmp_path / "runs"
+
+
+def test_runs_of_different_thresholds_are_different_systems(thresholds: Path, tmp_path: Path):
+    report = write_overview([thresholds], [], tmp_path / "out", baseline="bow")
+    ates = {row.system: row.measures["ate_rmse_m"] for row in report.rows}
+    assert {system: (ate.n, ate.median) for system, ate in ates.items() if ate} == {
+        "bow": (1, 1.0), "bow (orb.n_features=1000)": (2, 2.5), "bow (orb.n_features=1500)": (1, 4),
+    }  # fmt: skip
+    assert [c.first for c in report.comparisons[:2]] == ["bow", "bow"]
+    assert "all runs have orb.n_levels=7, orb.retired=3" in report.notes
+    assert report.runs[0].settings == {"orb.n_levels": 7, "orb.retired": 3}
+    for name in ("report.md", "report.html", "table.csv"):
+        assert "bow (orb.n_features=1500)" in (tmp_path / "out" / name).read_text(), name
+    other = summarize(collect([thresholds], []), "bow (orb.n_features=1500)")
+    assert other.systems[0] == "bow (orb.n_features=1500)"
+
+
+def test_options_that_change_results_make_systems_too(run_folder: Path, tmp_path: Path):
+    for name, options in (("a", {}), ("b", {"weights": "mine.onnx"}), ("c", {"realtime": True})):
+        copy_run(run_folder, tmp_path / name, detector="capsule", sensor="mono", **options)
+    copy_run(run_folder, tmp_path / "d", detector="capsule", sensor="mono", threads=7)
+    rows = summarize(collect([tmp_path], [])).rows
+    assert {row.system: row.runs for row in rows} == {
+        "capsule, mono": 2, "capsule (weights=mine.onnx), mono": 1,
+        "capsule (realtime=True), mono": 1,
+    }  # fmt: skip
+
+
+def test_thresholds_do_not_make_loop_detectors_differ():
+    runs = [
+        entry(f"bow{own}", "01", 1.0 + len(own), **loops(0, 0)) for own in ("", " (orb.n_levels=7)")
+    ]
+    assert [section.title for section in versus(summarize(Found(runs, [])))] == [
+        "Side by side: bow / bow (orb.n_levels=7)"
+    ]
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"orb": 3}', "[" * 9999])
+def test_a_run_with_damaged_thresholds_is_left_out(thresholds: Path, text: str):
+    (thresholds / "0" / "config.json").write_text(text)
+    found = collect([thresholds], [])
+    assert len(found.runs) == 3
+    assert f"left out: {thresholds / '0'}: config.json is damaged" in found.notes
 
 
 def test_changes_of_a_rendered_town_are_perturbations(run_folder: Path, tmp_path: Path):
@@ -549,7 +612,7 @@ FIGURES = {
 def test_html_has_every_figure_and_loads_nothing(written):
     html = (written[1] / "report.html").read_text()
     assert set(re.findall('<figure class="card ([^"]*)"', html)) == FIGURES
-    assert html.count("<table>") == 7
+    assert html.count("<table>") == 8
     assert not re.search("<(script|iframe|object|embed|img)", html)
 
 

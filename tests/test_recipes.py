@@ -11,6 +11,7 @@ import pytest
 from conftest import StereoSequence, corridor_depth
 
 from vslam import Slam
+from vslam.config import Config
 from vslam.loops import LoopEdge
 from vslam.trajectory import read_trajectory
 
@@ -75,6 +76,12 @@ def test_a_saved_map_is_continued_and_localised_in(after, corridor):
     localised = after["Localise in a map without changing it"]
     assert localised["in_map"].sum() > 0.9 * n
     assert localised["slam"].map.n_keyframes == continued.map.n_keyframes
+
+
+def test_thresholds_are_changed(after):
+    changed = after["Change thresholds"]
+    assert changed["slam"].context.config == changed["config"]
+    assert changed["config"].orb.n_features == 1000 != Config().orb.n_features
 
 
 @pytest.mark.parametrize(("words", "sensor"), [("single camera", "mono"), ("RGB-D", "rgbd")])

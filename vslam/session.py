@@ -9,6 +9,7 @@ import numpy as np
 
 from vslam.camera import same_camera
 from vslam.closing import LoopClosing
+from vslam.config import changed_thresholds
 from vslam.frame_poses import FrameTable
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracker import Tracker
@@ -110,6 +111,7 @@ class Session:
             images=None if images is None else images.files(map_.n_keyframes),
             frames=self.mapper.frames.table(),
             drives=(*opened.drives, drive) if self.mode.changes_map else opened.drives,
+            thresholds=changed_thresholds(self.context.config.model_dump()),
             world=opened.world,
             checkpoint=self.state(),
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera, DepthImage, Image, check_images
 from vslam.closing import LoopClosing
-from vslam.config import Config
+from vslam.config import Config, as_config
 from vslam.errors import InputError
 from vslam.features import Extracted, TrackingState, TrackResult
 from vslam.frontend.extraction import FrameImages
@@ -61,7 +62,7 @@ class Slam:
     def __init__(
         self,
         camera: Camera,
-        config: Config | None = None,
+        config: Config | Mapping[str, Any] | None = None,
         detector: LoopDetector | str = DEFAULT_DETECTOR,
         *,
         threads: int = 2,
@@ -74,7 +75,8 @@ class Slam:
         Args:
             camera: the rectified camera that the images come from; ``camera.left_camera()`` for
                 monocular SLAM.
-            config: thresholds; None uses the defaults.
+            config: thresholds, also as a dictionary such as ``{"orb": {"n_features": 1000}}``;
+                those left out keep their defaults.
             detector: proposes loop candidates and places for relocalisation: a name
                 (``vslam.loopclosure.registry``; ``both`` is the capsule network together with the
                 bag of words, ``none`` is odometry only) or an object.
@@ -91,8 +93,9 @@ class Slam:
 
         Raises:
             ValueError: the map cannot be continued; the message gives the reason in a few words.
+            InputError: a threshold is unknown or out of range.
         """
-        config = config or Config()
+        config = as_config({} if config is None else config)
         if isinstance(detector, str):
             detector, images = detector_with_images(detector, config)
         self.context = context = TrackingContext.create(camera, config)
@@ -114,7 +117,7 @@ class Slam:
     def load(
         cls,
         path: Path | str,
-        config: Config | None = None,
+        config: Config | Mapping[str, Any] | None = None,
         detector: LoopDetector | str | None = None,
         *,
         resume: bool = False,
@@ -124,7 +127,7 @@ class Slam:
 
         Args:
             path: the map file, or the folder of a run.
-            config: as for a new map.
+            config: as for a new map; None uses the thresholds that the map was made with.
             detector: the detector that the map was made with, as a name or an object; None uses
                 the shipped detector of that name.
             resume: as for a new map.
@@ -138,6 +141,7 @@ class Slam:
         if resume and stored.frames is None:
             raise InputError(f"{path}: the map has no drive to continue; load it without resume.")
         detector = stored.detector.name if detector is None else detector
+        config = as_config(stored.thresholds, str(path)) if config is None else config
         try:
             return cls(stored.camera, config, detector, start=stored, resume=resume, **options)
         except (ValueError, KeyError) as error:

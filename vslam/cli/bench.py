@@ -22,6 +22,7 @@ from vslam.cli.options import (
     names_in,
     open_given,
     option,
+    read_thresholds,
     reads_source,
     sequences,
 )
@@ -86,7 +87,7 @@ def bench(
     from vslam.cli.console import console
     from vslam.lab.bench import execute
     from vslam.lab.bench.estimate import check_disk, duration, estimate, size
-    from vslam.lab.bench.grid import make_grid, parse_perturbations
+    from vslam.lab.bench.grid import make_grid, parse_perturbations, thresholds_digest
     from vslam.lab.bench.table import GridProgress, shown_live
     from vslam.loopclosure.registry import parse_weights, require_detector
 
@@ -105,6 +106,7 @@ def bench(
     cells = make_grid(
         kind, frames, laws, chosen, seeds, given.max_frames, files,
         sensor=given.sensor, calib=tuple(map(str, given.calib)),
+        thresholds=thresholds_digest(options.config),
     )  # fmt: skip
     execute.prepare(out, identity_of(kind, given))
     finished = execute.finished_cells(cells, out, options.config)
@@ -163,21 +165,19 @@ def absolute(given: SourceOptions) -> SourceOptions:
 def cell_options(
     kind: str,
     given: SourceOptions,
-    config: Path | None,
+    config: str | None,
     threads: int | None,
     jobs: int,
     scheduler: str | None,
     out: Path,
 ) -> RunOptions:
     """The settings that all cells of a benchmark share."""
-    from vslam.config import Config, load_config
     from vslam.lab.bench.execute import RunOptions, scratch_folder
     from vslam.machine import available_cores
 
-    thresholds = Config() if config is None else load_config(config)
     return RunOptions(
         data=Path(given.data) if kind != "synthetic" else None,
-        config=thresholds.model_dump_json(indent=2) + "\n",  # as a run writes it
+        config=read_thresholds(config).model_dump_json(indent=2) + "\n",  # as a run writes it
         threads=threads or max(1, min(available_cores() // jobs, 4)),
         scratch=None if scheduler else scratch_folder(out),
         source=tuple(_words_of(given)),

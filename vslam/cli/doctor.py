@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vslam.cli.console import console
-from vslam.cli.options import OUTPUT, Thresholds, open_given, option, reads_source, require_data
+from vslam.cli.options import (
+    OUTPUT,
+    Thresholds,
+    open_given,
+    option,
+    read_thresholds,
+    reads_source,
+    require_data,
+)
 from vslam.errors import InputError, counted
 
 if TYPE_CHECKING:
@@ -43,14 +51,13 @@ def doctor(
     ] = None,
 ) -> None:
     """Check images, calibration and times before a run; exit code 1 if there is a fault."""
-    from vslam.config import Config, load_config
     from vslam.datasets.frames import first_frames
     from vslam.doctor.examine import Diagnosis, examine
     from vslam.doctor.findings import Finding
     from vslam.doctor.page import write_page
 
     require_data(given)
-    thresholds = Config() if config is None else load_config(config)
+    thresholds = read_thresholds(config)
     try:
         diagnosis = examine(first_frames(open_given(given, console(shown=True))), thresholds.orb)
     except InputError as error:

@@ -165,12 +165,14 @@ def _compile(settings: RunSettings, told: Console) -> None:
 
 
 def _new_folder(options: RunOptions, settings: RunSettings, out: Path, lock: ExitStack) -> Path:
+    from vslam.config import changed_thresholds
     from vslam.report.folder import create_run_folder
     from vslam.run.autosave import lock_run
     from vslam.run.options import write_options
 
     s = settings
-    folder = create_run_folder(out, s.dataset, s.sequence, s.perturb, s.detector)
+    changed = changed_thresholds(s.config.model_dump())
+    folder = create_run_folder(out, s.dataset, s.sequence, s.perturb, s.detector, changed)
     lock.enter_context(lock_run(folder))
     write_options(folder, options)
     return folder

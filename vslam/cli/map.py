@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.cli.options import METHOD, OUTPUT, Quiet, Thresholds, option
+from vslam.cli.options import METHOD, OUTPUT, Quiet, Thresholds, option, read_thresholds
 from vslam.errors import InputError, ResultsError, counted
 
 if TYPE_CHECKING:
@@ -129,7 +129,6 @@ def merge(
     one, nothing is written and the exit code is 1. The files of the maps are not changed.
     """
     from vslam.cli.console import console
-    from vslam.config import Config, load_config
     from vslam.loopclosure.registry import detector_with_images
     from vslam.maps.storage import load_map, map_file_of, save_map
     from vslam.merging import Memory, merge_maps
@@ -137,7 +136,7 @@ def merge(
     if len(maps) < 2:
         raise InputError(f"{maps[0]}: this is one map; name two or more to merge.")
     _require_free(out)
-    thresholds = Config() if config is None else load_config(config)
+    thresholds = read_thresholds(config)
     # No camera waits for the network, which may see all keyframes at once.
     seen = thresholds.siamese.model_copy(update={"embedded_at_once": sys.maxsize})
     thresholds = thresholds.model_copy(update={"siamese": seen})

@@ -15,6 +15,7 @@ from vslam.errors import InputError
 
 if TYPE_CHECKING:
     from vslam.cli.console import Console
+    from vslam.config import Config
     from vslam.datasets.frames import Source
     from vslam.datasets.sources import SourceOptions
 
@@ -64,9 +65,13 @@ Perturb = Annotated[
 ]
 Seed = Annotated[int, option(METHOD, "N", "Seed of the random numbers.", min=0)]
 Thresholds = Annotated[
-    Path | None,
+    str | None,
     option(
-        METHOD, "FILE", "JSON file with thresholds, such as the config.json of a run.", "--config"
+        METHOD,
+        "FILE|NAME=VALUE",
+        "Thresholds: a JSON file, such as the config.json of a run, or values separated by "
+        "commas, such as orb.n_features=1000 (docs/reference/thresholds.md).",
+        "--config",
     ),
 ]
 Weights = Annotated[
@@ -300,6 +305,23 @@ def kind_of_source(options: SourceOptions) -> str:
 
     require_data(options)
     return options.dataset or detect_dataset(options.data)
+
+
+def read_thresholds(given: str | None) -> Config:
+    """The thresholds of ``--config``, a file or values; the defaults for None.
+
+    Raises:
+        InputError: as `vslam.config.load_config`.
+    """
+    from vslam.config import Config, as_config, load_config
+
+    if given is None:
+        return Config()
+    if "=" not in given or Path(given).exists():
+        return load_config(given)
+    pairs = (pair.partition("=") for pair in given.split(","))
+    values = {name.strip(): value.strip() for name, _, value in pairs}
+    return as_config(values, f"--config {given}")
 
 
 def open_given(options: SourceOptions, told: Console) -> Source:

@@ -23,6 +23,7 @@ from vslam.cli.options import (
     ViewerName,
     flag,
     option,
+    read_thresholds,
     reads_source,
 )
 from vslam.errors import InputError
@@ -154,12 +155,13 @@ def run(
         raise InputError(f"--local-weights {local_weights}: no such file; name an .onnx file.")
     if localize and map_file is None:
         raise InputError("--localize: name the map to localise in with --map.")
+    of_map: dict[str, object] = {}
     if map_file is not None:
         if compare:
             raise InputError(
                 "--compare: a run that continues a map has the detector of that map; leave it out."
             )
-        map_file, detector = _map_to_continue(map_file, detector)
+        map_file, detector, of_map = _map_to_continue(map_file, detector)
     detector = detector or DEFAULT_DETECTOR
     require_detector(detector, weights)
     beside = _compared(compare, detector)
@@ -169,7 +171,7 @@ def run(
             "out --realtime."
         )
 
-    from vslam.config import Config, load_config
+    from vslam.config import as_config
     from vslam.machine import available_cores
     from vslam.run.options import RunOptions
 
@@ -181,7 +183,7 @@ def run(
         detector=detector,
         weights=weights,
         local_weights=local_weights,
-        thresholds=Config() if config is None else load_config(config),
+        thresholds=as_config(of_map, str(map_file)) if config is None else read_thresholds(config),
         map_file=map_file,
         localize=localize,
         compare=beside,
@@ -219,17 +221,20 @@ def _compared(names: str, detector: str) -> tuple[str, ...]:
     return found
 
 
-def _map_to_continue(file: Path, detector: DetectorName | None) -> tuple[Path, DetectorName]:
-    """The map of a file or of the folder of a run, and the detector that it was made with.
+def _map_to_continue(
+    file: Path, detector: DetectorName | None
+) -> tuple[Path, DetectorName, dict[str, object]]:
+    """The map of a file or of the folder of a run, and the detector and thresholds that it was made
+    with.
 
     The path is absolute, because ``runs/latest`` changes when this run creates its folder.
     """
     from vslam.maps.storage import made_with, map_file_of
 
     file = map_file_of(file)
-    _, of_map = made_with(file)
+    _, of_map, thresholds = made_with(file)
     if detector not in (None, of_map):
         raise InputError(
             f"--detector {detector}: {file} was made with the detector {of_map}; leave it out."
         )
-    return file.resolve(), cast("DetectorName", of_map)
+    return file.resolve(), cast("DetectorName", of_map), thresholds

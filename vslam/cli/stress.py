@@ -146,6 +146,7 @@ def stress(
     from vslam.cli.tables import show_sections
     from vslam.datasets.frames import first_frames
     from vslam.lab.bench import execute
+    from vslam.lab.bench.grid import thresholds_digest
     from vslam.lab.stress.criterion import Criterion
     from vslam.lab.stress.plan import Plan, parse_laws
     from vslam.lab.stress.report import boundary_sections, write_report
@@ -187,7 +188,7 @@ def stress(
     plan = Plan(
         kind, tuple(opened), tuple(fitting), tuple(names), seeds, steps, given.max_frames,
         baseline or names[0], Criterion(max_lost, ate_factor, ate_least), tuple(others), preset,
-        given.sensor, tuple(map(str, given.calib)),
+        given.sensor, tuple(map(str, given.calib)), thresholds_digest(options.config),
     )  # fmt: skip
     execute.prepare(out, identity_of(kind, given))
     searches, results = plan.searches(), Results(out, options.config)

@@ -42,18 +42,46 @@ def read_json(model: type[_Model], path: Path, what: str) -> _Model:
             range.
     """
     try:
-        return model.model_validate_json(path.read_bytes())
+        text = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot read the {what} ({error.strerror}).") from error
+    return checked(model, text, str(path), what)
+
+
+def checked(model: type[_Model], given: object, where: str, what: str) -> _Model:
+    """Check thresholds or settings; those that are left out keep their defaults.
+
+    Args:
+        model: what they describe.
+        given: JSON as bytes, a dictionary, or a model, which is returned as it is.
+        where: the file or argument that they come from, for the messages.
+        what: a name for them, for the messages.
+
+    Raises:
+        InputError: as ``read_json``.
+    """
+    try:
+        if isinstance(given, bytes):
+            return model.model_validate_json(given)
+        return model.model_validate(given)
     except ValidationError as error:
-        first = error.errors()[0]
-        if not first["loc"]:
-            raise InputError(f"{path}: the {what} is no JSON object; correct the file.") from error
-        *place, key = map(str, first["loc"])
-        why = plain_reason(first["msg"])
-        if first["type"] == "extra_forbidden":
-            why = f"unknown key{did_you_mean(key, _keys(model, place))}; correct or remove it"
-        raise InputError(f"{path}: {'.'.join((*place, key))}: {why}.") from error
+        raise InputError(f"{where}: {_fault(model, error, what)}.") from None
+
+
+def _fault(model: type[BaseModel], error: ValidationError, what: str) -> str:
+    """What is wrong with the first of the values that are."""
+    first = error.errors()[0]
+    place = [str(name) for name in first["loc"]]
+    if first["type"] == "json_invalid":
+        return f"the {what} is not JSON ({first['ctx']['error']}); correct the file"
+    if first["type"] == "model_type":
+        name = ".".join(place) or f"the {what}"
+        return f'{name} must map names to values, as in {{"name": 1}}'
+    why = plain_reason(first["msg"])
+    if first["type"] in ("extra_forbidden", "invalid_key"):
+        meant = did_you_mean(place[-1], _keys(model, place[:-1]))
+        why = f"unknown key{meant}; correct or remove it"
+    return f"{'.'.join(place)}: {why}"
 
 
 def _keys(model: type[BaseModel], place: list[str]) -> list[str]:

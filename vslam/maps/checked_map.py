@@ -125,6 +125,7 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
         images=images,
         frames=_frames(data, n) if header["frames"] else None,
         drives=tuple(str(drive) for drive in header["drives"]),
+        thresholds=dict(header.get("thresholds", {})),
         world=None if world is None else _world(world),
         checkpoint=checkpoint,
     )

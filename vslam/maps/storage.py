@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from zipfile import BadZipFile
 
 import numpy as np
@@ -36,9 +36,9 @@ def save_map(path: Path | str, stored: StoredMap, *, resumable: bool = False) ->
     """Write a map; an existing file is replaced.
 
     After an error or a power cut the file is as it was before. Its ``header`` is JSON (schema,
-    camera, detector, drives, versions); the arrays are those of ``ARRAYS``, and, by keyframe,
-    ``detector_NAME_first``, ``detector_NAME_values``, ``image_first`` and ``image_values``.
-    Observations are listed by landmark, in the order of the map's chains.
+    camera, detector, drives, thresholds, versions); the arrays are those of ``ARRAYS``, and, by
+    keyframe, ``detector_NAME_first``, ``detector_NAME_values``, ``image_first`` and
+    ``image_values``. Observations are listed by landmark, in the order of the map's chains.
 
     Args:
         path: the file.
@@ -105,6 +105,7 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
         "versions": versions(),
         "camera": asdict(stored.camera),
         "drives": list(stored.drives),
+        "thresholds": stored.thresholds,
         "detector": {
             "name": stored.detector.name,
             "fingerprint": stored.detector.fingerprint,
@@ -156,15 +157,24 @@ def map_file_of(path: Path | str) -> Path:
     return path / "map.npz" if path.is_dir() else path
 
 
-def made_with(path: Path | str) -> tuple[Camera, str]:
-    """The camera and the detector's name that a map was made with; its arrays are not read.
+class MadeWith(NamedTuple):
+    """Camera, name of the detector, and changed thresholds that a map was made with."""
+
+    camera: Camera
+    detector: str
+    thresholds: dict[str, Any]
+
+
+def made_with(path: Path | str) -> MadeWith:
+    """What a map was made with; its arrays are not read.
 
     Raises:
         InputError: as ``load_map``.
     """
     path = Path(path)
     with _opened(path) as (_, header), _as_damage(path):
-        return camera_of(header), str(header["detector"]["name"])
+        thresholds = dict(header.get("thresholds", {}))
+        return MadeWith(camera_of(header), str(header["detector"]["name"]), thresholds)
 
 
 def _read(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:

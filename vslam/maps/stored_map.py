@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,7 @@ class StoredMap:
             learned descriptors.
         frames: frame poses of the last drive; None if they are not kept.
         drives: source of the images of each drive, such as "kitti 06".
+        thresholds: those that differed from the defaults in the last drive, by dotted name.
         world: the map's place in the world of a ground truth; None without ground truth.
         checkpoint: state from which the last drive continues with identical results; the map then
             includes dead keyframes and landmarks under their old ids. None if the map is compact or
@@ -65,6 +67,7 @@ class StoredMap:
     images: PerKeyframe | None = None
     frames: FrameTable | None = None
     drives: tuple[str, ...] = ()
+    thresholds: dict[str, Any] = field(default_factory=dict)
     world: World | None = None
     checkpoint: Checkpoint | None = None
 
@@ -236,6 +239,7 @@ def appended(one: StoredMap, other: StoredMap) -> StoredMap:
         detector=replace(one.detector, tables=tables),
         images=images,
         drives=(*one.drives, *other.drives),
+        thresholds=one.thresholds,
         world=one.world,
     )
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import contextlib
 import re
 import shutil
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from datetime import datetime
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vslam.errors import InputError, ResultsError
 from vslam.evaluation.loops import LoopEvaluation, evaluate_loops
@@ -32,16 +32,26 @@ if TYPE_CHECKING:
 _LONGEST_PART = 60  # characters: file systems take 255 for a name, and a URL may have more
 
 
-def create_run_folder(out: Path, dataset: str, sequence: str, perturb: str, detector: str) -> Path:
+def create_run_folder(
+    out: Path,
+    dataset: str,
+    sequence: str,
+    perturb: str,
+    detector: str,
+    thresholds: Mapping[str, Any] | None = None,
+) -> Path:
     """Create ``out/<YYYYmmdd-HHMMSS>-<dataset>-<sequence>-<perturb>-<detector>``.
 
-    A number is added to a name in use. ``out/latest`` becomes a link to the folder where the file
-    system has links.
+    The first of the changed ``thresholds`` follows, and how many more there are. A number is added
+    to a name in use. ``out/latest`` becomes a link to the folder where the file system has links.
 
     Raises:
         InputError: the folder cannot be created.
     """
     parts = [dataset, sequence, perturb.replace(":", "").replace(",", "+"), detector]
+    if thresholds:
+        (name, value), *more = thresholds.items()
+        parts.append(f"{name}={value}" + (f"+{len(more)}more" if more else ""))
     name = "-".join([f"{datetime.now():%Y%m%d-%H%M%S}", *map(_safe, parts)])
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -63,7 +73,7 @@ def create_run_folder(out: Path, dataset: str, sequence: str, perturb: str, dete
 
 def _safe(part: str) -> str:
     """A name as a part of a file name."""
-    return re.sub(r"[^A-Za-z0-9.+-]+", "_", part)[:_LONGEST_PART]
+    return re.sub(r"[^A-Za-z0-9.+=-]+", "_", part)[:_LONGEST_PART]
 
 
 def write_results(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from html import escape
 
+from vslam.config import thresholds_in_words
 from vslam.errors import counted
 from vslam.evaluation.loops import LoopLimits
 from vslam.loopclosure.registry import about
@@ -180,6 +181,7 @@ def run_page(
     pictures: list[Part] = [seen_note(report, seen), *seen] if seen else []
     replay = Code("\n".join(f"rerun {name}" for name in recordings))
     evo = Code(report.evo_command or "")
+    changed = thresholds_in_words(report.thresholds)
     return Page(
         f"{report.dataset} {report.sequence}",
         (
@@ -188,6 +190,7 @@ def run_page(
             f"detector {report.detector} ({about(report.detector)})",
             f"perturb {report.perturb}",
             f"seed {report.seed}",
+            *([f"thresholds {changed}"] if changed else []),
             f"{report.created:%Y-%m-%d %H:%M %Z}",
         ),
         (
@@ -236,10 +239,12 @@ def option_rows(report: ReportJson) -> list[tuple[str, str]]:
     weights = [("weights", str(report.weights))] if report.weights else []
     if report.local_weights:
         weights += [("local-weights", str(report.local_weights))]
+    changed = [f"{name}={value}" for name, value in report.thresholds.items()]
+    thresholds = [("thresholds", ", ".join(changed))] if changed else []
     realtime = [("realtime", "yes")] if report.realtime else []
     compare = [("compare", ", ".join(report.compare))] if report.compare else []
     calib = [("calib", str(path)) for path in report.calib]
-    return [*options, ("max-frames", limit), *weights, *realtime, *calib, *compare]
+    return [*options, ("max-frames", limit), *thresholds, *weights, *realtime, *calib, *compare]
 
 
 def machine_rows(report: ReportJson) -> list[tuple[str, str]]:

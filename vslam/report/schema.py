@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import StringConstraints
+from pydantic import Field, StringConstraints
 
 from vslam.report.document import Document, Record
 
@@ -128,6 +128,7 @@ class Machine(Record):
 class ReportJson(Measures, Document):
     """One run in numbers.
 
+    ``thresholds`` are those that differ from the defaults, by dotted name.
     ``evaluation_remark`` says why there are no errors, or of how many frames they are.
     ``warnings`` are sentences about faults of the rig that the run has shown.
     ``detectors`` has a row for each detector, the run's own first, where others were run beside it
@@ -192,6 +193,7 @@ class ReportJson(Measures, Document):
     map: Path | None = None
     localize: bool = False
     compare: tuple[str, ...] = ()
+    thresholds: dict[str, Any] = Field(default_factory=dict)
 
     machine: Machine
     versions: dict[str, str]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.config import changed_thresholds
 from vslam.errors import InputError
 from vslam.evaluation.loops import LoopEvaluation, evaluate_loops
 from vslam.evaluation.trajectories import Evaluation, evaluate_trajectory
@@ -50,7 +51,7 @@ def summarize(
     states = Counter(track.state for track in outcome.tracks)
     done = frames - states[TrackingState.DROPPED]
     options = asdict(outcome.settings)
-    del options["config"]
+    options["thresholds"] = changed_thresholds(options.pop("config").model_dump())
     loops = _loops(outcome, verdict)
     return ReportJson(
         lost_before_map=_lost_before_map(outcome),

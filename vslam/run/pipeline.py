@@ -418,7 +418,7 @@ def require_camera(map_file: Path, camera: Camera) -> None:
     Raises:
         InputError: the cameras differ, or there is no such map.
     """
-    of_map, _ = made_with(map_file)
+    of_map = made_with(map_file).camera
     if not same_camera(of_map, camera):
         raise InputError(
             f"{map_file}: the map's camera is not that of the images ({of_map.sensor}, "

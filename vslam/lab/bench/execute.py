@@ -164,7 +164,7 @@ def publish(outcome: CellOutcome, out: Path) -> None:
             if path.suffix in (".json", ".md", ".html"):  # the command that reproduces the ATE
                 data = data.replace(outcome.folder.encode(), shlex.quote(str(target)).encode())
             path.write_bytes(data)
-        shutil.rmtree(target, ignore_errors=True)  # made with other thresholds, or damaged
+        shutil.rmtree(target, ignore_errors=True)  # damaged, or of another version
         part.rename(target)
         failed.unlink(missing_ok=True)
     except OSError as error:

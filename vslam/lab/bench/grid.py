@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
+from vslam.config import changed_thresholds
 from vslam.datasets.perturbation import law_kind, parse_perturbation
 from vslam.datasets.sources import SOURCES
 from vslam.errors import InputError
@@ -17,7 +19,7 @@ from vslam.report.schema import ReportJson
 
 @dataclass(frozen=True, order=True)
 class Cell:
-    """One run of the grid: everything that determines its figures, except thresholds and images.
+    """One run of the grid: everything that determines its figures, except the images.
 
     Attributes:
         perturb: perturbation in canonical spelling, e.g. ``none`` or ``brightness:1.5,blur:0.5``.
@@ -27,6 +29,7 @@ class Cell:
         digest: digest of these weights.
         sensor: value of ``--sensor``; None for all images that the data has.
         calib: calibration files.
+        thresholds: digest of the thresholds that differ from the defaults; empty if none does.
     """
 
     dataset: str
@@ -39,6 +42,7 @@ class Cell:
     digest: str = ""
     sensor: str | None = None
     calib: tuple[str, ...] = ()
+    thresholds: str = ""
 
     @property
     def name(self) -> str:
@@ -48,6 +52,7 @@ class Cell:
         parts += [f"{self.max_frames}frames"] if self.max_frames else []
         parts += [f"weights{self.digest}"] if self.digest else []
         parts += [self.sensor] if self.sensor else []
+        parts += [f"config{self.thresholds}"] if self.thresholds else []
         return "-".join(re.sub(r"[^A-Za-z0-9.+-]+", "_", part) for part in parts)
 
     def arguments(self) -> list[str]:
@@ -104,6 +109,7 @@ def make_grid(
     weights: Mapping[str, Path] | None = None,
     sensor: str | None = None,
     calib: tuple[str, ...] = (),
+    thresholds: str = "",
 ) -> list[Cell]:
     """All cells, ordered so that an interrupted benchmark is as useful as possible: all sequences
     with the first seed, then all with the next.
@@ -128,6 +134,7 @@ def make_grid(
             digest=digests.get(detector, ""),
             sensor=sensor,
             calib=calib,
+            thresholds=thresholds,
         )
         for seed, sequence, perturb, detector in product(
             range(runs), sequences, perturbations, detectors
@@ -136,9 +143,23 @@ def make_grid(
     ]
 
 
+def thresholds_digest(config: str) -> str:
+    """Digest of the thresholds that differ from the defaults, for ``Cell``; empty if none does.
+
+    Args:
+        config: the text of a ``config.json``.
+    """
+    changed = changed_thresholds(json.loads(config))
+    return _digest_of(json.dumps(changed, sort_keys=True).encode()) if changed else ""
+
+
+def _digest_of(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:8]
+
+
 def _digest(path: Path) -> str:
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()[:8]
+        return _digest_of(path.read_bytes())
     except OSError as error:
         raise InputError(f"--weights {path}: cannot be read ({error.strerror}).") from error
 
@@ -187,6 +208,7 @@ def is_finished(cell: Cell, folder: Path, config: str) -> bool:
         cell.digest,  # the folder is named after it
         cell.sensor,
         tuple(map(str, report.calib)),
+        cell.thresholds,  # those of ``config``
     )
     as_asked = cell.sensor in (None, report.sensor)
     whole = (report.start, report.every) == (0, 1)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+from vslam.config import changed_thresholds
 from vslam.errors import InputError, counted
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.lab.overview.schema import MEASURES, Drive, OverviewJson, RunEntry
@@ -15,6 +19,8 @@ from vslam.trajectory import Trajectory, read_trajectory
 from vslam.untrusted import require_utf8
 
 MONOCULAR = ", mono"  # ends the name of a monocular system
+# Options of a run that change its results and that its drive does not say.
+_OPTIONS = ("weights", "local_weights", "realtime", "map", "localize")
 
 
 @dataclass(frozen=True)
@@ -42,7 +48,6 @@ def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
             read or placed.
     """
     found = Found([], [])
-    configs: dict[str, Path] = {}
     for folder in run_folders(folders):
         require_utf8(folder)
         report = _read(folder, found.notes)
@@ -57,18 +62,12 @@ def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
         found.estimate[entry.source] = folder / "trajectory.tum"
         if (folder / "ground_truth_kitti.txt").is_file():
             found.truth.setdefault((entry.drive.dataset, entry.drive.place), folder)
-        if (folder / "config.json").is_file():
-            configs.setdefault((folder / "config.json").read_text(errors="replace"), folder)
     if not found.runs:
         raise InputError(
             f"{', '.join(map(str, folders))}: no finished run here; name folders that 'vslam run' "
             "or 'vslam bench' wrote."
         )
-    if len(configs) > 1:
-        found.notes.append(
-            f"runs with {len(configs)} different sets of thresholds are in one table: "
-            + ", ".join(str(folder / "config.json") for folder in configs.values())
-        )
+    _name_by_settings(found)
     for text in trajectories:
         _add_external(text, found)
     return found
@@ -137,7 +136,6 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
     parts += [f"every {report.every}"] if report.every > 1 else []
     if report.max_frames:  # the sequence may be shorter
         parts.append(f"{min(report.max_frames, report.frames)} frames")
-    detector = report.detector + (MONOCULAR if report.sensor == "mono" else "")
     sequence, town = report.sequence, None
     laws: list[str] = []
     if report.dataset == "synthetic":
@@ -156,7 +154,8 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
             excerpt=", ".join(parts),
             perturb=",".join(laws) or "none",
         ),
-        system=detector,
+        system=report.detector + (MONOCULAR if report.sensor == "mono" else ""),
+        settings=_settings(report, folder),
         seed=report.seed,
         town=town,
         alignment=alignment_of(report.sensor),
@@ -166,6 +165,40 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
         machine=f"{report.machine.cpu}, {counted(report.machine.cores, 'core')}, "
         f"{counted(report.threads, 'thread')}",
     )
+
+
+def _settings(report: ReportJson, folder: Path) -> dict[str, Any]:
+    """The thresholds and options of a run that differ from the defaults."""
+    path = folder / "config.json"
+    try:
+        changed = changed_thresholds(json.loads(path.read_bytes())) if path.exists() else {}
+    except (OSError, ValueError, AttributeError, RecursionError) as error:
+        raise InputError(f"{path.name} is damaged") from error
+    options = {name: getattr(report, name) for name in _OPTIONS}
+    return changed | {name: str(value) for name, value in options.items() if value}
+
+
+def _name_by_settings(found: Found) -> None:
+    """Make one system of each set of settings; its name has those that not all runs share."""
+    first = found.runs[0].settings
+    shared = {
+        name: value
+        for name, value in first.items()
+        if all(run.settings.get(name) == value for run in found.runs)
+    }
+    if shared:
+        found.notes.append(f"all runs have {', '.join(f'{k}={v}' for k, v in shared.items())}")
+    for k, run in enumerate(found.runs):
+        own = ", ".join(f"{n}={v}" for n, v in run.settings.items() if n not in shared)
+        if own:
+            name = run.system.removesuffix(MONOCULAR)
+            system = f"{name} ({own}){run.system.removeprefix(name)}"
+            found.runs[k] = run.model_copy(update={"system": system})
+
+
+def without_settings(system: str) -> str:
+    """The name of a system without the settings that tell its runs from others."""
+    return re.sub(r" \(.*\)", "", system)
 
 
 def _add_external(text: str, found: Found) -> None:

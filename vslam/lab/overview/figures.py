@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from vslam.errors import InputError
-from vslam.lab.overview.collect import Found, read_aligned
+from vslam.lab.overview.collect import Found, read_aligned, without_settings
 from vslam.lab.overview.schema import Drive, OverviewJson, Row, RunEntry
 from vslam.lab.overview.summary import strengths, systems
 from vslam.report import page
@@ -128,7 +128,7 @@ def _curve(
         color, dashes = looks[name]
         for axes, measure in ((upper, "ate_rmse_m"), (lower, "loops_found")):
             some = [row for row in mine if row.measures[measure]]
-            if not some or (measure == "loops_found" and name == "none"):
+            if not some or (measure == "loops_found" and without_settings(name) == "none"):
                 continue
             at = [strength[row.drive] for row in some]
             median, least, greatest = _spreads(some, measure)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Literal
+from typing import Any, Literal
+
+from pydantic import Field
 
 from vslam.report.document import Document, Record
 
@@ -46,15 +48,17 @@ class Drive(Record):
 class RunEntry(Record):
     """One run. ``measures`` has the names of ``MEASURES``; None where a run has no such value.
 
-    ``system`` is the loop detector, or the name of another system; ``source`` the folder of the
-    run or the file of the trajectory; ``seed`` is None for other systems. ``town`` is the seed of
-    a rendered town: the same route in another town counts as the same drive with another seed.
-    ``alignment`` is what was fitted before errors were computed: ``se3``, or ``sim3`` for a
-    monocular run, whose scale is arbitrary.
+    ``settings`` are the thresholds and options that differ from the defaults. ``system`` is the
+    loop detector, followed in brackets by the settings that not all runs share, or the name of
+    another system; ``source`` the folder of the run or the file of the trajectory; ``seed`` is None
+    for other systems. ``town`` is the seed of a rendered town: the same route in another town
+    counts as the same drive with another seed. ``alignment`` is what was fitted before errors were
+    computed: ``se3``, or ``sim3`` for a monocular run, whose scale is arbitrary.
     """
 
     drive: Drive
     system: str
+    settings: dict[str, Any] = Field(default_factory=dict)
     seed: int | None
     town: int | None = None
     alignment: str = "se3"

@@ -19,6 +19,7 @@ from contextlib import suppress
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
+from vslam.config import thresholds_in_words
 from vslam.errors import InputError
 from vslam.lab.overview.collect import run_folders
 from vslam.report.finished_run import read_report
@@ -161,7 +162,7 @@ def _cells(report: ReportJson) -> tuple[str, ...]:
     return (
         f"{report.dataset} {report.sequence}, {report.sensor}",
         report.perturb,
-        report.detector,
+        ", ".join(filter(None, (report.detector, thresholds_in_words(report.thresholds)))),
         f"{report.frames}{' (interrupted)' if report.interrupted else ''}",
         str(report.lost_frames),
         number(report.ate_rmse_m, "{:.3f}"),

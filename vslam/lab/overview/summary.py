@@ -14,7 +14,7 @@ from itertools import combinations
 from typing import NamedTuple
 
 from vslam.errors import InputError, counted, did_you_mean
-from vslam.lab.overview.collect import MONOCULAR, Found
+from vslam.lab.overview.collect import MONOCULAR, Found, without_settings
 from vslam.lab.overview.schema import (
     ALL,
     MEASURES,
@@ -61,7 +61,7 @@ def summarize(found: Found, baseline: str | None = None) -> OverviewJson:
         InputError: no run of the baseline.
     """
     names = systems(found.runs, baseline)
-    if baseline not in (None, names[0].removesuffix(MONOCULAR)):
+    if baseline is not None and not _is_called(names[0], baseline):
         meant = did_you_mean(baseline, names)
         raise InputError(
             f"--baseline {baseline}: no run of it{meant}; choose from {', '.join(names)}."
@@ -103,14 +103,21 @@ def _unlike_towns(runs: Iterable[RunEntry]) -> Iterator[str]:
 
 def systems(runs: Iterable[RunEntry | Row], baseline: str | None = None) -> list[str]:
     """The baseline if one is named, monocular or not, then loop detectors from the simplest to the
-    most elaborate, then other systems as they came."""
+    most elaborate, then other systems as they came. Of one detector the run without changed
+    settings comes first."""
     names = dict.fromkeys(run.system for run in runs)
 
-    def key(name: str) -> tuple[bool, int]:
-        place = _KNOWN.index(name) if name in _KNOWN else len(_KNOWN)
-        return name.removesuffix(MONOCULAR) != baseline, place
+    def key(name: str) -> tuple[bool, int, bool]:
+        plain = without_settings(name)
+        place = _KNOWN.index(plain) if plain in _KNOWN else len(_KNOWN)
+        return not _is_called(name, baseline), place, name != plain
 
     return sorted(names, key=key)
+
+
+def _is_called(system: str, name: str | None) -> bool:
+    """Whether ``--baseline`` may call a system so: with its settings or without."""
+    return name in {one.removesuffix(MONOCULAR) for one in (system, without_settings(system))}
 
 
 def make_rows(runs: list[RunEntry]) -> list[Row]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 from vslam.errors import counted
 from vslam.evaluation.loops import LoopLimits
+from vslam.lab.overview.collect import without_settings
 from vslam.lab.overview.schema import Comparison, Drive, OverviewJson, Row, Spread
 from vslam.lab.overview.summary import ALPHA, COMPARED, ROTATION, least_pairs
 from vslam.report.page import Bullets, Section, Table
@@ -13,7 +15,8 @@ from vslam.report.page import Bullets, Section, Table
 _TEXTS = ("sequence", "perturbation")
 _SHOWN = {**COMPARED, **ROTATION}
 _MEASURES = ("lost_frames", *_SHOWN, "loops_found")
-_COLUMNS = 10  # at most so many columns of figures, which fit a terminal of 80 characters
+_WIDTH = 60  # characters for all columns of figures, so that a table fits a terminal of 80
+_COLUMN = 6  # characters of a column of figures at least
 _NOTES = {
     "lost_frames": "Lost: number of lost frames.",
     "rpe_m": "RPE: error of the motion from one frame to the next.",
@@ -59,7 +62,7 @@ def _without_revisits(report: OverviewJson) -> str:
     """Why loop detectors do not differ, or hardly; empty where a drive has a revisit or nobody
     could judge it."""
     judged = [row for row in report.rows if row.measures["loops_found"] is not None]
-    names = {row.system for row in judged}
+    names = {row.system for row in judged if row.system == without_settings(row.system)}
     counts = [row.measures[name] for row in judged for name in ("loops_found", "loops_missed")]
     if len(names) < 2 or any(count.greatest for count in counts if count is not None):
         return ""
@@ -78,7 +81,9 @@ def _is_tie(one: Comparison) -> bool:
 
 def _section(report: OverviewJson, rows: Rows, names: list[str]) -> Section:
     order = {(row.drive, row.alignment): None for row in report.rows if row.system in names}
-    each = max(1, _COLUMNS // len(names))  # measures of one table
+    words = [re.split(", | ", name) for name in names]  # a heading breaks between them
+    width = sum(max(_COLUMN, *(1 + len(word) for word in parts)) for parts in words)
+    each = max(1, _WIDTH // width)  # measures of one table
     tables = []
     for k in range(0, len(_MEASURES), each):
         measures = _MEASURES[k : k + each]

@@ -82,6 +82,7 @@ class Plan:
         preset: ``kitti-c`` for fixed severities, or None.
         sensor: ``mono`` for the left camera alone, None for all images that the data has.
         calib: calibration files.
+        thresholds: as in `Cell`.
         baseline: the system to which the errors of a preset are compared.
     """
 
@@ -98,6 +99,7 @@ class Plan:
     preset: str | None = None
     sensor: str | None = None
     calib: tuple[str, ...] = ()
+    thresholds: str = ""
 
     def clean_cells(self) -> list[Cell]:
         """The runs of each system on clean images."""
@@ -111,6 +113,7 @@ class Plan:
                 self.max_frames,
                 sensor=self.sensor,
                 calib=self.calib,
+                thresholds=self.thresholds,
             )
             for sequence in self.sequences
             for system in self.systems

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.cli.options import INPUT, OUTPUT, Quiet
+from vslam.cli.options import INPUT, OUTPUT, Quiet, flag, option
 from vslam.errors import InputError, counted
 
 if TYPE_CHECKING:
@@ -34,20 +34,10 @@ RunOrFile = Annotated[
 ]
 Data = Annotated[
     str | None,
-    typer.Option(
-        metavar="DATA",
-        help="Where the images of the run are now.",
-        show_default="where the run read them",
-        rich_help_panel=INPUT,
-    ),
+    option(INPUT, "DATA", "Where the images of the run are now.", unset="where the run read them"),
 ]
 Link = Annotated[
-    bool,
-    typer.Option(
-        "--link",
-        help="Link the images of the data set in place of copies.",
-        rich_help_panel=OUTPUT,
-    ),
+    bool, flag(OUTPUT, "Link the images of the data set in place of copies.", "--link")
 ]
 
 
@@ -58,12 +48,12 @@ def register(app: typer.Typer) -> None:
 
 def _out(default: str) -> typer.models.OptionInfo:
     is_file = "." in default
-    return typer.Option(
+    return option(
+        OUTPUT,
+        "FILE" if is_file else "FOLDER",
+        f"{'File' if is_file else 'Folder'} to write{'' if is_file else ' to'}.",
         "--out",
-        metavar="FILE" if is_file else "FOLDER",
-        help=f"{'File' if is_file else 'Folder'} to write{'' if is_file else ' to'}.",
-        show_default=f"RUN/{default}",
-        rich_help_panel=OUTPUT,
+        unset=f"RUN/{default}",
     )
 
 
@@ -73,10 +63,7 @@ def colmap(
     data: Data = None,
     out: Annotated[Path | None, _out("colmap")] = None,
     text: Annotated[
-        bool,
-        typer.Option(
-            "--text", help="Write text files in place of binary ones.", rich_help_panel=OUTPUT
-        ),
+        bool, flag(OUTPUT, "Write text files in place of binary ones.", "--text")
     ] = False,
     link: Link = False,
     quiet: Quiet = False,
@@ -126,10 +113,10 @@ def ply(
     out: Annotated[Path | None, _out("landmarks.ply")] = None,
     colours: Annotated[
         bool,
-        typer.Option(
+        flag(
+            OUTPUT,
+            "Colour the landmarks from the images, which are otherwise not needed.",
             "--colours/--no-colours",
-            help="Colour the landmarks from the images, which are otherwise not needed.",
-            rich_help_panel=OUTPUT,
         ),
     ] = True,
     quiet: Quiet = False,

@@ -22,8 +22,8 @@ from vslam.frontend.tracking import (
 )
 from vslam.geometry import Matrix, inverse, orthonormalised, se3_exp, se3_log
 from vslam.map_view import MapView
+from vslam.odometry import Odometry
 from vslam.states import TrackerState
-from vslam.uncertainty import PoseUncertainty
 
 
 class TrackerStatus(Enum):
@@ -305,7 +305,7 @@ def result_of(
     found: Found,
     is_keyframe: bool,
     stage_ms: dict[str, float],
-    uncertainty: PoseUncertainty,
+    odometry: Odometry,
 ) -> TrackResult:
     """The result that a caller of the library gets for a frame; ``stage_ms`` holds the
     milliseconds of each stage."""
@@ -321,5 +321,6 @@ def result_of(
         is_keyframe=is_keyframe,
         relocalised=found.relocalised,
         stage_ms=stage_ms,
-        uncertainty=uncertainty,
+        T_odom_camera=odometry.T_odom_camera,
+        uncertainty=odometry.now,
     )

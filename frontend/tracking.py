@@ -28,8 +28,8 @@ from vslam.frontend.orb import scale_factors
 from vslam.frontend.pose import optimise_pose, pose_covariance
 from vslam.geometry import compose, inverse, transform
 from vslam.map_view import LocalMap
+from vslam.odometry import adjoint
 from vslam.reprojection import stack_uvr
-from vslam.uncertainty import adjoint
 
 NEVER = np.iinfo(np.int64).max
 

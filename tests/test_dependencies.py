@@ -27,7 +27,9 @@ FOLDERS = {
 LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.errors", "vslam.machine"),
     ("vslam.kernels", "vslam.plugins", "vslam.untrusted", "vslam.lock_file"),
-    ("vslam.config", "vslam.geometry", "vslam.ransac", "vslam.features", "vslam.camera"),
+    ("vslam.config", "vslam.geometry", "vslam.ransac", "vslam.camera"),
+    ("vslam.odometry",),
+    ("vslam.features",),
     (
         "vslam.loops",
         "vslam.reprojection",

@@ -151,6 +151,9 @@ RULES = {
             ("vslam synth block", AGAIN),
         )
     ),
+    "docs/research/uncertainty.md": Rules(
+        not_run=(("python tools/experiments/uncertainty", "test_odometry.py runs it"),)
+    ),
     "docs/research/loops.md": Rules(
         not_run=(
             ("vslam loops bench", "it takes hours; test_loopbench.py runs it on a small town"),

@@ -19,8 +19,8 @@ from vslam.map import Map
 from vslam.mapping import Mapper
 from vslam.maps.stored_map import StoredMap, World
 from vslam.modes import Mode
+from vslam.odometry import Odometry
 from vslam.states import Checkpoint
-from vslam.uncertainty import UncertaintyModel
 
 _log = logging.getLogger(__name__)
 
@@ -95,7 +95,7 @@ class Session:
     tracker: Tracker
     rig: RigCalibration
     mode: Mode
-    uncertainty: UncertaintyModel
+    odometry: Odometry
     opened: OpenedMap
 
     def stored_map(self, drive: str) -> StoredMap:
@@ -135,7 +135,7 @@ class Session:
             policy,
             self.closing.state(),
             self.rig.state(),
-            self.uncertainty.state(),
+            self.odometry.state(),
         )
 
     def restore(self, state: Checkpoint) -> None:
@@ -144,7 +144,7 @@ class Session:
         self.mode.restore(state.policy)
         self.closing.restore(state.closing)
         self.rig.restore(state.rig)
-        self.uncertainty.restore(state.uncertainty)
+        self.odometry.restore(state.odometry)
         landmark = state.tracker.landmark
         xyz = np.full((len(landmark), 3), np.nan)
         xyz[landmark >= 0] = self.mapper.map.arrays.xyz[landmark[landmark >= 0]]

@@ -139,7 +139,7 @@ class Checkpoint:
     """The states of all parts.
 
     Attributes:
-        uncertainty: of the pose of the last frame (``UncertaintyModel``).
+        odometry: pose and uncertainty of the last frame (``Odometry``).
     """
 
     tracker: TrackerState
@@ -147,4 +147,4 @@ class Checkpoint:
     policy: PolicyState
     closing: ClosingState
     rig: RigState = field(default_factory=RigState)
-    uncertainty: tuple[float, ...] = (0.0,) * 44
+    odometry: tuple[float, ...] = (*np.eye(4).ravel().tolist(), *[0.0] * 44)

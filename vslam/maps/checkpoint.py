@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from vslam.features import PATCH_PIXELS, Features, KeyframePatches
 from vslam.loops import ResembledPlace, loop_entry, loop_of
 from vslam.map import Map
+from vslam.odometry import N_STATE
 from vslam.states import (
     Checkpoint,
     ClosingState,
@@ -21,7 +22,6 @@ from vslam.states import (
     TrackerState,
     VerifierState,
 )
-from vslam.uncertainty import N_NUMBERS
 
 # N features of the last tracked frame; M keyframes with patches, which have R rows in total.
 ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
@@ -69,7 +69,7 @@ def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
         },
         "mapper": {name: getattr(checkpoint.mapper, name) for name in _OF_MAPPER},
         "policy": asdict(checkpoint.policy),
-        "uncertainty": checkpoint.uncertainty,
+        "odometry": checkpoint.odometry,
         "rig": {"delay": checkpoint.rig.delay, "sides": checkpoint.rig.sides},
         "closing": {
             "places": [[sorted(one.keyframes), one.length, one.age] for one in consistency.places],
@@ -153,7 +153,7 @@ def checked_checkpoint(
             _count(policy["due"], -1),
         ),
         closing=_closing_of(entry["closing"], map_.n_keyframes),
-        uncertainty=tuple(_numbers(entry["uncertainty"], N_NUMBERS + 1).tolist()),
+        odometry=tuple(_numbers(entry["odometry"], N_STATE).tolist()),
         rig=RigState(
             **{name: tuple(_numbers(entry["rig"][name]).tolist()) for name in ("delay", "sides")}
         ),

@@ -21,7 +21,12 @@ from vslam.maps.storage import save_map
 from vslam.report.frame_table import write_covariances, write_frames
 from vslam.report.schema import ReportJson
 from vslam.report.summary import evaluate_run, summarize
-from vslam.run.outcome import RunOutcome, causal_trajectory, matched_ground_truth
+from vslam.run.outcome import (
+    RunOutcome,
+    causal_trajectory,
+    matched_ground_truth,
+    odometry_trajectory,
+)
 from vslam.trajectory import write_kitti, write_tum
 
 if TYPE_CHECKING:
@@ -92,7 +97,7 @@ def write_results(
     trajectories
     (``trajectory_kitti.txt``, ``trajectory.tum``, ``ground_truth_kitti.txt``, ``keyframes.tum``,
     ``trajectory_causal.tum`` with the poses as they were given at the time, ``covariance.csv`` with
-    their covariances,
+    their covariances, ``trajectory_odom.tum`` with those that never jump,
     ``trajectory_<detector>.tum`` of each detector compared), maps (``map.npz``, ``map.ply``),
     numbers (``frames.csv``, ``config.json``, read by ``--config``, and ``report.json``), and pages
     for people (``figures/*.png``, ``report.md`` and ``report.html``, one file that makes no
@@ -190,6 +195,8 @@ def _write_data(
         write_tum(file, outcome.keyframes)
     with written.file("trajectory_causal.tum") as file:
         write_tum(file, causal_trajectory(outcome.tracks))
+    with written.file("trajectory_odom.tum") as file:
+        write_tum(file, odometry_trajectory(outcome.tracks))
     with written.file("covariance.csv") as file:
         write_covariances(file, outcome.tracks)
     for other in outcome.compared:

@@ -50,7 +50,7 @@ def write_covariances(path: Path, tracks: list[TrackResult]) -> None:
     """Write a row per frame whose covariances are known: time (s), then the upper triangles, row by
     row, of the covariance relative to the landmarks around the camera (``local``) and to the start
     of the drive (``drive``), of ``[x, y, z, rx, ry, rz]`` in metres and radians, in the frame of
-    the camera (``vslam.uncertainty``)."""
+    the camera (``vslam.odometry``)."""
     upper = np.triu_indices(6)
     pairs = [f"{_AXES[row]}_{_AXES[column]}" for row, column in zip(*upper, strict=True)]
     with path.open("w", newline="", encoding="utf-8") as file:

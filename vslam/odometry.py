@@ -1,4 +1,8 @@
-"""How sure a pose is: its covariance, from the optimisation of each pose and the map's drift.
+"""Odometry beside the map: poses that never jump, and how sure each pose is.
+
+The pose of the camera in the map jumps where a loop is closed or the camera is found again. A robot
+that controls itself by poses needs some that do not: ``odom`` follows the motion from frame to
+frame, and drifts (ROS REP 105).
 
 A pose has two errors. The *local* one is that of the camera relative to the landmarks around it,
 and is drawn anew in every frame. The *drift* is that of these landmarks relative to the start of
@@ -20,15 +24,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.geometry import Matrix
+from vslam.geometry import Matrix, inverse, orthonormalised
 
 # Chosen on four rendered drives so that the squared errors over 1 s and 10 s are those that the
 # covariances predict, and checked on four others (docs/research/uncertainty.md).
-LOCAL, DRIFT, CORRELATION = 1.5, 2.7, 0.5
+LOCAL, DRIFT, CORRELATION = 1.8, 3.3, 0.5
 # Standard deviation of the acceleration of a camera that is lost, in m/s^2 and rad/s^2.
 ACCELERATION, TURNING = 2.0, 1.0
 
-N_NUMBERS = 43
+N_NUMBERS = 43  # of ``PoseUncertainty.numbers``
+N_STATE = 16 + N_NUMBERS + 1  # of ``Odometry.state``
 _UPPER = np.triu_indices(6)
 
 
@@ -113,10 +118,15 @@ def _growth(n: int) -> float:
     return 1.0 + 2.0 * r / (1.0 - r) * (1.0 - (1.0 - r**n) / (n * (1.0 - r)))
 
 
-class UncertaintyModel:
-    """Follows the uncertainty of the pose from frame to frame."""
+class Odometry:
+    """Follows the motion of the camera from frame to frame, and the uncertainty of its pose.
+
+    Attributes:
+        T_odom_camera: ``(4, 4)`` pose of the last frame; the first frame is the origin.
+    """
 
     def __init__(self) -> None:
+        self.T_odom_camera = np.eye(4)
         self._local = np.zeros((6, 6))
         self._drift = np.zeros((6, 6))
         self._n_keyframes = 0
@@ -131,12 +141,14 @@ class UncertaintyModel:
         """Advance to the next frame.
 
         Args:
-            T_now_last: ``(4, 4)`` motion from the last frame to this one.
+            T_now_last: ``(4, 4)`` motion from the last frame to this one: maps points from the last
+                camera to this one.
             elapsed: seconds between them.
             covariance: ``(6, 6)`` of the optimised pose (``pose_covariance``); None if the pose is
                 only predicted, with a constant velocity: its error then grows with the square of
                 the time.
         """
+        self.T_odom_camera = orthonormalised(self.T_odom_camera @ inverse(T_now_last))
         A = adjoint(T_now_last)
         self._drift = _symmetric(A @ self._drift @ A.T)
         if covariance is not None and np.isfinite(covariance).all():
@@ -155,10 +167,11 @@ class UncertaintyModel:
 
     def state(self) -> tuple[float, ...]:
         """The state between two frames, for a checkpoint."""
-        return (*self.now.numbers().tolist(), self._lost_s)
+        return (*self.T_odom_camera.ravel(), *self.now.numbers().tolist(), self._lost_s)
 
     def restore(self, state: tuple[float, ...]) -> None:
         """Continue from a state that ``state`` returned."""
-        found = PoseUncertainty.of_numbers(np.array(state[:-1]))
+        self.T_odom_camera = np.array(state[:16]).reshape(4, 4)
+        found = PoseUncertainty.of_numbers(np.array(state[16:-1]))
         self._local, self._drift, self._n_keyframes = found.local, found.drift, found.n_keyframes
         self._lost_s = state[-1]

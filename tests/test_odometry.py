@@ -1,28 +1,32 @@
-"""How sure a pose is: the covariance of one pose, its growth along a drive, and its files."""
+"""Odometry beside the map: poses that never jump, and covariances that hold what they promise."""
 
 from __future__ import annotations
 
 import csv
+import runpy
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from ring import Oracle
+from test_closing import DRIFTING, EXACT, ROUND, run
 from test_pose import CAMERA, TRUTH, observations
 
 from vslam.features import TrackingState, TrackResult
 from vslam.frontend.pose import optimise_pose, pose_covariance
 from vslam.geometry import inverse, se3_exp, se3_log
-from vslam.report.frame_table import write_covariances, write_frames
-from vslam.slam import Slam
-from vslam.uncertainty import (
+from vslam.odometry import (
     CORRELATION,
     DRIFT,
     LOCAL,
+    Odometry,
     PoseUncertainty,
-    UncertaintyModel,
     adjoint,
     relative_covariance,
 )
+from vslam.report.frame_table import write_covariances, write_frames
+from vslam.slam import Slam
 
 MOTION = se3_exp(np.array([0.1, -0.05, -1.0, 0.01, 0.05, -0.02]))
 
@@ -75,7 +79,7 @@ def test_the_drift_grows_as_the_sum_of_correlated_steps_does():
 
 
 def test_the_drift_before_both_frames_does_not_count():
-    model = UncertaintyModel()
+    model = Odometry()
     model.move(np.eye(4), 0.0, some_covariance())
     model.keyframe()
     first = model.now
@@ -90,7 +94,7 @@ def test_the_drift_before_both_frames_does_not_count():
 
 
 def test_a_pose_that_is_predicted_gets_less_sure_with_the_square_of_the_time():
-    model = UncertaintyModel()
+    model = Odometry()
     model.move(np.eye(4), 0.0, some_covariance(1e-6))
     deviations = []
     for covariance in (None, None, np.full((6, 6), np.nan), None):
@@ -103,7 +107,7 @@ def test_a_pose_that_is_predicted_gets_less_sure_with_the_square_of_the_time():
 
 
 def test_the_state_comes_back_equal():
-    one, other = UncertaintyModel(), UncertaintyModel()
+    one, other = Odometry(), Odometry()
     for k in range(5):
         one.move(MOTION, 0.1, some_covariance(1e-4, k) if k != 3 else None)
         one.keyframe()
@@ -132,6 +136,55 @@ def test_a_drive_gets_less_sure_where_it_is_lost_and_with_every_keyframe(corrido
     made = np.array([result.is_keyframe for result in results])
     assert (np.diff(drift)[made[1:]] > 0).all()
     assert results[-1].uncertainty.n_keyframes == made.sum()
+
+
+NEES = runpy.run_path(
+    str(Path(__file__).parents[1] / "tools" / "experiments" / "uncertainty" / "nees.py")
+)
+
+
+@pytest.mark.parametrize("promised", [1.0, 0.25])
+def test_the_tool_finds_covariances_that_promise_too_much(promised):
+    """Errors of every frame, drawn with the variance that the covariance has, or four times it."""
+    rng = np.random.default_rng(0)
+    C = np.diag([1e-4, 1e-4, 4e-4, 1e-6, 1e-6, 1e-6])
+    truth, results = [], []
+    for k in range(600):
+        T_wc = se3_exp(np.array([0.0, 0.0, 0.8 * k, 0.0, 0.0, 0.0]))
+        error = se3_exp(np.sqrt(LOCAL) * rng.multivariate_normal(np.zeros(6), C))
+        sure = PoseUncertainty(promised * C, np.zeros((6, 6)), 0)
+        tracked = TrackResult(k, 0.1 * k, T_wc, TrackingState.OK, 0, 0, 0, 0, False)
+        truth.append(T_wc)
+        results.append(replace(tracked, T_odom_camera=T_wc @ error, uncertainty=sure))
+    nees = NEES["mean_nees"](results, np.array(truth), 1.0)
+    assert nees == pytest.approx(1.0 / promised, rel=0.2)
+
+
+def steps(poses: list[np.ndarray]) -> np.ndarray:
+    """Distance from each position to the next one, metres."""
+    return np.linalg.norm(np.diff([pose[:3, 3] for pose in poses], axis=0), axis=1)
+
+
+@pytest.mark.slow
+def test_a_loop_moves_the_map_and_not_the_odometry():
+    slam, results = run(DRIFTING, ROUND, Oracle(DRIFTING, ROUND))
+    assert slam.corrections
+    odom = steps([result.T_odom_camera for result in results])
+    assert odom.max() < 1.05 * np.median(odom)
+    corrections = steps([result.T_map_odom for result in results])
+    assert corrections.max() > 10.0 * np.median(corrections)
+    last = results[-1]
+    np.testing.assert_allclose(last.T_map_odom @ last.T_odom_camera, last.T_wc, atol=1e-9)
+
+
+def test_the_odometry_does_not_jump_where_the_camera_is_found_again():
+    lost = range(30, 36)
+    _, results = run(EXACT, [*range(50)], dark=lost)
+    assert all(results[k].state == TrackingState.LOST for k in lost)
+    odom = steps([result.T_odom_camera for result in results])
+    assert odom.max() < 1.2 * np.median(odom)
+    assert results[0].T_odom_camera is not None
+    np.testing.assert_array_equal(results[0].T_odom_camera, np.eye(4))
 
 
 def test_the_tables_hold_deviations_and_both_covariances(tmp_path):

@@ -82,7 +82,7 @@ ONLY_IN = {
     "rerun": "vslam.run.recorder",
     "evo": "vslam.evaluation.trajectories",
     "distributed": "vslam.lab.bench.cluster",
-    "rosbags": ("vslam.datasets.bag", "vslam.datasets.bag_limits"),
+    "rosbags": ("vslam.datasets.bag", "vslam.datasets.bag_limits", "vslam.maps.ros"),
     "PIL": "vslam.datasets.image_folders",
     "pyorbslam3": "vslam.lab.stress.orbslam3",
     "deflate": "vslam.datasets.png",

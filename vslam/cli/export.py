@@ -187,6 +187,46 @@ def euroc(
         typer.echo(f"{target}: {counted(len(trajectory), 'pose')}")
 
 
+@commands.command(epilog="[b]Example[/b]\n  vslam export ros runs/latest")
+def ros(
+    run: Run,
+    out: Annotated[Path | None, _out("ros.mcap")] = None,
+    online: Annotated[
+        bool,
+        flag(
+            OUTPUT,
+            "Take the poses in the map as they were first estimated, so that map -> odom jumps at "
+            "loops as it did during the drive, in place of the final ones.",
+            "--online",
+        ),
+    ] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write odometry, transforms, path and landmarks as ROS 2 messages, in an MCAP file."""
+    import numpy as np
+
+    from vslam.maps.new_output import new_file
+    from vslam.maps.ros import frame_poses, save_bag
+    from vslam.report.finished_run import read_run
+    from vslam.report.frame_table import read_covariances
+    from vslam.trajectory import read_trajectory
+
+    target = out or run / "ros.mcap"
+    if target.suffix != ".mcap":
+        raise InputError(f"--out {target}: ROS knows the format by the name; end it in .mcap.")
+    map_ = read_run(run).map
+    trajectory = read_trajectory(run / f"trajectory{'_causal' * online}.tum")
+    odometry = read_trajectory(run / "trajectory_odom.tum")
+    if not np.array_equal(odometry.timestamps, trajectory.timestamps):
+        raise InputError(f"{run}: its trajectories are of different frames; run again.")
+    poses = frame_poses(odometry, trajectory, read_covariances(run / "covariance.csv"))
+    xyz = map_.arrays.xyz[map_.living_landmarks()]
+    with new_file(target) as file:
+        save_bag(file, poses, trajectory, xyz)
+    if not quiet:
+        typer.echo(f"{target}: {counted(len(poses), 'pose')}, {counted(len(xyz), 'landmark')}")
+
+
 def _beside(run: Path, name: str) -> Path:
     """A file in the folder of a run, or beside a map file under the name of the map."""
     return run / name if run.is_dir() else run.with_suffix(Path(name).suffix)

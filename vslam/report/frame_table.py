@@ -6,7 +6,9 @@ import csv
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from vslam.errors import InputError
 from vslam.features import TrackResult
 from vslam.report.summary import stage_names
 
@@ -63,3 +65,31 @@ def write_covariances(path: Path, tracks: list[TrackResult]) -> None:
                 both = track.uncertainty.near, track.uncertainty.covariance
                 values = [f"{value:.6e}" for one in both for value in one[upper]]
                 table.writerow([f"{track.timestamp:.6f}", *values])
+
+
+def read_covariances(
+    path: Path,
+) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Read what ``write_covariances`` wrote: the two ``(6, 6)`` covariances of each frame, by its
+    time as the file has it.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    upper = np.triu_indices(6)
+    found = {}
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            for time, *values in list(csv.reader(file))[1:]:
+                both = np.zeros((2, 6, 6))
+                numbers = np.array(values, np.float64).reshape(2, len(upper[0]))
+                for matrix, triangle in zip(both, numbers, strict=True):
+                    matrix[upper] = matrix.T[upper] = triangle
+                found[time] = both[0], both[1]
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); name the folder of a run, or run again."
+        ) from error
+    except (ValueError, csv.Error) as error:
+        raise InputError(f"{path}: damaged ({error}); run again.") from error
+    return found

@@ -232,10 +232,22 @@ def test_refusals(folder, tmp_path, monkeypatch):
     (tmp_path / "run.mcap").touch()
     with pytest.raises(InputError, match="exists already"):
         export(folder, "--out", tmp_path / "run.mcap")
-    monkeypatch.setitem(sys.modules, "rosbags.interfaces", None)
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
     with pytest.raises(InputError, match=r"pip install 'vslam\[bag\]'"):
         export(folder, "--out", tmp_path / "other.mcap")
     assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
+
+
+@pytest.mark.slow
+def test_a_run_that_only_localises_has_no_landmarks(folder, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(folder, run)
+    (run / "map.npz").unlink()
+    assert export(run) == f"{run / 'ros.mcap'}: 28 poses, 0 landmarks\n"
+    bag = read(run / "ros.mcap")
+    assert len(bag["/odom"]) == 28
+    ((_, cloud),) = bag["/map_points"]
+    assert (cloud.width, len(cloud.data)) == (0, 0)
 
 
 @pytest.mark.slow
@@ -243,6 +255,7 @@ def test_refusals(folder, tmp_path, monkeypatch):
     ("name", "text", "why"),
     [
         ("covariance.csv", None, "No such file"),
+        ("trajectory.tum", None, "No such file"),
         ("covariance.csv", "timestamp\n0.1,1,2,three\n", "damaged"),
         ("covariance.csv", "timestamp\n0.1,1,2\n", "damaged"),
         ("trajectory_odom.tum", "0 0 0 0 0 0 0 1\n", "of different frames"),

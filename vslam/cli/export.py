@@ -207,20 +207,22 @@ def ros(
 
     from vslam.maps.new_output import new_file
     from vslam.maps.ros import frame_poses, save_bag
-    from vslam.report.finished_run import read_run
+    from vslam.maps.storage import load_map
     from vslam.report.frame_table import read_covariances
     from vslam.trajectory import read_trajectory
 
     target = out or run / "ros.mcap"
     if target.suffix != ".mcap":
         raise InputError(f"--out {target}: ROS knows the format by the name; end it in .mcap.")
-    map_ = read_run(run).map
     trajectory = read_trajectory(run / f"trajectory{'_causal' * online}.tum")
     odometry = read_trajectory(run / "trajectory_odom.tum")
     if not np.array_equal(odometry.timestamps, trajectory.timestamps):
         raise InputError(f"{run}: its trajectories are of different frames; run again.")
     poses = frame_poses(odometry, trajectory, read_covariances(run / "covariance.csv"))
-    xyz = map_.arrays.xyz[map_.living_landmarks()]
+    xyz = np.empty((0, 3))
+    if (run / "map.npz").is_file():  # a run that only localises has no map of its own
+        map_ = load_map(run).map
+        xyz = map_.arrays.xyz[map_.living_landmarks()]
     with new_file(target) as file:
         save_bag(file, poses, trajectory, xyz)
     if not quiet:

@@ -184,14 +184,7 @@ def save_bag(
         OSError: the file cannot be written.
     """
     try:
-        from rosbags.interfaces import (
-            Qos,
-            QosDurability,
-            QosHistory,
-            QosLiveliness,
-            QosReliability,
-            QosTime,
-        )
+        from rosbags import interfaces as of
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
     except ModuleNotFoundError as error:
@@ -199,10 +192,10 @@ def save_bag(
             f"{path}: bags are written by rosbags, which is not installed; "
             "pip install 'vslam[bag]'."
         ) from error
-    for_ever = QosTime(9223372036, 854775807)
-    kept = Qos(
-        QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,
-        for_ever, for_ever, QosLiveliness.AUTOMATIC, for_ever, False,
+    for_ever = of.QosTime(9223372036, 854775807)
+    kept = of.Qos(
+        of.QosHistory.KEEP_LAST, 1, of.QosReliability.RELIABLE, of.QosDurability.TRANSIENT_LOCAL,
+        for_ever, for_ever, of.QosLiveliness.AUTOMATIC, for_ever, False,
     )  # fmt: skip
     store = get_typestore(Stores.ROS2_HUMBLE)
     types = store.types.__getitem__

@@ -13,7 +13,7 @@ from ring import Oracle
 from test_closing import DRIFTING, EXACT, ROUND, run
 from test_pose import CAMERA, TRUTH, observations
 
-from vslam.features import TrackingState, TrackResult
+from vslam.features import Extracted, TrackingState, TrackResult
 from vslam.frontend.pose import optimise_pose, pose_covariance
 from vslam.geometry import inverse, se3_exp, se3_log
 from vslam.odometry import (
@@ -175,6 +175,19 @@ def test_a_loop_moves_the_map_and_not_the_odometry():
     assert corrections.max() > 10.0 * np.median(corrections)
     last = results[-1]
     np.testing.assert_allclose(last.T_map_odom @ last.T_odom_camera, last.T_wc, atol=1e-9)
+
+
+def test_the_odometry_of_a_resumed_drive_continues_without_the_state_of_tracking(tmp_path):
+    slam, results = run(EXACT, [*range(30)])
+    slam.save(tmp_path / "map.npz")
+    again = Slam.load(tmp_path / "map.npz", detector="none", resume=True)
+    again.resume_odometry(results[-1])
+    image = np.zeros((1, 2), np.uint8)
+    last = again.step_features(Extracted(EXACT.see(30, 1)), 3.0, image)
+    assert last.state == TrackingState.OK
+    moved = np.linalg.norm(last.T_odom_camera[:3, 3] - results[-1].T_odom_camera[:3, 3])
+    assert moved == pytest.approx(steps([r.T_odom_camera for r in results])[-1], rel=0.1)
+    assert last.uncertainty.n_keyframes >= results[-1].uncertainty.n_keyframes
 
 
 def test_the_odometry_does_not_jump_where_the_camera_is_found_again():

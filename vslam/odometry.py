@@ -165,6 +165,11 @@ class Odometry:
         self._drift = self._drift + self._local
         self._n_keyframes += 1
 
+    def resume(self, T_odom_camera: Matrix, uncertainty: PoseUncertainty) -> None:
+        """Continue from the last frame of a drive whose state was not saved."""
+        self.T_odom_camera, self._local = T_odom_camera, uncertainty.local
+        self._drift, self._n_keyframes = uncertainty.drift, uncertainty.n_keyframes
+
     def state(self) -> tuple[float, ...]:
         """The state between two frames, for a checkpoint."""
         return (*self.T_odom_camera.ravel(), *self.now.numbers().tolist(), self._lost_s)

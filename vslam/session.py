@@ -10,6 +10,7 @@ import numpy as np
 from vslam.camera import same_camera
 from vslam.closing import LoopClosing
 from vslam.config import changed_thresholds
+from vslam.features import TrackResult
 from vslam.frame_poses import FrameTable
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracker import Tracker
@@ -149,6 +150,14 @@ class Session:
         xyz = np.full((len(landmark), 3), np.nan)
         xyz[landmark >= 0] = self.mapper.map.arrays.xyz[landmark[landmark >= 0]]
         self.rig.mark_corrected(self.tracker.restore(state.tracker, xyz))
+
+    def resume_odometry(self, last: TrackResult) -> None:
+        """Continue the odometry of a resumed drive after its last frame, unless ``resume`` has
+        restored it from a checkpoint."""
+        T_odom_camera, uncertainty = last.T_odom_camera, last.uncertainty
+        if T_odom_camera is None or uncertainty is None or self.opened.checkpoint is not None:
+            return
+        self.odometry.resume(T_odom_camera, uncertainty)
 
     def resume(self) -> None:
         """Continue after the last frame of a resumed drive, if there is one.

@@ -311,6 +311,11 @@ class Slam:
             elapsed = frame.timestamp - frames.timestamp(-1)
         self._odometry.move(T_now_last, elapsed, covariance)
 
+    def resume_odometry(self, last: TrackResult) -> None:
+        """Continue ``T_odom_camera`` and the uncertainty after the last result of a drive that was
+        resumed from a map without the state of tracking; otherwise they begin anew."""
+        self._session.resume_odometry(last)
+
     def finish(self) -> None:
         """Complete all mapping, so that map and trajectory stay as they are until the next step."""
         self._mapper.finish()

@@ -244,6 +244,14 @@ def _source_options(
             show_default="all that the data has",
         ),
     ] = None,
+    mask: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE|FOLDER",
+            help="Image that is black where the left images are not to be used, or a folder of one "
+            "for each image (docs/howto/masks.md).",
+        ),
+    ] = None,
     start: Annotated[int, typer.Option(min=0, metavar="N", help="First frame.")] = 0,
     every: Annotated[int, typer.Option(min=1, metavar="N", help="Use every N-th frame only.")] = 1,
     max_frames: Annotated[
@@ -265,7 +273,7 @@ def _source_options(
     return SourceOptions(
         data=data or "", dataset=dataset, seq=seq, calib=tuple(calib or ()), right=right,
         depth=depth, fps=fps, side_by_side=side_by_side, topics=topics, depth_scale=depth_scale,
-        sensor=sensor, start=start, every=every, max_frames=max_frames,
+        sensor=sensor, mask=mask, start=start, every=every, max_frames=max_frames,
     )  # fmt: skip
 
 

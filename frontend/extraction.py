@@ -14,6 +14,7 @@ from vslam.camera import DepthImage, Image, ImageMap
 from vslam.errors import UnreadableImageError
 from vslam.features import Extracted, Features, Keypoints, Pyramid, Side
 from vslam.frontend.depth import columns_of_depth
+from vslam.frontend.masks import Mask
 from vslam.frontend.orb import Extraction, build_pyramid, with_keypoints
 from vslam.frontend.pose_alignment import coarse_levels
 from vslam.frontend.side_delay import row_offsets
@@ -45,6 +46,7 @@ class FrameImages:
 
     Attributes:
         left: ``(H, W)`` uint8.
+        mask: of the left image; None if all of it is used.
         pyramid: of the left image; None if frames are not tracked by patches.
         coarse: ``coarse_levels`` of that pyramid, or None.
         sides: the comparison of the left and the right image; None without a right image, or if it
@@ -59,14 +61,17 @@ class FrameImages:
         read_second: Callable[[], Image | DepthImage | None],
         context: TrackingContext,
         image_map: ImageMap = map,
+        mask: Mask | None = None,
     ) -> None:
         """
         Args:
             left: ``(H, W)`` uint8.
             read_second: gives the second image, or raises UnreadableImageError.
             context, image_map: see ``extract_features``.
+            mask: of the left image; None uses all of it.
         """
         self.left = left
+        self.mask = mask
         self.pyramid: Pyramid | None = None
         self.coarse: Pyramid | None = None
         self.sides: Sides | None = None
@@ -98,12 +103,19 @@ class FrameImages:
         """The features, and others at given positions of the left image."""
         return matched(self.find_corners(), self._context, keypoints)
 
+    @cached_property
+    def left_for_places(self) -> Image:
+        """``(H, W)`` uint8: the left image by which places are recognised. It shows nothing where
+        the image is masked."""
+        return self.left if self.mask is None else self.mask.filled(self.left)
+
     @property
     def image(self) -> Image:
-        """``(H, W)`` uint8 that the features are extracted from."""
+        """``(H, W)`` uint8 that the features are extracted from, as ``left_for_places``."""
         if self.find_corners().side == Side.LEFT:
-            return self.left
-        return np.array(self._second, np.uint8)  # a copy: the right image is the caller's
+            return self.left_for_places
+        right = np.array(self._second, np.uint8)  # a copy: the right image is the caller's
+        return right if self.mask is None else self.mask.filled(right)
 
     def _found(self) -> Corners:
         try:
@@ -114,7 +126,9 @@ class FrameImages:
         if self._second is not None and not context.camera.depth:
             right = np.asarray(self._second, np.uint8)
             self.sides = compare_sides(self.left, right, context.config.stereo)
-        return find_corners(self.left, self._second, context, self._image_map, self.sides)
+        return find_corners(
+            self.left, self._second, context, self._image_map, self.sides, self.mask
+        )
 
 
 def extract_features(
@@ -143,24 +157,29 @@ def find_corners(
     context: TrackingContext,
     image_map: ImageMap = map,
     sides: Sides | None = None,
+    mask: Mask | None = None,
 ) -> Corners:
     """The first step of ``extract_features``: the features of each image alone.
 
     Args:
         sides: the result of ``compare_sides``; None computes it.
+        mask: of the image whose features are tracked, which is the right one if the left one is
+            black. A right image is not masked for stereo matching: what is masked in the left image
+            has no match in it.
     """
     camera, config = context.camera, context.config
+    allowed = None if mask is None else mask.levels
     if second is None:
-        return _corners_alone(left, context, Side.LEFT)
+        return _corners_alone(left, context, Side.LEFT, allowed)
     if camera.depth:
-        (found,) = extract_in_any_light([left], config)
+        (found,) = extract_in_any_light([left], config, allowed=allowed)
         return Corners(found, depth=np.asarray(second, np.float32))
     right_image = np.asarray(second, np.uint8)
     sides = sides or compare_sides(left, right_image, config.stereo)
     if sides.black == "left":
-        return _corners_alone(right_image, context, Side.RIGHT)
+        return _corners_alone(right_image, context, Side.RIGHT, allowed)
     pair = balanced(left, right_image, config.stereo, sides)
-    found, right = extract_in_any_light(pair, config, image_map)
+    found, right = extract_in_any_light(pair, config, image_map, allowed)
     return Corners(found, right)
 
 
@@ -190,8 +209,10 @@ def matched(
     return Extracted(_features(found, u_right), found.pyramid, rows)
 
 
-def _corners_alone(image: Image, context: TrackingContext, side: Side) -> Corners:
-    (found,) = extract_in_any_light([image], context.config)
+def _corners_alone(
+    image: Image, context: TrackingContext, side: Side, allowed: Pyramid | None
+) -> Corners:
+    (found,) = extract_in_any_light([image], context.config, allowed=allowed)
     return Corners(found, side=side)
 
 

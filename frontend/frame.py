@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera, Image
 from vslam.features import Extracted, FeatureGrid, Features, Keypoints, Pyramid, Side
+from vslam.frontend.masks import Mask
 from vslam.frontend.sides import Sides
 from vslam.geometry import Matrix, inverse
 
@@ -70,6 +71,7 @@ class Frame:
             features are those landmarks that were found by their patches.
         coarse: ``coarse_levels`` of the image, by which the next frame is aligned; None if it is
             not.
+        mask: of the image; None if all of it is used.
     """
 
     index: int
@@ -91,6 +93,7 @@ class Frame:
     covariance: Matrix | None = None
     source: FeatureSource | None = None
     coarse: Pyramid | None = None
+    mask: Mask | None = None
 
     @classmethod
     def of(

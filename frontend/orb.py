@@ -25,6 +25,7 @@ LANES = 32  # pixels read per row of the disc: its 31 columns and one of weight 
 SPARE = 64  # unused bytes at the end of a pyramid
 KEYPOINT_REACH = 2.0  # pixels of a level; features that are nearer show the same corner
 MARGIN = 19  # largest distance of a rotated test point from its keypoint (13 sqrt 2), rounded up
+EVERYWHERE = np.empty(0, np.uint8)
 PATTERN: NDArray[np.int8] = np.load(Path(__file__).with_name("orb_pattern.npy"))
 
 
@@ -43,16 +44,22 @@ class Extraction:
     pyramid: Pyramid
 
 
-def extract(image: NDArray[np.uint8], config: OrbConfig) -> Extraction:
+def extract(
+    image: NDArray[np.uint8], config: OrbConfig, allowed: Pyramid | None = None
+) -> Extraction:
     """Extract up to ``config.n_features`` ORB features from an ``(H, W)`` uint8 image.
 
     A pure function, safe to call from several threads.
+
+    Args:
+        allowed: 1 for the pixels where a corner may lie, 0 for the others; None allows all.
     """
     pyramid = build_pyramid(image, config)
     xy, octave, angle, descriptors = extract_levels(
         pyramid.pixels,
         pyramid.offsets,
         pyramid.shapes,
+        EVERYWHERE if allowed is None else allowed.pixels,
         _quota(config.n_features, config.n_levels, config.scale_factor),
         config.fast_threshold,
         config.fast_threshold_min,
@@ -175,13 +182,16 @@ def build_pyramid(image: NDArray[np.uint8], config: OrbConfig) -> Pyramid:
 
 
 @kernel
-def extract_levels(pixels, offsets, shapes, quota, threshold, threshold_min, cell, inside, pattern):
+def extract_levels(
+    pixels, offsets, shapes, allowed, quota, threshold, threshold_min, cell, inside, pattern
+):
     """Extract the features of all levels.
 
     A single kernel, so that an image takes the global interpreter lock only once.
 
     Args:
         pixels, offsets, shapes: of the ``Pyramid``.
+        allowed: for each of the pixels 1 where a corner may lie, else 0; empty allows all.
         quota: ``(L,)`` int64, greatest number of features per level.
         threshold, threshold_min, cell: see ``local_maxima``.
         inside: ``DISC``.
@@ -198,7 +208,8 @@ def extract_levels(pixels, offsets, shapes, quota, threshold, threshold_min, cel
         height, width = shapes[level]
         first = offsets[level]
         image = pixels[first : first + height * width].reshape(height, width)
-        corners = detect_corners(image, quota[level], threshold, threshold_min, cell)
+        here = allowed[first : first + height * width]
+        corners = detect_corners(image, here, quota[level], threshold, threshold_min, cell)
         if len(corners) == 0:
             continue
         turned = orientations(image, corners, inside)
@@ -216,13 +227,17 @@ def extract_levels(pixels, offsets, shapes, quota, threshold, threshold_min, cel
 
 
 @kernel
-def detect_corners(pixels, quota, threshold, threshold_min, cell):
-    """Up to ``quota`` FAST-9 corners of one level, spread evenly: ``(n, 2)`` float32 x, y in pixels
-    of the level."""
+def detect_corners(pixels, allowed, quota, threshold, threshold_min, cell):
+    """Up to ``quota`` FAST-9 corners of one level, spread evenly over the pixels that are
+    ``allowed``: ``(n, 2)`` float32 x, y in pixels of the level."""
     height, width = pixels.shape
     if min(height, width) <= 2 * MARGIN or quota == 0:
         return np.empty((0, 2), np.float32)
     scores = fast_scores(pixels.reshape(height * width), height, width)
+    if len(allowed):
+        flat = scores.reshape(height * width)
+        for i in range(len(flat)):
+            flat[i] *= allowed[i]
     x, y, score = local_maxima(scores, MARGIN, threshold, threshold_min, cell)
     keep = spread(x, y, score, width, height, quota)
     corners = np.empty((len(keep), 2), np.float32)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from vslam.features import PATCH_RADIUS, Features, Pyramid
 from vslam.frontend.alignment import find_patches
+from vslam.frontend.masks import Mask
 from vslam.frontend.matching import predict_view
 from vslam.frontend.pose import optimise_pose, pose_covariance
 from vslam.frontend.tracking import TrackingContext
@@ -42,13 +43,18 @@ class PatchTrack(NamedTuple):
 
 
 def track_patches(
-    pyramid: Pyramid, T_cw: Matrix, view: MapView, context: TrackingContext
+    pyramid: Pyramid,
+    T_cw: Matrix,
+    view: MapView,
+    context: TrackingContext,
+    mask: Mask | None = None,
 ) -> PatchTrack:
     """Find the landmarks of the local map that have patches, and the pose of the camera.
 
     Args:
         pyramid: of the image.
         T_cw: ``(4, 4)`` pose, right to about two pixels.
+        mask: of the image; None if all of it is used.
     """
     known, local = view.patches, view.local_landmarks
     camera, config, scales = context.camera, context.config.alignment, context.scales
@@ -65,6 +71,8 @@ def track_patches(
         scales,
         1.0,
     )
+    if mask is not None:
+        radius[~mask.shows(uvr[:, :2], octave)] = 0.0
     margin = _MARGIN * scales[octave]
     size = np.array([camera.width, camera.height])
     inside = (uvr[:, :2] > margin[:, None]) & (uvr[:, :2] < size - 1 - margin[:, None])

@@ -20,7 +20,7 @@ from vslam.frontend.tracking import (
     track_local_map,
     track_motion,
 )
-from vslam.geometry import Matrix, inverse, orthonormalised, se3_exp, se3_log
+from vslam.geometry import Matrix, inverse, orthonormalised, se3_exp, se3_log, transform
 from vslam.map_view import MapView
 from vslam.odometry import Odometry
 from vslam.states import TrackerState
@@ -140,10 +140,14 @@ class Tracker:
         if frame.coarse is not None and last.coarse is not None:
             size = camera.height, camera.width
             seen = last.xyz[last.landmark >= 0]
+            if frame.mask is not None:
+                uv = camera.project(transform(T_cw, seen))[:, :2]
+                coarsest = np.full(len(seen), self._config.orb.n_levels - 1)
+                seen = seen[frame.mask.shows(uv, coarsest)]
             T_cw = align_pose(
                 frame.coarse, last.coarse, seen, last.T_cw, T_cw, camera.intrinsics, size
             )
-        track = track_patches(frame.pyramid, T_cw, view, self._context)
+        track = track_patches(frame.pyramid, T_cw, view, self._context, frame.mask)
         n_inliers = len(track.ids)
         if n_inliers < max(
             config.patch_min_inliers, config.patch_min_inlier_ratio * track.n_matches

@@ -222,6 +222,8 @@ def track_local_map(
         context.scales,
         context.local_window if window is None else window,
     )
+    if frame.mask is not None:
+        radius[~frame.mask.shows(uvr[:, :2], octave)] = 0.0
     visible = radius > 0
     radius[tracked] = 0.0
     found = _search(

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import ImageMap
 from vslam.config import Config, WeakImageConfig
+from vslam.features import Pyramid
 from vslam.frontend.orb import Extraction, extract
 from vslam.kernels import kernel
 
@@ -33,7 +34,10 @@ _SHOWS_NOTHING = 2  # grey levels between the darkest and the brightest pixel of
 
 
 def extract_in_any_light(
-    images: Sequence[Grey], config: Config, image_map: ImageMap = map
+    images: Sequence[Grey],
+    config: Config,
+    image_map: ImageMap = map,
+    allowed: Pyramid | None = None,
 ) -> list[Extraction]:
     """ORB features of ``(H, W)`` uint8 images that were taken at the same time: as from
     ``extract``, but noisy images are filtered first, and the contrast of faint ones is raised. All
@@ -43,13 +47,18 @@ def extract_in_any_light(
 
     Args:
         image_map: applies a function to all images, in turn or in parallel.
+        allowed: where the first image may have corners, see ``extract``.
     """
     weak = config.weak_images
+
+    def found_in(image: Grey) -> Extraction:
+        return extract(image, config.orb, allowed if image is images[0] else None)
+
     images = without_noise(images, weak)
-    found = list(image_map(lambda image: extract(image, config.orb), images))
+    found = list(image_map(found_in, images))
     if is_faint(images, [len(one.xy) for one in found], config):
-        raised = image_map(lambda image: extract(with_contrast(image, weak), config.orb), images)
-        found = list(raised)
+        images = list(image_map(lambda image: with_contrast(image, weak), images))
+        found = list(image_map(found_in, images))
     return found
 
 

@@ -17,6 +17,7 @@ from vslam.camera import Camera
 from vslam.cli.main import app
 from vslam.config import OrbConfig
 from vslam.datasets.euroc import open_euroc
+from vslam.datasets.frames import stored_frames
 from vslam.datasets.kitti import open_kitti
 from vslam.datasets.tum import open_tum
 from vslam.doctor.checks import check_depth, check_times
@@ -46,6 +47,10 @@ class Seen:
         if self.left[index] is None:
             raise UnreadableImageError(Path("000.png"), "cannot be decoded; download it again.")
         return self.left[index], self.second[index]
+
+    @property
+    def stored(self):
+        return stored_frames(self.timestamps, self.read)
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from vslam.config import OrbConfig
 from vslam.frontend.corners import fast_scores, local_maxima, spread
 from vslam.frontend.orb import (
     DISC,
+    EVERYWHERE,
     MARGIN,
     PATTERN,
     build_pyramid,
@@ -135,7 +136,7 @@ def test_weak_corner_survives_only_in_a_cell_without_a_strong_one():
 
 def test_no_two_corners_touch_and_none_is_near_the_border():
     image = textured()
-    corners = detect_corners(image, 10_000, 12, 7, 35).astype(int)
+    corners = detect_corners(image, EVERYWHERE, 10_000, 12, 7, 35).astype(int)
     assert len(corners) > 300
     taken = np.zeros(image.shape, np.uint8)
     taken[corners[:, 1], corners[:, 0]] = 1
@@ -236,7 +237,7 @@ def test_descriptors_turn_with_the_image():
     image = textured()
     side = image.shape[1]
     turned = np.ascontiguousarray(np.rot90(image))  # pixel (x, y) goes to (y, side - 1 - x)
-    corners = detect_corners(image, 300, 12, 7, 35)
+    corners = detect_corners(image, EVERYWHERE, 300, 12, 7, 35)
     moved = np.stack([corners[:, 1], side - 1 - corners[:, 0]], axis=1)
     described, angles = [], []
     for pixels, points in ((image, corners), (turned, moved)):

@@ -226,3 +226,15 @@ def check_images(left: Image, second: Image | DepthImage | None, camera: Camera)
             "with (255 * image).astype(np.uint8)"
         )
         raise ValueError(f"images are of {types}, not of {expected_types}; {how}")
+
+
+def check_mask(mask: NDArray[np.uint8] | NDArray[np.bool_], camera: Camera) -> None:
+    """Refuse a mask that does not fit a camera (``Slam.step``).
+
+    Raises:
+        ValueError: its size or type is wrong; the message says which.
+    """
+    if mask.shape != (expected := (camera.height, camera.width)):
+        raise ValueError(f"the mask is {mask.shape}, the camera's images are {expected}")
+    if mask.dtype not in (np.uint8, np.bool_):
+        raise ValueError(f"the mask is of {mask.dtype}, not of uint8 or bool; use mask > 0")

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, DepthImage, Image, check_images
+from vslam.camera import Camera, DepthImage, Image, check_images, check_mask
 from vslam.closing import LoopClosing
 from vslam.config import Config, as_config
 from vslam.errors import InputError
 from vslam.features import Extracted, TrackingState, TrackResult
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.frame import Frame
+from vslam.frontend.masks import Mask
 from vslam.frontend.relocaliser import Relocaliser
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracker import Found, Tracker, TrackerStatus, result_of
@@ -180,7 +181,14 @@ class Slam:
         """
         return self._session.stored_map(drive)
 
-    def step(self, left: Image, second: Image | DepthImage | None, timestamp: float) -> TrackResult:
+    def step(
+        self,
+        left: Image,
+        second: Image | DepthImage | None,
+        timestamp: float,
+        *,
+        mask: NDArray[np.uint8] | NDArray[np.bool_] | None = None,
+    ) -> TrackResult:
         """Track one rectified stereo pair, RGB-D image or monocular image, and insert it as a
         keyframe if it shows something new.
 
@@ -193,6 +201,8 @@ class Slam:
                 image's pixels, ``(H, W)`` float32 metres, 0 where unknown; None for a monocular
                 camera.
             timestamp: seconds, later than that of the last call.
+            mask: ``(H, W)`` uint8 or bool, 0 where the left image is not to be used, for example
+                where it shows the hood of the car; None uses all of it.
 
         Raises:
             ValueError: the images have another size or type, or the timestamp is not finite or not
@@ -200,7 +210,11 @@ class Slam:
             RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
         """
         check_images(left, second, self.context.camera)
-        images = FrameImages(np.array(left), lambda: second, self.context)
+        of_left = None
+        if mask is not None:
+            check_mask(mask, self.context.camera)
+            of_left = Mask.of(mask, self.context.config.orb)
+        images = FrameImages(np.array(left), lambda: second, self.context, mask=of_left)
         return self.step_images(images, timestamp)
 
     def step_images(
@@ -212,8 +226,9 @@ class Slam:
             images: they are not copied: do not write to them afterwards.
             timestamp, stage_ms: as for ``step_features``.
         """
-        frame = self._next_frame(Extracted.nothing(), timestamp, images.left)
+        frame = self._next_frame(Extracted.nothing(), timestamp, images.left_for_places)
         frame.source, frame.pyramid, frame.coarse = images, images.pyramid, images.coarse
+        frame.mask = images.mask
         return self._step(frame, StageClock(dict(stage_ms or {})))
 
     def step_features(

@@ -56,7 +56,7 @@ def register(app: typer.Typer) -> None:
     app.command(epilog=_EXAMPLES)(bench)
 
 
-@reads_source(without=("seq", "start", "every"))
+@reads_source(without=("seq", "start", "every", "mask"))
 def bench(
     given: SourceOptions,
     seqs: Annotated[str | None, sequences("00-05")] = None,

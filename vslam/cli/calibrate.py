@@ -53,7 +53,7 @@ def register(app: typer.Typer) -> None:
     app.command(epilog=_EXAMPLES)(calibrate)
 
 
-@reads_source(without=("calib", "depth", "depth_scale"))
+@reads_source(without=("calib", "depth", "depth_scale", "mask"))
 def calibrate(
     given: SourceOptions,
     board: Annotated[

@@ -224,6 +224,15 @@ def _source_options(
             unset="all that the data has",
         ),
     ] = None,
+    mask: Annotated[
+        Path | None,
+        option(
+            INPUT,
+            "FILE|FOLDER",
+            "Image that is black where the left images are not to be used, or a folder of one for "
+            "each image (docs/howto/masks.md).",
+        ),
+    ] = None,
     start: Annotated[int, option(INPUT, "N", "First frame.", min=0)] = 0,
     every: Annotated[int, option(INPUT, "N", "Use every N-th frame only.", min=1)] = 1,
     max_frames: Annotated[
@@ -244,7 +253,7 @@ def _source_options(
     return SourceOptions(
         data=data or "", dataset=dataset, seq=seq, calib=tuple(calib or ()), right=right,
         depth=depth, fps=fps, side_by_side=side_by_side, topics=topics, depth_scale=depth_scale,
-        sensor=sensor, start=start, every=every, max_frames=max_frames,
+        sensor=sensor, mask=mask, start=start, every=every, max_frames=max_frames,
     )  # fmt: skip
 
 

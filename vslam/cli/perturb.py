@@ -27,7 +27,7 @@ def register(app: typer.Typer) -> None:
     app.command("perturb", epilog=_EXAMPLE)(preview)
 
 
-@reads_source()
+@reads_source(without=("mask",))
 def preview(
     given: SourceOptions,
     perturb: Perturb = "brightness",

@@ -55,7 +55,7 @@ def register(app: typer.Typer) -> None:
     app.command("foreign", hidden=True, context_settings={"allow_extra_args": True})(foreign)
 
 
-@reads_source(without=("seq", "start", "every"))
+@reads_source(without=("seq", "start", "every", "mask"))
 def stress(
     given: SourceOptions,
     seqs: Annotated[str | None, sequences("00")] = None,
@@ -218,7 +218,7 @@ def stress(
         raise typer.Exit(1)
 
 
-@reads_source(without=("source", "start", "every"))
+@reads_source(without=("source", "start", "every", "mask"))
 def foreign(
     context: typer.Context,
     given: SourceOptions,

@@ -47,6 +47,9 @@ class TimedFrame:
         file: the left image's file, if its pixels need no rectification; else None.
         colour: decodes the left image as it was taken, ``(H, W, 3)`` uint8 red, green, blue, or
             ``(H, W)`` if it is grey; None for a source without colours. Raises as ``read``.
+        name: file name of the left image; None if it has none.
+        mask: reads the mask of the left image, ``(H, W)`` uint8, 0 where it is not to be used; None
+            if all of it is used. Raises UnreadableImageError.
     """
 
     timestamp: float
@@ -54,6 +57,8 @@ class TimedFrame:
     sides: tuple[Callable[[], Image], Callable[[], Image]] | None = None
     file: Path | None = None
     colour: Callable[[], NDArray[np.uint8]] | None = None
+    name: str | None = None
+    mask: Callable[[], Image] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -134,6 +139,8 @@ class Source(_Frames):
         n_expected: the number of frames, approximate for a stream, or None if unknown.
         live: frames arrive in real time and are lost if they are not read, as from a camera.
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames without a pose, or None.
+        rectify_mask: maps an ``(H, W)`` uint8 mask of the left images as they were taken to one of
+            the rectified images; None if the images were not changed.
 
     Raises:
         InputError: the times of stored frames do not increase.
@@ -141,6 +148,7 @@ class Source(_Frames):
     """
 
     camera: Camera
+    rectify_mask: Callable[[Image], Image] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -178,7 +186,12 @@ def stored_frames(
     if files is None:
         return tuple(frames)
     return tuple(
-        replace(frame, file=file, colour=None if colour is None else partial(colour, file))
+        replace(
+            frame,
+            file=file,
+            colour=None if colour is None else partial(colour, file),
+            name=file.name,
+        )
         for frame, file in zip(frames, files, strict=True)
     )
 

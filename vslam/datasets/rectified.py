@@ -48,6 +48,7 @@ def rectified(raw: RawSource, calibration: Calibration) -> Source:
         n_expected=raw.n_expected,
         live=raw.live,
         ground_truth=T_wc,
+        rectify_mask=rectification.left_depth,
     )
 
 

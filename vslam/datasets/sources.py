@@ -13,6 +13,7 @@ from vslam.datasets import DATASETS, open_plugin_source, open_sequence
 from vslam.datasets.detection import detect_dataset
 from vslam.datasets.frames import RawSource, Source, selected
 from vslam.datasets.image_files import list_images
+from vslam.datasets.masks import with_masks
 from vslam.datasets.rectified import rectified
 from vslam.errors import InputError
 
@@ -37,6 +38,8 @@ class SourceOptions(BaseModel):
         depth_scale: units of the depth images per metre.
         sensor: ``stereo``, ``rgbd`` or ``mono``, which reads the left images alone; None reads all
             images of the source.
+        mask: image that says which pixels of the left images are used, or folder of one for each
+            image, see `vslam.datasets.masks.with_masks`.
         start, every, max_frames: selects every N-th frame, from a first one on, up to a number.
     """
 
@@ -53,6 +56,7 @@ class SourceOptions(BaseModel):
     topics: str = ""
     depth_scale: float | None = None
     sensor: str | None = None
+    mask: Path | None = None
     start: int = 0
     every: int = 1
     max_frames: int | None = None
@@ -103,7 +107,9 @@ def open_source(
             f"--sensor {o.sensor}: {source.name} has the sensor {source.camera.sensor}; leave the "
             "option out, or use mono."
         )
-    return source
+    if o.mask is None:
+        return source
+    return with_masks(source, o.mask, start=o.start, every=o.every)
 
 
 def _open_images(dataset: str, options: SourceOptions) -> Source:

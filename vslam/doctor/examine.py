@@ -77,9 +77,11 @@ def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
         images = list(lefts.values())
         findings += [checks.check_features(images, config), checks.check_sharpness(images)]
     findings += checks.check_times(sequence.timestamps)
+    masked, hidden = _examine_mask(sequence, lefts)
+    findings += masked
     seconds = [second for _, second in read.values() if second is not None]
     if not seconds:
-        return Diagnosis([*findings, checks.check_scale(sequence.camera, None)])
+        return Diagnosis([*findings, checks.check_scale(sequence.camera, None)], hidden)
     if seconds[0].dtype == np.uint8:
         blind = any(f.check == "features" and f.verdict == "fault" for f in findings)
         found, pictures = _examine_stereo(sequence, lefts, blind=blind)
@@ -87,7 +89,25 @@ def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
         found = [*checks.check_depth(images, seconds), checks.check_scale(sequence.camera, None)]
         found += _examine_focal_length(sequence, found)
         pictures = [_depth_picture(images[0], seconds[0])]
-    return Diagnosis(findings + found, pictures)
+    return Diagnosis(findings + found, hidden + pictures)
+
+
+def _examine_mask(sequence: Source, lefts: dict[int, Image]) -> tuple[list[Finding], list[Picture]]:
+    """How much the mask hides, and the first image with what is hidden in red; nothing without a
+    mask."""
+    for frame, left in lefts.items():
+        if (read := sequence.stored[frame].mask) is None:
+            break
+        try:
+            masked = read() == 0
+        except UnreadableImageError as error:
+            return [Finding("mask", "fault", str(error).rstrip("."), "repair this mask")], []
+        drawn = cv2.cvtColor(left, cv2.COLOR_GRAY2BGR)
+        drawn[masked] = (drawn[masked] + np.array(_RED)) // 2
+        measured = f"the mask hides {100.0 * masked.mean():.1f} % of the image"
+        caption = f"Frame {frame}: the mask hides what is red; no feature is taken from there."
+        return [Finding("mask", "good", measured)], [Picture(caption, np.asarray(drawn, np.uint8))]
+    return [], []
 
 
 @dataclass(frozen=True)

@@ -243,8 +243,10 @@ def option_rows(report: ReportJson) -> list[tuple[str, str]]:
     thresholds = [("thresholds", ", ".join(changed))] if changed else []
     realtime = [("realtime", "yes")] if report.realtime else []
     compare = [("compare", ", ".join(report.compare))] if report.compare else []
-    calib = [("calib", str(path)) for path in report.calib]
-    return [*options, ("max-frames", limit), *thresholds, *weights, *realtime, *calib, *compare]
+    files = [("calib", str(path)) for path in report.calib]
+    if report.mask:
+        files.append(("mask", str(report.mask)))
+    return [*options, ("max-frames", limit), *thresholds, *weights, *realtime, *files, *compare]
 
 
 def machine_rows(report: ReportJson) -> list[tuple[str, str]]:

@@ -190,6 +190,7 @@ class ReportJson(Measures, Document):
     local_weights: Path | None = None
     realtime: bool = False
     calib: tuple[Path, ...] = ()
+    mask: Path | None = None
     map: Path | None = None
     localize: bool = False
     compare: tuple[str, ...] = ()

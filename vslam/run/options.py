@@ -55,6 +55,7 @@ def settings_of(options: RunOptions, source: Source, perturb: str) -> RunSetting
         local_weights=options.local_weights,
         realtime=options.realtime or source.live,
         calib=options.calib,
+        mask=options.mask,
         map=options.map_file,
         localize=options.localize,
         compare=options.compare,
@@ -70,7 +71,7 @@ def write_options(folder: Path, options: RunOptions) -> None:
     data = Path(options.data)
     absolute: dict[str, object] = {
         name: path.resolve()
-        for name in ("right", "depth", "weights", "local_weights", "map_file")
+        for name in ("right", "depth", "mask", "weights", "local_weights", "map_file")
         if (path := getattr(options, name)) is not None
     }
     if options.data and data.exists():

@@ -41,6 +41,7 @@ class RunSettings:
     local_weights: Path | None = None
     realtime: bool = False
     calib: tuple[Path, ...] = ()
+    mask: Path | None = None
     map: Path | None = None
     localize: bool = False
     compare: tuple[str, ...] = ()

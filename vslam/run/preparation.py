@@ -13,11 +13,14 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 
 from vslam.camera import DepthImage, Image, ImageMap
+from vslam.config import OrbConfig
 from vslam.datasets.frames import TimedFrame
 from vslam.errors import DroppedFrameError, UnreadableImageError
 from vslam.frontend.extraction import FrameImages
+from vslam.frontend.masks import Mask
 from vslam.frontend.tracking import TrackingContext
 from vslam.run.outcome import RunSettings
 from vslam.run.realtime import Played, play
@@ -115,16 +118,22 @@ def prepare_frame(
         else:
             left, second = frame.read(image_map)
             read_second = _giving(second)
+        mask = None if frame.mask is None else _mask(frame.mask, context.config.orb)
     except UnreadableImageError as error:
         dropped = isinstance(error, DroppedFrameError)
         return PreparedFrame(None, {}, str(error), dropped)
     read = time.perf_counter()
-    images = FrameImages(left, read_second, context, image_map)
+    images = FrameImages(left, read_second, context, image_map, mask)
     if not context.tracks_patches:
         images.extracted  # noqa: B018
     done = time.perf_counter()
     stage_ms = {"read": 1e3 * (read - start), "extract": 1e3 * (done - read)}
     return PreparedFrame(images, stage_ms)
+
+
+@lru_cache(maxsize=1)  # the frames of a static mask share its function
+def _mask(read: Callable[[], Image], config: OrbConfig) -> Mask:
+    return Mask.of(read(), config)
 
 
 def _giving(second: Image | DepthImage | None) -> Callable[[], Image | DepthImage | None]:

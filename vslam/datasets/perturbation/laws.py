@@ -107,13 +107,13 @@ def perturbed(frames: Iterator[TimedFrame], perturbation: Perturbation) -> Itera
         read = partial(_read_perturbed, frame, perturbation, index, t)
         laws = [law for law in perturbation.laws if isinstance(law, EachSide)]
         if frame.sides is None or len(laws) < len(perturbation.laws):
-            yield TimedFrame(frame.timestamp, read)
+            yield TimedFrame(frame.timestamp, read, mask=frame.mask)
             continue
         left, right = (
             partial(_read_side, read_side, laws, index, t, side)
             for side, read_side in enumerate(frame.sides)
         )
-        yield TimedFrame(frame.timestamp, read, (left, right))
+        yield TimedFrame(frame.timestamp, read, (left, right), mask=frame.mask)
 
 
 def _read_side(

@@ -1,0 +1,60 @@
+"""Masks: the pixels of an image that are not to be used, such as the hood of the car."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import Image
+from vslam.config import OrbConfig
+from vslam.features import Pyramid
+from vslam.frontend.orb import build_pyramid
+
+# Pixels of a level between a feature and the nearest masked pixel. Corner detection and alignment
+# look no farther, and a patch is shifted by at most two pixels, so the edge of the hood is not seen
+# by either of them.
+REACH = 4
+_WINDOW = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
+
+
+@dataclass(frozen=True)
+class Mask:
+    """The mask of one image.
+
+    Attributes:
+        used: ``(H, W)`` bool, False where the image is not to be used.
+        levels: 1 for the pixels of the pyramid where a feature may lie, 0 for the others.
+    """
+
+    used: NDArray[np.bool_]
+    levels: Pyramid
+
+    @classmethod
+    def of(cls, mask: NDArray[np.uint8] | NDArray[np.bool_], config: OrbConfig) -> Self:
+        """The mask that an ``(H, W)`` array describes: 0 where a pixel is not to be used."""
+        used = mask > 0
+        levels = build_pyramid(used * np.uint8(255), config)
+        for index in range(config.n_levels):
+            level = levels.level(index)  # below 255 where a masked pixel contributes
+            level[:] = cv2.erode(level, _WINDOW) == 255
+        return cls(used, levels)
+
+    def shows(self, xy: NDArray[np.floating], octave: NDArray[np.integer]) -> NDArray[np.bool_]:
+        """``(N,)`` bool: whether features may lie at ``(N, 2)`` positions (full-resolution pixels)
+        of ``(N,)`` octaves. Positions outside the image count as those of its border."""
+        shapes = self.levels.shapes[octave]
+        ratio = self.levels.shapes[0, ::-1] / shapes[:, ::-1]
+        pixel = np.rint((np.nan_to_num(xy) + 0.5) / ratio - 0.5)
+        column, row = pixel.clip(0, shapes[:, ::-1] - 1).astype(np.int64).T
+        at = self.levels.offsets[octave] + row * shapes[:, 1] + column
+        return self.levels.pixels[at] > 0
+
+    def filled(self, image: Image) -> Image:
+        """A copy of an ``(H, W)`` uint8 image whose masked pixels have the mean grey of the others,
+        for networks that see the image as a whole."""
+        mean = np.uint8(image[self.used].mean()) if self.used.any() else np.uint8(0)
+        return np.where(self.used, image, mean)

@@ -79,16 +79,6 @@ def _read(app, docname, source):
         path = (path.parent / included[1]).resolve()
         source[0] = path.read_text()
     source[0] = _mend_links(path, source[0])
-    if docname == "index":
-        source[0] += _more(Path(app.srcdir), source[0])
-
-
-def _more(folder: Path, index: str) -> str:
-    """A list of the pages that the index does not name yet."""
-    named = set(index.split())
-    missing = sorted(path.stem for path in folder.glob("*.md") if path.stem not in named)
-    lines = ["", "```{toctree}", ":caption: More", ":maxdepth: 1", *(set(missing) - {"index"})]
-    return "\n".join([*lines[:4], *sorted(lines[4:]), "```", ""]) if lines[4:] else ""
 
 
 _ARRAY = re.compile(

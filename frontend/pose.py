@@ -45,53 +45,62 @@ def optimise_pose(
     return _optimise(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics)
 
 
+def pose_covariance(
+    T_cw: NDArray[np.float64],
+    points: NDArray[np.float64],
+    uvr: NDArray[np.float64],
+    inverse_sigma2: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    disparity_weight: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64]:
+    """Covariance of an optimised pose relative to the landmarks: the inverse of the normal matrix,
+    scaled by the mean squared residual (Hartley and Zisserman, Multiple View Geometry, 5.2 and
+    A6.3.2: the variance of the observations is estimated from their residuals).
+
+    Args:
+        T_cw: ``(4, 4)`` optimised pose.
+        points, uvr, inverse_sigma2, intrinsics, disparity_weight: of the inliers, as for
+            ``optimise_pose``.
+
+    Returns:
+        ``(6, 6)`` covariance of ``xi = [v, w]``, metres and radians, where ``exp(xi) T_cw`` is the
+        true pose; NaN if the observations do not determine the pose.
+    """
+    if disparity_weight is None:
+        disparity_weight = np.full(len(points), intrinsics[5])
+    H, chi2, n = _information(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics)
+    if n <= 6:
+        return np.full((6, 6), np.nan)
+    try:
+        found: NDArray[np.float64] = np.linalg.inv(H) * (chi2 / (n - 6))
+    except np.linalg.LinAlgError:
+        return np.full((6, 6), np.nan)
+    return found
+
+
+@kernel
+def _information(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics):
+    """Normal matrix, sum of the squared residuals in variances, and number of coordinates."""
+    every = np.ones(len(points), np.bool_)
+    H, _, chi2, _, n = normal_equations(
+        T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics, every, False
+    )
+    for row in range(6):
+        for column in range(row):
+            H[column, row] = H[row, column]
+    return H, chi2, n
+
+
 @kernel
 def _optimise(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics):
     n = len(points)
-    fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
     T = T_cw.copy()
     inlier = np.ones(n, np.bool_)
     for turn in range(ROUNDS):
-        robust = turn < 2
         for _ in range(ITERATIONS):
-            H = np.zeros((6, 6))
-            b = np.zeros(6)
-            J = np.empty((3, 6))
-            r = np.empty(3)
-            used = 0
-            for i in range(n):
-                if not inlier[i]:
-                    continue
-                p = points[i]
-                x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
-                y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
-                z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
-                if z <= 1e-6:
-                    continue
-                pinhole = (fx, fy, cx, cy, bf, disparity_weight[i])
-                r_u, r_v, r_disparity, stereo = residual(
-                    x, y, z, uvr[i, 0], uvr[i, 1], uvr[i, 2], pinhole
-                )
-                chi2, limit = chi_square(r_u, r_v, r_disparity, stereo, inverse_sigma2[i])
-                r[0], r[1], r[2] = r_u, r_v, r_disparity
-                weight = inverse_sigma2[i]
-                iz = 1.0 / z
-                if robust and chi2 > limit:
-                    weight *= np.sqrt(limit / chi2)
-                used += 1
-                # d(u, v, -disparity)/d(v, w) for T <- exp([v, w]) T.
-                J[0, 0], J[0, 1], J[0, 2] = fx * iz, 0.0, -fx * x * iz * iz
-                J[1, 0], J[1, 1], J[1, 2] = 0.0, fy * iz, -fy * y * iz * iz
-                J[2, 0], J[2, 1], J[2, 2] = 0.0, 0.0, disparity_weight[i] * bf * iz * iz
-                for k in range(3 if stereo else 2):
-                    J[k, 3] = -J[k, 1] * z + J[k, 2] * y
-                    J[k, 4] = J[k, 0] * z - J[k, 2] * x
-                    J[k, 5] = -J[k, 0] * y + J[k, 1] * x
-                    for row in range(6):
-                        scaled = weight * J[k, row]
-                        b[row] += scaled * r[k]
-                        for column in range(row + 1):
-                            H[row, column] += scaled * J[k, column]
+            H, b, _, used, _ = normal_equations(
+                T, points, uvr, inverse_sigma2, disparity_weight, intrinsics, inlier, turn < 2
+            )
             if used < 3:
                 return T, np.zeros(n, np.bool_)
             for row in range(6):
@@ -105,6 +114,58 @@ def _optimise(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics):
                 break
         classify(T, points, uvr, inverse_sigma2, disparity_weight, intrinsics, inlier)
     return T, inlier
+
+
+@inner_kernel
+def normal_equations(T, points, uvr, inverse_sigma2, disparity_weight, intrinsics, inlier, robust):
+    """Linearise the reprojection errors of all inliers at pose ``T``, with the Huber loss if
+    ``robust``.
+
+    Returns:
+        Lower triangle of the normal matrix, right side, sum of the squared errors in variances,
+        number of observations, and number of their coordinates.
+    """
+    fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
+    H = np.zeros((6, 6))
+    b = np.zeros(6)
+    J = np.empty((3, 6))
+    r = np.empty(3)
+    used, coordinates, total = 0, 0, 0.0
+    for i in range(len(points)):
+        if not inlier[i]:
+            continue
+        p = points[i]
+        x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
+        y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
+        z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+        if z <= 1e-6:
+            continue
+        pinhole = (fx, fy, cx, cy, bf, disparity_weight[i])
+        r_u, r_v, r_disparity, stereo = residual(x, y, z, uvr[i, 0], uvr[i, 1], uvr[i, 2], pinhole)
+        chi2, limit = chi_square(r_u, r_v, r_disparity, stereo, inverse_sigma2[i])
+        r[0], r[1], r[2] = r_u, r_v, r_disparity
+        weight = inverse_sigma2[i]
+        iz = 1.0 / z
+        if robust and chi2 > limit:
+            weight *= np.sqrt(limit / chi2)
+        rows = 3 if stereo else 2
+        used += 1
+        coordinates += rows
+        total += chi2
+        # d(u, v, -disparity)/d(v, w) for T <- exp([v, w]) T.
+        J[0, 0], J[0, 1], J[0, 2] = fx * iz, 0.0, -fx * x * iz * iz
+        J[1, 0], J[1, 1], J[1, 2] = 0.0, fy * iz, -fy * y * iz * iz
+        J[2, 0], J[2, 1], J[2, 2] = 0.0, 0.0, disparity_weight[i] * bf * iz * iz
+        for k in range(rows):
+            J[k, 3] = -J[k, 1] * z + J[k, 2] * y
+            J[k, 4] = J[k, 0] * z - J[k, 2] * x
+            J[k, 5] = -J[k, 0] * y + J[k, 1] * x
+            for row in range(6):
+                scaled = weight * J[k, row]
+                b[row] += scaled * r[k]
+                for column in range(row + 1):
+                    H[row, column] += scaled * J[k, column]
+    return H, b, total, used, coordinates
 
 
 @inner_kernel

@@ -22,6 +22,7 @@ from vslam.frontend.tracking import (
 )
 from vslam.geometry import Matrix, inverse, orthonormalised, se3_exp, se3_log, transform
 from vslam.map_view import MapView
+from vslam.odometry import Odometry
 from vslam.states import TrackerState
 
 
@@ -154,6 +155,7 @@ class Tracker:
             return Found(TrackingState.LOST, track.n_matches, n_inliers)
         frame.T_cw, frame.features = track.T_cw, track.features
         frame.landmark, frame.xyz = track.ids, track.xyz
+        frame.covariance = track.covariance
         return Found(TrackingState.OK, track.n_matches, n_inliers, track.visible)
 
     def match_features(self, frame: Frame, view: MapView) -> bool:
@@ -303,7 +305,11 @@ class Tracker:
 
 
 def result_of(
-    frame: Frame, found: Found, is_keyframe: bool, stage_ms: dict[str, float]
+    frame: Frame,
+    found: Found,
+    is_keyframe: bool,
+    stage_ms: dict[str, float],
+    odometry: Odometry,
 ) -> TrackResult:
     """The result that a caller of the library gets for a frame; ``stage_ms`` holds the
     milliseconds of each stage."""
@@ -319,4 +325,6 @@ def result_of(
         is_keyframe=is_keyframe,
         relocalised=found.relocalised,
         stage_ms=stage_ms,
+        T_odom_camera=odometry.T_odom_camera,
+        uncertainty=odometry.now,
     )

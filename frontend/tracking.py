@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import DISPARITY_WEIGHT, Camera
 from vslam.config import Config
-from vslam.features import NO_PATCHES, Features, LandmarkPatches
+from vslam.features import NO_PATCHES, Features, LandmarkPatches, Side
 from vslam.frontend.alignment import align_frame
 from vslam.frontend.frame import Frame
 from vslam.frontend.matching import (
@@ -25,9 +25,10 @@ from vslam.frontend.matching import (
     search_windows,
 )
 from vslam.frontend.orb import scale_factors
-from vslam.frontend.pose import optimise_pose
+from vslam.frontend.pose import optimise_pose, pose_covariance
 from vslam.geometry import compose, inverse, transform
 from vslam.map_view import LocalMap
+from vslam.odometry import adjoint
 from vslam.reprojection import stack_uvr
 
 NEVER = np.iinfo(np.int64).max
@@ -274,15 +275,24 @@ def refine(
         aligned = np.isfinite(moved[:, 0])
         uvr[aligned] += moved[aligned][:, [0, 1, 0]]
         certainty[aligned] = context.config.alignment.certainty
+    certain, disparity_weight = weight * certainty, DISPARITY_WEIGHT / np.sqrt(certainty)
+    intrinsics, xyz = context.camera.intrinsics, frame.xyz[matched]
     T_camera_w, inlier = optimise_pose(
-        frame.T_camera_left @ T_cw,
-        frame.xyz[matched],
-        uvr,
-        weight * certainty,
-        context.camera.intrinsics,
-        DISPARITY_WEIGHT / np.sqrt(certainty),
+        frame.T_camera_left @ T_cw, xyz, uvr, certain, intrinsics, disparity_weight
     )
     frame.set_camera_pose(T_camera_w)
+    covariance = pose_covariance(
+        T_camera_w,
+        xyz[inlier],
+        uvr[inlier],
+        certain[inlier],
+        intrinsics,
+        disparity_weight[inlier],
+    )
+    if frame.side == Side.RIGHT:
+        A = adjoint(inverse(frame.T_camera_left))
+        covariance = A @ covariance @ A.T
+    frame.covariance = covariance
     outliers = matched[~inlier]
     frame.landmark[outliers] = -1
     frame.xyz[outliers] = np.nan

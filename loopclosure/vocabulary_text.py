@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError, ResultsError
-from vslam.kernels import inner_kernel, kernel
 from vslam.loopclosure.vocabulary import (
     MAX_BRANCHING,
     MAX_LEVELS,
@@ -27,17 +26,6 @@ from vslam.loopclosure.vocabulary import (
 
 NUMBERS = 35  # numbers in the line of a node: parent, leaf, 32 bytes, weight
 L1_NORM, TF_IDF = 0, 0  # DBoW2's codes for the scoring and weighting that vslam uses
-
-_TOO_FEW, _TOO_MANY, _NO_NUMBER, _NO_BYTE, _NO_FLAG, _NO_PARENT, _NO_WEIGHT = range(1, 8)
-_FAULTS = {
-    _TOO_FEW: f"has fewer than {NUMBERS} numbers",
-    _TOO_MANY: f"has more than {NUMBERS} numbers",
-    _NO_NUMBER: "holds something that is not a number",
-    _NO_BYTE: "has a descriptor byte that is not a whole number from 0 to 255",
-    _NO_FLAG: "has a leaf flag that is neither 0 nor 1",
-    _NO_PARENT: "names a parent that does not come before it",
-    _NO_WEIGHT: "has a weight that is negative or too large",
-}
 
 
 def read_vocabulary(path: Path) -> Vocabulary:
@@ -87,15 +75,12 @@ def read_text(path: Path) -> Vocabulary:
         raise InputError(f"{path}: the file is empty; fetch or export the vocabulary again.")
     header, _, body = text.partition(b"\n")
     branching, levels = _read_header(path, header)
-    body_bytes = np.frombuffer(body, np.uint8)
-    n = body.count(b"\n") + 1
-    parent, leaf = np.zeros(n + 1, np.int64), np.zeros(n + 1, np.bool_)
-    descriptors = np.zeros((n + 1, 32), np.uint8)
-    weight = np.zeros(n + 1)
-    node, fault = parse_nodes(body_bytes, parent, leaf, descriptors, weight)
-    if fault:
-        raise InputError(f"{path}: line {node + 1} {_FAULTS[fault]}; fetch or export it again.")
-    parent[0] = -1
+    numbers = _read_nodes(path, body.split(b"\n"))
+    n = len(numbers)
+    parent = np.concatenate([[-1], numbers[:, 0].astype(np.int64)])
+    leaf = np.concatenate([[False], numbers[:, 1] == 1])
+    descriptors, weight = np.zeros((n + 1, 32), np.uint8), np.zeros(n + 1)
+    descriptors[1:], weight[1:] = numbers[:, 2:-1], numbers[:, -1]
     _check_family(path, parent, leaf, branching)
     order, level = _breadth_first(parent)
     if level[-1] > levels:
@@ -162,6 +147,38 @@ def _read_header(path: Path, header: bytes) -> tuple[int, int]:
     return branching, levels
 
 
+def _read_nodes(path: Path, lines: list[bytes]) -> NDArray[np.float64]:
+    """``(n, 35)`` numbers of the lines of the nodes 1 to n, each in its range."""
+
+    def refuse(node: int, fault: str) -> InputError:
+        return InputError(f"{path}: line {node + 1} {fault}; fetch or export it again.")
+
+    numbers = np.empty((len(lines), NUMBERS))
+    for node, line in enumerate(lines, 1):
+        words = line.split()
+        if len(words) != NUMBERS:
+            amount = "fewer" if len(words) < NUMBERS else "more"
+            raise refuse(node, f"has {amount} than {NUMBERS} numbers")
+        try:
+            numbers[node - 1] = list(map(float, words))
+        except ValueError:
+            raise refuse(node, "holds something that is not a number") from None
+    parent, leaf, byte, weight = numbers[:, 0], numbers[:, 1], numbers[:, 2:-1], numbers[:, -1]
+    before = np.arange(1, len(lines) + 1)
+    for right, fault in (
+        (~np.isnan(numbers).any(1), "holds something that is not a number"),
+        ((parent >= 0) & (parent < before) & (parent % 1 == 0),
+         "names a parent that does not come before it"),
+        ((leaf == 0) | (leaf == 1), "has a leaf flag that is neither 0 nor 1"),
+        (((byte >= 0) & (byte <= 255) & (byte % 1 == 0)).all(1),
+         "has a descriptor byte that is not a whole number from 0 to 255"),
+        ((weight >= 0) & (weight <= 3e38), "has a weight that is negative or too large"),
+    ):  # fmt: skip
+        if not right.all():
+            raise refuse(1 + int(np.argmin(right)), fault)
+    return numbers
+
+
 def _check_family(
     path: Path, parent: NDArray[np.int64], leaf: NDArray[np.bool_], branching: int
 ) -> None:
@@ -193,98 +210,3 @@ def _breadth_first(parent: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArra
         generations.append(by_parent[np.repeat(first[parents], counts) + within])
     levels = np.repeat(np.arange(len(generations)), [len(nodes) for nodes in generations])
     return np.concatenate(generations), levels
-
-
-@inner_kernel
-def read_number(text, position):
-    """Parse a decimal number at ``position``; returns its value, NaN if it is not a number, and the
-    position after it."""
-    end = len(text)
-    negative = False
-    if position < end and (text[position] == ord("-") or text[position] == ord("+")):
-        negative = text[position] == ord("-")
-        position += 1
-    value, exponent, digits = 0.0, 0, 0
-    while position < end and ord("0") <= text[position] <= ord("9"):
-        value = 10.0 * value + (text[position] - ord("0"))
-        digits += 1
-        position += 1
-    if position < end and text[position] == ord("."):
-        position += 1
-        while position < end and ord("0") <= text[position] <= ord("9"):
-            value = 10.0 * value + (text[position] - ord("0"))
-            digits += 1
-            exponent -= 1
-            position += 1
-    if digits == 0:
-        return np.nan, position
-    if position < end and (text[position] == ord("e") or text[position] == ord("E")):
-        position += 1
-        down = position < end and text[position] == ord("-")
-        if position < end and (down or text[position] == ord("+")):
-            position += 1
-        power, digits = 0, 0
-        while position < end and ord("0") <= text[position] <= ord("9"):
-            power = min(10 * power + (text[position] - ord("0")), 9999)
-            digits += 1
-            position += 1
-        if digits == 0:
-            return np.nan, position
-        exponent += -power if down else power
-    # Dividing by a power of ten rounds once; multiplying by its inverse would round twice.
-    value = value / 10.0**-exponent if exponent < 0 else value * 10.0**exponent
-    return (-value if negative else value), position
-
-
-@kernel
-def parse_nodes(text, parent, leaf, descriptors, weight):
-    """Parse the lines of the nodes 1 to n into ``(n + 1,)`` arrays.
-
-    Returns:
-        The number of the first faulty node and its fault (a key of ``_FAULTS``); 0, 0 if there is
-        none.
-    """
-    position, end = 0, len(text)
-    for node in range(1, len(parent)):
-        column = 0
-        while True:
-            while position < end and (
-                text[position] == ord(" ")
-                or text[position] == ord("\t")
-                or text[position] == ord("\r")
-            ):
-                position += 1
-            if position == end or text[position] == ord("\n"):
-                position += 1
-                break
-            if column == NUMBERS:
-                return node, _TOO_MANY
-            value, position = read_number(text, position)
-            if np.isnan(value) or (
-                position < end
-                and text[position] != ord(" ")
-                and text[position] != ord("\t")
-                and text[position] != ord("\r")
-                and text[position] != ord("\n")
-            ):
-                return node, _NO_NUMBER
-            if column == 0:
-                if not (0 <= value < node and value == np.floor(value)):
-                    return node, _NO_PARENT
-                parent[node] = np.int64(value)
-            elif column == 1:
-                if value != 0.0 and value != 1.0:
-                    return node, _NO_FLAG
-                leaf[node] = value == 1.0
-            elif column < NUMBERS - 1:
-                if not (0 <= value <= 255 and value == np.floor(value)):
-                    return node, _NO_BYTE
-                descriptors[node, column - 2] = np.uint8(value)
-            else:
-                if not (0.0 <= value <= 3e38):
-                    return node, _NO_WEIGHT
-                weight[node] = value
-            column += 1
-        if column < NUMBERS:
-            return node, _TOO_FEW
-    return 0, 0

@@ -395,8 +395,8 @@ def _wrong_words(point: Point, code: int, said: list[str], fault: Exception) -> 
 
 RESULTS = (
     "trajectory_online.tum", "trajectory_kitti.txt", "trajectory.tum", "ground_truth_kitti.txt",
-    "keyframes.tum", "trajectory_causal.tum", "map.npz", "frames.csv", "config.json",
-    "report.json", "report.md", "report.html", "figures",
+    "keyframes.tum", "trajectory_causal.tum", "trajectory_odom.tum", "covariance.csv", "map.npz",
+    "frames.csv", "config.json", "report.json", "report.md", "report.html", "figures",
 )  # fmt: skip
 
 

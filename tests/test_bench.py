@@ -418,7 +418,6 @@ def test_bench_loses_nothing_to_an_interrupt(bench, stub: Path, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "parts"),
     [
-        ("--detectors bow,vgg16", ["vgg16", "ships no weights"]),
         ("--detectors orb", ["--detectors orb", "unknown"]),
         ("--seqs 00-02", ["no such sequence", "01"]),
         ("--perturb snow", ["unknown law 'snow'"]),

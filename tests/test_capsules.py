@@ -6,19 +6,16 @@ import numpy as np
 import pytest
 import reference_routing
 import torch
-from siamese_worlds import SMALL, small_network, views
-from torch.nn import functional
+from siamese_worlds import SMALL, small_network
 
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.images import to_size
 from vslam.loopclosure.training import capsules
 from vslam.loopclosure.training.branches import (
-    CapsuleBranch,
     CapsuleShape,
     standardised,
     textured,
 )
-from vslam.loopclosure.training.convolutional import alexnet
 from vslam.loopclosure.training.extractors import LIGHT_BLOCKS, grid_side
 from vslam.loopclosure.training.preprocessing import to_tensor
 from vslam.loopclosure.training.pruning import lowest, masked, mean_couplings, pruned
@@ -170,15 +167,6 @@ def test_the_default_network_is_within_the_budget():
         assert network.eval().embed(images(1, 227)).shape == (1, 1024)
 
 
-def test_the_original_extractor_is_the_larger_one():
-    original = CapsuleBranch(CapsuleShape(extractor="original", outputs=2)).eval()
-    with torch.no_grad():
-        assert original(images(1, 227)).shape == (1, 32)
-    light = CapsuleBranch(CapsuleShape(outputs=2))
-    count = [sum(p.numel() for p in branch.parameters()) for branch in (original, light)]
-    assert count[0] > 20 * count[1]
-
-
 def test_gain_and_bias_of_the_camera_drop_out():
     x = images(1)
     assert torch.allclose(standardised(0.5 * x + 0.2), standardised(x), atol=0.02)
@@ -278,45 +266,6 @@ def test_bad_weights_are_named(tmp_path, content):
         path.write_bytes(content)
     with pytest.raises(InputError, match=r"w\.safetensors: .*vslam train"):
         load_network(path)
-
-
-@pytest.mark.slow
-def test_a_torchvision_file_of_another_network_is_refused(tmp_path):
-    torch.save({"features.0.weight": torch.zeros(1)}, tmp_path / "x.pth")
-    with pytest.raises(InputError, match="another network"):
-        alexnet((227, 227)).load_torchvision(tmp_path / "x.pth")
-    with pytest.raises(InputError, match="not a readable weight file"):
-        alexnet((227, 227)).load_torchvision(tmp_path / "none.pth")
-
-
-@pytest.mark.slow
-@torch.no_grad()
-def test_before_training_alexnet_tells_images_apart_and_has_nothing_that_blurs_that():
-    torch.manual_seed(0)
-    network = build_network("alexnet")
-    images = to_tensor(views(2).images[[0, 2]]).contiguous()
-    images = functional.interpolate(images, size=network.size, mode="bilinear")
-    training = network.train().embed(images)
-    torch.testing.assert_close(training, network.eval().embed(images))
-    assert float(training[0] @ training[1]) < 0.97
-
-
-@pytest.mark.slow
-def test_alexnet_takes_a_torchvision_file(tmp_path):
-    torch.manual_seed(0)
-    network = build_network("alexnet").eval()
-    state = {k: v for k, v in network.branch.state_dict().items() if "descriptor" not in k}
-    assert state["features.10.weight"].shape == (256, 256, 3, 3)  # torchvision's names and shapes
-    assert state["classifier.4.weight"].shape == (4096, 4096)
-    changed = {k: v * 0 + 0.001 for k, v in state.items()}
-    torch.save({**changed, "classifier.6.weight": torch.zeros(1000, 4096)}, tmp_path / "a.pth")
-    network.branch.load_torchvision(tmp_path / "a.pth")
-    assert (network.branch.features[0].weight == 0.001).all()
-    with torch.no_grad():
-        d = network.embed(images(2, 227))
-        assert torch.allclose(
-            network.similarity(d[:1], d[1:]), network.similarity(d[1:], d[:1]), atol=1e-6
-        )
 
 
 def test_an_unknown_network_is_refused():

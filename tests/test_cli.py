@@ -141,7 +141,6 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
 @pytest.mark.parametrize(
     ("words", "parts"),
     [
-        ("--detector vgg16", ["--detector vgg16", "ships no weights", "vslam train vgg16"]),
         ("--detector capsule --weights no.safetensors", ["no.safetensors", "no such file"]),
         ("--detector bow --weights no.safetensors", ["--weights", "bow has no weights"]),
         ("--dataset synthetic --seq 77", ["synthetic route 77", "choose one of demo"]),
@@ -151,7 +150,6 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--keep-open --view native", ["--keep-open: only for --view web"]),
         ("--compare both,bow --detector bow", ["--compare bow", "name another"]),
         ("--compare bow,words --detector none", ["--compare words", "unknown; choose one of"]),
-        ("--compare vgg16 --detector none", ["--compare vgg16", "ships no weights", "--detector"]),
         ("--data nowhere", ["nowhere", "no such file or folder", "--data"]),
         ("--data .", ["the folder is empty", "--data"]),
         ("nowhere", ["nowhere", "no such file or folder", "--data"]),
@@ -195,7 +193,7 @@ def test_the_environment_names_kitti_alone(call, root, monkeypatch):
         ("bench --dataset nuscenes", ["--dataset", "'nuscenes'", "'kitti'"]),
         ("perturb --dataset nuscenes", ["--dataset", "'nuscenes'", "'kitti'"]),
         ("eval gt.txt --gt gt.txt --align x", ["--align", "'x'", "'se3'", "'sim3'"]),
-        ("train alexandria --data photos:x", ["'alexandria'", "'capsule'", "'alexnet'"]),
+        ("train alexandria --data photos:x", ["'alexandria'", "'capsule'", "'capsule-paper'"]),
         ("train capsule --data photos:x --preset worst", ["--preset", "'worst'", "'paper'"]),
         ("train capsule --data photos:x --device tpu", ["--device", "'tpu'", "'cuda'"]),
         ("export places --data photos:x --fit best", ["--fit", "'best'", "'squash'"]),
@@ -219,7 +217,7 @@ def test_choices_are_checked_by_the_parser(call, words, parts):
         ("perturb --dataset eurok", "euroc"),
         ("train capsul --data photos:x", "capsule"),
         ("stress --laws rian", "rain"),
-        ("loops bench --detectors thumbnai", "thumbnail"),
+        ("loops bench --detectors capsle", "capsule"),
         ("loops bench --perturb blurr:0.5", "blur"),
         ("bench --detectors capsul", "capsule"),
         ("run --compare bwo --detector none", "bow"),

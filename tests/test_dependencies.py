@@ -27,7 +27,9 @@ FOLDERS = {
 LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.errors", "vslam.machine"),
     ("vslam.kernels", "vslam.plugins", "vslam.untrusted", "vslam.lock_file"),
-    ("vslam.config", "vslam.geometry", "vslam.ransac", "vslam.features", "vslam.camera"),
+    ("vslam.config", "vslam.geometry", "vslam.ransac", "vslam.camera"),
+    ("vslam.odometry",),
+    ("vslam.features",),
     (
         "vslam.loops",
         "vslam.reprojection",
@@ -80,7 +82,7 @@ ONLY_IN = {
     "rerun": "vslam.run.recorder",
     "evo": "vslam.evaluation.trajectories",
     "distributed": "vslam.lab.bench.cluster",
-    "rosbags": ("vslam.datasets.bag", "vslam.datasets.bag_limits"),
+    "rosbags": ("vslam.datasets.bag", "vslam.datasets.bag_limits", "vslam.maps.ros"),
     "PIL": "vslam.datasets.image_folders",
     "pyorbslam3": "vslam.lab.stress.orbslam3",
     "deflate": "vslam.datasets.png",

@@ -6,6 +6,7 @@ import ast
 import csv
 import json
 import re
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -24,6 +25,7 @@ LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)[^)]*\)")
 SOURCE = re.compile(
     r"`((?:vslam|frontend|backend|loopclosure|tools|tests|docs)/[\w./-]+\.(?:py|md|csv|json|npy|npz|html))"
 )
+IN_HISTORY = re.compile(r"kept in the history\W+commit ([0-9a-f]{7,})")
 
 
 def name(path: Path) -> str:
@@ -35,14 +37,37 @@ def test_links_and_files_named_exist(document):
     text = document.read_text()
     links = [link for link in LINK.findall(text) if not link.endswith("reference/commands.md")]
     missing = [link for link in links if not (document.parent / link).exists()]
-    missing += [file for file in SOURCE.findall(text) if not (ROOT / file).exists()]
+    missing += [file for file in files_named(text) if not (ROOT / file).exists()]
     assert missing == []
+
+
+def files_named(text: str) -> list[str]:
+    """Without those of lines that name the commit of a removed script."""
+    lines = [line for line in text.splitlines() if not IN_HISTORY.search(line)]
+    return SOURCE.findall("\n".join(lines))
+
+
+def test_what_is_kept_in_the_history_is_there():
+    for line in "\n".join(document.read_text() for document in DOCUMENTS).splitlines():
+        for commit in IN_HISTORY.findall(line):
+            if not is_in_history(commit):
+                pytest.skip("the clone is shallow, or no repository")
+            for file in SOURCE.findall(line):
+                assert (ROOT / file).exists() or is_in_history(f"{commit}:{file}"), file
+
+
+def is_in_history(what: str) -> bool:
+    """Whether git has a commit, or a file in a commit (``COMMIT:FILE``)."""
+    return not subprocess.run(
+        ["git", "cat-file", "-e", what], cwd=ROOT, check=False, capture_output=True
+    ).returncode
 
 
 def test_a_missing_file_would_be_seen():
     text = "[a](docs/none.md) and `vslam/none.py`, not [b](https://x.org) or [c](#d)"
     assert LINK.findall(text) == ["docs/none.md"]
-    assert SOURCE.findall(text) == ["vslam/none.py"]
+    assert files_named(text) == ["vslam/none.py"]
+    assert files_named("`vslam/none.py`, which is kept in the history (commit 01abcde)") == []
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=name)

@@ -1,24 +1,18 @@
-"""Driving known streets does not grow the map; laps are linked where they meet."""
+"""Driving known streets does not grow the map."""
 
 from __future__ import annotations
 
-import sys
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
-from ring import CAMERA, LAP, RADIUS, STEP, Oracle, Ring
+from ring import CAMERA, LAP, Oracle, Ring
 from test_closing import errors
 
 from vslam.config import Config
-from vslam.errors import InputError
 from vslam.features import Extracted, Features
 from vslam.geometry import inverse
 from vslam.slam import Slam
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tools" / "experiments" / "lifelong"))
-from laps import BLACK, find_seam, plan_laps
 
 RING = Ring.create()
 PLACES = [float(k % LAP) for k in range(5 * LAP)]
@@ -99,41 +93,3 @@ def test_a_camera_that_is_carried_is_not_left_where_little_agrees(merge_after_fr
     truth = inverse(RING.pose(0)) @ RING.pose(3)
     off = inverse(truth) @ slam.trajectory().T_wc[-1]
     assert np.linalg.norm(off[:3, 3]) < 0.2
-
-
-def circle(n: int, frames: int) -> np.ndarray:
-    """``(frames, 4, 4)`` poses along a circle of n frames."""
-    whole = 2 * np.pi * RADIUS / STEP
-    return np.array([RING.pose(k * whole / n) for k in range(frames)])
-
-
-def test_laps_are_linked_where_the_route_meets_itself():
-    assert find_seam(circle(100, 101)) == (100, 0)
-    with pytest.raises(InputError, match="does not close on itself"):
-        find_seam(circle(100, 95))
-
-
-def test_laps_go_round_without_a_leap():
-    planned = plan_laps((12, 2), laps=4, lights=3)
-    assert planned.place == [*range(13), *[*range(3, 13)] * 3]
-    assert planned.frame == planned.place
-    assert planned.lap == [1] * 13 + [2] * 10 + [3] * 10 + [4] * 10
-    assert planned.light == [0] * 13 + [1] * 10 + [2] * 10 + [0] * 10
-    assert planned.step == list(range(43))
-
-
-def test_incidents_come_from_the_third_lap_on_and_time_goes_on():
-    plain, planned = (plan_laps((400, 20), 30, 4, seed) for seed in (None, 0))
-    first = plain.lap.index(3)
-    assert planned.place[:first] == plain.place[:first]
-    assert planned.frame[:first] == plain.frame[:first]
-    steps, places = np.diff(planned.step), np.diff(planned.place) % 380
-    assert steps.min() == 1
-    assert steps.max() > 5
-    dropped = steps > 1
-    assert (places[dropped] == steps[dropped]).all()  # the camera drives on
-    cuts = np.flatnonzero((places != steps) & (places != steps % 380))
-    assert 10 < len(cuts) < 60
-    assert 100 < planned.frame.count(BLACK) < 2000
-    assert all(21 <= place <= 400 for place in planned.place[first:])
-    assert plan_laps((400, 20), 30, 4, 0) == planned

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from pydantic import ValidationError
 from siamese_worlds import small_settings, views
 from torch.nn import functional
 
@@ -170,14 +169,6 @@ def test_it_goes_on_at_another_size(imagenet):
     theirs, ours = (dict(n.branch.extractor.named_parameters()) for n in (network, larger))
     for key in theirs:
         torch.testing.assert_close(theirs[key], ours[key], rtol=0, atol=0)
-
-
-def test_weights_that_speak_of_what_was_left_out_are_read_if_nothing_was():
-    assert CapsuleShape.model_validate({"inner": None, "skipped": []}) == CapsuleShape()
-    with pytest.raises(ValidationError, match="inner"):
-        CapsuleShape.model_validate({"inner": [8]})
-    with pytest.raises(ValidationError, match="skipped"):
-        CapsuleShape.model_validate({"skipped": [2]})
 
 
 @pytest.mark.slow

@@ -285,7 +285,6 @@ def test_report_says_who_wins_in_all_three_files(vocabulary, tmp_path):
         (["--detectors", "none"], "--detectors none: finds no loops"),
         (["--detectors", "magic"], "--detectors magic: unknown"),
         (["--detectors", ""], "unknown"),
-        (["--detectors", "vgg16"], "vslam ships no weights"),
         (["--detectors", "bow", "--weights", "capsule=x"], "must be NAME=FILE"),
         (["--detectors", "bow", "--perturb", "fog"], "--perturb fog"),
         (["--detectors", "bow", "--data", "kitti:/nowhere"], "/nowhere"),

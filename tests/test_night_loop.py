@@ -64,7 +64,9 @@ def test_the_default_closes_a_loop_by_night_that_the_bag_of_words_misses(compare
 
 def test_the_loop_says_that_the_network_found_and_verified_it(compared):
     closed = [edge for edge in compared.loops if edge.accepted]
-    assert [(edge.proposed_by, edge.matched_by) for edge in closed] == [("capsule", "learned")]
+    (edge,) = closed
+    assert "capsule" in edge.proposed_by
+    assert edge.matched_by == "learned"
 
 
 def test_the_library_closes_it_without_being_told_how(round_the_block, compared):

@@ -23,8 +23,6 @@ from vslam.lab.loopbench.drives import open_drives
 from vslam.lab.loopbench.measure_online import measure_drive
 from vslam.lab.loopbench.online import (
     Decisions,
-    Detection,
-    ScoredDetector,
     Window,
     decide,
     decision_curve,
@@ -83,9 +81,8 @@ SCORES[7, 7] = SCORES[6, 6] = 1.0  # themselves, which are not asked
 
 
 def told(window: Window, relation=RELATION, scores=SCORES):
-    images = [None] * len(relation)
-    searchable = window.searchable(len(images), None)
-    decisions = decide(ScoredDetector(Scores(scores), images), images, searchable)
+    searchable = window.searchable(len(relation), None)
+    decisions = decide(scores, searchable)
     return decisions, judge(decisions, relation, searchable)
 
 
@@ -169,26 +166,6 @@ def test_windows_of_images_and_of_seconds():
 def test_windows_that_are_refused(text):
     with pytest.raises(InputError, match=re.escape(f"--window {text}: must be above 0")):
         parse_window(text)
-
-
-def test_a_detector_knows_an_image_only_once_it_is_older_than_the_window():
-    class Diary:
-        name = "diary"
-
-        def __init__(self) -> None:
-            self.known: list[str] = []
-            self.asked: list[tuple[str, str]] = []
-
-        def add(self, image):
-            self.known.append(image)
-
-        def find(self, image):
-            self.asked.append((image, "".join(self.known)))
-            return Detection(len(self.known) - 1, 1.0) if self.known else None
-
-    diary = Diary()
-    decide(diary, list("abcdef"), Window(3, timed=False).searchable(6, None))
-    assert diary.asked == [("a", ""), ("b", ""), ("c", ""), ("d", "a"), ("e", "ab"), ("f", "abc")]
 
 
 def test_what_cannot_be_measured_is_said():
@@ -307,9 +284,7 @@ def test_a_drive_is_measured_before_and_after_verification_and_reported(tmp_path
     drive = write_drive(tmp_path, places)
     scores = np.zeros((7, 7))
     scores[[2, 3, 4, 5, 6], [0, 0, 0, 1, 2]] = 0.1, 0.1, 0.8, 0.7, 0.9
-    starts = [lambda images: ScoredDetector(Scores(scores), images)]
-    window = parse_window("2")
-    cells = measure_drive(drive, starts, window, load(), threads=1, progress_bar=no_bar)
+    cells = measure_drive(drive, [Scores(scores)], parse_window("2"), load(), threads=1)
     assert [cell.verified_by for cell in cells] == ["nothing", "orb", "learned", "both"]
     for cell in cells:
         assert (cell.images, cell.answerable, cell.window) == (7, 2, "2 images")
@@ -345,8 +320,7 @@ def test_a_drive_is_measured_before_and_after_verification_and_reported(tmp_path
         (["--protocol", "online", "--detectors", "magic"], "--detectors magic: unknown"),
         (["--protocol", "online", "--data", "town:demo"], "--protocol online needs drives"),
         (["--window", "30s"], "--window: only for --protocol online"),
-        (["--detectors", "ibow"], "--detectors ibow: learns during a drive"),
-        (["--detectors", "thumbnail", "--weights", "thumbnail=x"], "the detector thumbnail has"),
+        (["--detectors", "bow", "--weights", "bow=x"], "the detector bow has no weights"),
     ],
 )
 def test_command_refuses_in_one_sentence(arguments, said, tmp_path, monkeypatch):
@@ -360,7 +334,7 @@ def test_command_refuses_in_one_sentence(arguments, said, tmp_path, monkeypatch)
 @pytest.mark.slow
 def test_command_on_a_rendered_drive(tmp_path, monkeypatch):
     monkeypatch.setenv("VSLAM_CACHE", str(tmp_path / "cache"))
-    arguments = ["--protocol", "online", "--detectors", "bow,thumbnail,ibow", "--quiet"]
+    arguments = ["--protocol", "online", "--detectors", "bow,capsule", "--quiet"]
     arguments += ["--data", "drive:block[seed=7,every=14]", "--window", "10s"]
     arguments += ["--out", str(tmp_path / "out")]
     result = CliRunner().invoke(app, ["loops", "bench", *arguments], catch_exceptions=False)
@@ -369,7 +343,7 @@ def test_command_on_a_rendered_drive(tmp_path, monkeypatch):
     assert found["cells"] == found["costs"] == []
     names = [(cell["detector"], cell["verified_by"]) for cell in found["online"]]
     verified = ("nothing", "orb", "learned", "both")
-    assert names == [(d, v) for d in ("bow", "thumbnail", "ibow") for v in verified]
+    assert names == [(d, v) for d in ("bow", "capsule") for v in verified]
     cell = found["online"][0]
     assert (cell["data"], cell["images"], cell["window"]) == ("block in town 7", 20, "10 s")
     assert cell["answerable"] > 0

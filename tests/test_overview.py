@@ -351,8 +351,8 @@ def test_every_system_stands_beside_its_baseline():
     light = "brightness:1"
     assert points.sentences[1].startswith(f"ATE, {light}, none against bow: a tie")
     assert points.sentences[2].startswith(f"ATE, {light}, both against bow: a tie")
-    with pytest.raises(InputError, match="--baseline vgg16: no run of it; choose from none, bow"):
-        summarize(Found(runs, []), "vgg16")
+    with pytest.raises(InputError, match="--baseline capsule: no run of it; choose from none, bow"):
+        summarize(Found(runs, []), "capsule")
 
 
 def test_what_a_run_does_not_have_is_not_made_up():

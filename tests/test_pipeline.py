@@ -225,9 +225,9 @@ def test_run_without_pages_is_enough_for_a_report_later(kitti_tree, tmp_path):
     assert done.returncode == 0, done.stderr
     folder = tmp_path / "runs" / "latest"
     assert {path.name for path in folder.iterdir()} == {
-        "config.json", "frames.csv", "ground_truth_kitti.txt", "keyframes.tum", "map.npz",
-        "report.json", "run.json", "trajectory.tum", "trajectory_causal.tum",
-        "trajectory_kitti.txt", "trajectory_online.tum",
+        "config.json", "covariance.csv", "frames.csv", "ground_truth_kitti.txt", "keyframes.tum",
+        "map.npz", "report.json", "run.json", "trajectory.tum", "trajectory_causal.tum",
+        "trajectory_kitti.txt", "trajectory_odom.tum", "trajectory_online.tum",
     }  # fmt: skip
     readme = (Path(__file__).parents[1] / "README.md").read_text()
     assert [path.name for path in folder.iterdir() if f"`{path.name}`" not in readme] == []

@@ -130,8 +130,8 @@ PARTS = {  # what fails: where it is looked up, the name of the result that it c
 }
 ALL = {
     "trajectory_kitti.txt", "trajectory.tum", "ground_truth_kitti.txt", "trajectory_causal.tum",
-    "keyframes.tum", "map.npz", "frames.csv", "config.json", "report.json", "figures", "report.md",
-    "report.html",
+    "keyframes.tum", "trajectory_odom.tum", "covariance.csv", "map.npz", "frames.csv",
+    "config.json", "report.json", "figures", "report.md", "report.html",
 }  # fmt: skip
 
 

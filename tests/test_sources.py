@@ -363,7 +363,7 @@ def test_a_stress_test_of_a_video(folder, tmp_path):
     words += ["--laws", "bias,desync", "--detectors", "none", "--seeds", "1", "--steps", "1"]
     words += ["--max-frames", "8", "--out", tmp_path / "stress"]
     done = CliRunner().invoke(app, list(map(str, words)), catch_exceptions=False)
-    assert "1 of 1 searches finished" in done.output
+    assert "finished 1 of 1 searches" in done.output
     report = json.loads((tmp_path / "stress" / "stress.json").read_text())
     assert [(b["sequence"], b["law"]) for b in report["boundaries"]] == [("pair", "bias")]
     assert "desync: looks at the next frame" in report["notes"][0]

@@ -284,10 +284,8 @@ def test_pruning_and_fine_tuning(tmp_path):
             assert torch.equal(before[name], after[name]), name
     with pytest.raises(InputError, match="--weights"):
         starting_network(wanted, collection, None, "cpu")
-    with pytest.raises(InputError, match="weights of capsule, not of alexnet"):
-        starting_network(
-            settings.model_copy(update={"network": "alexnet"}), collection, full.weights, "cpu"
-        )
+    with pytest.raises(InputError, match="weights of capsule-pruned, not of capsule"):
+        starting_network(settings, collection, tuned.weights, "cpu")
 
 
 def test_cross_entropy_is_equation_3():

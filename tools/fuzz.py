@@ -333,7 +333,7 @@ def mutate(data: bytes, rng: np.random.Generator, name: str) -> bytes:
     if data[:8] == b"\x89PNG\r\n\x1a\n" and rng.random() < 0.3:
         return _mutate_png(data, rng)
     text = not data[:512].translate(None, bytes(range(32, 127)) + b"\n\r\t")
-    changes = (_BYTES + _TEXT * 3) if text else _BYTES
+    changes = [_bytes, _number, _lines, _nest] if text else [_bytes]
     for _ in range(int(rng.integers(1, 5))):
         if data:
             data = changes[int(rng.integers(len(changes)))](data, rng)
@@ -345,40 +345,23 @@ def _place(data: bytes, rng: np.random.Generator) -> int:
     return int(rng.integers(min(len(data), 256) if rng.random() < 0.5 else len(data)))
 
 
-def _flip(data: bytes, rng: np.random.Generator) -> bytes:
-    at = _place(data, rng)
-    return data[:at] + bytes([data[at] ^ 1 << int(rng.integers(8))]) + data[at + 1 :]
-
-
-def _byte(data: bytes, rng: np.random.Generator) -> bytes:
-    at = _place(data, rng)
-    return data[:at] + rng.bytes(1) + data[at + 1 :]
-
-
-def _integer(data: bytes, rng: np.random.Generator) -> bytes:
-    at, size = _place(data, rng), int(rng.choice([1, 2, 4, 8]))
-    value = _SPECIAL[int(rng.integers(len(_SPECIAL)))] & (1 << 8 * size) - 1
-    order = "little" if rng.random() < 0.5 else "big"
-    return data[:at] + value.to_bytes(size, order) + data[at + size :]
-
-
-def _cut(data: bytes, rng: np.random.Generator) -> bytes:
-    return data[: _place(data, rng)]
-
-
-def _remove(data: bytes, rng: np.random.Generator) -> bytes:
-    at = _place(data, rng)
-    return data[:at] + data[at + int(rng.integers(1, 64)) :]
-
-
-def _repeat(data: bytes, rng: np.random.Generator) -> bytes:
-    at, size = _place(data, rng), int(rng.integers(1, 64))
-    return data[:at] + data[at : at + size] * int(rng.integers(2, 50)) + data[at + size :]
-
-
-def _insert(data: bytes, rng: np.random.Generator) -> bytes:
-    at = _place(data, rng)
-    return data[:at] + rng.bytes(int(rng.integers(1, 64))) + data[at:]
+def _bytes(data: bytes, rng: np.random.Generator) -> bytes:
+    """Flip a bit, or replace, cut off, remove, repeat or insert bytes."""
+    way, at, size = rng.integers(8), _place(data, rng), int(rng.integers(1, 64))
+    if way < 2:
+        return data[:at] + bytes([data[at] ^ 1 << int(rng.integers(8))]) + data[at + 1 :]
+    if way < 4:
+        size = int(rng.choice([1, 2, 4, 8]))
+        value = int(rng.choice(np.array(_SPECIAL, np.uint64))) & (1 << 8 * size) - 1
+        new = value.to_bytes(size, "little" if rng.random() < 0.5 else "big")
+        return data[:at] + new + data[at + size :]
+    if way == 4:
+        return data[:at]
+    if way == 5:
+        return data[:at] + data[at + size :]
+    if way == 6:
+        return data[:at] + data[at : at + size] * int(rng.integers(2, 50)) + data[at + size :]
+    return data[:at] + rng.bytes(size) + data[at:]
 
 
 def _number(data: bytes, rng: np.random.Generator) -> bytes:
@@ -402,80 +385,50 @@ def _lines(data: bytes, rng: np.random.Generator) -> bytes:
 
 def _nest(data: bytes, rng: np.random.Generator) -> bytes:
     """Insert deeply nested brackets, or YAML aliases that grow at every level."""
+    way = int(rng.integers(6))
+    if way == 5:  # a number becomes a growing list
+        return _GROWING + b"\n" + re.sub(rb"\[[^]]*\]", b"*a8", data, count=1)
     bombs = (
         b"[" * 20_000,
         b'{"a":' * 20_000,
         b"- " * 20_000,
-        b"\n".join(
-            [b"a0: &a0 [x, x, x, x, x, x, x, x, x]"]
-            + [b"a%d: &a%d [%s]" % (k, k, b", ".join([b"*a%d" % (k - 1)] * 9)) for k in range(1, 9)]
-        ),
+        _GROWING,
         "\u202e\ufeff\x00é".encode(),
     )
-    at = _place(data, rng)
-    bomb = bombs[int(rng.integers(len(bombs)))]
-    return bomb + b"\n" + data if rng.random() < 0.5 else data[:at] + bomb + data[at:]
+    at = 0 if rng.random() < 0.5 else _place(data, rng)
+    return data[:at] + bombs[way] + b"\n" + data[at:]
 
 
-def _alias(data: bytes, rng: np.random.Generator) -> bytes:
-    """Replace a number in YAML by an alias of a growing list."""
-    head = b"\n".join(
-        [b"a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]"]
-        + [b"a%d: &a%d [%s]" % (k, k, b", ".join([b"*a%d" % (k - 1)] * 9)) for k in range(1, 9)]
-    )
-    return head + b"\n" + re.sub(rb"\[[^]]*\]", b"*a8", data, count=1)
-
-
-_BYTES = [_flip, _flip, _byte, _integer, _integer, _cut, _remove, _repeat, _insert]
-_TEXT = [_number, _number, _lines, _nest, _alias]
+_GROWING = b"\n".join(
+    [b"a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+    + [b"a%d: &a%d [%s]" % (k, k, b", ".join([b"*a%d" % (k - 1)] * 9)) for k in range(1, 9)]
+)
 
 
 def _mutate_npz(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change the values, shape or type of an array, or claim too large a size in a header."""
+    """Change the values, shape or type of an array, or claim a size of 100 GB in a header."""
     with np.load(io.BytesIO(data)) as file:
         arrays = dict(file)
     name = str(rng.choice(sorted(arrays)))
-    array = arrays[name]
-    way = int(rng.integers(8))
+    array = arrays.pop(name)
+    way, out, claim = int(rng.integers(7)), io.BytesIO(), io.BytesIO()
     if way == 0:
-        del arrays[name]
-    elif way == 1:
         arrays[name] = array.reshape(-1)[: int(rng.integers(0, array.size + 1))]
-    elif way == 2:
+    elif way == 1:
         arrays[name] = np.concatenate([array.reshape(-1)] * 3)
-    elif way == 3:
+    elif way == 2:
         arrays[name] = array.astype(str(rng.choice(["f8", "i1", "u8", "c16", "S3", "f2"])))
-    elif way == 4:
+    elif way == 3:
         arrays[name] = array.reshape((1, *array.shape, 1))
-    elif way in (5, 6) and array.size:
-        changed = array.reshape(-1).copy()
-        values = [-1, -(2**40), 2**40, 77, 0, np.nan, np.inf]
-        with np.errstate(all="ignore"):
-            at = int(rng.integers(array.size)) if way == 5 else slice(None)
-            changed[at] = np.array(rng.choice(values)).astype(array.dtype)
-        arrays[name] = changed.reshape(array.shape)
-    else:
-        return _promising(arrays, name)
-    out = io.BytesIO()
-    np.savez(out, **arrays)
-    return out.getvalue()
-
-
-def _promising(arrays: dict[str, np.ndarray], name: str) -> bytes:
-    """A header that claims a size of 100 GB."""
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
-        for key, array in arrays.items():
-            buffer = io.BytesIO()
-            np.save(buffer, array)
-            raw = buffer.getvalue()
-            if key == name:
-                header = io.BytesIO()
-                np.lib.format.write_array_header_1_0(
-                    header, {"descr": "<f8", "fortran_order": False, "shape": (12_500_000_000,)}
-                )
-                raw = header.getvalue() + bytes(64)
-            archive.writestr(f"{key}.npy", raw)
+    elif way == 4 and array.size and array.dtype.kind in "biuf":
+        arrays[name] = array.copy()
+        _change(arrays[name].reshape(-1), rng, len(array.reshape(-1)))
+    np.savez(out, **arrays)  # otherwise without the array
+    if way == 5:
+        header = {"descr": "<f8", "fortran_order": False, "shape": (12_500_000_000,)}
+        np.lib.format.write_array_header_1_0(claim, header)
+        with zipfile.ZipFile(out, "a", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr(f"{name}.npy", claim.getvalue() + bytes(64))
     return out.getvalue()
 
 

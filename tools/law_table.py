@@ -1,15 +1,9 @@
-"""Write docs/howto/laws.csv: every law of ``--perturb`` with its unit and range.
-
-python tools/law_table.py            # writes it
-python tools/law_table.py --check    # exits 1 if the file differs
-"""
+"""Write docs/howto/laws.csv: every law of ``--perturb`` with its unit and range."""
 
 from __future__ import annotations
 
-import argparse
 import csv
 import io
-import sys
 from pathlib import Path
 
 from vslam.datasets.perturbation import LAWS
@@ -32,13 +26,5 @@ def table() -> str:
     return text.getvalue()
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--check", action="store_true", help="compare, do not write")
-    if parser.parse_args().check:
-        sys.exit(TABLE.read_text() != table())
-    TABLE.write_text(table())
-
-
 if __name__ == "__main__":
-    main()
+    TABLE.write_text(table())

@@ -18,7 +18,7 @@ DepthImage = NDArray[np.float32]  # (H, W) metres along z, 0 where unknown
 Sensor = Literal["stereo", "mono", "rgbd"]
 
 # The disparity of an observation is more accurate than its column and row; its reprojection error
-# has this weight (docs/research/motorway.md, tools/experiments/motorway/noise_model.py).
+# has this weight (docs/research/motorway.md).
 DISPARITY_WEIGHT = 3.0
 
 _OFF_CENTRE = 0.2  # of the image size; a calibration of half the size gives 0.25, of twice it 0.5

@@ -9,7 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.geometry import inverse
 from vslam.kernels import inner_kernel, kernel
+from vslam.odometry import PoseUncertainty
 
 MIN_DISPARITY = 0.01  # pixels; farther points are clamped to the depth of this disparity
 PATCH_RADIUS = 8  # half width of the patch kept around a feature, in pixels of its octave
@@ -249,6 +251,9 @@ class TrackResult:
         is_keyframe: whether the frame became a keyframe.
         relocalised: whether the frame was searched for in the whole map and found there.
         stage_ms: wall time of each stage of the pipeline, in milliseconds.
+        T_odom_camera: ``(4, 4)`` pose in a frame that never jumps, but drifts; it is the identity
+            at the first frame. None in the results of older files.
+        uncertainty: how sure the pose is; None in the results of older files.
     """
 
     index: int
@@ -262,3 +267,14 @@ class TrackResult:
     is_keyframe: bool
     relocalised: bool = False
     stage_ms: dict[str, float] = field(default_factory=dict)
+    T_odom_camera: NDArray[np.float64] | None = None
+    uncertainty: PoseUncertainty | None = None
+
+    @property
+    def T_map_odom(self) -> NDArray[np.float64]:
+        """``(4, 4)`` the correction that leads from ``T_odom_camera`` to ``T_wc``; it jumps where a
+        loop is closed, the map is adjusted or the camera is found again (ROS REP 105)."""
+        if self.T_odom_camera is None:
+            return np.eye(4)
+        T: NDArray[np.float64] = self.T_wc @ inverse(self.T_odom_camera)
+        return T

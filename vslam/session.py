@@ -10,6 +10,7 @@ import numpy as np
 from vslam.camera import same_camera
 from vslam.closing import LoopClosing
 from vslam.config import changed_thresholds
+from vslam.features import TrackResult
 from vslam.frame_poses import FrameTable
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracker import Tracker
@@ -19,6 +20,7 @@ from vslam.map import Map
 from vslam.mapping import Mapper
 from vslam.maps.stored_map import StoredMap, World
 from vslam.modes import Mode
+from vslam.odometry import Odometry
 from vslam.states import Checkpoint
 
 _log = logging.getLogger(__name__)
@@ -94,6 +96,7 @@ class Session:
     tracker: Tracker
     rig: RigCalibration
     mode: Mode
+    odometry: Odometry
     opened: OpenedMap
 
     def stored_map(self, drive: str) -> StoredMap:
@@ -133,6 +136,7 @@ class Session:
             policy,
             self.closing.state(),
             self.rig.state(),
+            self.odometry.state(),
         )
 
     def restore(self, state: Checkpoint) -> None:
@@ -141,10 +145,19 @@ class Session:
         self.mode.restore(state.policy)
         self.closing.restore(state.closing)
         self.rig.restore(state.rig)
+        self.odometry.restore(state.odometry)
         landmark = state.tracker.landmark
         xyz = np.full((len(landmark), 3), np.nan)
         xyz[landmark >= 0] = self.mapper.map.arrays.xyz[landmark[landmark >= 0]]
         self.rig.mark_corrected(self.tracker.restore(state.tracker, xyz))
+
+    def resume_odometry(self, last: TrackResult) -> None:
+        """Continue the odometry of a resumed drive after its last frame, unless ``resume`` has
+        restored it from a checkpoint."""
+        T_odom_camera, uncertainty = last.T_odom_camera, last.uncertainty
+        if T_odom_camera is None or uncertainty is None or self.opened.checkpoint is not None:
+            return
+        self.odometry.resume(T_odom_camera, uncertainty)
 
     def resume(self) -> None:
         """Continue after the last frame of a resumed drive, if there is one.

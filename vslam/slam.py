@@ -20,8 +20,9 @@ from vslam.frontend.frame import Frame
 from vslam.frontend.masks import Mask
 from vslam.frontend.relocaliser import Relocaliser
 from vslam.frontend.rig import RigCalibration
-from vslam.frontend.tracker import Found, Tracker, result_of
+from vslam.frontend.tracker import Found, Tracker, TrackerStatus, result_of
 from vslam.frontend.tracking import TrackingContext
+from vslam.geometry import Matrix, inverse
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.learned_relocalization import LearnedRelocalisation
 from vslam.loopclosure.registry import DEFAULT_DETECTOR, detector_with_images
@@ -35,6 +36,7 @@ from vslam.mapping import Mapper
 from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, World
 from vslam.modes import Localising, MapBuilding
+from vslam.odometry import Odometry
 from vslam.session import Session, open_map
 from vslam.shared_map import mapping_executor
 from vslam.trajectory import Trajectory
@@ -113,7 +115,10 @@ class Slam:
         recognise = LearnedRelocalisation(images, camera, config)
         self._relocaliser = Relocaliser(context, detector.locate, recognise)
         self._mode = Localising(mapper) if localize else MapBuilding(context, mapper, tracker)
-        self._session = Session(context, closing, mapper, tracker, rig, self._mode, opened)
+        self._odometry = Odometry()
+        self._session = Session(
+            context, closing, mapper, tracker, rig, self._mode, self._odometry, opened
+        )
         self._session.resume()
         self.next_extraction = -1
 
@@ -252,10 +257,13 @@ class Slam:
         if not mapper.n_keyframes:
             self.rig.extract(frame, tracker.twist)
             clock.lap("extract")
+            self._follow(frame, frame.T_cw, None)
             begun = self._mode.begin(mapper.append_pose(frame, tracked=False))
             found = Found.at_start(frame, begun=begun)
+            if begun:
+                self._odometry.keyframe()
             clock.lap("keyframe")
-            return result_of(frame, found, not found.is_lost, clock.ms)
+            return result_of(frame, found, begun, clock.ms, self._odometry)
 
         T_predicted = tracker.predict(frame.timestamp, mapper.frames, mapper.view)
         tracked = tracker.track_patches(frame, T_predicted, mapper.view)
@@ -274,29 +282,54 @@ class Slam:
             clock.lap("relocalise")
         if found.is_lost:
             frame.T_cw = T_predicted
+            self._follow(frame, T_predicted, None)
             placed = mapper.append_pose(frame, tracked=False)
             tracker.lose()
             is_keyframe = self._mode.begin_after_loss(placed)
         else:
+            found_again = found.relocalised or tracker.status is not TrackerStatus.TRACKING
+            T_moved = T_predicted if found_again else frame.T_cw
             tracker.accept(frame, found, mapper.frames)
+            self._follow(frame, T_moved, frame.covariance)
             placed = mapper.append_pose(frame, tracked=True, near=found.keyframe)
             is_keyframe = self._mode.update_map(placed, found)
             self.rig.observe(frame, frame.twist)
         # Where patches failed, they probably fail again.
         self.next_extraction = self._mode.due if by_patches else frame.index + 2
+        if is_keyframe:
+            self._odometry.keyframe()
         clock.lap("keyframe")
-        return result_of(frame, found, is_keyframe, clock.ms)
+        return result_of(frame, found, is_keyframe, clock.ms, self._odometry)
 
     def skip(self, timestamp: float, *, dropped: bool = False) -> TrackResult:
         """Add a frame without images at the predicted pose: it is LOST, or DROPPED if there was
         merely no time to process it."""
         frame = self._next_frame(Extracted.nothing(), timestamp, None)
         frame.T_cw = self._tracker.predict(timestamp, self._mapper.frames, self._mapper.view)
+        self._follow(frame, frame.T_cw, None)
         self._mapper.append_pose(frame, tracked=False)
         if self._mapper.n_keyframes and not dropped:
             self._tracker.lose()
         found = Found(TrackingState.DROPPED if dropped else TrackingState.LOST)
-        return result_of(frame, found, False, {})
+        return result_of(frame, found, False, {}, self._odometry)
+
+    def _follow(self, frame: Frame, T_cw: Matrix, covariance: Matrix | None) -> None:
+        """Advance the odometry to the next frame, before its pose is recorded.
+
+        Args:
+            T_cw: ``(4, 4)`` where its motion from the last frame leads.
+        """
+        frames = self._mapper.frames
+        T_now_last, elapsed = np.eye(4), 0.0
+        if len(frames):
+            T_now_last = T_cw @ inverse(frames.pose(-1))
+            elapsed = frame.timestamp - frames.timestamp(-1)
+        self._odometry.move(T_now_last, elapsed, covariance)
+
+    def resume_odometry(self, last: TrackResult) -> None:
+        """Continue ``T_odom_camera`` and the uncertainty after the last result of a drive that was
+        resumed from a map without the state of tracking; otherwise they begin anew."""
+        self._session.resume_odometry(last)
 
     def finish(self) -> None:
         """Complete all mapping, so that map and trajectory stay as they are until the next step."""

@@ -136,10 +136,15 @@ class RigState:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The states of all parts."""
+    """The states of all parts.
+
+    Attributes:
+        odometry: pose and uncertainty of the last frame (``Odometry``).
+    """
 
     tracker: TrackerState
     mapper: MapperState
     policy: PolicyState
     closing: ClosingState
     rig: RigState = field(default_factory=RigState)
+    odometry: tuple[float, ...] = (*np.eye(4).ravel().tolist(), *[0.0] * 44)

@@ -52,9 +52,7 @@ class OnnxNetwork:
         try:
             comparison = base64.b64decode(metadata[COMPARISON])
             self._comparison = open_session(path, comparison, "query")
-            compared = self._comparison.get_inputs()
-            self._views = tuple(compared[0].shape)
-            self._compared = [one.name for one in compared]
+            self._views = tuple(self._comparison.get_inputs()[0].shape)
             self.name: str = metadata[NAME]
             self.about: dict[str, Any] = json.loads(metadata[ABOUT])
             height, width = self._embedding.get_inputs()[0].shape
@@ -84,7 +82,7 @@ class OnnxNetwork:
         # NumPy computes the lengths four times as fast as onnxruntime.
         lengths = np.sqrt(np.einsum("nvd,nvd->nv", views, views))
         given = {"query": query.reshape(self._views), "gallery": views, "lengths": lengths}
-        (similarity,) = self._comparison.run(None, {name: given[name] for name in self._compared})
+        (similarity,) = self._comparison.run(None, given)
         return np.asarray(similarity, np.float32)
 
 

@@ -31,7 +31,7 @@ class LocalDescriptors:
     def __init__(self, path: Path = SHIPPED_LOCAL) -> None:
         """
         Args:
-            path: ONNX file that ``tools/training/train_local.py`` wrote.
+            path: ONNX file of ``vslam.loopclosure.training.export.export_local``.
 
         Raises:
             InputError: there is no such file.

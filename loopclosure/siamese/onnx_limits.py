@@ -25,8 +25,8 @@ _SIDE = 512  # assumed for each dimension of an input that the graph leaves open
 
 # The operators that the networks of vslam use. None of them contains another graph.
 _OPERATORS = {
-    "Abs", "Add", "AveragePool", "Cast", "Clip", "Concat", "Conv", "Div", "Exp", "Expand", "Gather",
-    "Gemm", "Greater", "GridSample", "LeakyRelu", "MatMul", "Max", "MaxPool", "Mul", "Pad", "Pow",
+    "Abs", "Add", "Cast", "Clip", "Concat", "Conv", "Div", "Exp", "Expand", "Gather",
+    "Greater", "GridSample", "MatMul", "Max", "Mul", "Pad", "Pow",
     "ReduceL2", "ReduceLogSumExp", "ReduceMax", "ReduceMean", "ReduceSum", "Relu", "Reshape",
     "ScatterElements", "Shape", "Sigmoid", "Slice", "Split", "Sqrt", "Squeeze", "Sub", "Transpose",
     "Unsqueeze",
@@ -147,6 +147,6 @@ def _products(node: NodeProto, shapes: dict[str, Any]) -> int:
     only a few for each number of their result."""
     if node.op_type == "Conv":
         return math.prod(shapes[node.output[0]]) * math.prod(shapes[node.input[1]][1:])
-    if node.op_type in ("MatMul", "Gemm"):
+    if node.op_type == "MatMul":
         return math.prod(shapes[node.output[0]]) * max(shapes[node.input[0]][-2:])
     return 0

@@ -6,10 +6,7 @@ from pathlib import Path
 
 from vslam.errors import InputError
 
-NETWORKS = (
-    "capsule", "capsule-pruned", "capsule-paper", "alexnet", "vgg16", "darknet19", "googlenet",
-    "mobilenet", "squeezenet", "pcanet",
-)  # fmt: skip
+NETWORKS = ("capsule", "capsule-pruned", "capsule-paper")
 PRUNED = ("capsule-pruned", "capsule-paper")
 """Networks made from trained weights of ``capsule`` by removing primary capsules."""
 TO_THE_LETTER = "capsule-paper"
@@ -38,9 +35,4 @@ def find_weights(name: str, weights: Path | None = None) -> Path:
         )
     if path.exists():
         return path
-    if weights is None:
-        raise InputError(
-            f"--detector {name}: vslam ships no weights for it; train it with 'vslam train {name}' "
-            "and name the .onnx file with --weights."
-        )
     raise InputError(f"--weights {path}: no such file; name the .onnx file of a trained network.")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from pydantic import (
@@ -21,7 +21,6 @@ from vslam.loopclosure.training.capsules import CapsuleLayer
 from vslam.loopclosure.training.extractors import (
     LIGHT_BLOCKS,
     LightExtractor,
-    OriginalExtractor,
     PrimaryCapsules,
     grid_side,
 )
@@ -57,7 +56,7 @@ class CapsuleShape(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    extractor: Literal["light", "original", "lite0"] = "light"
+    extractor: Literal["light", "lite0"] = "light"
     pixels: int = Field(227, ge=32, description="Height of the input.")
     width: int | None = Field(None, ge=32, description="Width of the input; None: a square.")
     views: int = Field(1, ge=1, le=16, description="Parts of the image, from left to right.")
@@ -76,15 +75,6 @@ class CapsuleShape(BaseModel):
     iterations: int = Field(3, ge=1, description="Iterations of the routing.")
     over: Literal["primary", "output"] = "primary"
     kept: int | None = Field(None, description="Places kept of each type; None before pruning.")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _without_what_is_gone(cls, given: Any) -> Any:
-        """Drop keys of older weights, by which no channel or block of the extractor is missing."""
-        if not isinstance(given, dict):
-            return given
-        nothing = {key for key in ("inner", "skipped") if not given.get(key, True)}
-        return {key: value for key, value in given.items() if key not in nothing}
 
     @model_validator(mode="after")
     def _flat_images_keep_their_height(self) -> CapsuleShape:
@@ -159,8 +149,6 @@ class CapsuleShape(BaseModel):
     @property
     def grid(self) -> tuple[int, int]:
         """Rows and columns of places of a view."""
-        if self.extractor == "original":
-            return 8, 8
         height, width = self.view
         if self.extractor == "lite0":
             return lite_grid_side(height), lite_grid_side(width)
@@ -209,16 +197,9 @@ class CapsuleBranch(nn.Module):
         self.size, self.views, self.layout = shape.input, shape.views, shape.layout
         self.dimensions = shape.views * shape.outputs * shape.depth
         self.unrolling = Unrolling(shape.input, shape.half_angle, shape.middle)
-        self.extractor: nn.Module
-        self.primary: nn.Module
-        if shape.extractor == "original":
-            self.extractor = nn.Identity()
-            self.primary = OriginalExtractor(shape.types, shape.size)
-        else:
-            lite = shape.extractor == "lite0"
-            grid = LiteExtractor() if lite else LightExtractor(shape.blocks)
-            self.extractor = grid
-            self.primary = PrimaryCapsules(grid.out_channels, shape.types, shape.size)
+        lite = shape.extractor == "lite0"
+        self.extractor = LiteExtractor() if lite else LightExtractor(shape.blocks)
+        self.primary = PrimaryCapsules(self.extractor.out_channels, shape.types, shape.size)
         # With channels last, depthwise convolutions take a third less forward, a quarter backward.
         for module in (self.extractor, self.primary):
             module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

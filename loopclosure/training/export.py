@@ -26,11 +26,9 @@ from vslam.loopclosure.siamese.inference import (
     OnnxNetwork,
 )
 from vslam.loopclosure.training.local import LocalNetwork
-from vslam.loopclosure.training.pcanet import PcaNetBranch
 from vslam.loopclosure.training.siamese import SiameseNetwork, for_inference
 
 TOLERANCE = 1e-4  # of a descriptor of length 1
-HASHED_TOLERANCE = 0.01  # for PCANet, where rounding of a response near 0 flips a bit of a code
 SIMILARITY_TOLERANCE = 0.02  # because the square root magnifies rounding at distance 0
 _SMALL = 64  # a tensor with fewer numbers is not worth storing in half precision
 
@@ -103,9 +101,7 @@ def export_onnx(network: SiameseNetwork, path: Path, about: dict[str, Any] | Non
     descriptors = np.stack([written.embed(image) for image in images])
     difference = float(np.abs(descriptors - expected.numpy()).max())
     apart = float(np.abs(written.compare(descriptors[0], descriptors) - alike).max())
-    hashed = isinstance(network.branch, PcaNetBranch)
-    allowed = HASHED_TOLERANCE if hashed else TOLERANCE
-    if not (difference < allowed and apart < SIMILARITY_TOLERANCE):
+    if not (difference < TOLERANCE and apart < SIMILARITY_TOLERANCE):
         raise ResultsError(f"{path}: differs from torch by {difference:.1e}; do not use it.")
     return difference
 
@@ -114,7 +110,7 @@ def to_onnx(
     module: nn.Module, inputs: tuple[Tensor, ...], names: list[str], outputs: list[str],
     dynamic_shapes: Any = None,
 ) -> onnx.ModelProto:  # fmt: skip
-    """Convert a module to an ONNX graph without unused inputs. Tensors that half precision
+    """Convert a module to an ONNX graph. Tensors that half precision
     represents exactly are stored in it."""
     log = logging.getLogger("torch.onnx")
     level = log.level
@@ -131,10 +127,6 @@ def to_onnx(
     assert program is not None
     model = program.model_proto
     _halve(model.graph)
-    read = {name for node in model.graph.node for name in node.input}
-    used = [one for one in model.graph.input if one.name in read]
-    del model.graph.input[:]
-    model.graph.input.extend(used)
     for node in model.graph.node:  # remove the source paths of this machine
         del node.metadata_props[:]
     del model.graph.metadata_props[:]

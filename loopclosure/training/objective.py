@@ -14,7 +14,7 @@ from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
 from vslam.loopclosure.training.augmentation import Augmentation, augment
 from vslam.loopclosure.training.data import Collection
 from vslam.loopclosure.training.preprocessing import to_tensor
-from vslam.loopclosure.training.siamese import DistanceHead, SiameseNetwork
+from vslam.loopclosure.training.siamese import SiameseNetwork
 
 _MOST_SAME = 5  # most images of its place that count for a validation image
 
@@ -129,12 +129,9 @@ def blend(network: SiameseNetwork, before: dict[str, Tensor], share: float) -> N
 def calibrate(network: SiameseNetwork, score: NDArray, same: NDArray) -> None:
     """Fit a and b of ``p = sigmoid(a - b d)`` in place, with equal weight for true and false pairs.
 
-    The order of the scores, and so AP, does not change; p becomes a calibrated probability. Heads
-    without a and b are left unchanged.
+    The order of the scores, and so AP, does not change; p becomes a calibrated probability.
     """
     head = network.head
-    if not isinstance(head, DistanceHead):
-        return
     a, b = head.log_a.exp().item(), head.log_b.exp().item()
     p = np.clip(np.asarray(score, np.float64), 1e-12, 1 - 1e-12)
     d = (a - np.log(p / (1 - p))) / b

@@ -22,13 +22,13 @@ def mean_couplings(network: SiameseNetwork, batches: Iterable[Tensor]) -> Tensor
     """Activity of each primary capsule, ``(T, K)``: mean of c_ij over images and outputs j.
 
     Args:
-        network: network with a capsule branch, in eval mode.
+        network: the network, in eval mode.
         batches: images of the training set, ``(N, 3, H, W)`` each.
 
     Raises:
-        InputError: there are no images, or the network has no capsules.
+        InputError: there are no images.
     """
-    branch = _capsules_of(network)
+    branch = network.branch
     total, count = None, 0
     for images in batches:
         c = branch.routed(images)[1]
@@ -55,7 +55,7 @@ def lowest(activity: Tensor, fraction: float = 0.2) -> Tensor:
 def masked(network: SiameseNetwork, drop: Tensor) -> SiameseNetwork:
     """A copy in which the capsules of ``drop`` ``(T, K)`` are masked but still computed."""
     copied = copy.deepcopy(network)
-    layer = _capsules_of(copied).capsules
+    layer = copied.branch.capsules
     layer.alive.copy_(~drop.flatten())
     layer.masked = True
     return copied
@@ -66,11 +66,8 @@ def pruned(network: SiameseNetwork, drop: Tensor, name: str = "capsule-pruned") 
 
     Args:
         name: name of the copy, one of ``PRUNED``.
-
-    Raises:
-        InputError: the network has no capsules.
     """
-    branch = _capsules_of(network)
+    branch = network.branch
     layer = branch.capsules
     kept = (~drop).nonzero()[:, 1].view(len(drop), -1)
     shape = branch.shape.model_copy(update={"kept": kept.shape[1]})
@@ -86,19 +83,9 @@ def pruned(network: SiameseNetwork, drop: Tensor, name: str = "capsule-pruned") 
 
 
 def with_iterations(network: SiameseNetwork, iterations: int) -> SiameseNetwork:
-    """A copy with another number of routing iterations. (Not in the paper.)
-
-    Raises:
-        InputError: the network has no capsules.
-    """
+    """A copy with another number of routing iterations. (Not in the paper.)"""
     copied = copy.deepcopy(network)
-    branch = _capsules_of(copied)
+    branch = copied.branch
     branch.shape = branch.shape.model_copy(update={"iterations": iterations})
     branch.capsules.iterations = iterations
     return copied
-
-
-def _capsules_of(network: SiameseNetwork) -> CapsuleBranch:
-    if not isinstance(network.branch, CapsuleBranch):
-        raise InputError(f"{network.name}: has no capsules to prune; choose capsule.")
-    return network.branch

@@ -10,7 +10,6 @@ from pydantic import BaseModel, ConfigDict, Field
 from vslam.config.section import read_json
 from vslam.loopclosure.training.augmentation import STRONG, Augmentation
 from vslam.loopclosure.training.branches import CapsuleShape
-from vslam.loopclosure.training.siamese import Head
 
 
 class TrainSettings(BaseModel):
@@ -19,10 +18,7 @@ class TrainSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     network: str = Field("capsule", description="Network to train.")
-    shape: CapsuleShape = Field(
-        CapsuleShape(), description="Shape of a capsule branch; others only use its image size."
-    )
-    head: Head | None = Field(None, description="How descriptors are compared; null: default.")
+    shape: CapsuleShape = Field(CapsuleShape(), description="Shape of the capsule branch.")
     fit: Literal["squash", "crop"] = Field(
         "squash", description="Whole view, or its middle with the input's aspect ratio."
     )
@@ -61,11 +57,6 @@ class TrainSettings(BaseModel):
     )
 
 
-# Small networks learn in such a short time only from mild changes (docs/research/training.md).
-_MILD = Augmentation(
-    homography=0.05, shift=0.05, log_gain=0.2, bias=10.0, log_gamma=0.2, masks=1, noise=3.0,
-    blur=0.5,
-)  # fmt: skip
 _BEST = TrainSettings(
     loss="bce+contrast",
     schedule="cosine",
@@ -97,23 +88,6 @@ PRESETS = {
             "pairs": 4096,
             "epochs": 16,
             "augmentation": STRONG.model_copy(update={"turn": 30.0}),
-        }
-    ),
-    # The same settings for all architectures, with random weights and one head
-    # (docs/research/rivals.md). There is no mining and little validation, since these would take
-    # most time with slow networks.
-    "rivals": _BEST.model_copy(
-        update={
-            "shape": CapsuleShape(pixels=129),
-            "head": "distance",
-            "learning_rate": 3e-4,
-            "mixed_precision": True,
-            "batch": 16,
-            "epochs": 16,
-            "together": 1,
-            "hard_share": 0.0,
-            "validation_images": 150,
-            "augmentation": _MILD,
         }
     ),
 }

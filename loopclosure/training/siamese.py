@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from pydantic import ValidationError
@@ -14,17 +14,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vslam.errors import InputError, ResultsError
-from vslam.loopclosure.siamese.weights import NETWORKS, PRUNED
-from vslam.loopclosure.training.branches import CapsuleBranch, CapsuleShape, Layout
+from vslam.loopclosure.siamese.weights import NETWORKS
+from vslam.loopclosure.training.branches import CapsuleBranch, CapsuleShape
 from vslam.loopclosure.training.capsules import TINY
-from vslam.loopclosure.training.convolutional import CONVOLUTIONAL, ConvolutionalBranch
 from vslam.loopclosure.training.extractors import fold_batch_norms
-from vslam.loopclosure.training.pcanet import PcaNetBranch
 
-Head = Literal["distance", "concatenation"]
-"""How two descriptors are compared: :class:`DistanceHead` or :class:`ConcatenationHead`."""
-
-_OWN_HEAD: dict[str, Head] = {"alexnet": "concatenation", "vgg16": "concatenation"}  # Eq. 1
 _SOFTNESS = 0.04  # temperature of the soft maximum over alignments, in cosines
 
 
@@ -103,34 +97,8 @@ class DistanceHead(nn.Module):
         return self.of_cosine(aligned(alike, most))
 
 
-class ConcatenationHead(nn.Module):
-    """Both vectors concatenated, fully connected layers with batch normalisation (Eq. 1).
-
-    The result is the mean over both orders of the pair, so that the order does not matter.
-    """
-
-    def __init__(self, dimensions: int, hidden: int = 256) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(
-            nn.Linear(2 * dimensions, hidden, bias=False),
-            nn.BatchNorm1d(hidden),
-            nn.ReLU(inplace=True),
-            nn.Linear(hidden, 1),
-        )
-
-    def forward(self, a: Tensor, b: Tensor) -> Tensor:
-        """Logits ``(N,)`` of pairs of ``(N, D)`` descriptors."""
-        both = torch.cat([torch.cat([a, b], 1), torch.cat([b, a], 1)])
-        return self.layers(both).view(2, -1).mean(0)
-
-    def compare(self, query: Tensor, gallery: Tensor, lengths: Tensor) -> Tensor:
-        """Logits ``(M,)`` of one ``(1, D)`` descriptor with each of ``(M, 1, D)``."""
-        gallery = gallery[:, 0]
-        return self.forward(query.expand_as(gallery), gallery)
-
-
 class SiameseNetwork(nn.Module):
-    """Common interface of all branches: ``embed`` and ``similarity``.
+    """A capsule branch, which computes descriptors, and a head, which compares them.
 
     Attributes:
         name: one of ``NETWORKS``.
@@ -138,12 +106,7 @@ class SiameseNetwork(nn.Module):
         dimensions: dimension D of the descriptors.
     """
 
-    def __init__(
-        self,
-        name: str,
-        branch: CapsuleBranch | ConvolutionalBranch | PcaNetBranch,
-        head: DistanceHead | ConcatenationHead,
-    ) -> None:
+    def __init__(self, name: str, branch: CapsuleBranch, head: DistanceHead) -> None:
         super().__init__()
         self.name, self.branch, self.head = name, branch, head
         self.size, self.dimensions = branch.size, branch.dimensions
@@ -179,31 +142,19 @@ class SiameseNetwork(nn.Module):
         return sum(p.numel() for p in self.parameters())
 
 
-def build_network(
-    name: str, shape: CapsuleShape | None = None, head: Head | None = None
-) -> SiameseNetwork:
+def build_network(name: str, shape: CapsuleShape | None = None) -> SiameseNetwork:
     """A network with random weights, drawn from torch's global generator.
 
     Args:
         name: one of ``NETWORKS``.
-        shape: shape of a capsule branch; others only use its image size.
-        head: None for the paper's head: concatenation for AlexNet and VGG16, else distance.
+        shape: shape of the capsule branch; None for that of the paper.
 
     Raises:
-        InputError: the name is unknown, or the images are too small.
+        InputError: the name is unknown.
     """
-    shape = shape or CapsuleShape()
-    branch: CapsuleBranch | ConvolutionalBranch | PcaNetBranch
-    if name in ("capsule", *PRUNED):
-        branch = CapsuleBranch(shape)
-    elif name == "pcanet":
-        branch = PcaNetBranch(shape.input)
-    elif name in CONVOLUTIONAL:
-        branch = CONVOLUTIONAL[name](shape.input)
-    else:
+    if name not in NETWORKS:
         raise InputError(f"{name}: no such network; choose one of {', '.join(NETWORKS)}.")
-    if (head or _OWN_HEAD.get(name)) == "concatenation":
-        return SiameseNetwork(name, branch, ConcatenationHead(branch.dimensions))
+    branch = CapsuleBranch(shape or CapsuleShape())
     return SiameseNetwork(name, branch, DistanceHead(branch.views))
 
 
@@ -222,12 +173,9 @@ def save_network(
         key: value.detach().half() if half and value.is_floating_point() else value.detach()
         for key, value in network.state_dict().items()
     }
-    shape = network.branch.shape if isinstance(network.branch, CapsuleBranch) else None
     metadata = {
         "name": network.name,
-        "shape": shape.model_dump_json() if shape else "",
-        "size": json.dumps(network.size),
-        "head": "distance" if isinstance(network.head, DistanceHead) else "concatenation",
+        "shape": network.branch.shape.model_dump_json(),
         "about": json.dumps(about),
     }
     try:
@@ -251,13 +199,8 @@ def load_network(path: Path) -> tuple[SiameseNetwork, dict[str, Any]]:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        if metadata["shape"]:
-            shape = CapsuleShape.model_validate_json(metadata["shape"])
-        else:
-            height, width = json.loads(metadata["size"])
-            shape = CapsuleShape().with_layout(Layout((height, width)))
-        head: Any = metadata.get("head")
-        network = build_network(metadata["name"], shape, head)
+        shape = CapsuleShape.model_validate_json(metadata["shape"])
+        network = build_network(metadata["name"], shape)
         wanted = network.state_dict()
         network.load_state_dict({k: v.to(wanted[k].dtype) for k, v in tensors.items()})
         about: dict[str, Any] = json.loads(metadata["about"])

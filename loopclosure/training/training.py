@@ -125,7 +125,7 @@ def train(
     train_images, validation = divide(collection, settings.seed, settings.validation_share)
     validation = validation_images(validation, settings.validation_images, settings.seed)
     torch.manual_seed(settings.seed)
-    network = start or build_network(settings.network, settings.shape, settings.head)
+    network = start or build_network(settings.network, settings.shape)
     network = network.to(where)
     before = copy.deepcopy(network.state_dict()) if settings.learned_share < 1 else None
     optimiser = _optimiser(network, settings)
@@ -308,16 +308,15 @@ class _Training:
 
 
 def _optimiser(network: SiameseNetwork, settings: TrainSettings) -> torch.optim.Optimizer:
-    extractor = getattr(network.branch, "extractor", None)
+    extractor = network.branch.extractor
     if isinstance(extractor, LiteExtractor):
         extractor.freeze(settings.frozen)
-    given = [] if extractor is None else [p for p in extractor.parameters() if p.requires_grad]
+    given = [p for p in extractor.parameters() if p.requires_grad]
     single = [p for p in network.head.parameters() if p.ndim == 0]
     apart = {id(p) for p in (*given, *single)}
     others = [p for p in network.parameters() if p.requires_grad and id(p) not in apart]
     sets = [(others, 1.0), (given, settings.extractor_rate), (single, _HEAD_RATE)]
     groups: list[dict[str, Any]] = [{"params": p, "factor": f} for p, f in sets if p]
-    # The fused optimiser passes over the weights once, so that a step of VGG16 takes half the time.
     return torch.optim.Adam(groups, lr=settings.learning_rate, fused=True)
 
 

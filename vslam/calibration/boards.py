@@ -236,7 +236,8 @@ def _reduced(image: Image) -> tuple[Image, float]:
     import cv2
 
     times = max(1.0, max(image.shape) / _SEARCHED_PX)
-    return cv2.resize(image, None, None, 1 / times, 1 / times, cv2.INTER_AREA), times
+    small = cv2.resize(image, None, None, 1 / times, 1 / times, cv2.INTER_AREA)
+    return cast("Image", small), times
 
 
 def _charuco_finder(board: Board) -> Finder:
@@ -413,7 +414,7 @@ def _layout(
     H, mask = cv2.findHomography(
         at, xy.mean(axis=1), cv2.RANSAC, _OFF_PLACE * side, maxIters=_TRIALS
     )
-    if H is None or (n := np.count_nonzero(mask)) < _RECOGNISED_TAGS:
+    if H is None or (n := int(np.count_nonzero(mask))) < _RECOGNISED_TAGS:
         return 0, None
     fits = mask.ravel() > 0
     tags = cv2.perspectiveTransform(xy.reshape(1, -1, 2), np.linalg.inv(H)).reshape(-1, 4, 2)[fits]
@@ -423,5 +424,5 @@ def _layout(
     bits, _, size = family.rpartition("_")
     if size == "1000":  # the smaller dictionaries are its first markers
         family = f"{bits}_{next(n for n in _SIZES if n > numbers[fits].max())}"
-    rows = max(3, int(at[fits, 1].max()) + 1)
+    rows = max(3 if kind == "charuco" else 1, int(at[fits, 1].max()) + 1)
     return n, Board(kind, columns, rows, 0.1, 0.1 * ratio, family)

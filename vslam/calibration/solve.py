@@ -192,7 +192,8 @@ def _without_outliers(
     Raises:
         InputError: too few views are left; ``seen`` and ``fix`` are parts of the sentence.
     """
-    kept, dropped = list(views), []
+    kept = list(views)
+    dropped: list[tuple[str, float]] = []
     while len(kept) >= FEWEST_VIEWS:
         found, errors = fit(kept)
         out = ~(errors <= _OUTLIER * np.nanmedian(errors))  # NaN: a board behind the camera

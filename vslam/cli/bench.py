@@ -21,6 +21,7 @@ from vslam.cli.options import (
     kind_of_source,
     names_in,
     open_given,
+    option,
     read_thresholds,
     reads_source,
     sequences,
@@ -61,20 +62,16 @@ def bench(
     seqs: Annotated[str | None, sequences("00-05")] = None,
     perturb: Annotated[
         str,
-        typer.Option(
-            metavar="LIST",
-            help="Perturbations, separated by commas; + joins several in one, such as "
+        option(
+            METHOD,
+            "LIST",
+            "Perturbations, separated by commas; + joins several in one, such as "
             "fog:60+blur:0.5 ([b]vslam perturb --list[/b]).",
-            rich_help_panel=METHOD,
         ),
     ] = "none,brightness",
     detectors: Annotated[
         str,
-        typer.Option(
-            metavar="NAMES",
-            help="Loop detectors, separated by commas; the first is the baseline.",
-            rich_help_panel=METHOD,
-        ),
+        option(METHOD, "NAMES", "Loop detectors, separated by commas; the first is the baseline."),
     ] = "bow,both",
     weights: Weights = None,
     seeds: Seeds = 3,
@@ -82,9 +79,7 @@ def bench(
     jobs: Jobs = 1,
     threads: ThreadsOfRun = None,
     scheduler: Scheduler = None,
-    out: Annotated[
-        Path, typer.Option(metavar="FOLDER", help="Folder to write to.", rich_help_panel=OUTPUT)
-    ] = Path("bench"),
+    out: Annotated[Path, option(OUTPUT, "FOLDER", "Folder to write to.")] = Path("bench"),
     quiet: Quiet = False,
 ) -> None:
     """Compare loop detectors on sequences under perturbations."""

@@ -13,6 +13,7 @@ from vslam.cli.options import (
     OUTPUT,
     Thresholds,
     open_given,
+    option,
     read_thresholds,
     reads_source,
     require_data,
@@ -41,11 +42,11 @@ def doctor(
     config: Thresholds = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="HTML page to write; replaces an earlier one.",
-            show_default="doctor.html, or doctor-2.html and so on",
-            rich_help_panel=OUTPUT,
+        option(
+            OUTPUT,
+            "FILE",
+            "HTML page to write; replaces an earlier one.",
+            unset="doctor.html, or doctor-2.html and so on",
         ),
     ] = None,
 ) -> None:

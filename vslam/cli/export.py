@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.cli.options import INPUT, OUTPUT, Quiet
+from vslam.cli.options import INPUT, OUTPUT, Quiet, flag, option
 from vslam.errors import InputError, counted
 
 if TYPE_CHECKING:
@@ -34,20 +34,10 @@ RunOrFile = Annotated[
 ]
 Data = Annotated[
     str | None,
-    typer.Option(
-        metavar="DATA",
-        help="Where the images of the run are now.",
-        show_default="where the run read them",
-        rich_help_panel=INPUT,
-    ),
+    option(INPUT, "DATA", "Where the images of the run are now.", unset="where the run read them"),
 ]
 Link = Annotated[
-    bool,
-    typer.Option(
-        "--link",
-        help="Link the images of the data set in place of copies.",
-        rich_help_panel=OUTPUT,
-    ),
+    bool, flag(OUTPUT, "Link the images of the data set in place of copies.", "--link")
 ]
 
 
@@ -58,12 +48,12 @@ def register(app: typer.Typer) -> None:
 
 def _out(default: str) -> typer.models.OptionInfo:
     is_file = "." in default
-    return typer.Option(
+    return option(
+        OUTPUT,
+        "FILE" if is_file else "FOLDER",
+        f"{'File' if is_file else 'Folder'} to write{'' if is_file else ' to'}.",
         "--out",
-        metavar="FILE" if is_file else "FOLDER",
-        help=f"{'File' if is_file else 'Folder'} to write{'' if is_file else ' to'}.",
-        show_default=f"RUN/{default}",
-        rich_help_panel=OUTPUT,
+        unset=f"RUN/{default}",
     )
 
 
@@ -73,10 +63,7 @@ def colmap(
     data: Data = None,
     out: Annotated[Path | None, _out("colmap")] = None,
     text: Annotated[
-        bool,
-        typer.Option(
-            "--text", help="Write text files in place of binary ones.", rich_help_panel=OUTPUT
-        ),
+        bool, flag(OUTPUT, "Write text files in place of binary ones.", "--text")
     ] = False,
     link: Link = False,
     quiet: Quiet = False,
@@ -126,10 +113,10 @@ def ply(
     out: Annotated[Path | None, _out("landmarks.ply")] = None,
     colours: Annotated[
         bool,
-        typer.Option(
+        flag(
+            OUTPUT,
+            "Colour the landmarks from the images, which are otherwise not needed.",
             "--colours/--no-colours",
-            help="Colour the landmarks from the images, which are otherwise not needed.",
-            rich_help_panel=OUTPUT,
         ),
     ] = True,
     quiet: Quiet = False,
@@ -198,6 +185,48 @@ def euroc(
         write_euroc(file, trajectory)
     if not quiet:
         typer.echo(f"{target}: {counted(len(trajectory), 'pose')}")
+
+
+@commands.command(epilog="[b]Example[/b]\n  vslam export ros runs/latest")
+def ros(
+    run: Run,
+    out: Annotated[Path | None, _out("ros.mcap")] = None,
+    online: Annotated[
+        bool,
+        flag(
+            OUTPUT,
+            "Take the poses in the map as they were first estimated, so that map -> odom jumps at "
+            "loops as it did during the drive, in place of the final ones.",
+            "--online",
+        ),
+    ] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write odometry, transforms, path and landmarks as ROS 2 messages, in an MCAP file."""
+    import numpy as np
+
+    from vslam.maps.new_output import new_file
+    from vslam.maps.ros import frame_poses, save_bag
+    from vslam.maps.storage import load_map
+    from vslam.report.frame_table import read_covariances
+    from vslam.trajectory import read_trajectory
+
+    target = out or run / "ros.mcap"
+    if target.suffix != ".mcap":
+        raise InputError(f"--out {target}: ROS knows the format by the name; end it in .mcap.")
+    trajectory = read_trajectory(run / f"trajectory{'_causal' * online}.tum")
+    odometry = read_trajectory(run / "trajectory_odom.tum")
+    if not np.array_equal(odometry.timestamps, trajectory.timestamps):
+        raise InputError(f"{run}: its trajectories are of different frames; run again.")
+    poses = frame_poses(odometry, trajectory, read_covariances(run / "covariance.csv"))
+    xyz = np.empty((0, 3))
+    if (run / "map.npz").is_file():  # a run that only localises has no map of its own
+        map_ = load_map(run).map
+        xyz = map_.arrays.xyz[map_.living_landmarks()]
+    with new_file(target) as file:
+        save_bag(file, poses, trajectory, xyz)
+    if not quiet:
+        typer.echo(f"{target}: {counted(len(poses), 'pose')}, {counted(len(xyz), 'landmark')}")
 
 
 def _beside(run: Path, name: str) -> Path:

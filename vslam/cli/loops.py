@@ -20,6 +20,7 @@ from vslam.cli.options import (
     Seed,
     Weights,
     names_in,
+    option,
 )
 from vslam.errors import InputError, counted
 
@@ -34,8 +35,8 @@ _EXAMPLES = """
 [b]Examples[/b]
   vslam loops bench --detectors bow,capsule
   vslam loops bench --data "kitti:~/kitti\\[seq=00,truth=kitti00.mat]"
-  vslam loops bench --detectors capsule,alexnet --weights alexnet=alexnet.onnx
-  vslam loops bench --protocol online --detectors bow,capsule,ibow
+  vslam loops bench --detectors bow,capsule --weights capsule=capsule.onnx
+  vslam loops bench --protocol online --detectors bow,capsule
 """
 DATA = ("town:demo[seed=101]", "town:05[seed=102]", "town:demo[seed=103,aliased=1]")
 DRIVES = ("drive:05[seed=102]", "drive:demo[seed=103,aliased=1,every=5]")
@@ -58,77 +59,67 @@ def _group() -> None:
 def bench(
     protocol: Annotated[
         Literal["retrieval", "online"],
-        typer.Option(
-            metavar="retrieval|online",
-            help="[b]retrieval[/b] searches a gallery for every query; [b]online[/b] decides once "
+        option(
+            METHOD,
+            "retrieval|online",
+            "[b]retrieval[/b] searches a gallery for every query; [b]online[/b] decides once "
             "per image of a drive, searching the images before it.",
-            rich_help_panel=METHOD,
         ),
     ] = "retrieval",
     data: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="SOURCE",
-            help="Images: rendered places, [b]town:ROUTE\\[seed=101,aliased=1,places=150][/b], "
+        option(
+            INPUT,
+            "SOURCE",
+            "Images: rendered places, [b]town:ROUTE\\[seed=101,aliased=1,places=150][/b], "
             "or a source of [b]vslam train[/b]. With online: a rendered drive, "
             "[b]drive:ROUTE\\[seed=101,aliased=1,change=0.5,every=10][/b], kitti:DIR or "
             "fabmap:DIR. Repeat for more.",
-            show_default="three towns, or two drives",
-            rich_help_panel=INPUT,
+            unset="three towns, or two drives",
         ),
     ] = None,
     detectors: Annotated[
         str,
-        typer.Option(
-            metavar="NAMES",
-            help="Loop detectors, separated by commas; the first is the baseline.",
-            rich_help_panel=METHOD,
-        ),
+        option(METHOD, "NAMES", "Loop detectors, separated by commas; the first is the baseline."),
     ] = "bow,capsule,capsule-pruned",
     weights: Weights = None,
     perturb: Annotated[
         str,
-        typer.Option(
-            metavar="NAMES",
-            help="Changes of the query images: light, clipping, viewpoint, occlusion, noise, blur, "
+        option(
+            METHOD,
+            "NAMES",
+            "Changes of the query images: light, clipping, viewpoint, occlusion, noise, blur, "
             "change (rendered towns only), all.",
-            rich_help_panel=METHOD,
         ),
     ] = PERTURB,
     strengths: Annotated[
         str,
-        typer.Option(
-            metavar="NUMBERS",
-            help="Strengths of these changes, from 0 to 1, separated by commas.",
-            rich_help_panel=METHOD,
-        ),
+        option(METHOD, "NUMBERS", "Strengths of these changes, from 0 to 1, separated by commas."),
     ] = STRENGTHS,
     window: Annotated[
         str,
-        typer.Option(
-            metavar="AGE",
-            help="With online: search images that are at least this much older than the query, in "
+        option(
+            METHOD,
+            "AGE",
+            "With online: search images that are at least this much older than the query, in "
             "seconds (20s) or images (200).",
-            rich_help_panel=METHOD,
         ),
     ] = WINDOW,
     seed: Seed = 0,
     threads: AllThreads = None,
-    out: Annotated[
-        Path, typer.Option(metavar="FOLDER", help="Folder to write to.", rich_help_panel=OUTPUT)
-    ] = Path("loops-bench"),
+    out: Annotated[Path, option(OUTPUT, "FOLDER", "Folder to write to.")] = Path("loops-bench"),
     quiet: Quiet = False,
 ) -> None:
     """Measure precision and recall of loop detectors on images of places or drives."""
     from vslam.lab.loopbench.conditions import parse_conditions
+    from vslam.lab.loopbench.detectors import require_comparable
     from vslam.lab.loopbench.online import parse_window
-    from vslam.lab.loopbench.registry import require_comparable
     from vslam.loopclosure.registry import parse_weights
 
     names = names_in(detectors)
     files = parse_weights(weights or [], names)
     for name in names or [""]:
-        require_comparable(name, files.get(name), protocol)
+        require_comparable(name, files.get(name))
     conditions, youngest = parse_conditions(perturb, strengths), parse_window(window)
     if protocol == "online" and (perturb, strengths, seed) != (PERTURB, STRENGTHS, 0):
         raise InputError(
@@ -177,11 +168,11 @@ def _on_drives(
 ) -> str:
     """Measure in the online protocol of the literature; returns what was measured on."""
     from vslam.datasets.synthetic import store
+    from vslam.lab.loopbench.detectors import open_scorer
     from vslam.lab.loopbench.drives import open_drives
     from vslam.lab.loopbench.measure_online import measure_drive
-    from vslam.lab.loopbench.registry import online_detector
 
-    starts = [online_detector(one, asked.files.get(one), asked.vocabulary) for one in asked.names]
+    scorers = [open_scorer(one, asked.files.get(one), asked.vocabulary) for one in asked.names]
     threads, bar = asked.threads, asked.progress_bar
     drives = [
         drive
@@ -190,10 +181,7 @@ def _on_drives(
     ]
     scores: list[OnlineScore] = []
     for drive in drives:
-        scores += measure_drive(
-            drive, starts, window, asked.vocabulary,
-            threads=threads, progress_bar=bar,
-        )  # fmt: skip
+        scores += measure_drive(drive, scorers, window, asked.vocabulary, threads=threads)
         write(online=scores)
     return counted(len(drives), "drive")
 
@@ -210,14 +198,11 @@ def _on_sets(
     from vslam.cli.console import console
     from vslam.datasets.synthetic import store
     from vslam.lab.loopbench.cost import cost
-    from vslam.lab.loopbench.detectors import DetectorSet
+    from vslam.lab.loopbench.detectors import DetectorSet, open_scorer
     from vslam.lab.loopbench.measure import measure
-    from vslam.lab.loopbench.registry import comparable_scorer
     from vslam.lab.loopbench.sets import open_set
 
-    scorers = [
-        comparable_scorer(one, asked.files.get(one), asked.vocabulary) for one in asked.names
-    ]
+    scorers = [open_scorer(one, asked.files.get(one), asked.vocabulary) for one in asked.names]
     threads, bar = asked.threads, asked.progress_bar
     sets = [
         found

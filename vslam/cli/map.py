@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.cli.options import METHOD, OUTPUT, Quiet, Thresholds, read_thresholds
+from vslam.cli.options import METHOD, OUTPUT, Quiet, Thresholds, option, read_thresholds
 from vslam.errors import InputError, ResultsError, counted
 
 if TYPE_CHECKING:
@@ -27,12 +27,7 @@ commands = typer.Typer(
     no_args_is_help=True,
 )
 
-Out = Annotated[
-    Path,
-    typer.Option(
-        metavar="FILE", help="Map to write; it must not exist yet.", rich_help_panel=OUTPUT
-    ),
-]
+Out = Annotated[Path, option(OUTPUT, "FILE", "Map to write; it must not exist yet.")]
 MapFile = Annotated[Path, typer.Argument(metavar="MAP", help="Folder of a run, or a map.npz.")]
 
 
@@ -124,11 +119,7 @@ def merge(
     config: Thresholds = None,
     weights: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="ONNX file of the network of the detector that made the maps.",
-            rich_help_panel=METHOD,
-        ),
+        option(METHOD, "FILE", "ONNX file of the network of the detector that made the maps."),
     ] = None,
     quiet: Quiet = False,
 ) -> None:

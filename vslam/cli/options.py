@@ -28,12 +28,8 @@ def _with_plugins(names: tuple[str, ...], group: str) -> tuple[str, ...]:
 _DATASETS = _with_plugins(("kitti", "euroc", "tum", "synthetic"), plugins.READERS)
 _SOURCES = ("images", "video", "bag", "camera")
 DETECTOR_NAMES = _with_plugins(
-    (
-        "none", "bow", "both", "capsule", "capsule-pruned", "capsule-paper", "alexnet", "vgg16",
-        "darknet19", "googlenet", "mobilenet", "squeezenet", "pcanet",
-    ),
-    plugins.DETECTORS,
-)  # fmt: skip
+    ("none", "bow", "both", "capsule", "capsule-pruned", "capsule-paper"), plugins.DETECTORS
+)
 if TYPE_CHECKING:
     SourceName = str
     DetectorName = str
@@ -43,94 +39,81 @@ else:  # installed packages add names
 # Panels of --help.
 INPUT, METHOD, MAP, OUTPUT, EXECUTION = "Input", "Method", "Map", "Output", "Execution"
 
+
+def option(
+    panel: str, metavar: str, text: str, *names: str, unset: str | bool = True, **more: Any
+) -> Any:
+    """An option in a panel of ``--help``; ``unset`` says what it means to leave it out."""
+    return typer.Option(
+        *names, metavar=metavar, help=text, show_default=unset, rich_help_panel=panel, **more
+    )
+
+
+def flag(panel: str, text: str, *names: str) -> Any:
+    """An option without a value."""
+    return typer.Option(*names, help=text, rich_help_panel=panel)
+
+
 Perturb = Annotated[
     str,
-    typer.Option(
-        metavar="LAWS",
-        help="Perturbations, each with a strength, such as [b]fog:60,blur:0.5[/b]; [b]vslam "
+    option(
+        METHOD,
+        "LAWS",
+        "Perturbations, each with a strength, such as [b]fog:60,blur:0.5[/b]; [b]vslam "
         "perturb --list[/b] shows them all.",
-        rich_help_panel=METHOD,
     ),
 ]
-Seed = Annotated[
-    int,
-    typer.Option(min=0, metavar="N", help="Seed of the random numbers.", rich_help_panel=METHOD),
-]
+Seed = Annotated[int, option(METHOD, "N", "Seed of the random numbers.", min=0)]
 Thresholds = Annotated[
     str | None,
-    typer.Option(
-        "--config",
-        metavar="FILE|NAME=VALUE",
-        help="Thresholds: a JSON file, such as the config.json of a run, or values separated by "
+    option(
+        METHOD,
+        "FILE|NAME=VALUE",
+        "Thresholds: a JSON file, such as the config.json of a run, or values separated by "
         "commas, such as orb.n_features=1000 (docs/reference/thresholds.md).",
-        rich_help_panel=METHOD,
+        "--config",
     ),
 ]
 Weights = Annotated[
     list[str] | None,
-    typer.Option(
-        metavar="NAME=FILE",
-        help="Weights of a detector in place of the shipped ones; repeat for more.",
-        rich_help_panel=METHOD,
+    option(
+        METHOD, "NAME=FILE", "Weights of a detector in place of the shipped ones; repeat for more."
     ),
 ]
-Seeds = Annotated[
-    int,
-    typer.Option(
-        min=1, metavar="N", help="Seeds of each random perturbation.", rich_help_panel=METHOD
-    ),
-]
+Seeds = Annotated[int, option(METHOD, "N", "Seeds of each random perturbation.", min=1)]
 Jobs = Annotated[
     int,
-    typer.Option(
-        min=1,
-        metavar="N",
-        help="Runs at a time. Only with 1 are the frames per second comparable.",
-        rich_help_panel=EXECUTION,
+    option(
+        EXECUTION, "N", "Runs at a time. Only with 1 are the frames per second comparable.", min=1
     ),
 ]
 Threads = Annotated[
     int | None,
-    typer.Option(
+    option(
+        EXECUTION,
+        "N",
+        "Threads; they do not change the result.",
         min=1,
-        metavar="N",
-        help="Threads; they do not change the result.",
-        show_default="all cores, at most 4",
-        rich_help_panel=EXECUTION,
+        unset="all cores, at most 4",
     ),
 ]
 AllThreads = Annotated[
     int | None,
-    typer.Option(
-        min=1,
-        metavar="N",
-        help="Threads; they do not change the result.",
-        show_default="all cores",
-        rich_help_panel=EXECUTION,
-    ),
+    option(EXECUTION, "N", "Threads; they do not change the result.", min=1, unset="all cores"),
 ]
 ThreadsOfRun = Annotated[
     int | None,
-    typer.Option(
-        min=1,
-        metavar="N",
-        help="Threads of each run.",
-        show_default="the cores shared by --jobs, at most 4",
-        rich_help_panel=EXECUTION,
+    option(
+        EXECUTION, "N", "Threads of each run.", min=1, unset="the cores shared by --jobs, at most 4"
     ),
 ]
 Scheduler = Annotated[
     str | None,
-    typer.Option(
-        metavar="ADDRESS",
-        help="Dask scheduler, such as tcp://HOST:8786, whose workers do the runs.",
-        rich_help_panel=EXECUTION,
+    option(
+        EXECUTION, "ADDRESS", "Dask scheduler, such as tcp://HOST:8786, whose workers do the runs."
     ),
 ]
-Quiet = Annotated[
-    bool,
-    typer.Option("--quiet", help="Show no progress and no summary.", rich_help_panel=OUTPUT),
-]
+Quiet = Annotated[bool, flag(OUTPUT, "Show no progress and no summary.", "--quiet")]
 SensorName = Literal["stereo", "mono", "rgbd"]
 ViewerName = Literal["native", "web"]
 AlignmentName = Literal["se3", "sim3", "none"]
@@ -155,108 +138,105 @@ def kitti_root() -> str:
 
 def sequences(default: str) -> Any:
     """The option ``--seqs`` of a command whose default is ``default``."""
-    return typer.Option(
-        metavar="LIST",
-        help="Sequences of a data set, such as 00-05 or 00,demo.",
-        show_default=f"{default}; the only one of EuRoC and TUM",
-        rich_help_panel=INPUT,
+    return option(
+        INPUT,
+        "LIST",
+        "Sequences of a data set, such as 00-05 or 00,demo.",
+        unset=f"{default}; the only one of EuRoC and TUM",
     )
 
 
 def _source_options(
     source: Annotated[
         str | None,
-        typer.Argument(help="What to read; the same as [b]--data[/b].", show_default=False),
+        typer.Argument(
+            help="What to read; the same as [b]--data[/b].",
+            show_default=False,
+            rich_help_panel=INPUT,
+        ),
     ] = None,
     data: Annotated[
         str | None,
-        typer.Option(
-            metavar="DATA",
-            help="Data set, folder of images, video, bag, or a camera's number or URL "
+        option(
+            INPUT,
+            "DATA",
+            "Data set, folder of images, video, bag, or a camera's number or URL "
             "(docs/howto/sources.md).",
-            show_default="$KITTI_ROOT, else data/kitti",
+            unset="$KITTI_ROOT, else data/kitti",
         ),
     ] = None,
     dataset: Annotated[
         SourceName | None,
-        typer.Option(
-            metavar="KIND",
-            help=f"Kind of data: {', '.join((*_DATASETS, *_SOURCES))}.",
-            show_default="detected from the files",
+        option(
+            INPUT,
+            "KIND",
+            f"Kind of data: {', '.join((*_DATASETS, *_SOURCES))}.",
+            unset="detected from the files",
         ),
     ] = None,
     seq: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME",
-            help="Sequence of a data set.",
-            show_default="00; the only one of EuRoC and TUM",
-        ),
+        option(INPUT, "NAME", "Sequence of a data set.", unset="00; the only one of EuRoC and TUM"),
     ] = None,
     calib: Annotated[
         list[Path] | None,
-        typer.Option(
-            metavar="FILE",
-            help="Calibration of the cameras (docs/howto/cameras.md). Give it twice for one file "
+        option(
+            INPUT,
+            "FILE",
+            "Calibration of the cameras (docs/howto/cameras.md). Give it twice for one file "
             "per camera, the left one first.",
         ),
     ] = None,
     right: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER", help="Right images; [b]--data[/b] then names the left ones."
-        ),
+        option(INPUT, "FOLDER", "Right images; [b]--data[/b] then names the left ones."),
     ] = None,
     depth: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER", help="Depth images; [b]--data[/b] then names the grey or colour ones."
-        ),
+        option(INPUT, "FOLDER", "Depth images; [b]--data[/b] then names the grey or colour ones."),
     ] = None,
     fps: Annotated[
         float | None,
-        typer.Option(metavar="NUMBER", help="Frames per second where the data has no time stamps."),
+        option(INPUT, "NUMBER", "Frames per second where the data has no time stamps."),
     ] = None,
     side_by_side: Annotated[
-        bool,
-        typer.Option("--side-by-side", help="Each image holds the left and the right one."),
+        bool, flag(INPUT, "Each image holds the left and the right one.", "--side-by-side")
     ] = False,
     topics: Annotated[
         str,
-        typer.Option(
-            metavar="LEFT,RIGHT",
-            help="Image topics of a bag: one for mono, COLOUR,DEPTH for RGB-D.",
-        ),
+        option(INPUT, "LEFT,RIGHT", "Image topics of a bag: one for mono, COLOUR,DEPTH for RGB-D."),
     ] = "",
     depth_scale: Annotated[
         float | None,
-        typer.Option(
-            metavar="NUMBER",
-            help="Value of a depth pixel at one metre.",
-            show_default="from the calibration, data set or encoding",
+        option(
+            INPUT,
+            "NUMBER",
+            "Value of a depth pixel at one metre.",
+            unset="from the calibration, data set or encoding",
         ),
     ] = None,
     sensor: Annotated[
         SensorName | None,
-        typer.Option(
-            metavar="stereo|mono|rgbd",
-            help="Images to use. With [b]mono[/b], the left ones alone, the scale is arbitrary.",
-            show_default="all that the data has",
+        option(
+            INPUT,
+            "stereo|mono|rgbd",
+            "Images to use. With [b]mono[/b], the left ones alone, the scale is arbitrary.",
+            unset="all that the data has",
         ),
     ] = None,
     mask: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE|FOLDER",
-            help="Image that is black where the left images are not to be used, or a folder of one "
-            "for each image (docs/howto/masks.md).",
+        option(
+            INPUT,
+            "FILE|FOLDER",
+            "Image that is black where the left images are not to be used, or a folder of one for "
+            "each image (docs/howto/masks.md).",
         ),
     ] = None,
-    start: Annotated[int, typer.Option(min=0, metavar="N", help="First frame.")] = 0,
-    every: Annotated[int, typer.Option(min=1, metavar="N", help="Use every N-th frame only.")] = 1,
+    start: Annotated[int, option(INPUT, "N", "First frame.", min=0)] = 0,
+    every: Annotated[int, option(INPUT, "N", "Use every N-th frame only.", min=1)] = 1,
     max_frames: Annotated[
-        int | None,
-        typer.Option(min=1, metavar="N", help="Stop after N frames.", show_default="all"),
+        int | None, option(INPUT, "N", "Stop after N frames.", min=1, unset="all")
     ] = None,
 ) -> SourceOptions:
     """The source that the options describe."""
@@ -292,8 +272,6 @@ def reads_source(
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         source = [p for p in _parameters(_source_options) if p.name not in without]
         own = [p for p in _parameters(command) if p.name != "given"]
-        for parameter in source:
-            parameter.annotation.__metadata__[0].rich_help_panel = INPUT
 
         def called(**values: Any) -> None:
             given = {parameter.name: values.pop(parameter.name) for parameter in source}

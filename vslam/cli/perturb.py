@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vslam.cli.console import console
-from vslam.cli.options import OUTPUT, Perturb, Seed, open_given, reads_source
+from vslam.cli.options import OUTPUT, Perturb, Seed, flag, open_given, option, reads_source
 from vslam.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,21 +32,14 @@ def preview(
     given: SourceOptions,
     perturb: Perturb = "brightness",
     seed: Seed = 0,
-    frames: Annotated[
-        int,
-        typer.Option(
-            min=1, metavar="N", help="Number of frames, evenly spaced.", rich_help_panel=OUTPUT
-        ),
-    ] = 8,
-    out: Annotated[
-        Path, typer.Option(metavar="FILE", help="PNG file to write.", rich_help_panel=OUTPUT)
-    ] = Path("perturbation.png"),
+    frames: Annotated[int, option(OUTPUT, "N", "Number of frames, evenly spaced.", min=1)] = 8,
+    out: Annotated[Path, option(OUTPUT, "FILE", "PNG file to write.")] = Path("perturbation.png"),
     list_: Annotated[
         bool,
-        typer.Option(
+        flag(
+            OUTPUT,
+            "List the perturbations with their default strengths, and do nothing else.",
             "--list",
-            help="List the perturbations with their default strengths, and do nothing else.",
-            rich_help_panel=OUTPUT,
         ),
     ] = False,
 ) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vslam.cli.options import OUTPUT, Quiet
+from vslam.cli.options import OUTPUT, Quiet, flag, option
 from vslam.errors import counted
 
 _EXAMPLES = """
@@ -46,27 +46,17 @@ def report(
             show_default="the simplest detector",
         ),
     ] = None,
-    out: Annotated[
-        Path, typer.Option(metavar="FOLDER", help="Folder to write to.", rich_help_panel=OUTPUT)
-    ] = Path("report"),
+    out: Annotated[Path, option(OUTPUT, "FOLDER", "Folder to write to.")] = Path("report"),
     serve: Annotated[
         bool,
-        typer.Option(
+        flag(
+            OUTPUT,
+            "Write nothing, but serve a page of all runs on this machine until Ctrl-C.",
             "--serve",
-            help="Write nothing, but serve a page of all runs on this machine until Ctrl-C.",
-            rich_help_panel=OUTPUT,
         ),
     ] = False,
     port: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            max=65535,
-            metavar="N",
-            help="Port of [b]--serve[/b].",
-            show_default="any free one",
-            rich_help_panel=OUTPUT,
-        ),
+        int, option(OUTPUT, "N", "Port of [b]--serve[/b].", min=0, max=65535, unset="any free one")
     ] = 0,
     quiet: Quiet = False,
 ) -> None:

@@ -21,6 +21,8 @@ from vslam.cli.options import (
     Threads,
     Thresholds,
     ViewerName,
+    flag,
+    option,
     read_thresholds,
     reads_source,
 )
@@ -56,126 +58,78 @@ def run(
     seed: Seed = 0,
     detector: Annotated[
         DetectorName | None,
-        typer.Option(
-            metavar="NAME",
-            help="Loop detector: [b]both[/b] joins the capsule network and the bag of words, "
+        option(
+            METHOD,
+            "NAME",
+            "Loop detector: [b]both[/b] joins the capsule network and the bag of words, "
             f"[b]none[/b] closes no loops. Others: {_OTHER_DETECTORS}.",
-            show_default="both, or that of --map",
-            rich_help_panel=METHOD,
+            unset="both, or that of --map",
         ),
     ] = None,
     weights: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="ONNX file of the detector's network, written by [b]vslam train[/b].",
-            rich_help_panel=METHOD,
+        option(
+            METHOD, "FILE", "ONNX file of the detector's network, written by [b]vslam train[/b]."
         ),
     ] = None,
     local_weights: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="ONNX file of the local descriptors that verify loops.",
-            rich_help_panel=METHOD,
-        ),
+        Path | None, option(METHOD, "FILE", "ONNX file of the local descriptors that verify loops.")
     ] = None,
     config: Thresholds = None,
     compare: Annotated[
         str,
-        typer.Option(
-            metavar="NAMES",
-            help="Other loop detectors to run on the same frames, separated by commas, and to "
+        option(
+            METHOD,
+            "NAMES",
+            "Other loop detectors to run on the same frames, separated by commas, and to "
             "compare in one table.",
-            rich_help_panel=METHOD,
         ),
     ] = "",
-    map_file: Annotated[
-        Path | None,
-        typer.Option("--map", metavar="FILE", help="Continue this map.", rich_help_panel=MAP),
-    ] = None,
+    map_file: Annotated[Path | None, option(MAP, "FILE", "Continue this map.", "--map")] = None,
     localize: Annotated[
-        bool,
-        typer.Option(
-            "--localize", help="Track in the map without changing it.", rich_help_panel=MAP
-        ),
+        bool, flag(MAP, "Track in the map without changing it.", "--localize")
     ] = False,
     save_map: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Save the map to this file too, and replace what is there.",
-            rich_help_panel=MAP,
-        ),
+        option(MAP, "FILE", "Save the map to this file too, and replace what is there."),
     ] = None,
     autosave: Annotated[
-        float,
-        typer.Option(
-            min=0,
-            metavar="SECONDS",
-            help="Save the map this often; 0 saves it at the end only.",
-            rich_help_panel=MAP,
-        ),
+        float, option(MAP, "SECONDS", "Save the map this often; 0 saves it at the end only.", min=0)
     ] = 60.0,
     resume: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Continue a run that was interrupted.",
-            rich_help_panel=MAP,
-        ),
+        Path | None, option(MAP, "FOLDER", "Continue a run that was interrupted.")
     ] = None,
     threads: Threads = None,
     realtime: Annotated[
         bool,
-        typer.Option(
+        flag(
+            EXECUTION,
+            "Play the frames in real time and drop those that come too fast.",
             "--realtime",
-            help="Play the frames in real time and drop those that come too fast.",
-            rich_help_panel=EXECUTION,
         ),
     ] = False,
     view: Annotated[
         ViewerName | None,
-        typer.Option(
-            metavar="native|web",
-            help="Show the run live in Rerun, in a window or in a browser on this machine.",
-            rich_help_panel=OUTPUT,
+        option(
+            OUTPUT,
+            "native|web",
+            "Show the run live in Rerun, in a window or in a browser on this machine.",
         ),
     ] = None,
     keep_open: Annotated[
-        bool,
-        typer.Option(
-            "--keep-open",
-            help="Keep the page of [b]--view web[/b] open until Ctrl-C.",
-            rich_help_panel=OUTPUT,
-        ),
+        bool, flag(OUTPUT, "Keep the page of [b]--view web[/b] open until Ctrl-C.", "--keep-open")
     ] = False,
     out: Annotated[
-        Path,
-        typer.Option(
-            metavar="FOLDER", help="Folder that gets a folder for each run.", rich_help_panel=OUTPUT
-        ),
+        Path, option(OUTPUT, "FOLDER", "Folder that gets a folder for each run.")
     ] = Path("runs"),
     record: Annotated[
-        bool,
-        typer.Option(
-            "--record/--no-record",
-            help="Write a Rerun recording, or none.",
-            rich_help_panel=OUTPUT,
-        ),
+        bool, flag(OUTPUT, "Write a Rerun recording, or none.", "--record/--no-record")
     ] = True,
     pages: Annotated[
         bool,
-        typer.Option(
-            "--report/--no-report",
-            help="Write a report with figures, or report.json alone.",
-            rich_help_panel=OUTPUT,
-        ),
+        flag(OUTPUT, "Write a report with figures, or report.json alone.", "--report/--no-report"),
     ] = True,
-    ply: Annotated[
-        bool,
-        typer.Option("--ply", help="Write the landmarks as map.ply.", rich_help_panel=OUTPUT),
-    ] = False,
+    ply: Annotated[bool, flag(OUTPUT, "Write the landmarks as map.ply.", "--ply")] = False,
     quiet: Quiet = False,
 ) -> None:
     """Run SLAM on a sequence and write trajectory, map, recording and report to a folder."""
@@ -244,27 +198,21 @@ _BESIDE_RESUME = {"resume", "record", "view", "keep_open", "pages", "ply", "save
 
 def _refuse_beside_resume(context: typer.Context) -> None:
     """Refuse options beside ``--resume``: the run continues with its own."""
-    for option in context.command.params:
-        source = context.get_parameter_source(option.name or "")
+    for one in context.command.params:
+        source = context.get_parameter_source(one.name or "")
         given = source is not None and source.name == "COMMANDLINE"
-        if given and option.name not in _BESIDE_RESUME:
+        if given and one.name not in _BESIDE_RESUME:
             raise InputError(
-                f"{option.opts[0]}: a resumed run continues with its own options; leave it out."
+                f"{one.opts[0]}: a resumed run continues with its own options; leave it out."
             )
 
 
 def _compared(names: str, detector: str) -> tuple[str, ...]:
     """The detectors of ``--compare``, without repetitions."""
     from vslam.loopclosure.registry import require_detector
-    from vslam.loopclosure.siamese.weights import NETWORKS, SHIPPED
 
     found = tuple(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
     for name in found:
-        if name in NETWORKS and not (SHIPPED / f"{name}.onnx").exists():
-            raise InputError(
-                f"--compare {name}: vslam ships no weights for it; name it with --detector and "
-                "--weights, and compare it with another."
-            )
         require_detector(name, option="--compare")
     if detector in found:
         raise InputError(

@@ -24,6 +24,7 @@ from vslam.cli.options import (
     kind_of_source,
     names_in,
     open_given,
+    option,
     reads_source,
     sequences,
 )
@@ -60,116 +61,84 @@ def stress(
     seqs: Annotated[str | None, sequences("00")] = None,
     laws: Annotated[
         str,
-        typer.Option(
-            metavar="NAMES",
-            help="Perturbations to test, without strengths ([b]vslam perturb --list[/b]).",
-            rich_help_panel=METHOD,
+        option(
+            METHOD,
+            "NAMES",
+            "Perturbations to test, without strengths ([b]vslam perturb --list[/b]).",
         ),
     ] = "all",
     detectors: Annotated[
-        str,
-        typer.Option(
-            metavar="NAMES",
-            help="Loop detectors of vslam, separated by commas.",
-            rich_help_panel=METHOD,
-        ),
+        str, option(METHOD, "NAMES", "Loop detectors of vslam, separated by commas.")
     ] = "both",
     systems: Annotated[
         str,
-        typer.Option(
-            metavar="NAMES",
-            help="Systems to test: [b]vslam[/b], [b]orbslam3[/b] and those of --system.",
-            rich_help_panel=METHOD,
+        option(
+            METHOD, "NAMES", "Systems to test: [b]vslam[/b], [b]orbslam3[/b] and those of --system."
         ),
     ] = "vslam",
     system: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME=COMMAND",
-            help="Another system: a command that reads {folder}, in KITTI's format, and writes "
+        option(
+            METHOD,
+            "NAME=COMMAND",
+            "Another system: a command that reads {folder}, in KITTI's format, and writes "
             "{out} (docs/howto/stress.md).",
-            rich_help_panel=METHOD,
         ),
     ] = None,
     orbslam3_python: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Python interpreter that has pyorbslam3.",
-            show_default="this one",
-            rich_help_panel=METHOD,
-        ),
+        option(METHOD, "FILE", "Python interpreter that has pyorbslam3.", unset="this one"),
     ] = None,
     vocabulary: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Vocabulary of ORB-SLAM3, in DBoW2's text format.",
-            rich_help_panel=METHOD,
-        ),
+        Path | None, option(METHOD, "FILE", "Vocabulary of ORB-SLAM3, in DBoW2's text format.")
     ] = None,
     preset: Annotated[
         Literal["kitti-c"] | None,
-        typer.Option(
-            metavar="kitti-c",
-            help="Test the fixed severities of a published benchmark in place of --laws.",
-            rich_help_panel=METHOD,
+        option(
+            METHOD,
+            "kitti-c",
+            "Test the fixed severities of a published benchmark in place of --laws.",
         ),
     ] = None,
     baseline: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME",
-            help="Detector or system whose errors are the unit of the errors with --preset.",
-            show_default="the first",
-            rich_help_panel=METHOD,
+        option(
+            METHOD,
+            "NAME",
+            "Detector or system whose errors are the unit of the errors with --preset.",
+            unset="the first",
         ),
     ] = None,
     seeds: Seeds = 3,
     steps: Annotated[
-        int,
-        typer.Option(
-            min=1,
-            max=10,
-            metavar="N",
-            help="Bisection steps of each search.",
-            rich_help_panel=METHOD,
-        ),
+        int, option(METHOD, "N", "Bisection steps of each search.", min=1, max=10)
     ] = 5,
     max_lost: Annotated[
         float,
-        typer.Option(
+        option(
+            _FAILURE,
+            "PERCENT",
+            "A run fails if it loses more than this share of its frames.",
             min=0.0,
-            metavar="PERCENT",
-            help="A run fails if it loses more than this share of its frames.",
-            rich_help_panel=_FAILURE,
         ),
     ] = 5.0,
     ate_factor: Annotated[
         float,
-        typer.Option(
+        option(
+            _FAILURE,
+            "NUMBER",
+            "A run fails if its ATE exceeds that of the clean run by this factor.",
             min=1.0,
-            metavar="NUMBER",
-            help="A run fails if its ATE exceeds that of the clean run by this factor.",
-            rich_help_panel=_FAILURE,
         ),
     ] = 3.0,
     ate_least: Annotated[
-        float,
-        typer.Option(
-            min=0.0,
-            metavar="METRES",
-            help="An ATE below this one is never a failure.",
-            rich_help_panel=_FAILURE,
-        ),
+        float, option(_FAILURE, "METRES", "An ATE below this one is never a failure.", min=0.0)
     ] = 0.25,
     config: Thresholds = None,
     jobs: Jobs = 1,
     threads: ThreadsOfRun = None,
     scheduler: Scheduler = None,
-    out: Annotated[
-        Path, typer.Option(metavar="FOLDER", help="Folder to write to.", rich_help_panel=OUTPUT)
-    ] = Path("stress"),
+    out: Annotated[Path, option(OUTPUT, "FOLDER", "Folder to write to.")] = Path("stress"),
     quiet: Quiet = False,
 ) -> None:
     """Find the strength of each perturbation at which a run fails."""

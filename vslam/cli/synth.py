@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vslam.cli.options import OUTPUT, Quiet, Threads
+from vslam.cli.options import OUTPUT, Quiet, Threads, flag, option
 from vslam.errors import InputError, counted
 
 _EXAMPLES = """
@@ -35,145 +35,95 @@ def synth(
     ] = "",
     trajectory: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Poses in KITTI's format, 10 per second, to drive along.",
-            rich_help_panel=_DRIVE,
-        ),
+        option(_DRIVE, "FILE", "Poses in KITTI's format, 10 per second, to drive along."),
     ] = None,
     calibration: Annotated[
         str,
-        typer.Option(
-            metavar="00-02|03|04-12",
-            help="Use the cameras of these KITTI sequences with --trajectory.",
-            rich_help_panel=_DRIVE,
+        option(
+            _DRIVE, "00-02|03|04-12", "Use the cameras of these KITTI sequences with --trajectory."
         ),
     ] = "00-02",
     max_frames: Annotated[
         int | None,
-        typer.Option(
+        option(
+            _DRIVE,
+            "N",
+            "Stop after N frames; a later command can render the others.",
             min=1,
-            metavar="N",
-            help="Stop after N frames; a later command can render the others.",
-            show_default="all",
-            rich_help_panel=_DRIVE,
+            unset="all",
         ),
     ] = None,
-    seed: Annotated[
-        int,
-        typer.Option(min=0, metavar="N", help="Seed of the random numbers.", rich_help_panel=_TOWN),
-    ] = 0,
+    seed: Annotated[int, option(_TOWN, "N", "Seed of the random numbers.", min=0)] = 0,
     aliased: Annotated[
-        bool,
-        typer.Option(
-            "--aliased",
-            help="Repeat a few facades, so that places look alike.",
-            rich_help_panel=_TOWN,
-        ),
+        bool, flag(_TOWN, "Repeat a few facades, so that places look alike.", "--aliased")
     ] = False,
-    dynamic: Annotated[
-        int,
-        typer.Option(min=0, metavar="N", help="Number of moving cars.", rich_help_panel=_TOWN),
-    ] = 0,
+    dynamic: Annotated[int, option(_TOWN, "N", "Number of moving cars.", min=0)] = 0,
     change: Annotated[
         float,
-        typer.Option(
+        option(
+            _TOWN,
+            "0-1",
+            "How much the town changes between two passes; above 0.7 it grows dark.",
             min=0,
             max=1,
-            metavar="0-1",
-            help="How much the town changes between two passes; above 0.7 it grows dark.",
-            rich_help_panel=_TOWN,
         ),
     ] = 0.0,
     depth: Annotated[
-        bool,
-        typer.Option(
-            "--depth",
-            help="Also write 16-bit depth images in centimetres.",
-            rich_help_panel=OUTPUT,
-        ),
+        bool, flag(OUTPUT, "Also write 16-bit depth images in centimetres.", "--depth")
     ] = False,
     side_by_side: Annotated[
         Path | None,
-        typer.Option(
-            metavar="VIDEO",
-            help="Also write a lossless video with both images in each frame, and its calibration.",
-            rich_help_panel=OUTPUT,
+        option(
+            OUTPUT,
+            "VIDEO",
+            "Also write a lossless video with both images in each frame, and its calibration.",
         ),
     ] = None,
     fisheye: Annotated[
         bool,
-        typer.Option(
+        flag(
+            OUTPUT,
+            "Write unrectified fisheye images in EuRoC's layout, with Kalibr's camchain.yaml.",
             "--fisheye",
-            help="Write unrectified fisheye images in EuRoC's layout, with Kalibr's camchain.yaml.",
-            rich_help_panel=OUTPUT,
         ),
     ] = False,
     rgbd: Annotated[
         bool,
-        typer.Option(
+        flag(
+            OUTPUT,
+            "Write images with depth in TUM's layout, and the stereo pairs beside them.",
             "--rgbd",
-            help="Write images with depth in TUM's layout, and the stereo pairs beside them.",
-            rich_help_panel=OUTPUT,
         ),
     ] = False,
     pairs: Annotated[
         int,
-        typer.Option(
-            min=0,
-            metavar="N",
-            help="Render N labelled pairs of images to train on, and no sequence.",
-            rich_help_panel=_PAIRS,
+        option(
+            _PAIRS, "N", "Render N labelled pairs of images to train on, and no sequence.", min=0
         ),
     ] = 0,
     lateral: Annotated[
         str,
-        typer.Option(
-            metavar="LOW:HIGH",
-            help="Metres that the second view is moved to the right; -3.2 is the other lane.",
-            rich_help_panel=_PAIRS,
+        option(
+            _PAIRS,
+            "LOW:HIGH",
+            "Metres that the second view is moved to the right; -3.2 is the other lane.",
         ),
     ] = "-1.4:1.4",
     heading: Annotated[
-        str,
-        typer.Option(
-            metavar="LOW:HIGH",
-            help="Degrees that the second view is turned to either side.",
-            rich_help_panel=_PAIRS,
-        ),
+        str, option(_PAIRS, "LOW:HIGH", "Degrees that the second view is turned to either side.")
     ] = "0:14",
     out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Folder to write to.",
-            show_default="the user's cache",
-            rich_help_panel=OUTPUT,
-        ),
+        Path | None, option(OUTPUT, "FOLDER", "Folder to write to.", unset="the user's cache")
     ] = None,
     list_: Annotated[
         bool,
-        typer.Option(
-            "--list",
-            help="List the routes and what has been rendered, and do nothing else.",
-            rich_help_panel=OUTPUT,
-        ),
+        flag(OUTPUT, "List the routes and what has been rendered, and do nothing else.", "--list"),
     ] = False,
     clean: Annotated[
-        bool,
-        typer.Option(
-            "--clean",
-            help="Remove what has been rendered, of ROUTE or of all routes.",
-            rich_help_panel=OUTPUT,
-        ),
+        bool, flag(OUTPUT, "Remove what has been rendered, of ROUTE or of all routes.", "--clean")
     ] = False,
     verify: Annotated[
-        bool,
-        typer.Option(
-            "--verify",
-            help="Compare all checksums and render damaged frames again.",
-            rich_help_panel=OUTPUT,
-        ),
+        bool, flag(OUTPUT, "Compare all checksums and render damaged frames again.", "--verify")
     ] = False,
     threads: Threads = None,
     quiet: Quiet = False,
@@ -221,11 +171,10 @@ def synth(
         if trajectory is None
         else route_of_poses(read_kitti_poses(trajectory), route, calibration)
     )
-    for option, given in (("--fisheye", fisheye), ("--rgbd", rgbd)):
+    for form, given in (("--fisheye", fisheye), ("--rgbd", rgbd)):
         if given and (depth or pairs or verify or fisheye == rgbd):
             raise InputError(
-                f"{option}: leave out --depth, --pairs and --verify, and one of --fisheye and "
-                "--rgbd."
+                f"{form}: leave out --depth, --pairs and --verify, and one of --fisheye and --rgbd."
             )
     variation = Variation(
         seed or town.seed, aliased or town.aliased, change or town.change, dynamic or town.moving

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 import typer
 
 from vslam.cli.export import commands as export
-from vslam.cli.options import EXECUTION, INPUT, METHOD, OUTPUT, AllThreads, Quiet
+from vslam.cli.options import EXECUTION, INPUT, METHOD, OUTPUT, AllThreads, Quiet, flag, option
 from vslam.errors import counted
 
 if TYPE_CHECKING:
@@ -44,22 +44,19 @@ def register(app: typer.Typer) -> None:
     app.command(epilog=_TRAIN_EXAMPLES)(train)
 
 
-NetworkName = Literal[
-    "capsule", "capsule-pruned", "capsule-paper", "alexnet", "vgg16", "darknet19", "googlenet",
-    "mobilenet", "squeezenet", "pcanet",
-]  # fmt: skip
+NetworkName = Literal["capsule", "capsule-pruned", "capsule-paper"]
 NETWORK_NAMES = get_args(NetworkName)
-PresetName = Literal["paper", "best", "pretrained", "rivals"]
+PresetName = Literal["paper", "best", "pretrained"]
 DeviceName = Literal["cpu", "cuda"]
 FitName = Literal["squash", "crop"]
 DataSources = Annotated[
     list[str],
-    typer.Option(
-        "--data",
-        metavar="KIND:PATH",
-        help="Source of images: kitti, fabmap, pairs, photos or pack, with options in brackets "
+    option(
+        INPUT,
+        "KIND:PATH",
+        "Source of images: kitti, fabmap, pairs, photos or pack, with options in brackets "
         "(docs/howto/training.md). Repeat for more.",
-        rich_help_panel=INPUT,
+        "--data",
     ),
 ]
 
@@ -76,117 +73,65 @@ def train(
     data: DataSources,
     preset: Annotated[
         PresetName,
-        typer.Option(
-            metavar="NAME",
-            help="Settings: [b]paper[/b] as published, [b]best[/b], [b]pretrained[/b], or "
-            "[b]rivals[/b], one recipe for all networks (docs/research/rivals.md).",
-            rich_help_panel=METHOD,
+        option(
+            METHOD,
+            "NAME",
+            "Settings: [b]paper[/b] as published, [b]best[/b], or [b]pretrained[/b], which "
+            "starts from ImageNet weights.",
         ),
     ] = "paper",
     settings: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="JSON file with settings in place of a preset.",
-            rich_help_panel=METHOD,
-        ),
+        Path | None, option(METHOD, "FILE", "JSON file with settings in place of a preset.")
     ] = None,
     epochs: Annotated[
         int | None,
-        typer.Option(
-            min=1,
-            metavar="N",
-            help="Greatest number of epochs.",
-            show_default="of the settings",
-            rich_help_panel=METHOD,
-        ),
+        option(METHOD, "N", "Greatest number of epochs.", min=1, unset="of the settings"),
     ] = None,
     pairs: Annotated[
         int | None,
-        typer.Option(
-            min=2,
-            metavar="N",
-            help="Pairs of images in each epoch.",
-            show_default="of the settings",
-            rich_help_panel=METHOD,
-        ),
+        option(METHOD, "N", "Pairs of images in each epoch.", min=2, unset="of the settings"),
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(
-            min=0,
-            metavar="N",
-            help="Seed of the random numbers.",
-            show_default="of the settings",
-            rich_help_panel=METHOD,
-        ),
+        option(METHOD, "N", "Seed of the random numbers.", min=0, unset="of the settings"),
     ] = None,
     weights: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Network to start from: the one to prune for capsule-pruned and capsule-paper, "
-            "a file of torchvision for alexnet and vgg16.",
-            rich_help_panel=METHOD,
+        option(
+            METHOD,
+            "FILE",
+            "Network to start from; for capsule-pruned and capsule-paper, the one to prune.",
         ),
     ] = None,
     pixels: Annotated[
-        str | None,
-        typer.Option(
-            metavar="SIDE|HxW",
-            help="Size of the images; smaller ones train faster.",
-            rich_help_panel=METHOD,
-        ),
+        str | None, option(METHOD, "SIDE|HxW", "Size of the images; smaller ones train faster.")
     ] = None,
     prune_share: Annotated[
         float | None,
-        typer.Option(
+        option(
+            METHOD,
+            "SHARE",
+            "Share of the capsules that pruning removes.",
             min=0.01,
             max=0.99,
-            metavar="SHARE",
-            help="Share of the capsules that pruning removes.",
-            show_default="of the settings",
-            rich_help_panel=METHOD,
+            unset="of the settings",
         ),
     ] = None,
     allow_test_data: Annotated[
         bool,
-        typer.Option(
-            "--allow-test-data",
-            help="Also train on the frames that are kept for testing.",
-            rich_help_panel=METHOD,
-        ),
+        flag(METHOD, "Also train on the frames that are kept for testing.", "--allow-test-data"),
     ] = False,
-    device: Annotated[
-        DeviceName,
-        typer.Option(metavar="cpu|cuda", help="Where to train.", rich_help_panel=EXECUTION),
-    ] = "cpu",
+    device: Annotated[DeviceName, option(EXECUTION, "cpu|cuda", "Where to train.")] = "cpu",
     threads: AllThreads = None,
     resume: Annotated[
-        bool,
-        typer.Option(
-            "--resume",
-            help="Continue from the checkpoint in [b]--out[/b].",
-            rich_help_panel=EXECUTION,
-        ),
+        bool, flag(EXECUTION, "Continue from the checkpoint in [b]--out[/b].", "--resume")
     ] = False,
     max_minutes: Annotated[
-        float | None,
-        typer.Option(
-            min=0,
-            metavar="NUMBER",
-            help="Stop after this time with a checkpoint.",
-            rich_help_panel=EXECUTION,
-        ),
+        float | None, option(EXECUTION, "NUMBER", "Stop after this time with a checkpoint.", min=0)
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Folder to write to.",
-            show_default="training/NETWORK-PRESET",
-            rich_help_panel=OUTPUT,
-        ),
+        option(OUTPUT, "FOLDER", "Folder to write to.", unset="training/NETWORK-PRESET"),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -198,16 +143,12 @@ def train(
     _require_libraries("train")
     from vslam.loopclosure.siamese.images import parse_size
     from vslam.loopclosure.siamese.source_registry import open_source
-    from vslam.loopclosure.training.branches import CapsuleBranch
     from vslam.loopclosure.training.data import load, refuse_test_data
     from vslam.loopclosure.training.runtime import set_threads
     from vslam.loopclosure.training.settings import PRESETS, load_settings
     from vslam.loopclosure.training.siamese import load_network
     from vslam.machine import available_cores
 
-    if network == "pcanet":
-        _refuse_of_pcanet({"--epochs": epochs, "--pairs": pairs, "--max-minutes": max_minutes,
-                           "--resume": resume or None})  # fmt: skip
     began = time.monotonic()
     sources = [source for spec in data for source in open_source(spec)]
     if not allow_test_data:
@@ -218,12 +159,7 @@ def train(
     chosen = chosen.model_copy(update={k: v for k, v in given.items() if v is not None})
     shape = chosen.shape
     if weights is not None and weights.suffix == ".safetensors" and settings is None:
-        given_network, _ = load_network(weights)
-        branch = given_network.branch
-        if isinstance(branch, CapsuleBranch):
-            shape = branch.shape
-        else:
-            shape = shape.with_layout(branch.layout)
+        shape = load_network(weights)[0].branch.shape
     if pixels is not None:
         shape = shape.for_images_of(parse_size(pixels))
     chosen = chosen.model_copy(update={"shape": shape})
@@ -263,16 +199,6 @@ def _require_libraries(command: str) -> None:
             )
 
 
-def _refuse_of_pcanet(given: dict[str, object]) -> None:
-    """Refuse options that need several steps of training; ``given`` has their values or None."""
-    from vslam.errors import InputError
-
-    for option in (name for name, value in given.items() if value is not None):
-        raise InputError(
-            f"vslam train pcanet: learns in one step, without epochs; leave out {option}."
-        )
-
-
 def _train(
     collection: Collection,
     settings: TrainSettings,
@@ -288,7 +214,6 @@ def _train(
 ) -> TrainingOutcome:
     from vslam.cli.console import console
     from vslam.loopclosure.training.checkpoint import CHECKPOINT
-    from vslam.loopclosure.training.component_training import learn_components
     from vslam.loopclosure.training.export import export_onnx
     from vslam.loopclosure.training.initial_network import starting_network
     from vslam.loopclosure.training.model_card import describe, write_card
@@ -300,15 +225,12 @@ def _train(
     )
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "settings.json").write_text(settings.model_dump_json(indent=1) + "\n")
-    if settings.network == "pcanet":
-        outcome = learn_components(collection, settings, folder, device=device)
-    else:
-        with console(shown=not quiet).training_bar() as on_step:
-            outcome = run(
-                collection, settings, folder, device=device, threads=threads, resume=resume,
-                start=start, on_step=on_step,
-                should_stop=None if until is None else lambda: time.monotonic() > until,
-            )  # fmt: skip
+    with console(shown=not quiet).training_bar() as on_step:
+        outcome = run(
+            collection, settings, folder, device=device, threads=threads, resume=resume,
+            start=start, on_step=on_step,
+            should_stop=None if until is None else lambda: time.monotonic() > until,
+        )  # fmt: skip
     if outcome.weights.exists():
         network, about = load_network(outcome.weights)
         export_onnx(network, outcome.weights.with_suffix(".onnx"), about)
@@ -321,20 +243,9 @@ def _train(
 
 @export.command("onnx", epilog=_EXPORT_EXAMPLES)
 def onnx(
-    weights: Annotated[
-        Path,
-        typer.Option(
-            metavar="FILE", help="Weights of a training, .safetensors.", rich_help_panel=INPUT
-        ),
-    ],
+    weights: Annotated[Path, option(INPUT, "FILE", "Weights of a training, .safetensors.")],
     out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="File to write.",
-            show_default="as --weights, with .onnx",
-            rich_help_panel=OUTPUT,
-        ),
+        Path | None, option(OUTPUT, "FILE", "File to write.", unset="as --weights, with .onnx")
     ] = None,
 ) -> None:
     """Write the ONNX file that runs use and compare its output with torch's."""
@@ -354,16 +265,8 @@ def onnx(
 
 @export.command("weights")
 def weights_(
-    weights: Annotated[
-        Path,
-        typer.Option(
-            metavar="FILE", help="Weights of a training, .safetensors.", rich_help_panel=INPUT
-        ),
-    ],
-    out: Annotated[
-        Path,
-        typer.Option(metavar="FILE", help="File to write, .safetensors.", rich_help_panel=OUTPUT),
-    ],
+    weights: Annotated[Path, option(INPUT, "FILE", "Weights of a training, .safetensors.")],
+    out: Annotated[Path, option(OUTPUT, "FILE", "File to write, .safetensors.")],
 ) -> None:
     """Write weights as vslam ships them: in half precision, with model card and ONNX file."""
     _require_libraries("export weights")
@@ -392,18 +295,10 @@ def places(
     data: DataSources,
     fit: Annotated[
         FitName,
-        typer.Option(
-            metavar="squash|crop",
-            help="Squash the whole image into a square, or crop its middle.",
-            rich_help_panel=OUTPUT,
-        ),
+        option(OUTPUT, "squash|crop", "Squash the whole image into a square, or crop its middle."),
     ] = "squash",
-    pixels: Annotated[
-        str, typer.Option(metavar="SIDE|HxW", help="Size of the images.", rich_help_panel=OUTPUT)
-    ] = "227",
-    out: Annotated[
-        Path, typer.Option(metavar="FILE", help="File to write.", rich_help_panel=OUTPUT)
-    ] = Path("places.npz"),
+    pixels: Annotated[str, option(OUTPUT, "SIDE|HxW", "Size of the images.")] = "227",
+    out: Annotated[Path, option(OUTPUT, "FILE", "File to write.")] = Path("places.npz"),
 ) -> None:
     """Pack images into one small file for training on another machine."""
     from vslam.loopclosure.siamese.images import parse_size

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.cli.options import OUTPUT, Quiet, Seed
+from vslam.cli.options import OUTPUT, Quiet, Seed, option
 from vslam.errors import InputError, UnreadableImageError, counted
 
 if TYPE_CHECKING:
@@ -46,10 +46,9 @@ def train(
         ),
     ] = 5,
     seed: Seed = 0,
-    out: Annotated[
-        Path,
-        typer.Option(metavar="FILE", help="File to write, .npz or .txt.", rich_help_panel=OUTPUT),
-    ] = Path("vocabulary.npz"),
+    out: Annotated[Path, option(OUTPUT, "FILE", "File to write, .npz or .txt.")] = Path(
+        "vocabulary.npz"
+    ),
     quiet: Quiet = False,
 ) -> None:
     """Train a vocabulary on images, preferably of many different places."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from collections.abc import Sequence as Several
 from pathlib import Path
+from typing import Any
 
 from vslam import plugins
 from vslam.datasets.frames import Source
@@ -43,63 +44,36 @@ def open_sequence(
     Raises:
         InputError: the data set is unknown, a package is broken, or as the reader says.
     """
+    chosen: dict[str, Any] = {
+        "start": start, "every": every, "max_frames": max_frames, "monocular": monocular
+    }  # fmt: skip
     if dataset == "kitti":
         from vslam.datasets.kitti import open_kitti, open_kitti_images
 
         name = _FIRST if name is None else name
         if not calib:
-            return open_kitti(
-                root, name, start=start, every=every, max_frames=max_frames, monocular=monocular
-            )
+            return open_kitti(root, name, **chosen)
         from vslam.calibration.files import read_calibration
         from vslam.datasets.rectified import rectified
 
-        images = open_kitti_images(
-            root, name, start=start, every=every, max_frames=max_frames, monocular=monocular
-        )
+        images = open_kitti_images(root, name, **chosen)
         return rectified(images, read_calibration(calib, images.sizes[0]))
     if dataset == "euroc":
         from vslam.datasets.euroc import open_euroc
 
-        return open_euroc(
-            root,
-            name,
-            start=start,
-            every=every,
-            max_frames=max_frames,
-            monocular=monocular,
-            calib=calib,
-        )
+        return open_euroc(root, name, calib=calib, **chosen)
     if dataset == "tum":
         from vslam.datasets.tum import open_tum
 
-        return open_tum(
-            root,
-            name,
-            start=start,
-            every=every,
-            max_frames=max_frames,
-            monocular=monocular,
-            calib=calib,
-            depth_scale=depth_scale,
-        )
+        return open_tum(root, name, calib=calib, depth_scale=depth_scale, **chosen)
     if dataset == "synthetic" and calib:
         raise InputError("--calib: a rendered town has its own cameras; leave it out.")
     if dataset == "synthetic":
         from vslam.datasets.synthetic import open_synthetic
 
-        return open_synthetic(
-            _FIRST if name is None else name,
-            start=start,
-            every=every,
-            max_frames=max_frames,
-            monocular=monocular,
-            on_frame=on_render,
-        )
-    source = open_plugin_source(
-        dataset, root, name, start=start, every=every, max_frames=max_frames, monocular=monocular,
-        calib=calib,
-    )  # fmt: skip
+        name = _FIRST if name is None else name
+        return open_synthetic(name, on_frame=on_render, **chosen)
+    source = open_plugin_source(dataset, root, name, calib=calib, **chosen)
     if not source.seekable:
         raise InputError(
             f"--dataset {dataset}: this is a stream, which cannot seek; open it with "
@@ -136,14 +110,9 @@ def open_plugin_source(
     from vslam.datasets.plugin_reader import open_plugin
 
     return open_plugin(
-        others[dataset],
-        Path(root),
-        name,
-        start=start,
-        every=every,
-        max_frames=max_frames,
-        monocular=monocular,
-    )
+        others[dataset], Path(root), name,
+        start=start, every=every, max_frames=max_frames, monocular=monocular,
+    )  # fmt: skip
 
 
 def known_datasets() -> tuple[str, ...]:

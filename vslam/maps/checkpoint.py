@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from vslam.features import PATCH_PIXELS, Features, KeyframePatches
 from vslam.loops import ResembledPlace, loop_entry, loop_of
 from vslam.map import Map
+from vslam.odometry import N_STATE
 from vslam.states import (
     Checkpoint,
     ClosingState,
@@ -68,6 +69,7 @@ def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
         },
         "mapper": {name: getattr(checkpoint.mapper, name) for name in _OF_MAPPER},
         "policy": asdict(checkpoint.policy),
+        "odometry": checkpoint.odometry,
         "rig": {"delay": checkpoint.rig.delay, "sides": checkpoint.rig.sides},
         "closing": {
             "places": [[sorted(one.keyframes), one.length, one.age] for one in consistency.places],
@@ -151,6 +153,7 @@ def checked_checkpoint(
             _count(policy["due"], -1),
         ),
         closing=_closing_of(entry["closing"], map_.n_keyframes),
+        odometry=tuple(_numbers(entry["odometry"], N_STATE).tolist()),
         rig=RigState(
             **{name: tuple(_numbers(entry["rig"][name]).tolist()) for name in ("delay", "sides")}
         ),

@@ -18,10 +18,15 @@ from vslam.evaluation.trajectories import Evaluation, evo_command
 from vslam.evaluation.worlds import world_of
 from vslam.maps.ply import save_ply
 from vslam.maps.storage import save_map
-from vslam.report.frame_table import write_frames
+from vslam.report.frame_table import write_covariances, write_frames
 from vslam.report.schema import ReportJson
 from vslam.report.summary import evaluate_run, summarize
-from vslam.run.outcome import RunOutcome, causal_trajectory, matched_ground_truth
+from vslam.run.outcome import (
+    RunOutcome,
+    causal_trajectory,
+    matched_ground_truth,
+    odometry_trajectory,
+)
 from vslam.trajectory import write_kitti, write_tum
 
 if TYPE_CHECKING:
@@ -91,7 +96,8 @@ def write_results(
     The most valuable files are written first, and one that fails does not affect the others:
     trajectories
     (``trajectory_kitti.txt``, ``trajectory.tum``, ``ground_truth_kitti.txt``, ``keyframes.tum``,
-    ``trajectory_causal.tum`` with the poses as they were given at the time,
+    ``trajectory_causal.tum`` with the poses as they were given at the time, ``covariance.csv`` with
+    their covariances, ``trajectory_odom.tum`` with those that never jump,
     ``trajectory_<detector>.tum`` of each detector compared), maps (``map.npz``, ``map.ply``),
     numbers (``frames.csv``, ``config.json``, read by ``--config``, and ``report.json``), and pages
     for people (``figures/*.png``, ``report.md`` and ``report.html``, one file that makes no
@@ -189,6 +195,10 @@ def _write_data(
         write_tum(file, outcome.keyframes)
     with written.file("trajectory_causal.tum") as file:
         write_tum(file, causal_trajectory(outcome.tracks))
+    with written.file("trajectory_odom.tum") as file:
+        write_tum(file, odometry_trajectory(outcome.tracks))
+    with written.file("covariance.csv") as file:
+        write_covariances(file, outcome.tracks)
     for other in outcome.compared:
         with written.file(f"trajectory_{_safe(other.settings.detector)}.tum") as file:
             write_tum(file, other.trajectory)

@@ -5,25 +5,91 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.errors import InputError
 from vslam.features import TrackResult
 from vslam.report.summary import stage_names
 
 _COUNTS = ("n_features", "n_stereo", "n_matches", "n_inliers")
+_SIGMAS = ("sigma_m", "sigma_deg", "drift_m", "drift_deg")
+_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 def write_frames(path: Path, tracks: list[TrackResult]) -> None:
-    """Write a row per frame: time (s), state, counts, keyframe or not, milliseconds of each stage.
+    """Write a row per frame: time (s), state, counts, keyframe or not, standard deviations of the
+    position (m) and the orientation (degrees) relative to the landmarks around the camera and to
+    the start of the drive, milliseconds of each stage.
 
-    The cell of a stage that a frame did not go through is empty.
+    The cell of a stage that a frame did not go through is empty, as are unknown deviations.
     """
     stages = stage_names(tracks)
     with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(
-            ["frame", "timestamp", "state", *_COUNTS, "keyframe", *(f"{s}_ms" for s in stages)]
+            ["frame", "timestamp", "state", *_COUNTS, "keyframe", *_SIGMAS]
+            + [f"{s}_ms" for s in stages]
         )
         for track in tracks:
             counts = [getattr(track, name) for name in _COUNTS]
             times = [f"{track.stage_ms[s]:.3f}" if s in track.stage_ms else "" for s in stages]
             row = [track.index, f"{track.timestamp:.6f}", track.state, *counts]
-            table.writerow([*row, int(track.is_keyframe), *times])
+            table.writerow([*row, int(track.is_keyframe), *_sigmas(track), *times])
+
+
+def _sigmas(track: TrackResult) -> list[str]:
+    if track.uncertainty is None:
+        return [""] * len(_SIGMAS)
+    deviations = []
+    for covariance in (track.uncertainty.near, track.uncertainty.covariance):
+        variances = np.diag(covariance)
+        deviations += [np.sqrt(variances[:3].sum()), np.degrees(np.sqrt(variances[3:].sum()))]
+    return [f"{deviation:.6f}" for deviation in deviations]
+
+
+def write_covariances(path: Path, tracks: list[TrackResult]) -> None:
+    """Write a row per frame whose covariances are known: time (s), then the upper triangles, row by
+    row, of the covariance relative to the landmarks around the camera (``local``) and to the start
+    of the drive (``drive``), of ``[x, y, z, rx, ry, rz]`` in metres and radians, in the frame of
+    the camera (``vslam.odometry``)."""
+    upper = np.triu_indices(6)
+    pairs = [f"{_AXES[row]}_{_AXES[column]}" for row, column in zip(*upper, strict=True)]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(
+            ["timestamp", *(f"{of}_{pair}" for of in ("local", "drive") for pair in pairs)]
+        )
+        for track in tracks:
+            if track.uncertainty is not None:
+                both = track.uncertainty.near, track.uncertainty.covariance
+                values = [f"{value:.6e}" for one in both for value in one[upper]]
+                table.writerow([f"{track.timestamp:.6f}", *values])
+
+
+def read_covariances(
+    path: Path,
+) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Read what ``write_covariances`` wrote: the two ``(6, 6)`` covariances of each frame, by its
+    time as the file has it.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    upper = np.triu_indices(6)
+    found = {}
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            for time, *values in list(csv.reader(file))[1:]:
+                both = np.zeros((2, 6, 6))
+                numbers = np.array(values, np.float64).reshape(2, len(upper[0]))
+                for matrix, triangle in zip(both, numbers, strict=True):
+                    matrix[upper] = matrix.T[upper] = triangle
+                found[time] = both[0], both[1]
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); name the folder of a run, or run again."
+        ) from error
+    except (ValueError, csv.Error) as error:
+        raise InputError(f"{path}: damaged ({error}); run again.") from error
+    return found

@@ -127,6 +127,14 @@ def causal_trajectory(tracks: list[TrackResult]) -> Trajectory:
     return Trajectory(times, np.array(poses, np.float64).reshape(-1, 4, 4))
 
 
+def odometry_trajectory(tracks: list[TrackResult]) -> Trajectory:
+    """The pose of each frame in the frame that never jumps (``TrackResult.T_odom_camera``)."""
+    known = [track for track in tracks if track.T_odom_camera is not None]
+    times = np.array([track.timestamp for track in known], np.float64)
+    poses = [track.T_odom_camera for track in known]
+    return Trajectory(times, np.array(poses, np.float64).reshape(-1, 4, 4))
+
+
 def ground_truth_of(source: Source) -> Trajectory | None:
     """The ground truth of all frames that have one; None if there is none."""
     if source.ground_truth is None:

@@ -162,6 +162,8 @@ class _Run:
     def __init__(self, slam: Slam, settings: RunSettings, before: Progress) -> None:
         self.slam, self.settings, self.before = slam, settings, before
         self.tracks = before.tracks.results()
+        if self.tracks:
+            slam.resume_odometry(self.tracks[-1])
         self.skipped = list(before.skipped)
         self.latency_ms = list(before.latency_ms)
         self.startup_s = process_age()

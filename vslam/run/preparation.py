@@ -74,8 +74,8 @@ def prepared_frames(
     frames: Iterator[TimedFrame],
     context: TrackingContext,
     threads: int,
-    begin: int,
-    next_extraction: Callable[[], int],
+    begin: int = 0,
+    next_extraction: Callable[[], int] = lambda: -1,
 ) -> Iterator[tuple[float, PreparedFrame]]:
     """Frames in order with their times; with more than one thread, prepared a few frames ahead."""
     if threads == 1:

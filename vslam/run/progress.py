@@ -19,11 +19,13 @@ from vslam.errors import InputError
 from vslam.features import TrackingState, TrackResult
 from vslam.loops import LoopCorrection, LoopEdge, loop_entry, loop_of
 from vslam.maps.new_output import replaced_file
+from vslam.odometry import N_NUMBERS, PoseUncertainty
 from vslam.untrusted import ARCHIVE_ERRORS, read_json, read_npz
 
 SCHEMA = 3
 _STATES = tuple(TrackingState)
-_POSE, _NUMBERS = 16, 7  # columns of a frame: its pose, then the other numbers
+_POSE, _NUMBERS = 16, 7 + 16 + N_NUMBERS  # columns of a frame: its pose, then the other numbers
+_UNKNOWN = np.full(N_NUMBERS, np.nan)
 
 
 @dataclass(frozen=True)
@@ -31,8 +33,9 @@ class TrackTable:
     """Tracking results of N frames, in order.
 
     Attributes:
-        rows: ``(N, 23)`` float64: ``T_wc`` row by row; time, state, features, stereo features,
-            matches, inliers, flags (1 keyframe, 2 relocalised).
+        rows: ``(N, 82)`` float64: ``T_wc`` row by row; time, state, features, stereo features,
+            matches, inliers, flags (1 keyframe, 2 relocalised);
+            ``T_odom_camera`` row by row; ``PoseUncertainty.numbers``. NaN where unknown.
         stages: names of the timed stages.
         stage_ms: ``(N, S)`` float64 milliseconds, NaN for a stage that a frame skipped.
     """
@@ -79,6 +82,9 @@ class TrackLog:
             track.timestamp, _STATES.index(track.state), track.n_features, track.n_stereo,
             track.n_matches, track.n_inliers, track.is_keyframe + 2 * track.relocalised,
         ))  # fmt: skip
+        T_odom, uncertainty = track.T_odom_camera, track.uncertainty
+        self._rows.extend(np.full(16, np.nan) if T_odom is None else T_odom.ravel())
+        self._rows.extend(_UNKNOWN if uncertainty is None else uncertainty.numbers())
         for name in track.stage_ms:
             if name not in self._stage_ms:
                 self._stage_ms[name] = array("d", [np.nan] * self._n)
@@ -234,7 +240,8 @@ def _checked_table(rows: NDArray, stages: list[str], stage_ms: NDArray) -> Track
 
 
 def _track(index: int, row: NDArray[np.float64], stage_ms: dict[str, float]) -> TrackResult:
-    timestamp, state, *counts, flags = row[_POSE:].tolist()
+    timestamp, state, *counts, flags = row[_POSE : -16 - N_NUMBERS].tolist()
+    T_odom, numbers = row[-16 - N_NUMBERS : -N_NUMBERS].reshape(4, 4), row[-N_NUMBERS:]
     n_features, n_stereo, n_matches, n_inliers = map(int, counts)
     return TrackResult(
         index=index,
@@ -248,4 +255,6 @@ def _track(index: int, row: NDArray[np.float64], stage_ms: dict[str, float]) -> 
         is_keyframe=bool(int(flags) & 1),
         relocalised=bool(int(flags) & 2),
         stage_ms={name: ms for name, ms in stage_ms.items() if np.isfinite(ms)},
+        T_odom_camera=T_odom if np.isfinite(T_odom).all() else None,
+        uncertainty=PoseUncertainty.of_numbers(numbers) if np.isfinite(numbers).all() else None,
     )

@@ -149,11 +149,14 @@ def compile_shares() -> None:
             process.wait()
 
 
+_FEATURES = TrackingConfig(method="orb")
+
+
 def run_everything() -> None:
     """Run SLAM on a few small images, each a keyframe, of a camera that slides along a textured
     wall. This reaches all branches of tracking, triangulation, fusion and bundle adjustment."""
     every_frame = KeyframeConfig(max_interval_s=0.05, merge_after_frames=1)
-    run_slam(Config(keyframes=every_frame), FRAMES)
+    run_slam(Config(keyframes=every_frame, tracking=_FEATURES), FRAMES)
     compile_patches()
     decode_image()
 
@@ -162,7 +165,7 @@ def compile_tracking() -> None:
     """Compile extraction, stereo, matching, pose and tracking by a SLAM run with one keyframe."""
     decode_image()
     no_other = KeyframeConfig(max_interval_s=1e9, max_tracked_ratio=1e-6, min_tracked_close=0)
-    run_slam(Config(keyframes=no_other), 3)
+    run_slam(Config(keyframes=no_other, tracking=_FEATURES), 3)
 
 
 def compile_patches() -> None:

@@ -13,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import OrbConfig
+from vslam.errors import InputError, did_you_mean
 from vslam.frontend.orb import extract
 from vslam.lab.loopbench.conditions import Image
 from vslam.lab.loopbench.node_matching import NodeIndex, index_nodes
 from vslam.loopclosure.bow_index import InvertedIndex
 from vslam.loopclosure.local_matching import DescriptorMaps
+from vslam.loopclosure.registry import DETECTORS, require_detector
 from vslam.loopclosure.vocabulary import Vocabulary, bow_vector
 
 if TYPE_CHECKING:
@@ -100,6 +102,25 @@ class BowScorer:
         ).astype(np.float64)
 
 
+def require_comparable(name: str, weights: Path | None) -> None:
+    """Refuse a detector that cannot be compared, before large packages are imported.
+
+    Raises:
+        InputError: the detector is unknown, or there are no weights for it.
+    """
+    if name == "none":
+        raise InputError("--detectors none: finds no loops; leave it out.")
+    if name == "both":
+        raise InputError("--detectors both: has no score of its own; name bow,capsule.")
+    if name not in DETECTORS:
+        known = [one for one in DETECTORS if one not in ("none", "both")]
+        raise InputError(
+            f"--detectors {name}: unknown{did_you_mean(name, known)}; choose from "
+            f"{', '.join(known)}."
+        )
+    require_detector(name, weights, "--detectors")
+
+
 def open_scorer(name: str, weights: Path | None, vocabulary: Vocabulary) -> Scorer:
     """``bow``, or one of the networks.
 
@@ -162,12 +183,7 @@ class DetectorSet:
     Most conditions share a gallery, so the data of the last few galleries are cached.
     """
 
-    def __init__(self, scorers: list[Scorer], vocabulary: Vocabulary | None, threads: int) -> None:
-        """
-        Args:
-            vocabulary: None if all scorers use images alone, so that no features are extracted.
-            threads: threads for the extraction of features.
-        """
+    def __init__(self, scorers: list[Scorer], vocabulary: Vocabulary, threads: int) -> None:
         self.scorers = tuple(scorers)
         self._vocabulary, self._threads = vocabulary, threads
         self.local = LocalDescriptorCache()
@@ -190,13 +206,4 @@ class DetectorSet:
 
     def describe(self, images: list[Image]) -> list[DescribedImage]:
         """See :func:`describe`."""
-        if self._vocabulary is None:
-            return [_without_features(image) for image in images]
         return describe(images, self._vocabulary, self._threads)
-
-
-def _without_features(image: Image) -> DescribedImage:
-    words = np.empty(0, np.int32)
-    return DescribedImage(
-        image, np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8), words, index_nodes(words)
-    )

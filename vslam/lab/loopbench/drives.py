@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vslam.errors import InputError
-from vslam.lab.loopbench.sets import ProgressBar
+from vslam.lab.loopbench.sets import ProgressBar, rendered_route
 from vslam.loopclosure.siamese.image_source import ImageSource
 from vslam.loopclosure.siamese.kitti_source import read_kitti
 from vslam.loopclosure.siamese.source_registry import open_source, split_spec
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from vslam.datasets.synthetic import Variation
 
 _ORDERED = ("kitti", "fabmap")  # kinds of sources with images in order
-_OPTIONS = {"seed": "101", "aliased": "0", "change": "0", "every": "10"}
 
 
 def open_drives(
@@ -34,7 +33,7 @@ def open_drives(
         InputError: ``spec`` is not a drive or has an unknown route or option, or the data is
             missing or malformed.
     """
-    kind, route, given = split_spec(spec)
+    kind = split_spec(spec)[0]
     if kind in _ORDERED:
         return open_source(spec)
     if kind != "drive":
@@ -42,19 +41,10 @@ def open_drives(
             f"--data {spec}: --protocol online needs drives; name drive:ROUTE, kitti:DIR or "
             "fabmap:DIR."
         )
-    from vslam.datasets.synthetic import ROUTES, Variation
+    from vslam.datasets.synthetic import Variation
 
-    options = {**_OPTIONS, **given}
-    if route not in ROUTES or set(options) != set(_OPTIONS):
-        raise InputError(
-            f"--data {spec}: must be drive:ROUTE with a route of {', '.join(ROUTES)} and options "
-            f"{', '.join(_OPTIONS)}."
-        )
-    try:
-        seed, aliased, every = (int(options[key]) for key in ("seed", "aliased", "every"))
-        change = float(options["change"])
-    except ValueError as error:
-        raise InputError(f"--data {spec}: an option is not a number.") from error
+    route, given = rendered_route(spec, {"seed": 101, "aliased": 0, "change": 0.0, "every": 10})
+    seed, aliased, change, every = given.values()
     if seed < 0 or every < 1 or not 0.0 <= change <= 1.0:
         raise InputError(
             f"--data {spec}: seed must be at least 0, every at least 1 and change from 0 to 1."

@@ -41,27 +41,19 @@ def measure(
     condition: Condition,
     detectors: DetectorSet,
     seed: int,
-    *,
-    descriptors_only: bool = False,
 ) -> tuple[list[Score], list[Gain]]:
-    """Measure all detectors on a set under a condition; empty if the set does not have it.
-
-    Args:
-        descriptors_only: skip verification and the intervals of differences.
-    """
+    """Measure all detectors on a set under a condition; empty if the set does not have it."""
     query_set = test_set.query_set(condition, seed)
     if query_set is None:
         return [], []
     queries = detectors.describe(query_set.queries)
     gallery, stored = detectors.gallery(query_set.gallery)
-    verify = None if descriptors_only else Verification(queries, gallery, detectors.local)
+    verify = Verification(queries, gallery, detectors.local)
     found = {one.name: one.scores(queries, stored[one.name]) for one in detectors.scorers}
     scores = [
         _score(test_set.title, condition, scorer, found[scorer.name], query_set, verify)
         for scorer in detectors.scorers
     ]
-    if descriptors_only:
-        return scores, []
     first, *others = found
     gains = [
         _gain(test_set.title, condition, first, other, found, query_set.relation)
@@ -76,7 +68,7 @@ def _score(
     scorer: Scorer,
     scores: Matrix,
     query_set: QuerySet,
-    verify: Verification | None,
+    verify: Verification,
 ) -> Score:
     known = query_set.relation != UNKNOWN
     same, score = query_set.relation[known] == SAME, scores[known]
@@ -93,17 +85,15 @@ def _score(
         _, found = _best_images(over_sequences, query_set.relation)
         sequence_right = float((found == SAME)[answerable].mean())
     right, wrong = (truth == SAME)[answerable], truth == DIFFERENT
-    verified = {}
-    if verify is not None:
-        orb = np.array([verify.by_orb(q, int(g)) for q, g in enumerate(best)])
-        learned = np.array([verify.by_learned(q, int(g)) for q, g in enumerate(best)])
-        verified = {
-            name: Verified(
-                right=float((accepted[answerable] & right).mean()),
-                wrong=int((accepted & wrong).sum()),
-            )
-            for name, accepted in (("orb", orb), ("learned", learned), ("both", orb | learned))
-        }
+    orb = np.array([verify.by_orb(q, int(g)) for q, g in enumerate(best)])
+    learned = np.array([verify.by_learned(q, int(g)) for q, g in enumerate(best)])
+    verified = {
+        name: Verified(
+            right=float((accepted[answerable] & right).mean()),
+            wrong=int((accepted & wrong).sum()),
+        )
+        for name, accepted in (("orb", orb), ("learned", learned), ("both", orb | learned))
+    }
     return Score(
         data=title,
         condition=condition.name,

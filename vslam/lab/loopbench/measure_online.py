@@ -7,12 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.lab.loopbench.detectors import LocalDescriptorCache, describe
+from vslam.lab.loopbench.detectors import LocalDescriptorCache, Scorer, describe
 from vslam.lab.loopbench.measure import Verification, drawn_points
 from vslam.lab.loopbench.online import Decisions, Window, decide, decision_curve, judge
-from vslam.lab.loopbench.registry import Start
 from vslam.lab.loopbench.schema import DecisionCurve, OnlineScore
-from vslam.lab.loopbench.sets import ProgressBar
 from vslam.loopclosure.precision_recall import PrecisionRecall, max_f1, recall_at_full_precision
 from vslam.loopclosure.siamese.image_source import ImageSource
 from vslam.loopclosure.vocabulary import Vocabulary
@@ -20,21 +18,19 @@ from vslam.loopclosure.vocabulary import Vocabulary
 
 def measure_drive(
     drive: ImageSource,
-    starts: Sequence[Start],
+    scorers: Sequence[Scorer],
     window: Window,
     vocabulary: Vocabulary,
     *,
     threads: int,
-    progress_bar: ProgressBar,
 ) -> list[OnlineScore]:
     """Measure all detectors on one drive.
 
     Args:
         drive: images in order.
-        starts: functions that start the detectors.
+        scorers: the detectors.
         window: the newest images, which are not searched.
         vocabulary: vocabulary of ``bow`` and of the features that verification matches.
-        progress_bar: opened for each detector.
 
     Raises:
         InputError: no image has a true match before the window.
@@ -45,10 +41,8 @@ def measure_drive(
     images = describe([drive.grey(k) for k in range(len(drive))], vocabulary, threads)
     verify = Verification(images, images, LocalDescriptorCache())
     scores = []
-    for start in starts:
-        detector = start(images)
-        with progress_bar(f"{drive.name}: {detector.name}", len(images)) as advance:
-            found = decide(detector, images, searchable, advance)
+    for scorer in scorers:
+        found = decide(scorer.scores(images, scorer.store(images)), searchable)
         by_orb, by_learned = np.zeros((2, len(images)), np.bool_)
         for k in np.flatnonzero(found.match >= 0):
             pair = int(k), int(found.match[k])
@@ -56,7 +50,7 @@ def measure_drive(
         kept = {"nothing": found, "orb": found.only(by_orb), "learned": found.only(by_learned),
                 "both": found.only(by_orb | by_learned)}  # fmt: skip
         scores += [
-            _score(drive, detector.name, window, by, decisions, searchable)
+            _score(drive, scorer.name, window, by, decisions, searchable)
             for by, decisions in kept.items()
         ]
     return scores

@@ -15,60 +15,14 @@ et al., IROS 2019). A match that verification rejects counts as no match at any 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError
-from vslam.lab.loopbench.detectors import DescribedImage, Scorer
 from vslam.loopclosure.precision_recall import PrecisionRecall
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME
-
-
-class Detection(NamedTuple):
-    """``match`` is the number of an earlier image; a higher ``score`` is more similar."""
-
-    match: int
-    score: float
-
-
-class OnlineDetector(Protocol):
-    """A detector on one drive. ``find`` is called with each image in order; ``add`` is called with
-    the same image later, when it is older than the window and may be found."""
-
-    name: str
-
-    def add(self, image: DescribedImage) -> None:
-        """Store an image; the first one is number 0."""
-
-    def find(self, image: DescribedImage) -> Detection | None:
-        """The most similar of the added images; None if there is none."""
-
-
-class ScoredDetector:
-    """Makes an online detector of a scorer: computes all scores of a drive at once, then returns
-    the highest among the added images for each query."""
-
-    def __init__(self, scorer: Scorer, images: list[DescribedImage]) -> None:
-        self.name = scorer.name
-        self._scores = scorer.scores(images, scorer.store(images))
-        self._added = self._asked = 0
-
-    def add(self, image: DescribedImage) -> None:
-        """See :class:`OnlineDetector`."""
-        self._added += 1
-
-    def find(self, image: DescribedImage) -> Detection | None:
-        """See :class:`OnlineDetector`."""
-        row = self._scores[self._asked, : self._added]
-        self._asked += 1
-        if not len(row):
-            return None
-        best = int(row.argmax())
-        return Detection(best, float(row[best]))
 
 
 @dataclass(frozen=True)
@@ -136,28 +90,17 @@ class Decisions:
         )
 
 
-def decide(
-    detector: OnlineDetector,
-    images: list[DescribedImage],
-    searchable: NDArray[np.int64],
-    on_image: Callable[[], None] = lambda: None,
-) -> Decisions:
-    """Run a new detector over a drive.
+def decide(scores: NDArray[np.float64], searchable: NDArray[np.int64]) -> Decisions:
+    """The most similar of the searchable images, for each image of a drive.
 
     Args:
+        scores: ``(N, N)`` similarities, a row for each query.
         searchable: ``(N,)``, see :meth:`Window.searchable`.
-        on_image: called after each image.
     """
-    match, score = np.full(len(images), -1, np.int64), np.full(len(images), -np.inf)
-    added = 0
-    for k, image in enumerate(images):
-        for old in images[added : searchable[k]]:
-            detector.add(old)
-        added = int(searchable[k])
-        found = detector.find(image)
-        if found is not None:
-            match[k], score[k] = found
-        on_image()
+    match, score = np.full(len(scores), -1, np.int64), np.full(len(scores), -np.inf)
+    for k in np.flatnonzero(searchable):
+        match[k] = scores[k, : searchable[k]].argmax()
+        score[k] = scores[k, match[k]]
     return Decisions(match, score)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,6 @@ ProgressBar = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
 """``(text, number)`` opens a bar; the function that it yields is called after each step."""
 
 _GAP = 50  # images of a drive just before a query, which are not searched
-_OPTIONS = {"seed": "0", "aliased": "0", "places": "150"}
 
 
 @dataclass(frozen=True)
@@ -67,24 +67,33 @@ def open_set(spec: str, cache: Path, *, threads: int, progress_bar: ProgressBar)
     Raises:
         InputError: unknown kind, route or option, or data that is missing or malformed.
     """
-    kind, route, given = split_spec(spec)
-    if kind != "town":
+    if split_spec(spec)[0] != "town":
         return [_images(source) for source in open_source(spec)]
-    from vslam.datasets.synthetic import ROUTES
-
-    options = {**_OPTIONS, **given}
-    if route not in ROUTES or set(options) != set(_OPTIONS):
-        raise InputError(
-            f"--data {spec}: must be town:ROUTE with a route of {', '.join(ROUTES)} and options "
-            f"{', '.join(_OPTIONS)}."
-        )
-    try:
-        seed, aliased, places = (int(options[key]) for key in _OPTIONS)
-    except ValueError as error:
-        raise InputError(f"--data {spec}: an option is not a number.") from error
+    route, given = rendered_route(spec, {"seed": 0, "aliased": 0, "places": 150})
+    seed, aliased, places = given.values()
     return [
         _town(route, seed, bool(aliased), places, cache, threads=threads, progress_bar=progress_bar)
     ]
+
+
+def rendered_route(spec: str, defaults: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """The route of ``KIND:ROUTE[options]``, and its options by name.
+
+    Raises:
+        InputError: the route or an option is unknown, or an option is not a number.
+    """
+    from vslam.datasets.synthetic import ROUTES
+
+    kind, route, given = split_spec(spec)
+    if route not in ROUTES or not set(given) <= set(defaults):
+        raise InputError(
+            f"--data {spec}: must be {kind}:ROUTE with a route of {', '.join(ROUTES)} and options "
+            f"{', '.join(defaults)}."
+        )
+    try:
+        return route, defaults | {name: type(defaults[name])(given[name]) for name in given}
+    except ValueError as error:
+        raise InputError(f"--data {spec}: an option is not a number.") from error
 
 
 def _images(source: ImageSource) -> TestSet:

@@ -1,0 +1,96 @@
+"""A node of ROS 2: rectified stereo images in, odometry and transforms out (README.md)."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+import rclpy
+from camera import camera_of
+from message_filters import ApproximateTimeSynchronizer, Subscriber
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from sensor_msgs.msg import CameraInfo, Image
+from tf2_msgs.msg import TFMessage
+
+from vslam import Slam
+from vslam.datasets.bag_messages import grey_of, stamp_of
+from vslam.maps.ros import FramePose, odometry_message, static_tf_message, tf_message
+
+TOPICS = {
+    "left/image_rect": Image,
+    "right/image_rect": Image,
+    "left/camera_info": CameraInfo,
+    "right/camera_info": CameraInfo,
+}
+MOST_WAITING = 5  # pairs; older ones are dropped where tracking takes longer than a frame
+APART_S = 0.005  # most that the stamps of a pair may differ by
+
+
+def message_type(name: str) -> Any:
+    """The class of a message, such as ``nav_msgs/msg/Odometry``."""
+    package, _, message = name.split("/")
+    return getattr(import_module(f"{package}.msg"), message)
+
+
+class SlamNode(Node):
+    """Tracks every pair of images, and publishes its pose with the stamp of the left image."""
+
+    def __init__(self) -> None:
+        super().__init__("vslam")
+        self.slam: Slam | None = None
+        self.before: FramePose | None = None
+        self.detector = self.declare_parameter("detector", "both").value
+        self.map_file = self.declare_parameter("save_map", "").value
+        self.odometry = self.create_publisher(Odometry, "odom", 10)
+        self.tf = self.create_publisher(TFMessage, "/tf", 100)
+        kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.static_tf = self.create_publisher(TFMessage, "/tf_static", kept)
+        subscribers = [
+            Subscriber(self, kind, topic, qos_profile=qos_profile_sensor_data)
+            for topic, kind in TOPICS.items()
+        ]
+        self.pairs = ApproximateTimeSynchronizer(subscribers, MOST_WAITING, APART_S)
+        self.pairs.registerCallback(self.track)
+
+    def track(self, left: Image, right: Image, *infos: CameraInfo) -> None:
+        """Track a pair, and publish its pose."""
+        stamp = stamp_of(left)
+        try:
+            if self.slam is None:
+                self.slam = Slam(camera_of(*infos), detector=self.detector)
+                self.static_tf.publish(static_tf_message(message_type, stamp))
+            result = self.slam.step(grey_of(left), grey_of(right), stamp / 1e9)
+        except ValueError as error:  # a wrong camera, or a clock that was set back
+            self.get_logger().warning(f"a pair of images is left out: {error}")
+            return
+        pose = FramePose.of(result, stamp)
+        self.odometry.publish(odometry_message(message_type, pose, self.before))
+        self.tf.publish(tf_message(message_type, pose))
+        self.before = pose
+
+    def close(self) -> None:
+        """Complete the map, and save it if a file was named."""
+        if self.slam is None:
+            return
+        self.slam.finish()
+        if self.map_file:
+            self.slam.save(self.map_file)
+
+
+def main() -> None:
+    rclpy.init()
+    node = SlamNode()
+    try:
+        rclpy.spin(node)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        node.close()
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()

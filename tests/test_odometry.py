@@ -1,0 +1,228 @@
+"""Odometry beside the map: poses that never jump, and covariances that hold what they promise."""
+
+from __future__ import annotations
+
+import csv
+import runpy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ring import Oracle
+from test_closing import DRIFTING, EXACT, ROUND, run
+from test_pose import CAMERA, TRUTH, observations
+
+from vslam.features import Extracted, TrackingState, TrackResult
+from vslam.frontend.pose import optimise_pose, pose_covariance
+from vslam.geometry import inverse, se3_exp, se3_log
+from vslam.odometry import (
+    CORRELATION,
+    DRIFT,
+    LOCAL,
+    Odometry,
+    PoseUncertainty,
+    adjoint,
+    relative_covariance,
+)
+from vslam.report.frame_table import write_covariances, write_frames
+from vslam.slam import Slam
+
+MOTION = se3_exp(np.array([0.1, -0.05, -1.0, 0.01, 0.05, -0.02]))
+
+
+def some_covariance(scale: float = 1.0, seed: int = 0) -> np.ndarray:
+    root = np.random.default_rng(seed).normal(size=(6, 6))
+    return scale * (root @ root.T + np.eye(6))
+
+
+def test_the_adjoint_carries_a_small_motion_to_the_other_side_of_a_pose():
+    xi = np.array([0.02, -0.01, 0.03, 0.01, -0.02, 0.015])
+    np.testing.assert_allclose(
+        se3_exp(adjoint(MOTION) @ xi) @ MOTION, MOTION @ se3_exp(xi), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("kind", ["mono", "mixed", "stereo"])
+@pytest.mark.parametrize("believed", [0.7, 1.0])
+def test_errors_of_a_pose_are_those_that_its_covariance_predicts(kind, believed):
+    """Also if the observations are better than their inverse variances say. If they are not, one in
+    twenty fails the test for inliers, which makes the residuals of the others smaller."""
+    squared = []
+    for seed in range(200):
+        points, uvr, weight = observations(kind, noise=believed, seed=seed)
+        T, inlier = optimise_pose(TRUTH, points, uvr, weight, CAMERA.intrinsics)
+        C = pose_covariance(T, points[inlier], uvr[inlier], weight[inlier], CAMERA.intrinsics)
+        xi = se3_log(TRUTH @ inverse(T))
+        squared.append(xi @ np.linalg.inv(C) @ xi / 6.0)
+    assert 0.8 < np.mean(squared) < (1.25 if believed < 1.0 else 1.4)
+
+
+def test_too_few_observations_have_no_covariance():
+    points, uvr, weight = observations("mixed")
+    few = pose_covariance(TRUTH, points[:2], uvr[:2], weight[:2], CAMERA.intrinsics)
+    assert np.isnan(few).all()
+
+
+def test_the_drift_grows_as_the_sum_of_correlated_steps_does():
+    rng = np.random.default_rng(2)
+    n = 12
+    steps = np.empty((20_000, n))
+    steps[:, 0] = rng.normal(size=len(steps))
+    for k in range(1, n):
+        noise = np.sqrt(1.0 - CORRELATION**2) * rng.normal(size=len(steps))
+        steps[:, k] = CORRELATION * steps[:, k - 1] + noise
+    still = PoseUncertainty(np.zeros((6, 6)), np.zeros((6, 6)), 0)
+    moved = PoseUncertainty(np.zeros((6, 6)), n * np.eye(6), n)
+    predicted = relative_covariance(still, moved, np.eye(4))[0, 0]
+    assert DRIFT * steps.sum(axis=1).var() == pytest.approx(predicted, rel=0.05)
+
+
+def test_the_drift_before_both_frames_does_not_count():
+    model = Odometry()
+    model.move(np.eye(4), 0.0, some_covariance())
+    model.keyframe()
+    first = model.now
+    model.move(MOTION, 0.1, some_covariance(2.0, 1))
+    A = adjoint(MOTION)
+    expected = LOCAL * (some_covariance(2.0, 1) + A @ some_covariance() @ A.T)
+    np.testing.assert_allclose(relative_covariance(first, model.now, MOTION), expected, atol=1e-9)
+    model.keyframe()
+    grown = relative_covariance(first, model.now, MOTION) - expected
+    np.testing.assert_allclose(grown, DRIFT * some_covariance(2.0, 1), atol=1e-9)
+    assert (np.linalg.eigvalsh(model.now.covariance - first.near) > 0).all()
+
+
+def test_a_pose_that_is_predicted_gets_less_sure_with_the_square_of_the_time():
+    model = Odometry()
+    model.move(np.eye(4), 0.0, some_covariance(1e-6))
+    deviations = []
+    for covariance in (None, None, np.full((6, 6), np.nan), None):
+        model.move(np.eye(4), 0.5, covariance)
+        deviations.append(np.sqrt(np.diag(model.now.local)))
+    ratio = np.array(deviations)[1:] / deviations[0]
+    np.testing.assert_allclose(ratio, np.array([4.0, 9.0, 16.0])[:, None] * np.ones(6), rtol=1e-3)
+    model.move(np.eye(4), 0.5, some_covariance(1e-6))
+    assert np.diag(model.now.local).max() < 1e-4
+
+
+def test_the_state_comes_back_equal():
+    one, other = Odometry(), Odometry()
+    for k in range(5):
+        one.move(MOTION, 0.1, some_covariance(1e-4, k) if k != 3 else None)
+        one.keyframe()
+    other.restore(one.state())
+    assert other.state() == one.state()
+    for model in (one, other):
+        model.move(MOTION, 0.1, None)
+    assert other.state() == one.state()
+
+
+def test_a_drive_gets_less_sure_where_it_is_lost_and_with_every_keyframe(corridor):
+    slam = Slam(corridor.camera, detector="none", threads=1)
+    noise = np.random.default_rng(0).integers(0, 256, corridor.left[0].shape, dtype=np.uint8)
+    results = []
+    for k, left in enumerate(corridor.left):
+        image = noise if k == 15 else left
+        results.append(slam.step(image, corridor.right[k], corridor.timestamps[k]))
+    deviation = [np.sqrt(np.diag(result.uncertainty.near)[:3].sum()) for result in results]
+    assert results[15].state == TrackingState.LOST
+    usual = np.array(deviation[2:15] + deviation[17:])
+    assert deviation[15] > 3.0 * usual.max()
+    assert 1e-4 < np.median(usual) < 0.05
+    drift = [
+        np.trace(result.uncertainty.covariance - result.uncertainty.near) for result in results
+    ]
+    made = np.array([result.is_keyframe for result in results])
+    assert (np.diff(drift)[made[1:]] > 0).all()
+    assert results[-1].uncertainty.n_keyframes == made.sum()
+
+
+NEES = runpy.run_path(
+    str(Path(__file__).parents[1] / "tools" / "experiments" / "uncertainty" / "nees.py")
+)
+
+
+@pytest.mark.parametrize("promised", [1.0, 0.25])
+def test_the_tool_finds_covariances_that_promise_too_much(promised):
+    """Errors of every frame, drawn with the variance that the covariance has, or four times it."""
+    rng = np.random.default_rng(0)
+    C = np.diag([1e-4, 1e-4, 4e-4, 1e-6, 1e-6, 1e-6])
+    truth, results = [], []
+    for k in range(600):
+        T_wc = se3_exp(np.array([0.0, 0.0, 0.8 * k, 0.0, 0.0, 0.0]))
+        error = se3_exp(np.sqrt(LOCAL) * rng.multivariate_normal(np.zeros(6), C))
+        sure = PoseUncertainty(promised * C, np.zeros((6, 6)), 0)
+        tracked = TrackResult(k, 0.1 * k, T_wc, TrackingState.OK, 0, 0, 0, 0, False)
+        truth.append(T_wc)
+        results.append(replace(tracked, T_odom_camera=T_wc @ error, uncertainty=sure))
+    nees = NEES["mean_nees"](results, np.array(truth), 1.0)
+    assert nees == pytest.approx(1.0 / promised, rel=0.2)
+
+
+def steps(poses: list[np.ndarray]) -> np.ndarray:
+    """Distance from each position to the next one, metres."""
+    return np.linalg.norm(np.diff([pose[:3, 3] for pose in poses], axis=0), axis=1)
+
+
+@pytest.mark.slow
+def test_a_loop_moves_the_map_and_not_the_odometry():
+    slam, results = run(DRIFTING, ROUND, Oracle(DRIFTING, ROUND))
+    assert slam.corrections
+    odom = steps([result.T_odom_camera for result in results])
+    assert odom.max() < 1.05 * np.median(odom)
+    corrections = steps([result.T_map_odom for result in results])
+    assert corrections.max() > 10.0 * np.median(corrections)
+    last = results[-1]
+    np.testing.assert_allclose(last.T_map_odom @ last.T_odom_camera, last.T_wc, atol=1e-9)
+
+
+def test_the_odometry_of_a_resumed_drive_continues_without_the_state_of_tracking(tmp_path):
+    slam, results = run(EXACT, [*range(30)])
+    slam.save(tmp_path / "map.npz")
+    again = Slam.load(tmp_path / "map.npz", detector="none", resume=True)
+    again.resume_odometry(results[-1])
+    image = np.zeros((1, 2), np.uint8)
+    last = again.step_features(Extracted(EXACT.see(30, 1)), 3.0, image)
+    assert last.state == TrackingState.OK
+    moved = np.linalg.norm(last.T_odom_camera[:3, 3] - results[-1].T_odom_camera[:3, 3])
+    assert moved == pytest.approx(steps([r.T_odom_camera for r in results])[-1], rel=0.1)
+    assert last.uncertainty.n_keyframes >= results[-1].uncertainty.n_keyframes
+
+
+def test_the_odometry_does_not_jump_where_the_camera_is_found_again():
+    lost = range(30, 36)
+    _, results = run(EXACT, [*range(50)], dark=lost)
+    assert all(results[k].state == TrackingState.LOST for k in lost)
+    odom = steps([result.T_odom_camera for result in results])
+    assert odom.max() < 1.2 * np.median(odom)
+    assert results[0].T_odom_camera is not None
+    np.testing.assert_array_equal(results[0].T_odom_camera, np.eye(4))
+
+
+def test_the_tables_hold_deviations_and_both_covariances(tmp_path):
+    sure = PoseUncertainty(some_covariance(1e-4), some_covariance(1e-3, 1), 3)
+    known = TrackResult(
+        0, 1.5, np.eye(4), TrackingState.OK, 9, 8, 7, 6, True, False, {}, uncertainty=sure
+    )
+    tracks = [known, replace(known, index=1, timestamp=1.6, uncertainty=None)]
+    write_frames(tmp_path / "frames.csv", tracks)
+    write_covariances(tmp_path / "covariance.csv", tracks)
+    with (tmp_path / "frames.csv").open(newline="") as file:
+        first, second = csv.DictReader(file)
+    assert float(first["sigma_m"]) == pytest.approx(np.sqrt(np.trace(sure.near[:3, :3])), abs=1e-6)
+    assert float(first["drift_deg"]) == pytest.approx(
+        np.degrees(np.sqrt(np.trace(sure.covariance[3:, 3:]))), abs=1e-6
+    )
+    assert second["sigma_m"] == second["drift_m"] == ""
+    with (tmp_path / "covariance.csv").open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert float(row["local_y_rz"]) == pytest.approx(sure.near[1, 5], rel=1e-5)
+    assert float(row["drive_x_x"]) == pytest.approx(sure.covariance[0, 0], rel=1e-5)
+
+
+def test_numbers_come_back_as_the_same_uncertainty():
+    sure = PoseUncertainty(some_covariance(), some_covariance(seed=1), 3)
+    again = PoseUncertainty.of_numbers(sure.numbers())
+    np.testing.assert_array_equal(again.numbers(), sure.numbers())
+    np.testing.assert_allclose(again.drift, sure.drift, atol=1e-12)

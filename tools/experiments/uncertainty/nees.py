@@ -1,0 +1,83 @@
+"""Compare the errors of odometry with the covariances that vslam gives: a row per drive.
+
+    python tools/experiments/uncertainty/nees.py DATA SEQ[:START[:FRAMES]] ... [--perturb LAW ...]
+
+DATA is a folder in KITTI's format with exact ground truth, such as a rendered one. Every drive runs
+under every law. The normalised estimation error squared (NEES; Bar-Shalom et al., Estimation with
+Applications to Tracking and Navigation, 2001, 5.4) of the motion over 1 s and 10 s, divided by its
+six degrees of freedom, has a mean of 1 if the covariances are right, and is larger if they promise
+too much.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from vslam.datasets import open_sequence
+from vslam.datasets.frames import Source
+from vslam.datasets.perturbation import parse_perturbation, perturbed
+from vslam.features import TrackResult
+from vslam.geometry import Matrix, inverse, orthonormalised, se3_log
+from vslam.odometry import relative_covariance
+from vslam.slam import Slam
+
+INTERVALS_S = (1.0, 10.0)
+SKIPPED = 20  # frames at the start, while the map is young
+EVERY = 7  # frames between the intervals' starts: neighbours have nearly the same error
+
+
+def results_of(source: Source, law: str, seed: int) -> list[TrackResult]:
+    """What tracking gave for every frame."""
+    slam = Slam(source.camera)
+    perturbation = parse_perturbation(law, seed).bound_to(source)
+    results = []
+    for frame in perturbed(source.frames(), perturbation):
+        left, right = frame.read(map)
+        results.append(slam.step(left, right, frame.timestamp))
+    slam.finish()
+    return results
+
+
+def mean_nees(results: list[TrackResult], truth: Matrix, interval_s: float) -> float:
+    """Mean NEES per degree of freedom of the motion over an interval."""
+    times = np.array([result.timestamp for result in results])
+    nees = []
+    for first in range(SKIPPED, len(results), EVERY):
+        last = int(np.searchsorted(times, times[first] + interval_s))
+        if last == len(results):
+            break
+        one, other = results[first], results[last]
+        T_last_first = inverse(other.T_odom_camera) @ one.T_odom_camera
+        T_true = inverse(truth[last]) @ truth[first]
+        xi = se3_log(orthonormalised(T_true @ inverse(T_last_first)))
+        C = relative_covariance(one.uncertainty, other.uncertainty, T_last_first)
+        nees.append(xi @ np.linalg.solve(C, xi) / 6.0)
+    return float(np.mean(nees))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("drives", nargs="+", metavar="SEQ[:START[:FRAMES]]")
+    parser.add_argument("--perturb", nargs="+", default=["none"], metavar="LAW")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    print("| drive | law | NEES over 1 s | NEES over 10 s |\n|---|---|---|---|")
+    rows = []
+    for drive in options.drives:
+        name, *part = drive.split(":")
+        start, frames = (*map(int, part), 0, 0)[:2]
+        source = open_sequence("kitti", options.data, name, start=start, max_frames=frames or None)
+        for law in options.perturb:
+            results = results_of(source, law, options.seed)
+            rows.append([mean_nees(results, source.ground_truth, s) for s in INTERVALS_S])
+            print(f"| {drive} | {law} | {rows[-1][0]:.2f} | {rows[-1][1]:.2f} |", flush=True)
+    one, ten = np.mean(rows, axis=0)
+    print(f"| mean | | {one:.2f} | {ten:.2f} |")
+
+
+if __name__ == "__main__":
+    main()

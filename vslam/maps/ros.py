@@ -1,0 +1,303 @@
+"""Messages of ROS 2 from poses and landmarks, and a bag of them, without ROS.
+
+The frames are those of REP 105: ``map`` -> ``odom`` -> ``base_link`` -> ``camera_optical``. Their
+axes are those of REP 103: in ``map``, ``odom`` and ``base_link`` x points ahead, y to the left and
+z up; in ``camera_optical``, as everywhere else in vslam, x points right, y down and z ahead.
+``base_link`` lies in the left camera, and ``map`` and ``odom`` in its first pose. Lengths are in
+metres, or in the unit of a monocular map.
+
+Each function takes ``types``, which returns the class of a message by its name: those of rosbags
+for files, those of ROS for a node (``examples/ros2``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.errors import InputError
+from vslam.features import TrackResult
+from vslam.geometry import Matrix, inverse, inverses, se3_log
+from vslam.odometry import adjoint
+from vslam.trajectory import Trajectory, quaternions
+
+MAP, ODOM, BASE, OPTICAL = "map", "odom", "base_link", "camera_optical"
+Types = Callable[[str], Any]
+
+T_BASE_OPTICAL = np.array(
+    [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+_LAST_SECOND = 2**31  # builtin_interfaces/Time counts seconds in 32 bits with a sign
+_FLOAT32 = 7  # sensor_msgs/PointField
+_VERSION: Literal[8] = 8  # of a bag: the one of ROS 2 Humble, which later releases read too
+# Topics, their types, and whether they get a single message, which late subscribers get too.
+TOPICS = {
+    "/tf_static": ("tf2_msgs/msg/TFMessage", True),
+    "/map_points": ("sensor_msgs/msg/PointCloud2", True),
+    "/path": ("nav_msgs/msg/Path", True),
+    "/tf": ("tf2_msgs/msg/TFMessage", False),
+    "/odom": ("nav_msgs/msg/Odometry", False),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FramePose:
+    """The pose of a frame, as ROS wants it.
+
+    Attributes:
+        stamp: nanoseconds.
+        T_odom_camera, T_map_odom: ``(4, 4)`` as in ``TrackResult``.
+        near, covariance: ``(6, 6)`` as in ``PoseUncertainty``; None if unknown.
+    """
+
+    stamp: int
+    T_odom_camera: Matrix
+    T_map_odom: Matrix
+    near: Matrix | None = None
+    covariance: Matrix | None = None
+
+    @classmethod
+    def of(cls, result: TrackResult, stamp: int) -> FramePose:
+        """The pose of a frame as ``Slam.step`` returned it. ``stamp`` is that of its image in
+        nanoseconds, because transforms are looked up by exact times, and seconds in float64 resolve
+        only 0.2 us of Unix time."""
+        known, T = result.uncertainty, result.T_odom_camera
+        return cls(
+            stamp,
+            result.T_wc if T is None else T,
+            result.T_map_odom,
+            None if known is None else known.near,
+            None if known is None else known.covariance,
+        )
+
+    @property
+    def T_odom_base(self) -> Matrix:
+        """``(4, 4)`` the pose of ``base_link``, with the axes of ROS."""
+        return in_ros_axes(self.T_odom_camera)
+
+
+def in_ros_axes(T: Matrix) -> Matrix:
+    """``(..., 4, 4)`` motions between camera frames as motions between frames with ROS's axes."""
+    moved: Matrix = T_BASE_OPTICAL @ T @ T_BASE_OPTICAL.T
+    return moved
+
+
+def odometry_message(types: Types, pose: FramePose, before: FramePose | None) -> Any:
+    """``nav_msgs/Odometry``: the pose of ``base_link`` in ``odom``, and its mean velocity, in
+    ``base_link``, since the frame ``before``; zero without one."""
+    twist, R = np.zeros(6), T_BASE_OPTICAL[:3, :3]
+    if before is not None:
+        motion = inverse(before.T_odom_base) @ pose.T_odom_base
+        twist = se3_log(motion) / _seconds_between(before, pose)
+    linear, angular = (_xyz(types, "Vector3", part) for part in (twist[:3], twist[3:]))
+    return types("nav_msgs/msg/Odometry")(
+        header=_header(types, pose.stamp, ODOM),
+        child_frame_id=BASE,
+        pose=types("geometry_msgs/msg/PoseWithCovariance")(
+            pose=_pose(types, pose.T_odom_base),
+            covariance=_covariance(pose.covariance, R @ pose.T_odom_camera[:3, :3]),
+        ),
+        twist=types("geometry_msgs/msg/TwistWithCovariance")(
+            twist=types("geometry_msgs/msg/Twist")(linear=linear, angular=angular),
+            covariance=_covariance(_velocity_covariance(pose, before), R),
+        ),
+    )
+
+
+def tf_message(types: Types, pose: FramePose) -> Any:
+    """``tf2_msgs/TFMessage`` with ``map`` -> ``odom`` and ``odom`` -> ``base_link``."""
+    transforms = [
+        _transform(types, pose.stamp, MAP, ODOM, in_ros_axes(pose.T_map_odom)),
+        _transform(types, pose.stamp, ODOM, BASE, pose.T_odom_base),
+    ]
+    return types("tf2_msgs/msg/TFMessage")(transforms=transforms)
+
+
+def static_tf_message(types: Types, stamp: int) -> Any:
+    """``tf2_msgs/TFMessage`` with ``base_link`` -> ``camera_optical``."""
+    transform = _transform(types, stamp, BASE, OPTICAL, T_BASE_OPTICAL)
+    return types("tf2_msgs/msg/TFMessage")(transforms=[transform])
+
+
+def path_message(types: Types, trajectory: Trajectory) -> Any:
+    """``nav_msgs/Path``: the poses of ``base_link`` in ``map``."""
+    stamps = [nanoseconds(timestamp) for timestamp in trajectory.timestamps.tolist()]
+    poses = [
+        types("geometry_msgs/msg/PoseStamped")(
+            header=_header(types, stamp, MAP), pose=_pose(types, T)
+        )
+        for stamp, T in zip(stamps, in_ros_axes(trajectory.T_wc), strict=True)
+    ]
+    return types("nav_msgs/msg/Path")(header=_header(types, stamps[0], MAP), poses=poses)
+
+
+def points_message(types: Types, stamp: int, xyz: NDArray[np.float64]) -> Any:
+    """``sensor_msgs/PointCloud2`` in ``map``, of ``(N, 3)`` points in the world of vslam."""
+    points = (xyz @ T_BASE_OPTICAL[:3, :3].T).astype("<f4")
+    fields = [
+        types("sensor_msgs/msg/PointField")(name=name, offset=4 * k, datatype=_FLOAT32, count=1)
+        for k, name in enumerate("xyz")
+    ]
+    return types("sensor_msgs/msg/PointCloud2")(
+        header=_header(types, stamp, MAP),
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=False,
+        point_step=12,
+        row_step=12 * len(points),
+        data=np.frombuffer(points.tobytes(), np.uint8),
+        is_dense=True,
+    )
+
+
+def nanoseconds(timestamp: float) -> int:
+    """A time in seconds as nanoseconds.
+
+    Raises:
+        InputError: ROS cannot express it.
+    """
+    if not 0 <= timestamp < _LAST_SECOND:
+        raise InputError(
+            f"ROS has no time {timestamp:.0f} s; give the images times between 0 and 2^31 seconds."
+        )
+    return round(1e9 * timestamp)
+
+
+def save_bag(
+    path: Path, poses: Sequence[FramePose], trajectory: Trajectory, xyz: NDArray[np.float64]
+) -> None:
+    """Write an MCAP file with the topics of ``TOPICS``, at least one pose.
+
+    Args:
+        trajectory: the poses of the path.
+        xyz: ``(N, 3)`` landmarks in the world of the trajectory.
+
+    Raises:
+        InputError: rosbags is not installed, or ROS cannot express a time of the trajectory.
+        OSError: the file cannot be written.
+    """
+    try:
+        from rosbags import interfaces as of
+        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.typesys import Stores, get_typestore
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"{path}: bags are written by rosbags, which is not installed; "
+            "pip install 'vslam[bag]'."
+        ) from error
+    for_ever = of.QosTime(9223372036, 854775807)
+    kept = of.Qos(
+        of.QosHistory.KEEP_LAST, 1, of.QosReliability.RELIABLE, of.QosDurability.TRANSIENT_LOCAL,
+        for_ever, for_ever, of.QosLiveliness.AUTOMATIC, for_ever, False,
+    )  # fmt: skip
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = store.types.__getitem__
+    with TemporaryDirectory(dir=path.parent) as folder:
+        bag = Path(folder) / "bag"
+        with Writer(bag, version=_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
+            topics = {
+                topic: writer.add_connection(
+                    topic, name, typestore=store, offered_qos_profiles=[kept] if once else []
+                )
+                for topic, (name, once) in TOPICS.items()
+            }
+
+            def write(topic: str, stamp: int, message: Any) -> None:
+                data = store.serialize_cdr(message, TOPICS[topic][0])
+                writer.write(topics[topic], stamp, data)
+
+            start = poses[0].stamp
+            write("/tf_static", start, static_tf_message(types, start))
+            write("/map_points", start, points_message(types, start, xyz))
+            write("/path", start, path_message(types, trajectory))
+            before = None
+            for pose in poses:
+                write("/tf", pose.stamp, tf_message(types, pose))
+                write("/odom", pose.stamp, odometry_message(types, pose, before))
+                before = pose
+        next(bag.glob("*.mcap")).replace(path)
+
+
+def frame_poses(
+    odometry: Trajectory, trajectory: Trajectory, covariances: dict[str, tuple[Matrix, Matrix]]
+) -> list[FramePose]:
+    """The poses of the frames of a run.
+
+    Args:
+        odometry, trajectory: ``T_odom_camera`` and ``T_map_camera`` of the same frames.
+        covariances: ``near`` and ``covariance`` by time (``read_covariances``).
+
+    Raises:
+        InputError: ROS cannot express the times.
+    """
+    times = odometry.timestamps.tolist()
+    corrections = trajectory.T_wc @ inverses(odometry.T_wc)
+    return [
+        FramePose(
+            nanoseconds(timestamp), *motions, *covariances.get(f"{timestamp:.6f}", (None, None))
+        )
+        for timestamp, *motions in zip(times, odometry.T_wc, corrections, strict=True)
+    ]
+
+
+def _covariance(matrix: Matrix | None, R: Matrix) -> NDArray[np.float64]:
+    """``(36,)`` a covariance of ``[x, y, z, rx, ry, rz]`` with the axes rotated by ``R``, row by
+    row; zeros, the convention of ``sensor_msgs`` for an unknown one, for None."""
+    if matrix is None:
+        return np.zeros(36)
+    both = np.kron(np.eye(2), R)
+    rotated: NDArray[np.float64] = (both @ matrix @ both.T).ravel()
+    return rotated
+
+
+def _velocity_covariance(pose: FramePose, before: FramePose | None) -> Matrix | None:
+    """``(6, 6)`` covariance of the mean velocity between two frames, in the frame of the camera.
+    Their errors relative to the landmarks are independent, and those of the landmarks cancel."""
+    if before is None or before.near is None or pose.near is None:
+        return None
+    A = adjoint(inverse(pose.T_odom_camera) @ before.T_odom_camera)
+    total: Matrix = (pose.near + A @ before.near @ A.T) / _seconds_between(before, pose) ** 2
+    return total
+
+
+def _seconds_between(before: FramePose, pose: FramePose) -> float:
+    return (pose.stamp - before.stamp) / 1e9
+
+
+def _header(types: Types, stamp: int, frame: str) -> Any:
+    seconds, rest = divmod(stamp, 10**9)
+    time = types("builtin_interfaces/msg/Time")(sec=seconds, nanosec=rest)
+    return types("std_msgs/msg/Header")(stamp=time, frame_id=frame)
+
+
+def _xyz(types: Types, name: str, xyz: NDArray[np.float64]) -> Any:
+    x, y, z = xyz.tolist()
+    return types(f"geometry_msgs/msg/{name}")(x=x, y=y, z=z)
+
+
+def _rotation(types: Types, T: Matrix) -> Any:
+    x, y, z, w = quaternions(T[None, :3, :3])[0].tolist()
+    return types("geometry_msgs/msg/Quaternion")(x=x, y=y, z=z, w=w)
+
+
+def _pose(types: Types, T: Matrix) -> Any:
+    return types("geometry_msgs/msg/Pose")(
+        position=_xyz(types, "Point", T[:3, 3]), orientation=_rotation(types, T)
+    )
+
+
+def _transform(types: Types, stamp: int, parent: str, child: str, T: Matrix) -> Any:
+    return types("geometry_msgs/msg/TransformStamped")(
+        header=_header(types, stamp, parent),
+        child_frame_id=child,
+        transform=types("geometry_msgs/msg/Transform")(
+            translation=_xyz(types, "Vector3", T[:3, 3]), rotation=_rotation(types, T)
+        ),
+    )

@@ -131,6 +131,7 @@ RULES = {
         )
     ),
     "docs/howto/kitti.md": Rules(),
+    "docs/howto/masks.md": Rules(),
     "docs/howto/tum.md": Rules(),
     "docs/howto/untrusted.md": Rules((("--inputs 1000", "--inputs 2 --readers trajectory"),)),
     "docs/howto/lifelong.md": Rules(
@@ -398,6 +399,11 @@ def _videos(desk: Path, corridor) -> None:
     write_video(desk / "drive.mp4", pairs)
 
 
+def _video_and_mask(desk: Path, corridor) -> None:
+    _videos(desk, corridor)
+    cv2.imwrite("hood.png", np.pad(np.full((110, 480), 255, np.uint8), ((0, 50), (0, 0))))
+
+
 def _depth_sources(desk: Path, corridor) -> None:
     """Images in ``FOLDER``, a bag with depth."""
     c = corridor.camera
@@ -472,6 +478,7 @@ PREPARE: dict[str, Callable[[Path, object], None]] = {
     "docs/howto/bench.md": _earlier_run,
     "docs/howto/calibrate.md": _videos,
     "docs/explanation/design.md": _image,
+    "docs/howto/masks.md": _video_and_mask,
     "docs/howto/rgbd.md": _depth_sources,
     "docs/howto/sources.md": _pair_sources,
     "docs/howto/stress.md": _another_system,

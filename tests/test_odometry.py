@@ -13,6 +13,10 @@ from ring import Oracle
 from test_closing import DRIFTING, EXACT, ROUND, run
 from test_pose import CAMERA, TRUTH, observations
 
+from vslam.config import Config
+from vslam.datasets import open_sequence
+from vslam.datasets.perturbation import Perturbation
+from vslam.evaluation.odometry import motion_errors
 from vslam.features import Extracted, TrackingState, TrackResult
 from vslam.frontend.pose import optimise_pose, pose_covariance
 from vslam.geometry import inverse, se3_exp, se3_log
@@ -25,8 +29,13 @@ from vslam.odometry import (
     adjoint,
     relative_covariance,
 )
+from vslam.report.figures import draw_figures
 from vslam.report.frame_table import write_covariances, write_frames
+from vslam.run.outcome import RunSettings, matched_ground_truth
+from vslam.run.pipeline import run_sequence
+from vslam.run.recorder import Recorder
 from vslam.slam import Slam
+from vslam.trajectory import Trajectory
 
 MOTION = se3_exp(np.array([0.1, -0.05, -1.0, 0.01, 0.05, -0.02]))
 
@@ -156,7 +165,8 @@ def test_the_tool_finds_covariances_that_promise_too_much(promised):
         tracked = TrackResult(k, 0.1 * k, T_wc, TrackingState.OK, 0, 0, 0, 0, False)
         truth.append(T_wc)
         results.append(replace(tracked, T_odom_camera=T_wc @ error, uncertainty=sure))
-    nees = NEES["mean_nees"](results, np.array(truth), 1.0)
+    times = np.array([result.timestamp for result in results])
+    nees = NEES["mean_nees"](results, Trajectory(times, np.array(truth)), 1.0)
     assert nees == pytest.approx(1.0 / promised, rel=0.2)
 
 
@@ -226,3 +236,17 @@ def test_numbers_come_back_as_the_same_uncertainty():
     again = PoseUncertainty.of_numbers(sure.numbers())
     np.testing.assert_array_equal(again.numbers(), sure.numbers())
     np.testing.assert_allclose(again.drift, sure.drift, atol=1e-12)
+
+
+def test_the_report_draws_the_error_of_odometry_beside_two_sigma(kitti_tree):
+    sequence = open_sequence("kitti", kitti_tree, "00")
+    settings = RunSettings("kitti", "00", "none", "none", "stereo", 0, 1, 0, 1, None, Config())
+    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
+    truth = matched_ground_truth(outcome)
+    errors = motion_errors(outcome.tracks, truth, 1.0)
+    assert len(errors.first) == 18  # of 28 frames in 2.7 s
+    assert errors.distance.max() < 0.05
+    drawn = [figure.name for figure in draw_figures(outcome, None, truth, None)]
+    assert "odometry_error" in drawn
+    alone = replace(outcome, settings=replace(settings, sensor="mono"))
+    assert "odometry_error" not in [f.name for f in draw_figures(alone, None, truth, None)]

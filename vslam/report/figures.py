@@ -11,6 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from vslam.evaluation.loops import LoopEvaluation
+from vslam.evaluation.odometry import MotionErrors, motion_errors
 from vslam.evaluation.trajectories import Evaluation
 from vslam.features import TrackingState
 from vslam.report import page
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _STAGE_COLORS = [BLUE, AMBER, GREEN, VIOLET, "#ec4899", "#06b6d4", "#84cc16", "#f97316", GREY]
+_MOTION_S = 1.0  # seconds of the motions whose errors are drawn
 _MAX_BINS = 240  # of the stacked times: one bin is a pixel or two wide
 
 
@@ -86,6 +88,16 @@ def _drawings(
             _error_along_path(outcome, evaluation),
         )
         yield "error_histogram", "Number of frames by error.", _error_histogram(evaluation)
+    if ground_truth is not None and outcome.settings.sensor != "mono":
+        errors = motion_errors(outcome.tracks, ground_truth, _MOTION_S)
+        if len(errors.first) > 1:
+            yield (
+                "odometry_error",
+                "Error of the motion over one second, by odometry alone (trajectory_odom.tum), and "
+                "twice the standard deviation that its covariance predicts: about one error in "
+                "twenty should lie above.",
+                _odometry_error(errors),
+            )
     if outcome.tracks:
         yield (
             "tracked_points",
@@ -140,6 +152,16 @@ def _error_histogram(evaluation: Evaluation) -> Figure:
         axes.axvline(value, color=color, linewidth=1.4, label=f"{label} {value:.3g} m")
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.grid(visible=False, axis="x")
+    add_legend(figure, axes)
+    return figure
+
+
+def _odometry_error(errors: MotionErrors) -> Figure:
+    figure, axes = new_figure("Odometry over one second", "frame", "m", LOW)
+    axes.plot(errors.first, 2.0 * errors.sigma, color=AMBER, linewidth=1.1, label="two sigma")
+    axes.plot(errors.first, errors.distance, color=BLUE, linewidth=1.1, label="error")
+    axes.set_ylim(bottom=0)
+    _frame_axis(axes, errors.first)
     add_legend(figure, axes)
     return figure
 

@@ -19,10 +19,10 @@ import numpy as np
 from vslam.datasets import open_sequence
 from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import parse_perturbation, perturbed
+from vslam.evaluation.odometry import motion_errors
 from vslam.features import TrackResult
-from vslam.geometry import Matrix, inverse, orthonormalised, se3_log
-from vslam.odometry import relative_covariance
 from vslam.slam import Slam
+from vslam.trajectory import Trajectory
 
 INTERVALS_S = (1.0, 10.0)
 SKIPPED = 20  # frames at the start, while the map is young
@@ -41,21 +41,9 @@ def results_of(source: Source, law: str, seed: int) -> list[TrackResult]:
     return results
 
 
-def mean_nees(results: list[TrackResult], truth: Matrix, interval_s: float) -> float:
+def mean_nees(results: list[TrackResult], truth: Trajectory, interval_s: float) -> float:
     """Mean NEES per degree of freedom of the motion over an interval."""
-    times = np.array([result.timestamp for result in results])
-    nees = []
-    for first in range(SKIPPED, len(results), EVERY):
-        last = int(np.searchsorted(times, times[first] + interval_s))
-        if last == len(results):
-            break
-        one, other = results[first], results[last]
-        T_last_first = inverse(other.T_odom_camera) @ one.T_odom_camera
-        T_true = inverse(truth[last]) @ truth[first]
-        xi = se3_log(orthonormalised(T_true @ inverse(T_last_first)))
-        C = relative_covariance(one.uncertainty, other.uncertainty, T_last_first)
-        nees.append(xi @ np.linalg.solve(C, xi) / 6.0)
-    return float(np.mean(nees))
+    return float(motion_errors(results, truth, interval_s).nees[SKIPPED::EVERY].mean())
 
 
 def main() -> None:
@@ -73,7 +61,8 @@ def main() -> None:
         source = open_sequence("kitti", options.data, name, start=start, max_frames=frames or None)
         for law in options.perturb:
             results = results_of(source, law, options.seed)
-            rows.append([mean_nees(results, source.ground_truth, s) for s in INTERVALS_S])
+            truth = Trajectory(source.timestamps, source.ground_truth)
+            rows.append([mean_nees(results, truth, s) for s in INTERVALS_S])
             print(f"| {drive} | {law} | {rows[-1][0]:.2f} | {rows[-1][1]:.2f} |", flush=True)
     one, ten = np.mean(rows, axis=0)
     print(f"| mean | | {one:.2f} | {ten:.2f} |")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import cv2
@@ -18,6 +19,7 @@ from vslam.frontend.extraction import FrameImages
 from vslam.frontend.masks import REACH, Mask
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import transform
+from vslam.report.finished_run import open_images, read_run
 from vslam.run.preparation import prepare_frame
 from vslam.slam import Slam
 from vslam.trajectory import Trajectory
@@ -284,6 +286,10 @@ def test_report_and_doctor_show_the_mask(call, kitti_tree, mask, tmp_path):
     assert code == 0, err
     report = (tmp_path / "runs" / "latest" / "report.md").read_text()
     assert re.search(rf"\| mask +\| {re.escape(str(path))} +\|", report)
+    assert json.loads((tmp_path / "runs/latest/run.json").read_text())["mask"] == str(path)
+    path.rename(tmp_path / "moved.png")  # exports show the whole images
+    assert open_images(read_run("runs/latest")).stored[0].mask is None
+    path = tmp_path / "moved.png"
     code, out, _ = call("doctor", "--data", kitti_tree, "--mask", path)
     assert code == 0, out
     assert "the mask hides 31.2 % of the image" in out

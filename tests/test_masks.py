@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -87,6 +88,16 @@ def test_features_keep_their_distance_and_others_take_their_place(corridor, mask
     assert (masked.xy[:, 1] <= HOOD - REACH * scale).all()
     above = np.count_nonzero(whole.xy[:, 1] < HOOD - REACH * 4)
     assert np.count_nonzero(masked.xy[:, 1] < HOOD - REACH * 4) > above
+
+
+@pytest.mark.parametrize("sensor", ["mono", "rgbd"])
+def test_cameras_without_a_right_image_are_masked(corridor, mask, sensor):
+    camera, second = corridor.camera.left_camera(), None
+    if sensor == "rgbd":
+        camera, second = replace(corridor.camera, depth=True), np.ones(mask.shape, np.float32)
+    context = TrackingContext.create(camera, Config())
+    images = FrameImages(corridor.left[0], lambda: second, context, mask=Mask.of(mask, ORB))
+    assert images.extracted.features.xy[:, 1].max() < HOOD - REACH
 
 
 @pytest.mark.parametrize("method", ["orb", "patches"])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -18,6 +20,7 @@ from vslam.frontend.extraction import FrameImages
 from vslam.frontend.masks import REACH, Mask
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import transform
+from vslam.report.finished_run import open_images, read_run
 from vslam.run.preparation import prepare_frame
 from vslam.slam import Slam
 from vslam.trajectory import Trajectory
@@ -85,6 +88,16 @@ def test_features_keep_their_distance_and_others_take_their_place(corridor, mask
     assert (masked.xy[:, 1] <= HOOD - REACH * scale).all()
     above = np.count_nonzero(whole.xy[:, 1] < HOOD - REACH * 4)
     assert np.count_nonzero(masked.xy[:, 1] < HOOD - REACH * 4) > above
+
+
+@pytest.mark.parametrize("sensor", ["mono", "rgbd"])
+def test_cameras_without_a_right_image_are_masked(corridor, mask, sensor):
+    camera, second = corridor.camera.left_camera(), None
+    if sensor == "rgbd":
+        camera, second = replace(corridor.camera, depth=True), np.ones(mask.shape, np.float32)
+    context = TrackingContext.create(camera, Config())
+    images = FrameImages(corridor.left[0], lambda: second, context, mask=Mask.of(mask, ORB))
+    assert images.extracted.features.xy[:, 1].max() < HOOD - REACH
 
 
 @pytest.mark.parametrize("method", ["orb", "patches"])
@@ -284,6 +297,10 @@ def test_report_and_doctor_show_the_mask(call, kitti_tree, mask, tmp_path):
     assert code == 0, err
     report = (tmp_path / "runs" / "latest" / "report.md").read_text()
     assert re.search(rf"\| mask +\| {re.escape(str(path))} +\|", report)
+    assert json.loads((tmp_path / "runs/latest/run.json").read_text())["mask"] == str(path)
+    path.rename(tmp_path / "moved.png")  # exports show the whole images
+    assert open_images(read_run("runs/latest")).stored[0].mask is None
+    path = tmp_path / "moved.png"
     code, out, _ = call("doctor", "--data", kitti_tree, "--mask", path)
     assert code == 0, out
     assert "the mask hides 31.2 % of the image" in out

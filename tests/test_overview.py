@@ -439,10 +439,11 @@ def test_options_that_change_results_make_systems_too(run_folder: Path, tmp_path
     for name, options in (("a", {}), ("b", {"weights": "mine.onnx"}), ("c", {"realtime": True})):
         copy_run(run_folder, tmp_path / name, detector="capsule", sensor="mono", **options)
     copy_run(run_folder, tmp_path / "d", detector="capsule", sensor="mono", threads=7)
+    copy_run(run_folder, tmp_path / "e", detector="capsule", sensor="mono", mask="hood.png")
     rows = summarize(collect([tmp_path], [])).rows
     assert {row.system: row.runs for row in rows} == {
         "capsule, mono": 2, "capsule (weights=mine.onnx), mono": 1,
-        "capsule (realtime=True), mono": 1,
+        "capsule (realtime=True), mono": 1, "capsule (mask=hood.png), mono": 1,
     }  # fmt: skip
 
 

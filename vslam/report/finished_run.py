@@ -84,7 +84,7 @@ def open_images(
         raise InputError(
             f"{run.folder}: what a camera has shown cannot be seen again; {_WITHOUT_IMAGES}."
         )
-    moved = {"dataset": run.report.dataset} | ({} if data is None else {"data": data})
+    moved = {"dataset": run.report.dataset, "mask": None} | ({} if data is None else {"data": data})
     source = open_source(options.model_copy(update=moved), on_render)
     if not same_camera(run.camera, source.camera):
         raise _other_images(run)

@@ -20,7 +20,7 @@ from vslam.untrusted import require_utf8
 
 MONOCULAR = ", mono"  # ends the name of a monocular system
 # Options of a run that change its results and that its drive does not say.
-_OPTIONS = ("weights", "local_weights", "realtime", "map", "localize")
+_OPTIONS = ("weights", "local_weights", "realtime", "map", "localize", "mask")
 
 
 @dataclass(frozen=True)

@@ -101,12 +101,13 @@ def parse_perturbation(spec: str, seed: int) -> Perturbation:
 def perturbed(frames: Iterator[TimedFrame], perturbation: Perturbation) -> Iterator[TimedFrame]:
     """The same frames, perturbed as they are read; the laws count time from the first frame."""
     begin = None
+    laws = [law for law in perturbation.laws if isinstance(law, EachSide)]
+    pair_needed = len(laws) < len(perturbation.laws)
     for index, frame in enumerate(frames):
         begin = frame.timestamp if begin is None else begin
         t = frame.timestamp - begin
         read = partial(_read_perturbed, frame, perturbation, index, t)
-        laws = [law for law in perturbation.laws if isinstance(law, EachSide)]
-        if frame.sides is None or len(laws) < len(perturbation.laws):
+        if frame.sides is None or pair_needed:
             yield TimedFrame(frame.timestamp, read, mask=frame.mask)
             continue
         left, right = (
@@ -144,8 +145,8 @@ def contact_sheet(
     start: int = 0,
     every: int = 1,
 ) -> Image:
-    """A grey image with a row for each frame. A row shows the unperturbed left image, the two
-    perturbed images, and the change of one of them, amplified.
+    """A grey image with a row for each frame. Each row shows the left image before the
+    perturbation, both images after it, and the amplified change of one of them.
 
     Args:
         indices: frames of the sequence.
@@ -165,9 +166,9 @@ def contact_sheet(
 
 
 def sheet_of_laws(sequence: Source, specs: Collection[str], index: int, seed: int) -> Image:
-    """A grey image with a row for each perturbation of one frame. A row shows the unperturbed left
-    image, the two perturbed images, and the change of one of them, amplified. The rows are arranged
-    in two columns if there are several.
+    """A grey image with a row for each perturbation of one frame. Each row shows the left image
+    before the perturbation, both images after it, and the amplified change of one of them. Several
+    rows are arranged in two columns.
 
     Raises:
         InputError: the sequence lacks what a law needs.

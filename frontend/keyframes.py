@@ -234,9 +234,10 @@ class KeyframePolicy:
         """Whether frame ``index``, which was tracked by patches, is to become a keyframe. If one of
         the next frames is expected to be the one that is wanted, it is planned as a keyframe, so
         that its features can be extracted meanwhile."""
-        for ahead in range(self._config.patch_lead_frames + 1):
-            if self.due < 0 and self.wants_keyframe(evidence.ahead(ahead)):
-                self.due = index + ahead
+        if self.due < 0:
+            soon = range(self._config.patch_lead_frames + 1)
+            wanted = (index + k for k in soon if self.wants_keyframe(evidence.ahead(k)))
+            self.due = next(wanted, -1)
         if not 0 <= self.due <= index:
             return False
         self.due = -1

@@ -2,14 +2,13 @@
 
     python tools/bench_speed.py --case "KITTI 00=/data/kitti:00:216" [--also capsule] \
         [--repeats 3] [--write docs/research/performance.md] \
-        [--orbslam3-python PY --orbslam3-script run_orbslam3.py --vocabulary voc.txt]
+        [--orbslam3-python PY --vocabulary voc.txt]
 
 A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run one
 at a time and alternate, after one round that is not counted. vslam runs with its report, with
 ``--no-report``, with ``--no-report`` and each detector of ``--also`` instead of ``bow``, and in the
-last round with ``--realtime``, which takes as long as the drive. systems.py describes what the
-script of ORB-SLAM3 takes and prints; its ``track_ms_median`` and ``track_ms_p95`` are optional. The
-hand-written parts of the page, at its beginning and from "Limits" on, are kept.
+last round with ``--realtime``, which takes as long as the drive. The hand-written parts of the
+page, at its beginning and from "Limits" on, are kept.
 """
 
 from __future__ import annotations
@@ -120,9 +119,9 @@ def run_vslam(case: Case, scratch: str, *words: str) -> Run:
 
 
 def measure_case(
-    case: Case, orbslam3: OrbSlam3 | None, repeats: int, also: list[str]
+    case: Case, orbslam3: OrbSlam3 | None, repeats: int, also: list[str], scratch: str
 ) -> dict[str, list[Run]]:
-    """All counted runs of each system."""
+    """All counted runs of each system, in folders of their own in ``scratch``."""
     runs: dict[str, list[Run]] = {FULL: [], ORBSLAM3: [], LEAN: [], LIVE: []}
     words = {FULL: (), LEAN: ("--no-report",), LIVE: ("--no-report", "--realtime")}
     for name in also:
@@ -135,12 +134,12 @@ def measure_case(
         for system, done in runs.items():
             if system == LIVE and repeat < repeats:
                 continue
-            with tempfile.TemporaryDirectory(prefix="vslam-speed-") as scratch:
-                if system == ORBSLAM3:
-                    assert orbslam3 is not None
-                    run = systems.run_orbslam3(case, orbslam3, Path(scratch))
-                else:
-                    run = run_vslam(case, scratch, *words[system])
+            folder = tempfile.mkdtemp(dir=scratch)
+            if system == ORBSLAM3:
+                assert orbslam3 is not None
+                run = systems.run_orbslam3(case, orbslam3, Path(folder))
+            else:
+                run = run_vslam(case, folder, *words[system])
             counted = f"{repeat} of {repeats}" if repeat else "not counted"
             print(f"{case.title}, {system}: {run.process.wall_s:.1f} s, {counted}", file=sys.stderr)
             if repeat:
@@ -186,8 +185,7 @@ def latency(runs: dict[str, list[Run]], case: Case) -> str:
     lines = ["| ms per frame | p50 | p95 | p99 | dropped |", "|---|---|---|---|---|"]
     row = f"| vslam, image to pose, {rate(case):.0f} Hz | {' | '.join(values)} | {dropped} |"
     lines.append(row)
-    theirs = [run.report for run in runs.get(ORBSLAM3, [])]
-    if theirs and "track_ms_median" in theirs[0]:
+    if theirs := [run.report for run in runs.get(ORBSLAM3, [])]:
         cells = [
             systems.spread([report[key] for report in theirs], ".0f")
             for key in ("track_ms_median", "track_ms_p95")
@@ -288,14 +286,16 @@ def main() -> None:
     options = parse_options()
     load = os.getloadavg()[0]
     orbslam3 = systems.orbslam3_of(options)
-    # No large package may be imported before the last run; see systems.measure.
-    measured = [
-        (case, measure_case(case, orbslam3, options.repeats, options.also)) for case in options.case
-    ]
+    with tempfile.TemporaryDirectory(prefix="vslam-speed-") as scratch:
+        # No large package may be imported before the last run; see systems.measure.
+        measured = [
+            (case, measure_case(case, orbslam3, options.repeats, options.also, scratch))
+            for case in options.case
+        ]
+        sections = [section(case, runs) for case, runs in measured]
     setting = systems.setting(measured[0][1][FULL][0].report, orbslam3, options.repeats)
     text = "\n".join((
-        HEAD, *(section(case, runs) for case, runs in measured),
-        f"## Setting\n\n{setting} Load at the start: {load:.1f}.\n",
+        HEAD, *sections, f"## Setting\n\n{setting} Load at the start: {load:.1f}.\n",
         f"```sh\npython {anonymous(shlex.join(sys.argv))}\n```\n",
     ))  # fmt: skip
     if options.write:

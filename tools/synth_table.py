@@ -3,7 +3,7 @@ rendered drives.
 
     python tools/synth_table.py --routes demo,05 --lights "clean;brightness:1.0" \
         [--kitti KITTI --along 00,07] [--aliased demo:10] [--sensor mono] \
-        [--orbslam3-python PY --orbslam3-script run_orbslam3.py --vocabulary voc.txt]
+        [--orbslam3-python PY --vocabulary voc.txt]
 
 A drive is a built-in route; ``01/4`` is one with a quarter of its baseline, so that nearly all
 points are far. With ``--along`` it has the poses of a KITTI sequence (KITTI/poses/NN.txt) in a
@@ -13,8 +13,7 @@ What is missing is rendered first. A light is ``clean`` or a perturbation as of 
 ``every:3`` keeps every third frame, so that the camera is three times as fast. Changed images are
 written to a folder, and every system reads the same ones. Each finished row is kept in a JSON file
 beside the table and is not measured again unless the bytes of the drives changed or ``--again``
-names its system. The table is always written whole. systems.py describes what the script of
-ORB-SLAM3 takes and prints.
+names its system. The table is always written whole.
 """
 
 from __future__ import annotations
@@ -23,13 +22,17 @@ import argparse
 import csv
 import json
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from systems import OrbSlam3, add_orbslam3_options, changed_drive, orbslam3_of, run_over
+from systems import OrbSlam3, add_orbslam3_options, orbslam3_of, run_over
+
+if TYPE_CHECKING:
+    from vslam.datasets.frames import TimedFrame
 
 OURS = {"vslam": "bow", "vslam without loops": "none"}
 ORBSLAM3 = "ORB-SLAM3"
@@ -133,20 +136,36 @@ def _in_light(drive: Drive, light: str) -> Iterator[Path]:
     """A KITTI tree with the drive's images: unchanged, or changed in a temporary folder.
 
     ``cut:N`` takes N frames out, a third of the way; ``black:N`` blackens N frames there;
-    ``every:N`` keeps every N-th. Anything else is a perturbation of ``vslam run``.
+    ``every:N`` keeps every N-th. Anything else is a perturbation of ``vslam run``, with seed 0.
     """
+    import numpy as np
+
     from vslam.datasets import open_sequence
+    from vslam.datasets.perturbation import parse_perturbation, perturbed
+    from vslam.lab.stress.external import write_kitti_frames
+    from vslam.trajectory import write_kitti
 
     if light == "clean":
         yield drive.root
         return
-    count = len(open_sequence("kitti", drive.root, drive.name))
     kind, _, length = light.partition(":")
-    gap = range(count // 3, count // 3 + int(length)) if kind in GAPS else range(0)
     every = int(length) if kind == "every" else 1
-    frames = [k for k in range(0, count, every) if kind != "cut" or k not in gap]
-    law = "none" if gap or kind == "every" else light
-    with changed_drive(drive.root, drive.name, frames, law, black=gap) as root:
+    sequence = open_sequence("kitti", drive.root, drive.name, every=every)
+    gap = range(len(sequence) // 3, len(sequence) // 3 + int(length)) if kind in GAPS else range(0)
+    law = "none" if kind in (*GAPS, "every") else light
+    frames = list(perturbed(sequence.frames(), parse_perturbation(law, 0).bound_to(sequence)))
+    kept = [k for k in range(len(sequence)) if kind != "cut" or k not in gap]
+
+    def shown(k: int) -> TimedFrame:
+        if k not in gap:
+            return frames[k]
+        return replace(frames[k], read=lambda each: [*map(np.zeros_like, frames[k].read(each))])
+
+    with tempfile.TemporaryDirectory(prefix="vslam-drive-") as scratch:
+        root = Path(scratch)
+        write_kitti_frames(map(shown, kept), sequence.camera, root / "sequences" / drive.name)
+        (root / "poses").mkdir()
+        write_kitti(root / "poses" / f"{drive.name}.txt", sequence.ground_truth[kept])
         yield root
 
 

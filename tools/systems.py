@@ -1,15 +1,13 @@
 """Shared code of the scripts that compare vslam and ORB-SLAM3 (pyorbslam3): running both as
-processes, measuring their cost and accuracy, and changing drives.
+processes, and measuring their cost and accuracy.
 
 Wall time, CPU time and peak memory are those of the whole process, as the kernel reports them. The
 errors of both are computed by vslam.evaluation.trajectories from their trajectory files.
 
-ORB-SLAM3 is run by a script that takes VOCABULARY SEQUENCE_FOLDER OUT --frames N, writes one pose
-per frame to OUT in KITTI's format and prints a JSON object with frames, fps, cpu_ms_per_frame and
-lost. In a monocular run, it gets ``--mono --rate 20``, because ORB-SLAM3 gets lost if images come
-faster than its mapping. It then writes only keyframes, in TUM's format, and its ATE is that of the
-keyframes. The loops of vslam are evaluated by the ground truth (vslam.evaluation.loops). For
-ORB-SLAM3, only the number of closed loops is known, from ``loops`` in the JSON object or from its
+ORB-SLAM3 is run by vslam/lab/stress/orbslam3.py, as in ``vslam stress``. In a monocular run it gets
+20 images per second, because it gets lost if images come faster than its mapping; its ATE is then
+that of the keyframes. The loops of vslam are evaluated by the ground truth
+(vslam.evaluation.loops). For ORB-SLAM3, only the number of closed loops is known, from its
 messages.
 """
 
@@ -24,13 +22,12 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Collection, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 VSLAM = str(Path(sys.executable).with_name("vslam"))
+SCRIPT = Path(__file__).parents[1] / "vslam" / "lab" / "stress" / "orbslam3.py"
 PACKAGE = "pyorbslam3"
 LOOP_MESSAGE = "*Loop detected"  # printed once for each loop that it closes
 
@@ -45,10 +42,9 @@ class Case(NamedTuple):
 
 
 class OrbSlam3(NamedTuple):
-    """The interpreter that has pyorbslam3, the script that runs it, and its vocabulary."""
+    """The interpreter that has pyorbslam3, and its vocabulary."""
 
     python: Path
-    script: Path
     vocabulary: Path
 
 
@@ -66,13 +62,14 @@ class Process(NamedTuple):
 class Run(NamedTuple):
     """One run: the system's own report (``frames``, ``fps`` and ``cpu_ms_per_frame`` of the frame
     loop, and more), lost frames, numbers of closed, missed and wrong loops (None if unknown), and
-    the trajectory in KITTI's or TUM's format."""
+    the file of the trajectory in KITTI's or TUM's format, which lives as long as the folder of the
+    run."""
 
     process: Process
     report: dict[str, Any]
     lost: int
     loops: tuple[int | None, int | None, int | None]
-    trajectory: str
+    trajectory: Path
 
 
 def measure(command: list[str], folder: Path) -> Process:
@@ -84,8 +81,9 @@ def measure(command: list[str], folder: Path) -> Process:
     start = time.perf_counter()
     with log.open("wb") as output:
         child = subprocess.Popen(
-            command, cwd=folder, env=environment, stdout=output, stderr=subprocess.STDOUT
-        )
+            command, cwd=folder, env=environment, stdout=output, stderr=subprocess.STDOUT,
+            stdin=subprocess.PIPE,  # ORB-SLAM3's script ends when it closes
+        )  # fmt: skip
         ended, held = threading.Event(), []
         watch = threading.Thread(target=sample_memory, args=(child.pid, ended, start, held))
         watch.start()
@@ -96,6 +94,7 @@ def measure(command: list[str], folder: Path) -> Process:
             ended.set()
             watch.join()
         child.returncode = os.waitstatus_to_exitcode(status)
+        child.stdin.close()
     text = log.read_text(errors="replace")
     if child.returncode:
         sys.exit(f"{text}\n{' '.join(command)}: exit code {child.returncode}")
@@ -120,28 +119,30 @@ def run_vslam(case: Case, folder: Path, *words: str) -> Run:
     process = measure([*command, *words], folder)
     results = folder / "runs" / "latest"
     report = json.loads((results / "report.json").read_text())
-    trajectory = (results / "trajectory_kitti.txt").read_text()
     loops = report["loops_closed"], report["loops_missed"], report["loops_wrong"]
-    return Run(process, report, report["lost_frames"], loops, trajectory)
+    file = results / "trajectory_kitti.txt"
+    return Run(process, report, report["lost_frames"], loops, file)
 
 
 def run_orbslam3(case: Case, system: OrbSlam3, folder: Path, sensor: str = "stereo") -> Run:
-    command = [str(system.python), str(system.script), str(system.vocabulary)]
-    command += [str(case.data / "sequences" / case.seq), "out.txt", "--frames", str(case.frames)]
+    command = [str(system.python), str(SCRIPT), str(system.vocabulary)]
+    command += [str(case.data / "sequences" / case.seq), "out", "--frames", str(case.frames)]
     command += ["--mono", "--rate", "20"] if sensor == "mono" else []
     process = measure(command, folder)
     said = next(line for line in reversed(process.output.splitlines()) if line.startswith("{"))
     report = json.loads(said)
-    loops = report.get("loops", process.output.count(LOOP_MESSAGE))
-    trajectory = (folder / "out.txt").read_text()
-    return Run(process, report, report["lost"], (loops, None, None), trajectory)
+    loops = process.output.count(LOOP_MESSAGE), None, None
+    return Run(process, report, report["lost"], loops, folder / "out" / "trajectory.txt")
 
 
 def figures(run: Run, case: Case, sensor: str = "stereo") -> dict[str, float]:
     """Every measure of one run; NaN where it has no value, as t_rel on a path below 100 m."""
+    import numpy as np
+
     from vslam.datasets import open_sequence
     from vslam.errors import InputError
     from vslam.evaluation.trajectories import evaluate_trajectory
+    from vslam.lab.stress.external import read_poses
     from vslam.trajectory import Trajectory, read_trajectory
 
     process, frames = run.process, run.report["frames"]
@@ -160,17 +161,17 @@ def figures(run: Run, case: Case, sensor: str = "stereo") -> dict[str, float]:
     sequence = open_sequence("kitti", case.data, case.seq, max_frames=case.frames)
     if sequence.ground_truth is None:
         return found
-    with tempfile.NamedTemporaryFile("w") as file:
-        file.write(run.trajectory)
-        file.flush()
-        try:
-            estimate = read_trajectory(Path(file.name), sequence.timestamps)
-        except InputError:  # with too few poses, it is unknown which frames they belong to
-            return found
-    truth = Trajectory(sequence.timestamps, sequence.ground_truth)
-    if sensor == "mono":  # the scale is unknown, and ORB-SLAM3 writes only keyframes
-        return found | {"ate_m": evaluate_trajectory(estimate, truth, "sim3").ate_rmse_m}
-    errors = evaluate_trajectory(estimate, truth)
+    times = sequence.timestamps
+    truth = Trajectory(times, sequence.ground_truth)
+    try:
+        if sensor == "mono":  # the scale is unknown, and ORB-SLAM3 writes only keyframes
+            estimate = read_trajectory(run.trajectory, times)
+            return found | {"ate_m": evaluate_trajectory(estimate, truth, "sim3").ate_rmse_m}
+        # Frames without a pose get an interpolated one, as in ``vslam stress``.
+        estimate = read_poses(run.trajectory, times, np.arange(len(times))).bridged(times)
+        errors = evaluate_trajectory(estimate, truth)
+    except InputError:  # hardly a frame has a pose
+        return found
     t_rel = errors.t_rel_percent
     found |= {"ate_m": errors.ate_rmse_m, "rpe_m": errors.rpe_m}
     return found | {"t_rel": nan if t_rel is None else t_rel}
@@ -199,46 +200,6 @@ def setting(report: dict[str, Any], system: OrbSlam3 | None, repeats: int) -> st
     )
 
 
-@contextmanager
-def changed_drive(
-    source: Path, name: str, frames: Sequence[int], law: str, black: Collection[int] = ()
-) -> Iterator[Path]:
-    """A KITTI tree, in a temporary folder, with some ``frames`` of the sequence ``name`` of the
-    tree ``source``, perturbed by a ``law`` of ``vslam run --perturb`` with seed 0, or ``black``."""
-    import cv2
-    import numpy as np
-
-    from vslam.datasets import open_sequence
-    from vslam.datasets.perturbation import parse_perturbation
-
-    sequence = open_sequence("kitti", source, name)
-    perturbation = parse_perturbation(law, 0).bound_to(sequence)
-    with tempfile.TemporaryDirectory(prefix="vslam-drive-") as scratch:
-        root = Path(scratch)
-        folder = root / "sequences" / name
-        sides = [folder / "image_0", folder / "image_1"]
-        for made in (*sides, root / "poses"):
-            made.mkdir(parents=True)
-        calibration = source / "sequences" / name / "calib.txt"
-        (folder / "calib.txt").write_bytes(calibration.read_bytes())
-        for file in (Path("sequences", name, "times.txt"), Path("poses", f"{name}.txt")):
-            lines = (source / file).read_text().splitlines()
-            (root / file).write_text("".join(f"{lines[k]}\n" for k in frames))
-
-        def write(number: int) -> None:
-            k = frames[number]
-            t = float(sequence.timestamps[k] - sequence.timestamps[0])
-            images = perturbation.apply(k, t, *sequence.read(k))
-            for side, image in zip(sides, images, strict=True):
-                image = np.zeros_like(image) if k in black else image
-                path = side / f"{number:06d}.png"
-                cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-
-        with ThreadPoolExecutor(2) as pool:
-            list(pool.map(write, range(len(frames))))
-        yield root
-
-
 def run_over(
     data: Path, name: str, system: OrbSlam3 | None, *words: str, sensor: str = "stereo"
 ) -> tuple[Run, dict[str, float]]:
@@ -255,7 +216,7 @@ def run_over(
 
 def add_orbslam3_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that locate ORB-SLAM3; without them, it is left out."""
-    for name in ("orbslam3-python", "orbslam3-script", "vocabulary"):
+    for name in ("orbslam3-python", "vocabulary"):
         # Paths must be absolute, because each run has its own working folder. Links must not be
         # resolved, because the link to the interpreter determines the virtual environment.
         parser.add_argument(f"--{name}", type=lambda text: Path(text).absolute())
@@ -263,11 +224,9 @@ def add_orbslam3_options(parser: argparse.ArgumentParser) -> None:
 
 def orbslam3_of(options: argparse.Namespace) -> OrbSlam3 | None:
     """ORB-SLAM3 by the options of :func:`add_orbslam3_options`; None without them."""
-    given = (options.orbslam3_python, options.orbslam3_script, options.vocabulary)
+    given = (options.orbslam3_python, options.vocabulary)
     if not any(given):
         return None
     if missing := [path for path in given if path is None or not path.exists()]:
-        sys.exit(
-            f"ORB-SLAM3 needs --orbslam3-python, --orbslam3-script and --vocabulary: {missing[0]}"
-        )
+        sys.exit(f"ORB-SLAM3 needs --orbslam3-python and --vocabulary: {missing[0]}")
     return OrbSlam3(*given)

@@ -15,13 +15,15 @@ import shlex
 import subprocess
 import tempfile
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.datasets.frames import Source
+from vslam.camera import Camera
+from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.datasets.synthetic.store import calibration_text
 from vslam.errors import DroppedFrameError, InputError, ResultsError
@@ -40,6 +42,10 @@ class Poses:
 
     T_wc: NDArray[np.float64]
     known: NDArray[np.bool_]
+
+    def bridged(self, times: NDArray[np.float64]) -> Trajectory:
+        """All poses at the ``(N,)`` times of the frames; unknown ones are interpolated."""
+        return bridge_gaps(Trajectory(times, self.T_wc), self.known)
 
 
 def check_template(name: str, template: str) -> None:
@@ -101,14 +107,24 @@ def run_external(
 
 def export_kitti(sequence: Source, perturbation: Perturbation, folder: Path) -> NDArray[np.int64]:
     """Write the perturbed frames; returns the indices of the frames that were not dropped."""
+    frames = perturbed(sequence.frames(), perturbation.bound_to(sequence))
+    return write_kitti_frames(frames, sequence.camera, folder)
+
+
+def write_kitti_frames(
+    frames: Iterable[TimedFrame], camera: Camera, folder: Path
+) -> NDArray[np.int64]:
+    """Write frames and the calibration of a camera in KITTI's format; returns the indices of the
+    frames that were not dropped. Times are relative to the first frame."""
     import cv2
 
     times: list[float] = []
     kept: list[int] = []
     for name in ("image_0", "image_1"):
         (folder / name).mkdir(parents=True)
-    frames = perturbed(sequence.frames(), perturbation.bound_to(sequence))
+    begin = None
     for index, frame in enumerate(frames):
+        begin = frame.timestamp if begin is None else begin
         try:
             images = frame.read(map)
         except DroppedFrameError:
@@ -119,9 +135,9 @@ def export_kitti(sequence: Source, perturbation: Perturbation, folder: Path) -> 
                 if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
                     raise ResultsError(f"{path}: cannot be written; is the disk full?")
         kept.append(index)
-        times.append(frame.timestamp - float(sequence.timestamps[0]))
+        times.append(frame.timestamp - begin)
     (folder / "times.txt").write_text("".join(f"{t:.9e}\n" for t in times))
-    (folder / "calib.txt").write_text(calibration_text(sequence.camera))
+    (folder / "calib.txt").write_text(calibration_text(camera))
     return np.array(kept, np.int64)
 
 
@@ -155,8 +171,10 @@ def _outcome(
     if not (out / "trajectory.txt").is_file():
         raise InputError(f"{settings.detector}: no trajectory.txt in {{out}}.")
     times = np.asarray(sequence.timestamps, np.float64)
-    final = _poses(out / "trajectory.txt", times, kept)
-    causal = _poses(out / "causal.txt", times, kept) if (out / "causal.txt").is_file() else final
+    final = read_poses(out / "trajectory.txt", times, kept)
+    causal = final
+    if (out / "causal.txt").is_file():
+        causal = read_poses(out / "causal.txt", times, kept)
     lost = ~final.known
     if (out / "states.txt").is_file():
         states = (out / "states.txt").read_text().split()
@@ -165,7 +183,7 @@ def _outcome(
         lost[kept] = np.array(states) != "OK"
     dropped = np.ones(len(times), bool)
     dropped[kept] = False
-    trajectory = bridge_gaps(Trajectory(times, final.T_wc), final.known)
+    trajectory = final.bridged(times)
     given = np.where(causal.known[:, None, None], causal.T_wc, _last_known(causal))
     tracks = [
         TrackResult(
@@ -193,8 +211,18 @@ def _outcome(
     )
 
 
-def _poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) -> Poses:
-    """Poses by frame; an unknown pose is the last known one before it, or the first one."""
+def read_poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) -> Poses:
+    """Read the poses that a system wrote. An unknown pose is the last known one before it, or the
+    first one.
+
+    Args:
+        path: file in KITTI's or TUM's format.
+        times: ``(N,)`` seconds of the frames.
+        kept: indices of the frames that the system got.
+
+    Raises:
+        InputError: the file is malformed.
+    """
     T_wc, known = np.tile(np.eye(4), (len(times), 1, 1)), np.zeros(len(times), bool)
     try:
         found = read_trajectory(path, times[kept] - times[0])

@@ -131,13 +131,14 @@ def bench(
 
     _require_writable(out)
     from vslam.cli.console import console
-    from vslam.loopclosure.vocabulary import load
+    from vslam.loopclosure.vocabulary import SHIPPED
+    from vslam.loopclosure.vocabulary_text import read_vocabulary
     from vslam.machine import available_cores
 
     asked = _Asked(
         names,
         files,
-        load(),
+        read_vocabulary(files.get("bow", SHIPPED)),
         seed,
         threads or available_cores(),
         console(shown=not quiet).count_bar,

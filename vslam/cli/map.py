@@ -119,7 +119,7 @@ def merge(
     config: Thresholds = None,
     weights: Annotated[
         Path | None,
-        option(METHOD, "FILE", "ONNX file of the network of the detector that made the maps."),
+        option(METHOD, "FILE", "Weights or vocabulary of the detector that made the maps."),
     ] = None,
     quiet: Quiet = False,
 ) -> None:

@@ -69,7 +69,10 @@ def run(
     weights: Annotated[
         Path | None,
         option(
-            METHOD, "FILE", "ONNX file of the detector's network, written by [b]vslam train[/b]."
+            METHOD,
+            "FILE",
+            "ONNX file of the detector's network, written by [b]vslam train[/b], or the "
+            "vocabulary of [b]bow[/b], written by [b]vslam vocabulary[/b].",
         ),
     ] = None,
     local_weights: Annotated[

@@ -51,11 +51,10 @@ The same command continues a benchmark that was stopped (docs/howto/bench.md).
 """
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command(epilog=_EXAMPLES)(bench)
+app = typer.Typer()
 
 
+@app.command(epilog=_EXAMPLES)
 @reads_source(without=("seq", "start", "every", "mask"))
 def bench(
     given: SourceOptions,
@@ -84,7 +83,7 @@ def bench(
 ) -> None:
     """Compare loop detectors on sequences under perturbations."""
     chosen = names_in(detectors)
-    from vslam.cli.console import console
+    from vslam.cli.console import Console
     from vslam.lab.bench import execute
     from vslam.lab.bench.estimate import check_disk, duration, estimate, size
     from vslam.lab.bench.grid import make_grid, parse_perturbations, thresholds_digest
@@ -114,7 +113,7 @@ def bench(
     missing = progress.missing
     needed = estimate(missing, progress.reports, frames, jobs)
     check_disk(needed, out)
-    console(shown=not quiet).announce(
+    Console(shown=not quiet).announce(
         f"{counted(len(cells), 'run')}, {len(missing)} to do: about {duration(needed.seconds)} "
         f"with {jobs} at a time ({needed.basis}), {size(needed.kept)} in {out} and "
         f"{size(needed.scratch)} while it runs"
@@ -213,7 +212,7 @@ def open_all(
 
     Synthetic sequences are rendered here, because two runs cannot render one at the same time.
     """
-    from vslam.cli.console import console
+    from vslam.cli.console import Console
     from vslam.lab.bench.grid import parse_sequences
 
     once = f"--data {given.data}: a live camera gives each image once; record a video or a bag."
@@ -222,7 +221,7 @@ def open_all(
     opened = {}
     for name in [None] if seqs is None else parse_sequences(seqs):
         options = given.model_copy(update={"dataset": kind, "seq": name})
-        source = open_given(options, console(shown=shown))
+        source = open_given(options, Console(shown=shown))
         if source.live:
             raise InputError(once)
         opened[name or source.name] = source
@@ -243,13 +242,13 @@ def outcomes_of(
         from vslam.lab.bench.cluster import run_on_cluster
 
         return run_on_cluster(cells, options, scheduler, out)
-    from vslam.cli.console import console
+    from vslam.cli.console import Console
     from vslam.lab.bench.execute import run_here
     from vslam.machine import available_cores
     from vslam.run.warmup import compile_kernels, is_cold
 
     if cells and is_cold():  # once, not in each run
         message = "first run: compiling the kernels, less than a minute ..."
-        console(shown=shown).announce(message)
+        Console(shown=shown).announce(message)
         compile_kernels(processes=min(available_cores(), 2))
     return run_here(cells, options, jobs, out)

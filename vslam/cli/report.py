@@ -19,11 +19,10 @@ _EXAMPLES = """
 """
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command(epilog=_EXAMPLES)(report)
+app = typer.Typer()
 
 
+@app.command(epilog=_EXAMPLES)
 def report(
     runs: Annotated[
         list[Path],

@@ -45,11 +45,10 @@ _EXAMPLES = """
 _OTHER_DETECTORS = ", ".join(name for name in DETECTOR_NAMES if name not in ("none", "both"))
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command(epilog=_EXAMPLES)(run)
+app = typer.Typer()
 
 
+@app.command(epilog=_EXAMPLES)
 @reads_source()
 def run(
     context: typer.Context,

@@ -49,12 +49,10 @@ _ORBSLAM3 = "orbslam3"
 _FAILURE = "Failure"  # a panel of --help
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the application."""
-    app.command(epilog=_EXAMPLES)(stress)
-    app.command("foreign", hidden=True, context_settings={"allow_extra_args": True})(foreign)
+app = typer.Typer()
 
 
+@app.command(epilog=_EXAMPLES)
 @reads_source(without=("seq", "start", "every", "mask"))
 def stress(
     given: SourceOptions,
@@ -142,7 +140,7 @@ def stress(
     quiet: Quiet = False,
 ) -> None:
     """Find the strength of each perturbation at which a run fails."""
-    from vslam.cli.console import console
+    from vslam.cli.console import Console
     from vslam.cli.tables import show_sections
     from vslam.datasets.frames import first_frames
     from vslam.lab.bench import execute
@@ -196,7 +194,7 @@ def stress(
     def run(cells: Collection[Cell]) -> Generator[CellOutcome, None, None]:
         return outcomes_of(list(cells), options, jobs, scheduler, out, shown=not quiet)
 
-    announce = console(shown=not quiet).announce
+    announce = Console(shown=not quiet).announce
     announce(plan.criterion.words)
     stopped = False
     try:
@@ -218,6 +216,7 @@ def stress(
         raise typer.Exit(1)
 
 
+@app.command("foreign", hidden=True, context_settings={"allow_extra_args": True})
 @reads_source(without=("source", "start", "every", "mask"))
 def foreign(
     context: typer.Context,
@@ -236,7 +235,7 @@ def foreign(
     quiet: Annotated[bool, typer.Option("--quiet")] = False,
 ) -> None:
     """Run another system on a sequence and write a run's report; used by [b]vslam stress[/b]."""
-    from vslam.cli.console import console
+    from vslam.cli.console import Console
     from vslam.config import load_config
     from vslam.datasets.perturbation import parse_perturbation
     from vslam.lab.stress.external import run_external
@@ -247,7 +246,7 @@ def foreign(
         **given.model_dump(), perturb=perturb, seed=seed, threads=threads, detector=name,
         thresholds=load_config(config),
     )  # fmt: skip
-    source = open_given(given, console(shown=False))
+    source = open_given(given, Console(shown=False))
     perturbation = parse_perturbation(perturb, seed)
     settings = settings_of(options, source, perturbation.name)
     folder = create_run_folder(out, source.dataset, source.name, perturbation.name, name)

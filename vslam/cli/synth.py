@@ -24,11 +24,10 @@ _EXAMPLES = """
 _DRIVE, _TOWN, _PAIRS = "Drive", "Town", "Pairs of images"  # panels of --help
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command(epilog=_EXAMPLES)(synth)
+app = typer.Typer()
 
 
+@app.command(epilog=_EXAMPLES)
 def synth(
     route: Annotated[
         str, typer.Argument(help="Built-in route, or a name for that of --trajectory.")
@@ -129,7 +128,7 @@ def synth(
     quiet: Quiet = False,
 ) -> None:
     """Render a drive through a town in KITTI's format, with exact ground truth."""
-    from vslam.cli.console import console
+    from vslam.cli.console import Console
     from vslam.datasets.synthetic import (
         DRIVES,
         ROUTES,
@@ -180,7 +179,7 @@ def synth(
         seed or town.seed, aliased or town.aliased, change or town.change, dynamic or town.moving
     )
     threads = threads or min(available_cores(), 4)
-    with console(shown=not quiet).render_bar() as on_frame:
+    with Console(shown=not quiet).render_bar() as on_frame:
         if pairs:
             from vslam.datasets.synthetic.pairs import Moves, render_pairs
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import typer
 
-from vslam.cli.export import commands as export
+from vslam.cli.export import app as export
 from vslam.cli.options import EXECUTION, INPUT, METHOD, OUTPUT, AllThreads, Quiet, flag, option
 from vslam.errors import counted
 
@@ -39,9 +39,7 @@ _PLACES_EXAMPLES = """
 """
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command(epilog=_TRAIN_EXAMPLES)(train)
+app = typer.Typer()
 
 
 NetworkName = Literal["capsule", "capsule-pruned", "capsule-paper"]
@@ -61,6 +59,7 @@ DataSources = Annotated[
 ]
 
 
+@app.command(epilog=_TRAIN_EXAMPLES)
 def train(
     network: Annotated[
         NetworkName,
@@ -212,7 +211,7 @@ def _train(
     until: float | None,
     quiet: bool,
 ) -> TrainingOutcome:
-    from vslam.cli.console import console
+    from vslam.cli.console import Console
     from vslam.loopclosure.training.checkpoint import CHECKPOINT
     from vslam.loopclosure.training.export import export_onnx
     from vslam.loopclosure.training.initial_network import starting_network
@@ -225,7 +224,7 @@ def _train(
     )
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "settings.json").write_text(settings.model_dump_json(indent=1) + "\n")
-    with console(shown=not quiet).training_bar() as on_step:
+    with Console(shown=not quiet).training_bar() as on_step:
         outcome = run(
             collection, settings, folder, device=device, threads=threads, resume=resume,
             start=start, on_step=on_step,

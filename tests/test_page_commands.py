@@ -150,7 +150,7 @@ RULES = {
         not_run=(
             ("python tools/", HOURS),
             ("vslam loops bench", REAL),
-            ("vslam synth block", AGAIN),
+            ("vslam bench", HOURS),
         )
     ),
     "docs/research/uncertainty.md": Rules(

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import sys
 import threading
 import time
 from pathlib import Path
@@ -110,7 +111,7 @@ def main(
     _keep_first_of_each_time(tum)
     (out / "causal.txt").write_text("".join(_tum(t, T) for t, T in causal))
     (out / "states.txt").write_text("\n".join(states))
-    print(json.dumps(costs))
+    sys.stdout.write(f"{json.dumps(costs)}\n")
 
 
 def _keep_first_of_each_time(path: Path) -> None:

@@ -16,13 +16,12 @@ TOOLS = Path(__file__).parents[1] / "tools"
 def speed(monkeypatch):
     monkeypatch.syspath_prepend(str(TOOLS))
     yield importlib.import_module("bench_speed")
-    for name in ("bench_speed", "systems"):
-        sys.modules.pop(name, None)
+    sys.modules.pop("bench_speed", None)
 
 
 def made_run(speed, report, held=(), memory_mb=300.0):
-    process = speed.systems.Process("", 10.0, 15.0, memory_mb, list(held))
-    return speed.Run(process, report, 0, (0, 0, 0), Path("trajectory.txt"))
+    process = speed.Process("", 10.0, 15.0, memory_mb, list(held))
+    return speed.Run(process, report, 0, 0, Path("trajectory.txt"))
 
 
 def test_a_case_is_a_title_and_a_place(speed, kitti_tree):

@@ -15,15 +15,13 @@ import shlex
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
-from vslam.datasets.frames import Source, TimedFrame
+from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.datasets.synthetic.store import calibration_text
 from vslam.errors import DroppedFrameError, InputError, ResultsError
@@ -107,24 +105,14 @@ def run_external(
 
 def export_kitti(sequence: Source, perturbation: Perturbation, folder: Path) -> NDArray[np.int64]:
     """Write the perturbed frames; returns the indices of the frames that were not dropped."""
-    frames = perturbed(sequence.frames(), perturbation.bound_to(sequence))
-    return write_kitti_frames(frames, sequence.camera, folder)
-
-
-def write_kitti_frames(
-    frames: Iterable[TimedFrame], camera: Camera, folder: Path
-) -> NDArray[np.int64]:
-    """Write frames and the calibration of a camera in KITTI's format; returns the indices of the
-    frames that were not dropped. Times are relative to the first frame."""
     import cv2
 
     times: list[float] = []
     kept: list[int] = []
     for name in ("image_0", "image_1"):
         (folder / name).mkdir(parents=True)
-    begin = None
+    frames = perturbed(sequence.frames(), perturbation.bound_to(sequence))
     for index, frame in enumerate(frames):
-        begin = frame.timestamp if begin is None else begin
         try:
             images = frame.read(map)
         except DroppedFrameError:
@@ -135,9 +123,9 @@ def write_kitti_frames(
                 if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
                     raise ResultsError(f"{path}: cannot be written; is the disk full?")
         kept.append(index)
-        times.append(frame.timestamp - begin)
+        times.append(frame.timestamp - float(sequence.timestamps[0]))
     (folder / "times.txt").write_text("".join(f"{t:.9e}\n" for t in times))
-    (folder / "calib.txt").write_text(calibration_text(camera))
+    (folder / "calib.txt").write_text(calibration_text(sequence.camera))
     return np.array(kept, np.int64)
 
 

@@ -1,6 +1,6 @@
 """Runs ORB-SLAM3 (``pip install pyorbslam3``) on a folder in KITTI's format.
 
-usage: PYTHON orbslam3.py VOCABULARY FOLDER OUT [--mono] [--frames N] [--rate HZ]
+usage: PYTHON orbslam3.py VOCABULARY FOLDER OUT [--frames N]
 
 It prints the costs of its frame loop as a JSON object. The interpreter that has pyorbslam3 starts
 this file and need not have vslam, so nothing of vslam is imported here. The process ends when its
@@ -54,22 +54,13 @@ Viewer.ViewpointF: 2000.0
 """
 
 
-def main(
-    vocabulary: str, folder: Path, out: Path, *, mono: bool, frames: int | None, rate: float
-) -> None:
-    """Track every frame; write ``trajectory.txt``, ``causal.txt`` and ``states.txt``.
-
-    Args:
-        mono: use the left images alone; the trajectory then consists of the keyframes.
-        frames: number of frames from the first one on, None for all.
-        rate: most images per second, 0 for no limit. A monocular run gets lost if images come
-            faster than ORB-SLAM3 maps them.
-    """
+def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
+    """Track the first ``frames`` stereo frames, None for all; write ``trajectory.txt``,
+    ``causal.txt`` and ``states.txt``."""
     import pyorbslam3
 
     out.mkdir(exist_ok=True)
-    left = sorted((folder / "image_0").iterdir())[:frames]
-    right = left if mono else sorted((folder / "image_1").iterdir())[:frames]
+    left, right = (sorted((folder / f"image_{side}").iterdir())[:frames] for side in (0, 1))
     times = np.loadtxt(folder / "times.txt", ndmin=1)[:frames].tolist()
     rows = (folder / "calib.txt").read_text().splitlines()
     P0, P1 = (np.array(row.split()[1:], float).reshape(3, 4) for row in rows[:2])
@@ -81,22 +72,18 @@ def main(
             bf=-P1[0, 3],
         )
     )  # fmt: skip
-    sensor = pyorbslam3.Sensor.MONOCULAR if mono else pyorbslam3.Sensor.STEREO
-    slam = pyorbslam3.Slam(vocabulary, str(settings), sensor, use_viewer=False)
+    slam = pyorbslam3.Slam(vocabulary, str(settings), pyorbslam3.Sensor.STEREO, use_viewer=False)
     causal, states, track_ms = [], [], []
     wall, cpu = time.perf_counter(), time.process_time()
     for ours, theirs, t in zip(left, right, times, strict=True):
-        images = [cv2.imread(str(path), 0) for path in ((ours,) if mono else (ours, theirs))]
+        images = [cv2.imread(str(path), 0) for path in (ours, theirs)]
         began = time.perf_counter()
-        found = slam.track_monocular(*images, t) if mono else slam.track_stereo(*images, t)
-        taken = time.perf_counter() - began
-        track_ms.append(1e3 * taken)
+        found = slam.track_stereo(*images, t)
+        track_ms.append(1e3 * (time.perf_counter() - began))
         states.append("OK" if found.state == pyorbslam3.TrackingState.OK else "LOST")
         pose = found.pose_wc if found.pose_valid else None
         if pose is not None:
             causal.append((t, np.asarray(pose, float)))
-        if rate:
-            time.sleep(max(0.0, 1.0 / rate - taken))
     costs = {
         "frames": len(left),
         "fps": len(left) / (time.perf_counter() - wall),
@@ -107,7 +94,7 @@ def main(
     }
     slam.shutdown()
     tum = out / "trajectory.txt"
-    (slam.save_keyframe_trajectory_tum if mono else slam.save_trajectory_tum)(str(tum))
+    slam.save_trajectory_tum(str(tum))
     _keep_first_of_each_time(tum)
     (out / "causal.txt").write_text("".join(_tum(t, T) for t, T in causal))
     (out / "states.txt").write_text("\n".join(states))
@@ -142,7 +129,5 @@ if __name__ == "__main__":
     parser.add_argument("vocabulary")
     parser.add_argument("folder", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--mono", action="store_true")
     parser.add_argument("--frames", type=int)
-    parser.add_argument("--rate", type=float, default=0.0)
     main(**vars(parser.parse_args()))

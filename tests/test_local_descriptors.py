@@ -120,12 +120,6 @@ def test_images_of_culled_keyframes_are_forgotten(network):
         images.maps(1)
 
 
-@pytest.mark.slow
-def test_export_reads_any_size(tmp_path):
-    torch.manual_seed(0)
-    branch = build_network("capsule", load_network(SHIPPED / "capsule.safetensors")[0].branch.shape)
-    path = tmp_path / "local.onnx"
-    export_local(LocalNetwork(branch.branch.extractor, LocalHead()), path)
-    found = LocalDescriptors(path)
-    assert found.describe(picture(0, 100, 640)).coarse.shape == (7, 40, 64)
-    assert found.describe(picture(0, 480, 640)).fine.shape == (120, 160, 32)
+def test_the_network_reads_any_size(network):
+    assert network.describe(picture(0, 100, 640)).coarse.shape == (7, 40, 64)
+    assert network.describe(picture(0, 480, 640)).fine.shape == (120, 160, 32)

@@ -148,7 +148,6 @@ RULES = {
     ),
     "docs/research/local_descriptors.md": Rules(
         not_run=(
-            ("python tools/", HOURS),
             ("vslam loops bench", REAL),
             ("vslam bench", HOURS),
         )

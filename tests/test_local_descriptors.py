@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from reference_local import LocalHead, LocalNetwork, doubled
 from safetensors.torch import load_file
 
 from vslam.errors import InputError
@@ -13,9 +14,7 @@ from vslam.loopclosure.local_matching import positions
 from vslam.loopclosure.siamese import local_descriptors
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors, resized
 from vslam.loopclosure.siamese.weights import SHIPPED
-from vslam.loopclosure.training.export import export_local
-from vslam.loopclosure.training.local import LocalHead, LocalNetwork, doubled
-from vslam.loopclosure.training.siamese import build_network, load_network
+from vslam.loopclosure.training.siamese import load_network
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,9 @@
 """Build the wheel, install it into a clean environment and run it from another folder.
 
 This finds errors that the tests cannot see: files missing in the wheel, dependencies that only the
-development X
+development environment has, and imports that work only in the checkout. It runs the first frames of
+a rendered drive, whose true trajectory is exact.
+
 Each additional Python gets its own environment. With ``--runners``, the wheel is also started by
 pipx and uvx, if installed.
 

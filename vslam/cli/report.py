@@ -88,7 +88,7 @@ def write_overview_of(
 ) -> None:
     """Write the report of finished runs; unless ``quiet``, print its first tables and its path."""
     from vslam.cli.tables import show_sections
-    from vslam.lab.overview import write_overview
+    from vslam.lab.overview.render import write_overview
     from vslam.lab.overview.versus import versus
 
     written = write_overview(runs, trajectories, out, baseline)

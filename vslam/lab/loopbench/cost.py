@@ -69,10 +69,9 @@ def _network(name: str, weights: Path | None) -> Cost:
     from vslam.machine import peak_memory_mb
 
     began = time.process_time()
-    from vslam.config import SiameseConfig
-    from vslam.loopclosure.siamese.scoring import NetworkScorer
+    from vslam.lab.loopbench.detectors import NetworkScorer
 
-    network = NetworkScorer(name, weights, SiameseConfig().fit)
+    network = NetworkScorer(name, weights)
     loading = time.process_time() - began
     image = np.random.default_rng(0).integers(0, 256, (376, 1241), dtype=np.uint8)
     query = {}

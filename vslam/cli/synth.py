@@ -186,27 +186,14 @@ def synth(
             root = out or Path("pairs")
             moves = Moves(_range("--lateral", lateral, -4.0), _range("--heading", heading, 0.0))
             render_pairs(drive, variation, root, pairs, moves, threads=threads, on_frame=on_frame)
-        elif fisheye:
+        elif fisheye or rgbd:
             from vslam.datasets.synthetic.fisheye import render_fisheye
-
-            root = render_fisheye(
-                drive,
-                variation,
-                out or Path(f"{route}-fisheye"),
-                until=max_frames,
-                threads=threads,
-                on_frame=on_frame,
-            )
-        elif rgbd:
             from vslam.datasets.synthetic.rgbd import render_rgbd
 
-            root = render_rgbd(
-                drive,
-                variation,
-                out or Path(f"{route}-rgbd"),
-                until=max_frames,
-                threads=threads,
-                on_frame=on_frame,
+            render, form = (render_fisheye, "fisheye") if fisheye else (render_rgbd, "rgbd")
+            target = out or Path(f"{route}-{form}")
+            root = render(
+                drive, variation, target, until=max_frames, threads=threads, on_frame=on_frame
             )
         else:
             root = store.render_sequence(

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from vslam.config import OrbConfig
 
-_IMAGES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
-
 app = typer.Typer(
     name="vocabulary",
     help="Train, convert and show vocabularies of visual words.",
@@ -137,11 +135,13 @@ def _find(images: list[str]) -> list[Path]:
     """The image files of all folders and globs, sorted by name and without repetitions."""
     import glob
 
+    from vslam.datasets.image_files import is_image
+
     found: dict[Path, None] = {}
     for name in images:
         path = Path(name)
         if path.is_dir():
-            files = sorted(p for p in path.rglob("*") if p.suffix.lower() in _IMAGES)
+            files = sorted(filter(is_image, path.rglob("*")))
         elif path.is_file():
             files = [path]
         else:

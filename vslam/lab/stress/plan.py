@@ -42,28 +42,26 @@ class Search:
         name = parse_perturbation(f"{self.law}:{strength:g}", self.seed).name
         return replace(self.clean, perturb=name, seed=self.seed)
 
+    def position(self) -> float | None:
+        """The next position to test; None if the search has ended."""
+        return next_position({p: bool(v) for p, v in self.verdicts.items()}, self.steps)
+
     def wants(self) -> Cell | None:
         """The next cell to run; None if the search has ended."""
-        position = next_position({p: bool(v) for p, v in self.verdicts.items()}, self.steps)
-        return None if position is None else self.cell(position)
+        return None if (position := self.position()) is None else self.cell(position)
 
-    def advance(self, reports: Reports, criterion: Criterion) -> bool:
-        """Judge the runs that have finished; returns whether there was any."""
-        moved = False
+    def advance(self, reports: Reports, criterion: Criterion) -> None:
+        """Judge the runs that have finished."""
         clean = reports(self.clean)
-        while isinstance(clean, ReportJson):
-            states = {p: bool(v) for p, v in self.verdicts.items()}
-            position = next_position(states, self.steps)
-            if position is None:
-                break
+        if not isinstance(clean, ReportJson):
+            return
+        while (position := self.position()) is not None:
             cell = self.cell(position)
             found = reports(cell)
             if found is None:
                 break
             verdict = found if isinstance(found, str) else criterion.verdict(found, clean)
             self.verdicts[position], self.tested[position] = verdict, cell
-            moved = True
-        return moved
 
     @property
     def boundary(self) -> Boundary:

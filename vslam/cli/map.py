@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vslam.cli.tables import Rows
+    from vslam.config import Config
     from vslam.map import Map
     from vslam.maps.reconstruction import Reconstruction
     from vslam.maps.stored_map import StoredMap
@@ -126,7 +127,8 @@ def merge(
     """Merge several maps into one by verified loops between them.
 
     A map without a loop to the others is left out and named. If no map has a loop to the first
-    one, nothing is written and the exit code is 1. The files of the maps are not changed.
+    one, nothing is written and the exit code is 1. The files of the maps are not changed. Without
+    --config, the thresholds are those that the first map was made with.
     """
     from vslam.cli.console import console
     from vslam.loopclosure.registry import detector_with_images
@@ -136,15 +138,15 @@ def merge(
     if len(maps) < 2:
         raise InputError(f"{maps[0]}: this is one map; name two or more to merge.")
     _require_free(out)
-    thresholds = read_thresholds(config)
-    # No camera waits for the network, which may see all keyframes at once.
-    seen = thresholds.siamese.model_copy(update={"embedded_at_once": sys.maxsize})
-    thresholds = thresholds.model_copy(update={"siamese": seen})
     files = [map_file_of(path) for path in maps]
     for number, file in enumerate(files):
         if file.resolve() in [other.resolve() for other in files[:number]]:
             raise InputError(f"{file}: named twice; a map cannot be merged with itself.")
     stored = [load_map(file) for file in files]
+    thresholds = _thresholds_of(stored, files) if config is None else read_thresholds(config)
+    # No camera waits for the network, which may see all keyframes at once.
+    seen = thresholds.siamese.model_copy(update={"embedded_at_once": sys.maxsize})
+    thresholds = thresholds.model_copy(update={"siamese": seen})
     if not stored[0].map.n_keyframes:
         raise InputError(f"{files[0]}: the map is empty; name one that others can be merged into.")
     name = stored[0].detector.name
@@ -170,6 +172,24 @@ def merge(
         typer.echo("no map has a loop to the first one: nothing was written")
         raise typer.Exit(1)
     _save(save_map, out, merged.stored)
+
+
+def _thresholds_of(stored: list[StoredMap], files: list[Path]) -> Config:
+    """The thresholds that the first map was made with; other maps with different ones are named."""
+    from vslam.config import as_config
+
+    thresholds = stored[0].thresholds
+    others = [
+        str(file)
+        for one, file in zip(stored, files, strict=True)
+        if one.thresholds != thresholds
+    ]
+    if others:
+        typer.echo(
+            f"{', '.join(others)}: made with other thresholds than {files[0]}, whose thresholds "
+            "are used; --config names others."
+        )
+    return as_config(thresholds, str(files[0]))
 
 
 @commands.command(

@@ -180,9 +180,7 @@ def _thresholds_of(stored: list[StoredMap], files: list[Path]) -> Config:
 
     thresholds = stored[0].thresholds
     others = [
-        str(file)
-        for one, file in zip(stored, files, strict=True)
-        if one.thresholds != thresholds
+        str(file) for one, file in zip(stored, files, strict=True) if one.thresholds != thresholds
     ]
     if others:
         typer.echo(

@@ -206,7 +206,7 @@ def _write_data(
     with written.part("the evaluation"):
         evaluation, remark = evaluate_run(outcome)
     if (stored := outcome.stored) is not None:
-        if outcome.settings.map is None and evaluation is not None:
+        if outcome.settings.map_file is None and evaluation is not None:
             with written.part("the map's place in the ground truth"):
                 stored = replace(stored, world=world_of(outcome, evaluation))
         with written.file("map.npz") as file:
@@ -225,7 +225,7 @@ def _write_data(
 
 
 def _config_text(outcome: RunOutcome) -> str:
-    return outcome.settings.config.model_dump_json(indent=2) + "\n"
+    return outcome.settings.thresholds.model_dump_json(indent=2) + "\n"
 
 
 def write_trajectories(written: Results, outcome: RunOutcome) -> None:

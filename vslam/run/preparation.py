@@ -22,7 +22,7 @@ from vslam.errors import DroppedFrameError, UnreadableImageError
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.masks import Mask
 from vslam.frontend.tracking import TrackingContext
-from vslam.run.outcome import RunSettings
+from vslam.run.options import RunOptions
 from vslam.run.realtime import Played, play
 
 
@@ -40,7 +40,7 @@ class PreparedFrame:
 def in_their_time(
     frames: Iterator[TimedFrame],
     context: TrackingContext,
-    settings: RunSettings,
+    settings: RunOptions,
     *,
     live: bool,
     begin: int = 0,

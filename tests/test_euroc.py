@@ -12,8 +12,8 @@ from conftest import StereoSequence
 from scipy.spatial.transform import Rotation
 
 from vslam.datasets import open_sequence
+from vslam.datasets.association import poses_at
 from vslam.datasets.euroc import open_euroc
-from vslam.datasets.ground_truth import poses_at
 from vslam.datasets.perturbation import Perturbation
 from vslam.errors import InputError, UnreadableImageError
 from vslam.geometry import se3_exp

@@ -17,9 +17,8 @@ from vslam.errors import InputError
 from vslam.features import Extracted
 from vslam.geometry import inverse, inverses
 from vslam.loopclosure.registry import create_detector
-from vslam.maps.crop import in_box, near_frames, near_point
 from vslam.maps.storage import load_map, save_map
-from vslam.maps.stored_map import StoredMap, appended
+from vslam.maps.stored_map import StoredMap, appended, in_box, near_frames, near_point
 from vslam.merging import merge_maps
 from vslam.slam import Slam
 

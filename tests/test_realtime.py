@@ -21,7 +21,7 @@ from vslam.datasets.perturbation import Perturbation
 from vslam.features import TrackingState
 from vslam.run.options import RunOptions
 from vslam.run.pipeline import run_sequence
-from vslam.run.realtime import play
+from vslam.run.preparation import play
 from vslam.run.recorder import Recorder
 from vslam.slam import Slam
 

@@ -18,7 +18,7 @@ from vslam.camera import Camera
 from vslam.cli.main import app
 from vslam.datasets import open_sequence
 from vslam.datasets.kitti import open_kitti
-from vslam.datasets.synthetic import houses, parse_drive, store, textures, vehicles, views
+from vslam.datasets.synthetic import parse_drive, store, textures, vehicles
 from vslam.datasets.synthetic import town as town_module
 from vslam.datasets.synthetic.camera_effects import sensor_image
 from vslam.datasets.synthetic.files import lock_of
@@ -37,6 +37,7 @@ from vslam.datasets.synthetic.site import ALIASES, Variation
 from vslam.datasets.synthetic.solids import turn
 from vslam.datasets.synthetic.town import build_town
 from vslam.errors import InputError
+from vslam.lab.loopbench import views
 
 CAMERA = Camera(360.0, 360.0, 300.3, 95.7, 0.54, 620, 190)
 BY_DAY = Light(np.array([0.0, -0.8, -0.6]), visibility=1e9, haze=0.0)
@@ -196,7 +197,7 @@ def unpainted(monkeypatch):
     plain = np.full((2, 2), 99.0, np.float32)
     twice = (plain, plain)
     for module, names, value in (
-        (houses, ["facade"], twice),
+        (town_module, ["facade"], twice),
         (vehicles, ["_paint_side"], twice),
         (vehicles, ["_paint_end", "_paint_strip", "_paint_glass"], plain),
         (textures, ["foliage", "hedge", "fence", "sign"], twice),
@@ -275,7 +276,7 @@ def test_sight_lines_are_closed_at_bends(unpainted):
 def test_aliased_facades_repeat(route, monkeypatch, unpainted):
     painted = []
     monkeypatch.setattr(
-        houses, "facade", lambda rng, *rest, **_: painted.append((rng.random(), rest[2]))
+        town_module, "facade", lambda rng, *rest, **_: painted.append((rng.random(), rest[2]))
         or (np.full((2, 2), 9.0),) * 2,
     )  # fmt: skip
     build_town(route, Variation())

@@ -232,8 +232,8 @@ def crop(
 
     x points to the right of the first camera and z ahead; the height does not matter.
     """
-    from vslam.maps.crop import in_box, near_frames, near_point
     from vslam.maps.storage import load_map, map_file_of, save_map
+    from vslam.maps.stored_map import in_box, near_frames, near_point
 
     if sum(map(bool, (box, point, frames))) != 1:
         raise InputError("--box, --point, --frames: give exactly one, which says what is kept.")

@@ -16,7 +16,7 @@ from vslam.errors import InputError, ResultsError
 from vslam.evaluation.loops import LoopEvaluation, evaluate_loops
 from vslam.evaluation.trajectories import Evaluation, evo_command
 from vslam.evaluation.worlds import world_of
-from vslam.maps.ply import save_ply
+from vslam.maps.formats import save_ply
 from vslam.maps.storage import save_map
 from vslam.report.frame_table import write_covariances, write_frames
 from vslam.report.schema import ReportJson

@@ -30,9 +30,8 @@ from vslam.plugins import reason
 from vslam.run.autosave import NO_AUTOSAVE, Autosave, Unfinished
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome, causal_trajectory, ground_truth_of
-from vslam.run.preparation import PreparedFrame, in_their_time
+from vslam.run.preparation import Played, PreparedFrame, in_their_time
 from vslam.run.progress import Progress, TrackLog, in_frames
-from vslam.run.realtime import Played
 from vslam.run.recorder import Recorder
 from vslam.run.rig import (
     calibration_warnings,

@@ -18,14 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera
-from vslam.datasets.synthetic.kernel_arrays import (
+from vslam.datasets.synthetic.rasterise import find_visible, rasterise
+from vslam.datasets.synthetic.scene import (
+    Atlas,
     LightValues,
     PosedCamera,
     SampleBand,
     SurfaceArrays,
+    Surfaces,
 )
-from vslam.datasets.synthetic.rasterise import find_visible, rasterise
-from vslam.datasets.synthetic.scene import Atlas, Surfaces
 from vslam.datasets.synthetic.shade import shade
 from vslam.datasets.synthetic.shadows import NO_LAMPS, LampPools, ShadowMap
 

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.datasets.synthetic.kernel_arrays import SurfaceArrays
-from vslam.datasets.synthetic.scene import Atlas, Surfaces
+from vslam.datasets.synthetic.scene import Atlas, SurfaceArrays, Surfaces
 from vslam.kernels import kernel
 
 _MAX_CELLS = 30e6

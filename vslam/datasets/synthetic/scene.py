@@ -1,8 +1,8 @@
-"""The scene of the renderer: flat textured surfaces, and their textures with mipmaps."""
+"""The scene of the renderer, as its kernels take it: flat textured surfaces, their textures with
+mipmaps, light and camera."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import cv2
@@ -16,8 +16,7 @@ Float = NDArray[np.float64]
 OPAQUE, FOLIAGE, SCREEN = 0, 1, 2
 
 
-@dataclass(frozen=True)
-class Surfaces:
+class Surfaces(NamedTuple):
     """Q parallelograms (or triangles) ``origin + s edge_s + t edge_t``, s and t in [0, 1].
 
     Attributes:
@@ -47,28 +46,22 @@ class Surfaces:
     material: NDArray[np.uint8]
     thing: NDArray[np.int32]
 
-    def __len__(self) -> int:
-        return len(self.origin)
-
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Surfaces:
         """The surfaces ``rows``, a mask or indices."""
-        return Surfaces(*(np.ascontiguousarray(getattr(self, f.name)[rows]) for f in fields(self)))
+        return Surfaces(*(np.ascontiguousarray(column[rows]) for column in self))
 
     def moved(self, R: Float, t: Float) -> Surfaces:
         """The surfaces turned by ``R`` ``(3, 3)`` and then shifted by ``t`` ``(3,)``."""
-        values = dict(vars(self))
-        values["origin"] = self.origin @ R.T + t
-        values["edge_s"] = self.edge_s @ R.T
-        values["edge_t"] = self.edge_t @ R.T
-        return Surfaces(**values)
+        return self._replace(
+            origin=self.origin @ R.T + t, edge_s=self.edge_s @ R.T, edge_t=self.edge_t @ R.T
+        )
 
 
 def join(parts: list[Surfaces]) -> Surfaces:
     """All surfaces of ``parts`` (at least one) in their order."""
     if len(parts) == 1:
         return parts[0]
-    columns = zip(*(vars(part).values() for part in parts), strict=True)
-    return Surfaces(*(np.concatenate(column) for column in columns))
+    return Surfaces(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def patches(
@@ -187,30 +180,6 @@ def _flatten(
         if pyramid:
             row[len(pyramid) :] = row[len(pyramid) - 1]
     return offset, np.concatenate(flat) if flat else np.zeros(1, np.uint8)
-
-
-class SurfaceArrays(NamedTuple):
-    """Q surfaces in the form for kernels; `scene.Surfaces` documents the fields.
-
-    ``origin``, ``edge_s``, ``edge_t`` (Q, 3) f8; ``uv`` (Q, 6) f8; ``texture``, ``detail`` (Q,) i4;
-    ``detail_size``, ``gain`` (Q,) f8; ``triangle`` (Q,) bool; ``layer``, ``material`` (Q,) u1.
-    """
-
-    origin: NDArray[np.float64]
-    edge_s: NDArray[np.float64]
-    edge_t: NDArray[np.float64]
-    uv: NDArray[np.float64]
-    texture: NDArray[np.int32]
-    detail: NDArray[np.int32]
-    detail_size: NDArray[np.float64]
-    gain: NDArray[np.float64]
-    triangle: NDArray[np.bool_]
-    layer: NDArray[np.uint8]
-    material: NDArray[np.uint8]
-
-    @classmethod
-    def of(cls, surfaces: Surfaces) -> SurfaceArrays:
-        return cls(*(getattr(surfaces, name) for name in cls._fields))
 
 
 class LightValues(NamedTuple):

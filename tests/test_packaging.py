@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import email
 import os
 import re
@@ -98,6 +99,14 @@ def test_its_metadata_are_complete(wheels):
     )
     assert "vslam = vslam.cli.main:main" in points
     assert "# vslam" in str(metadata.get_payload())
+
+
+def test_an_old_python_is_refused_by_pip_and_not_by_an_import():
+    """pip runs setup.py before it reads which Python the package needs."""
+    tree = ast.parse((ROOT / "setup.py").read_text(), feature_version=(3, 9))
+    names = {one for node in ast.walk(tree) if isinstance(node, ast.Import) for one in node.names}
+    froms = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert {name.name for name in names} | froms == {"re", "pathlib", "setuptools"}
 
 
 def readme_for(source: str, tmp_path: Path) -> str:

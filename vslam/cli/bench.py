@@ -249,7 +249,7 @@ def outcomes_of(
     from vslam.run.warmup import compile_kernels, is_cold
 
     if cells and is_cold():  # once, not in each run
-        message = "first run: compiling the kernels, less than a minute ..."
+        message = "first run: compiling the kernels, about a minute ..."
         console(shown=shown).announce(message)
         compile_kernels(processes=min(available_cores(), 2))
     return run_here(cells, options, jobs, out)

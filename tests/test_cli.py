@@ -33,8 +33,8 @@ from vslam.report.folder import write_results
 from vslam.report.run_page import option_rows
 from vslam.run import pipeline as run_pipeline
 from vslam.run import recorder, warmup
-from vslam.run.moments import MomentRecorder
 from vslam.run.autosave import MAP
+from vslam.run.moments import MomentRecorder
 from vslam.run.outcome import RunOutcome
 from vslam.slam import Slam
 from vslam.trajectory import (

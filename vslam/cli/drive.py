@@ -70,6 +70,8 @@ def drive(
         _compile(settings, told)
         slam = begin(source.camera, settings, None if unfinished is None else unfinished.map)
         viewer = _viewer(output, told)
+        if unfinished is not None:
+            told.announce(f"continuing at frame {len(unfinished.progress.tracks)} ...")
         folder = resume or _new_folder(options, source, perturbation.name, out, lock)
         moments, pictures = MomentRecorder(), LoopPictureRecorder()
         recorder = _recorder(folder, output, unfinished, viewer, moments, pictures)
@@ -158,7 +160,7 @@ def _compile(settings: RunOptions, told: Console) -> None:
     from vslam.run.warmup import compile_kernels, is_cold
 
     if is_cold():
-        told.announce("first run: compiling the kernels, less than a minute ...")
+        told.announce("first run: compiling the kernels, about a minute ...")
     compile_kernels(processes=min(settings.threads, 2), load=settings.realtime)
 
 

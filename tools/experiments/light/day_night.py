@@ -146,6 +146,27 @@ def rows_of(source: Source, n_map: int | None, options: argparse.Namespace) -> I
                     yield [source.name, law, detector, candidates, len(asked), right, wrong, recall]
 
 
+def table(path: Path) -> str:
+    """The table as Markdown: recalls with each number of candidates, and how many of all poses are
+    wrong."""
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    detectors = list(dict.fromkeys(row["detector"] for row in rows))
+    head = ["drive", "law", "images", *(f"`{name}`" for name in detectors), "wrong"]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    for drive, law in dict.fromkeys((row["sequence"], row["law"]) for row in rows):
+        these = [row for row in rows if (row["sequence"], row["law"]) == (drive, law)]
+        recalls = [
+            ", ".join(f"{float(row['recall']):.2f}" for row in these if row["detector"] == name)
+            for name in detectors
+        ]
+        wrong = sum(int(row["wrong"]) for row in these)
+        poses = wrong + sum(int(row["right"]) for row in these)
+        cells = [f"`{drive}`", f"`{law}`", these[0]["images"], *recalls, f"{wrong} of {poses}"]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("dataset", choices=("kitti", "synthetic"))
@@ -168,6 +189,7 @@ def main() -> None:
             with options.out.open("a", newline="") as file:
                 csv.writer(file, lineterminator="\n").writerow(row)
             print(*row, sep="\t", flush=True)
+    print(table(options.out))
 
 
 if __name__ == "__main__":

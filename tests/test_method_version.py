@@ -2,12 +2,13 @@
 and by RGB-D, and a drive round a block whose loop is closed by night.
 
 After a change of the method, raise ``METHOD_VERSION`` in ``vslam/__init__.py`` and write the
-references again with ``make method-references``.
+references again with ``make method``.
 """
 
 from __future__ import annotations
 
 import os
+import platform
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +23,9 @@ from vslam.camera import Camera
 
 REFERENCES = Path(__file__).parent / "method_references.npz"
 WRITE = "WRITE_METHOD_REFERENCES"  # environment variable
-LIMIT_M = 1e-6  # rounding of another processor is far below, any change of the method far above
+# Processors of one kind with other vector units differ by less than the first limit. Without fused
+# multiplication, the night moves by 8e-5 m.
+LIMIT_M, LIMIT_ELSEWHERE_M = 1e-6, 1e-3
 Clip = tuple[Camera, Iterator[tuple[NDArray, NDArray, float]]]
 
 
@@ -32,9 +35,7 @@ def clips(request: pytest.FixtureRequest) -> dict[str, Callable[[], Clip]]:
 
     def stereo() -> Clip:
         corridor = request.getfixturevalue("corridor")
-        return corridor.camera, zip(
-            corridor.left, corridor.right, corridor.timestamps, strict=True
-        )
+        return corridor.camera, zip(corridor.left, corridor.right, corridor.timestamps, strict=True)
 
     def depth() -> Clip:
         corridor = request.getfixturevalue("corridor")
@@ -63,14 +64,16 @@ def positions(clip: Clip) -> NDArray[np.float64]:
 def test_the_version_of_the_method_is_that_of_its_trajectories(name, clips):
     found = positions(clips[name]())
     references = dict(np.load(REFERENCES)) if REFERENCES.exists() else {}
+    here = f"{platform.system()} {platform.machine()}"
     if os.environ.get(WRITE):
-        references |= {name: found, "version": np.array(METHOD_VERSION)}
+        references |= {name: found, "version": np.array(METHOD_VERSION), "made_on": np.array(here)}
         np.savez_compressed(REFERENCES, **references)
     far = moved(found, references[name])
-    assert references["version"] == METHOD_VERSION, "run make method-references"
-    assert far < LIMIT_M, (
+    limit = LIMIT_M if references["made_on"] == here else LIMIT_ELSEWHERE_M
+    assert references["version"] == METHOD_VERSION, "run make method"
+    assert far < limit, (
         f"the clip {name} moved by {far:.2g} m: raise METHOD_VERSION in vslam/__init__.py, "
-        "then run make method-references"
+        "then run make method"
     )
 
 

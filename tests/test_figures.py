@@ -195,8 +195,19 @@ def test_a_table_without_a_stamp_or_a_command_is_a_fault(figures, made):
 )
 def test_a_page_that_differs_from_its_source_is_found(figures, made, shown, instead, fault):
     assert PAGE.count(shown) == 1
-    (found,) = figures.compare(PAGE.replace(shown, instead), made)
+    (found,) = figures.sources.compare(PAGE.replace(shown, instead), made)
     assert fault in found
+
+
+def test_a_table_made_by_other_means_is_stamped_with_its_version(figures, made):
+    table = made / "docs/research/drives.csv"
+    table.write_text(table.read_text().replace("2.5,12", "2.54,12"))
+    assert figures.adopt(made, figures.METHOD_VERSION) == ["docs/research/drives.csv"]
+    report = figures.check(made)
+    assert report.faults == []
+    assert len(report.older) == 1
+    figures.make(made, quick=False)
+    assert "2.54,12" in table.read_text()  # it was not made again
 
 
 def test_tables_without_a_source_are_listed(figures, made):

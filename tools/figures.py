@@ -2,7 +2,7 @@
 
     python tools/figures.py [--quick] [--only TEXT]    # make figures, make figures FIGURES=quick
     python tools/figures.py --check                    # make figures-check
-    python tools/figures.py --adopt                    # stamp files that were made by other means
+    python tools/figures.py --adopt [VERSION]          # stamp files that were made by other means
 
 ``figures.toml`` lists every table and figure with the commands that make it. A command is run by
 bash in the root of the repository and writes into the folder ``$OUT`` under the names of the files;
@@ -12,22 +12,12 @@ places, or below ``build/figures`` with ``--quick``, and ``docs/stamps.json`` th
 each: commit, version of the method, machine, seed, command and digest. What has a valid stamp of
 this version is not made again.
 
-Tables in Markdown that are written by hand name their source in a comment before them. A line of it
-describes one row of the table, and the last line all further rows::
-
-    <!-- from: docs/x.csv | drive=$1, light=clean | | ate_m (system=ours) | found; missed -->
-
-It holds the CSV file, the filter that selects its row (``$1``: the text of the first cell of the
-table's row, or what its backticks enclose), then the columns that the numbers of each cell must
-equal, as they are rounded there. An empty place is not compared; ``mean x`` is the mean over all
-selected rows; a line ``-`` skips a row. Before a paragraph, the comment names columns whose values
-the paragraph must mention.
+sources.py explains how a page names the file that its numbers come from.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import hashlib
 import json
 import os
@@ -37,22 +27,19 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from graphlib import TopologicalSorter
-from itertools import chain, zip_longest
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
+
+import sources
 
 from vslam import METHOD_VERSION
 
 ROOT = Path(__file__).resolve().parents[1]
 STAMPS = "docs/stamps.json"
 KINDS = {".csv", ".json", ".svg", ".png", ".jpg"}  # of files below docs/ that need a stamp
-COMMENT = re.compile(r"<!-- from:(.*?)-->[ ]*\n", re.DOTALL)
-TABLE = re.compile(r"(--> *\n)?(?:^ *\|.*\n)+?^ *\|[-| :]+\|\n((?:^ *\|.*\n?)+)", re.MULTILINE)
-DECIMAL = re.compile(r"\d\.\d")
-NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d,]*(?:\.\d+)?")
 
 
 @dataclass(frozen=True)
@@ -194,7 +181,6 @@ def _is_done(entry: Entry, target: Path, command: str) -> bool:
 def _made(entry: Entry, command: str, root: Path, target: Path) -> bool:
     from vslam.datasets.synthetic.site import Variation
     from vslam.datasets.synthetic.store import cache_folder, folder_name
-    from vslam.report.summary import this_machine
 
     kind = "full" if target == root else "quick"
     out = root / "runs" / "figures" / f"{kind}-{METHOD_VERSION}" / entry.files[0].replace("/", "-")
@@ -208,22 +194,29 @@ def _made(entry: Entry, command: str, root: Path, target: Path) -> bool:
     shell = ["bash", "-euo", "pipefail", "-c", command]
     if subprocess.run(shell, cwd=root, env=environment, check=False).returncode:
         return False
-    machine = this_machine()
     stamps = read_stamps(target)
     for file in entry.files:
         (target / file).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(out / Path(file).name, target / file)
-        stamps[file] = Stamp(
-            digest_of(target / file),
-            _commit(root),
-            time.strftime("%Y-%m-%d %H:%M:%S"),
-            METHOD_VERSION,
-            f"{machine.cpu}, {machine.cores} cores, {machine.platform}",
-            entry.seed,
-            command,
-        )
+        stamps[file] = _stamp(target / file, entry, command, root, METHOD_VERSION)
     write_stamps(target, stamps)
     return True
+
+
+def _stamp(path: Path, entry: Entry, command: str, root: Path, method: int) -> Stamp:
+    """The stamp of a file that was made just now."""
+    from vslam.report.summary import this_machine
+
+    machine = this_machine()
+    return Stamp(
+        digest_of(path),
+        _commit(root),
+        time.strftime("%Y-%m-%d %H:%M:%S"),
+        method,
+        f"{machine.cpu}, {machine.cores} cores, {machine.platform}",
+        entry.seed,
+        command,
+    )
 
 
 def _commit(root: Path) -> str:
@@ -238,8 +231,14 @@ def _git(root: Path, *words: str) -> str:
     return done.stdout.strip()
 
 
-def adopt(root: Path) -> list[str]:
-    """Stamp every file that has no valid stamp with the commit that wrote it, and return them."""
+def adopt(root: Path, method: int | None = None) -> list[str]:
+    """Stamp every file that has no valid stamp, and return these files.
+
+    Args:
+        root: repository.
+        method: version of the method that made the files with the commands of figures.toml on this
+            machine; None if unknown: then the stamp has only the commit that wrote the file.
+    """
     stamps, adopted = read_stamps(root), []
     entries = {file: entry for entry in read_entries(root) for file in entry.paths(root)}
     for file in entries:
@@ -249,7 +248,11 @@ def adopt(root: Path) -> list[str]:
         # A commit that only moved the file did not write it.
         words = ("log", "-1", "--follow", "--diff-filter=AM", "--format=%h %as", "--", file)
         commit, _, date = _git(root, *words).partition(" ")
-        stamps[file] = Stamp(digest_of(root / file), commit, date)
+        stamps[file] = (
+            Stamp(digest_of(root / file), commit, date)
+            if method is None
+            else _stamp(root / file, entries[file], entries[file].run, root, method)
+        )
         adopted.append(file)
     write_stamps(root, stamps)
     return adopted
@@ -281,11 +284,10 @@ def check(root: Path) -> Report:
             report.older.append(f"{file}: {origin(stamps[file])}{on}")
     for page, text in texts.items():
         name = page.relative_to(root)
-        report.faults.extend(f"{name}: {one}" for one in compare(text, root))
-        tables = [] if str(name) in entries else TABLE.findall(text)
-        typed = sum(not comment and bool(DECIMAL.search(body)) for comment, body in tables)
-        if typed:
-            report.typed.append(f"{name}: {typed} of {len(tables)} tables")
+        report.faults.extend(f"{name}: {one}" for one in sources.compare(text, root))
+        typed, tables = sources.untraced(text)
+        if typed and str(name) not in entries:
+            report.typed.append(f"{name}: {typed} of {tables} tables")
     return report
 
 
@@ -298,8 +300,7 @@ def used(page: Path, text: str, root: Path) -> set[str]:
     """The files that a page links, shows or names as a source."""
     links = re.findall(r"\]\(([^)#\s:]+)\)", text)
     named = {os.path.relpath(os.path.normpath(page.parent / link), root) for link in links}
-    sources = (line.partition("|")[0].strip() for comment, _ in traced(text) for line in comment)
-    return named | set(sources)
+    return named.union(*map(sources.files_of, sources.COMMENT.findall(text)))
 
 
 def origin(stamp: Stamp) -> str:
@@ -320,122 +321,16 @@ def mark_older(page: Path, text: str, root: Path) -> str:
     }
 
     def marked(found: re.Match[str]) -> str:
-        sources = dict.fromkeys(line.partition("|")[0].strip() for line in _lines(found[1]))
-        named = "; ".join(f"`{file}`: {older[file]}" for file in sources if file in older)
-        return f"*Older than the current method (version {METHOD_VERSION}): {named}.*\n\n" * bool(
-            named
-        )
+        names = sorted(sources.files_of(found[1]) & older.keys())
+        origins = "; ".join(f"`{file}`: {older[file]}" for file in names)
+        return f"*Older than method version {METHOD_VERSION}: {origins}.*\n\n" if names else ""
 
-    rest = sorted(used(page, text, root) & older.keys())
-    text = COMMENT.sub(marked, text)
-    if rest:
-        items = "\n".join(f"- `{file}`: {older[file]}" for file in rest)
-        text += (
-            f"\n```{{note}}\nAn older method than version {METHOD_VERSION} made:\n\n{items}\n```\n"
-        )
-    return text
-
-
-def _lines(comment: str) -> list[str]:
-    return [line.strip() for line in comment.strip().splitlines()]
-
-
-def traced(text: str) -> Iterator[tuple[list[str], str]]:
-    """The lines of each source comment, and the table or paragraph that follows it."""
-    for found in COMMENT.finditer(text):
-        yield _lines(found[1]), text[found.end() :].partition("\n\n")[0]
-
-
-def compare(text: str, root: Path) -> Iterator[str]:
-    """A sentence for each value on a page that differs from its source."""
-    for lines, after in traced(text):
-        try:
-            if not after.lstrip().startswith("|"):
-                for line in lines:
-                    yield from _paragraph_faults(line, after, root)
-                continue
-            rows = [_cells(row) for row in after.splitlines()][2:]
-            if len(lines) > len(rows):
-                yield f"{len(lines)} source lines for the {len(rows)} rows after {rows[0]}"
-            for line, row in zip_longest(lines[: len(rows)], rows, fillvalue=lines[-1]):
-                yield from _row_faults(line, row, root)
-        except (LookupError, ValueError, OSError) as error:
-            yield f"source {lines[0]!r} cannot be read: {error}"
-
-
-def _cells(row: str) -> list[str]:
-    return [cell.strip() for cell in row.strip().strip("|").split("|")]
-
-
-def _row_faults(line: str, row: list[str], root: Path) -> Iterator[str]:
-    if line == "-":
-        return
-    file, filters, *columns = [part.strip() for part in line.split("|")]
-    for cell, column in zip(row, columns, strict=False):
-        values = _values(root / file, filters, column, row) if column else []
-        left, numbers = cell, []
-        for value in values:
-            if isinstance(value, str):
-                if value not in left:
-                    yield f"{row[0]}: {cell!r} lacks {value!r} of {file} ({column})"
-                left = left.replace(value, "", 1)
-            else:
-                numbers.append(value)
-        shown = NUMBER.findall(left)
-        agree = len(shown) == len(numbers) and all(map(_is_rounded, shown, numbers))
-        if column and not agree:
-            yield f"{row[0]}: {cell!r} differs from {values} of {file} ({column})"
-
-
-def _paragraph_faults(line: str, paragraph: str, root: Path) -> Iterator[str]:
-    file, filters, column = [part.strip() for part in line.split("|")]
-    shown = NUMBER.findall(paragraph)
-    for value in _values(root / file, filters, column, []):
-        if isinstance(value, str):
-            found = value in paragraph
-        else:
-            found = any(_is_rounded(number, value) for number in shown)
-        if not found:
-            yield f"{paragraph[:40]!r}... does not mention {value} of {file} ({column})"
-
-
-def _is_rounded(shown: str, value: float) -> bool:
-    number = shown.replace(",", "")
-    decimals = len(number.partition(".")[2])
-    return abs(float(number) - value) <= 0.5 * 10.0**-decimals * (1 + 1e-6)
-
-
-def _values(path: Path, filters: str, column: str, row: list[str]) -> list[float | str]:
-    """The values that a cell must show: numbers, or texts where the CSV file has texts."""
-    with path.open(newline="", encoding="utf-8") as file:
-        table = list(csv.DictReader(file))
-    found: list[float | str] = []
-    own = ""
-    for field in reversed(column.split(";")):
-        name, _, more = field.strip().removesuffix(")").partition(" (")
-        own = more or own
-        wanted = _wanted(f"{filters}, {own}", row)
-        rows = [one for one in table if wanted.items() <= one.items()]
-        if name.startswith("mean "):
-            numbers = [float(one[name.removeprefix("mean ")]) for one in rows]
-            found.append(sum(numbers) / len(numbers))
-        elif len(rows) != 1:
-            raise LookupError(f"{len(rows)} rows of {path.name} have {wanted}")
-        elif value := rows[0][name]:
-            found.append(float(value) if NUMBER.fullmatch(value) else value)
-    return found[::-1]
-
-
-def _wanted(filters: str, row: list[str]) -> dict[str, str]:
-    """Values by column, in which ``$1`` is replaced by the text of the row's first cell."""
-
-    def text(found: re.Match[str]) -> str:
-        cell = row[int(found[1]) - 1]
-        code = re.search("`(.*?)`", cell)
-        return code[1] if code else cell.strip("*")
-
-    pairs = [one.split("=", 1) for one in re.split(r", (?=\w+=)", filters.strip(", "))]
-    return {key: re.sub(r"\$(\d)", text, value) for key, value in pairs}
+    names = sorted(used(page, text, root) & older.keys())
+    items = "".join(f"- `{file}`: {older[file]}\n" for file in names)
+    note = (
+        f"\n```{{note}}\nFiles that are older than method version {METHOD_VERSION}:\n\n{items}```\n"
+    )
+    return sources.COMMENT.sub(marked, text) + (note if names else "")
 
 
 def main() -> None:
@@ -443,10 +338,13 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="minutes; writes to build/figures")
     parser.add_argument("--only", default="", help="files whose path contains this text")
     parser.add_argument("--check", action="store_true", help="make nothing; check what is there")
-    parser.add_argument("--adopt", action="store_true", help="stamp by the history of git")
+    parser.add_argument(
+        "--adopt", type=int, nargs="?", const=0, metavar="VERSION",
+        help="stamp files that were made by other means, by this version of the method if known",
+    )  # fmt: skip
     options = parser.parse_args()
-    if options.adopt:
-        print("\n".join(adopt(ROOT)))
+    if options.adopt is not None:
+        print("\n".join(adopt(ROOT, options.adopt or None)))
     elif options.check:
         report = check(ROOT)
         print("Made by another version of the method:", *report.older, sep="\n  ")

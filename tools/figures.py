@@ -292,8 +292,9 @@ def check(root: Path) -> Report:
 
 
 def pages(root: Path) -> list[Path]:
-    """README and the pages of the documentation that report figures."""
-    return [root / "README.md", *sorted((root / "docs").glob("*/*.md"))]
+    """README and the pages of the documentation, but for those that are made from the code."""
+    below = sorted((root / "docs").glob("*/*.md"))
+    return [root / "README.md", *(page for page in below if page.parent.name != "reference")]
 
 
 def used(page: Path, text: str, root: Path) -> set[str]:

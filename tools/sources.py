@@ -7,7 +7,8 @@ of the table, and the last line all further rows::
 
 It holds the CSV file, the filter that selects its row (``$1``: the text of the first cell of the
 table's row, or what its backticks enclose), then the columns that the numbers of each cell must
-equal, as they are rounded there. A filter in parentheses belongs to the columns before it in the
+equal, as they are rounded there; the last place is for all further columns. ``$0`` is the head of
+the column. A filter in parentheses belongs to the columns before it in the
 cell. An empty place is not compared; ``mean x`` and ``sum x`` are over all selected rows; a line
 ``-`` skips a row. Before a paragraph, the comment names columns whose values it must mention.
 """
@@ -52,11 +53,11 @@ def compare(text: str, root: Path) -> Iterator[str]:
                 for line in lines:
                     yield from _paragraph_faults(line, after, root)
                 continue
-            rows = [_cells(row) for row in after.splitlines()][2:]
+            head, _, *rows = [_cells(row) for row in after.splitlines()]
             if len(lines) > len(rows):
                 yield f"{len(lines)} source lines for the {len(rows)} rows after {rows[0]}"
             for line, row in zip_longest(lines[: len(rows)], rows, fillvalue=lines[-1]):
-                yield from _row_faults(line, row, root)
+                yield from _row_faults(line, head, row, root)
         except (LookupError, ValueError, OSError) as error:
             yield f"source {lines[0]!r} cannot be read: {error}"
 
@@ -65,12 +66,13 @@ def _cells(row: str) -> list[str]:
     return [cell.strip() for cell in row.strip().strip("|").split("|")]
 
 
-def _row_faults(line: str, row: list[str], root: Path) -> Iterator[str]:
+def _row_faults(line: str, head: list[str], row: list[str], root: Path) -> Iterator[str]:
     if line == "-":
         return
     file, filters, *columns = [part.strip() for part in line.split("|")]
-    for cell, column in zip(row, columns, strict=False):
-        values = _values(root / file, filters, column, row) if column else []
+    columns += columns[-1:] * (len(row) - len(columns))
+    for name, cell, column in zip(head, row, columns, strict=True):
+        values = _values(root / file, filters, column, [name, *row]) if column else []
         left, numbers = cell, []
         for value in values:
             if isinstance(value, str):
@@ -104,7 +106,8 @@ def _is_rounded(shown: str, value: float) -> bool:
 
 
 def _values(path: Path, filters: str, column: str, row: list[str]) -> list[float | str]:
-    """The values that a cell must show: numbers, or texts where the CSV file has texts."""
+    """The values that a cell must show: numbers, or texts where the CSV file has texts. ``row``
+    holds the head of its column, then all cells of its row."""
     with path.open(newline="", encoding="utf-8") as file:
         table = list(csv.DictReader(file))
     found: list[float | str] = []
@@ -125,10 +128,10 @@ def _values(path: Path, filters: str, column: str, row: list[str]) -> list[float
 
 
 def _wanted(filters: str, row: list[str]) -> dict[str, str]:
-    """Values by column, in which ``$1`` is replaced by the text of the row's first cell."""
+    """Values by column, in which ``$1`` is replaced by the text of ``row[1]``."""
 
     def text(found: re.Match[str]) -> str:
-        cell = row[int(found[1]) - 1]
+        cell = row[int(found[1])]
         code = re.search("`(.*?)`", cell)
         return code[1] if code else cell.strip("*")
 

@@ -293,8 +293,9 @@ def check(root: Path) -> Report:
 
 def pages(root: Path) -> list[Path]:
     """README and the pages of the documentation, but for those that are made from the code."""
-    below = sorted((root / "docs").glob("*/*.md"))
-    return [root / "README.md", *(page for page in below if page.parent.name != "reference")]
+    below = sorted((root / "docs").rglob("*.md"))
+    made = root / "docs" / "reference"
+    return [root / "README.md", *(page for page in below if made not in page.parents)]
 
 
 def used(page: Path, text: str, root: Path) -> set[str]:
@@ -349,7 +350,7 @@ def main() -> None:
     elif options.check:
         report = check(ROOT)
         print("Made by another version of the method:", *report.older, sep="\n  ")
-        print("Tables that are written by hand without a source:", *report.typed, sep="\n  ")
+        print("Tables that name no source:", *report.typed, sep="\n  ")
         print("Faults:", *(report.faults or ["none"]), sep="\n  ")
         sys.exit(bool(report.faults))
     else:

@@ -131,7 +131,7 @@ def test_a_table_of_another_version_is_listed_and_marked_on_its_page(figures, ma
     report = figures.check(made)
     assert report.faults == []
     (older,) = report.older
-    assert older.startswith("docs/research/finished.csv: method version before 1, commit ")
+    assert older.startswith("docs/research/finished.csv: before version 1, commit ")
     assert "Older" not in figures.mark_older(made / "README.md", PAGE, made)
 
     stamps = figures.read_stamps(made)
@@ -146,8 +146,8 @@ def test_a_table_of_another_version_is_listed_and_marked_on_its_page(figures, ma
     assert [line.partition(":")[0] for line in on_readme] == [*stamps][:1] + [*stamps][2:3]
     marked = figures.mark_older(made / "README.md", PAGE, made)
     before_the_table, _, _ = marked.partition("| drive |")
-    assert "`docs/research/drives.csv`: method version 0, commit" in before_the_table
-    assert "- `docs/research/plot.csv`: method version 0, commit" in marked
+    assert "`docs/research/drives.csv`: version 0, commit" in before_the_table
+    assert "- `docs/research/plot.csv`: version 0, commit" in marked
     assert "finished.csv" not in marked
 
     assert figures.make(made, quick=False) == 0  # both are made again
@@ -225,7 +225,7 @@ def test_the_command_checks(made, figures, monkeypatch, capsys):
     with pytest.raises(SystemExit) as ended:
         figures.main()
     assert ended.value.code == 0
-    assert "docs/research/finished.csv: method version before 1" in capsys.readouterr().out
+    assert "docs/research/finished.csv: before version 1" in capsys.readouterr().out
     (made / figures.STAMPS).write_text(json.dumps({}))
     with pytest.raises(SystemExit) as ended:
         figures.main()

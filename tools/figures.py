@@ -306,9 +306,9 @@ def used(page: Path, text: str, root: Path) -> set[str]:
 
 
 def origin(stamp: Stamp) -> str:
-    """``method version 1, commit 0123abc, 2026-11-25``."""
-    version = f"before {METHOD_VERSION}" if stamp.method is None else f"{stamp.method}"
-    return f"method version {version}, commit {stamp.commit}, {stamp.date[:10]}"
+    """``version 1, commit 0123abc, 2026-11-25``."""
+    version = "before version 1" if stamp.method is None else f"version {stamp.method}"
+    return f"{version}, commit {stamp.commit}, {stamp.date[:10]}"
 
 
 def mark_older(page: Path, text: str, root: Path) -> str:
@@ -325,14 +325,17 @@ def mark_older(page: Path, text: str, root: Path) -> str:
     def marked(found: re.Match[str]) -> str:
         names = sorted(sources.files_of(found[1]) & older.keys())
         origins = "; ".join(f"`{file}`: {older[file]}" for file in names)
-        return f"*Older than method version {METHOD_VERSION}: {origins}.*\n\n" if names else ""
+        return (
+            f"*Older than version {METHOD_VERSION} of the method: {origins}.*\n\n" if names else ""
+        )
 
     names = sorted(used(page, text, root) & older.keys())
-    items = "".join(f"- `{file}`: {older[file]}\n" for file in names)
-    note = (
-        f"\n```{{note}}\nFiles that are older than method version {METHOD_VERSION}:\n\n{items}```\n"
-    )
-    return sources.COMMENT.sub(marked, text) + (note if names else "")
+    text = sources.COMMENT.sub(marked, text)
+    if names:
+        items = "".join(f"- `{file}`: {older[file]}\n" for file in names)
+        title = f"Files that are older than version {METHOD_VERSION} of the method:"
+        text += f"\n```{{note}}\n{title}\n\n{items}```\n"
+    return text
 
 
 def main() -> None:
@@ -349,7 +352,11 @@ def main() -> None:
         print("\n".join(adopt(ROOT, options.adopt or None)))
     elif options.check:
         report = check(ROOT)
-        print("Made by another version of the method:", *report.older, sep="\n  ")
+        print(
+            f"Made by another version of the method than {METHOD_VERSION}:",
+            *report.older,
+            sep="\n  ",
+        )
         print("Tables that name no source:", *report.typed, sep="\n  ")
         print("Faults:", *(report.faults or ["none"]), sep="\n  ")
         sys.exit(bool(report.faults))

@@ -158,7 +158,7 @@ def test_a_table_of_another_version_is_listed_and_marked_on_its_page(figures, ma
     ("change", "fault"),
     [
         ("a,ours,0.1234,0", "drives.csv: was changed after the run of its stamp"),
-        (None, "drives.csv: missing"),
+        (None, "README.md: source 'docs/research/drives.csv"),
     ],
 )
 def test_a_table_that_is_changed_by_hand_is_a_fault(figures, made, change, fault):

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Literal
 
 import typer
 
-from vslam.cli.console import console
+from vslam.cli.console import Console
 from vslam.cli.options import open_given
 from vslam.errors import InputError, ResultsError
 
 if TYPE_CHECKING:
-    from vslam.cli.console import Console
     from vslam.datasets.frames import Source
     from vslam.datasets.perturbation import Perturbation
     from vslam.run.autosave import Unfinished
@@ -53,7 +52,7 @@ def drive(
     """
     if options.localize and output.save_map is not None:
         raise InputError("--save-map: localising does not change the map; leave it out.")
-    told = console(shown=not output.quiet)
+    told = Console(shown=not output.quiet)
     source, perturbation = _open(options, told)
     _refuse_camera(source, resume)
 

@@ -67,7 +67,8 @@ class FrameImages:
         Args:
             left: ``(H, W)`` uint8.
             read_second: gives the second image, or raises UnreadableImageError.
-            context, image_map: see ``extract_features``.
+            image_map: applies a function to both images, in turn or in parallel; the result does
+                not depend on it.
             mask: of the left image; None uses all of it.
         """
         self.left = left
@@ -131,26 +132,6 @@ class FrameImages:
         )
 
 
-def extract_features(
-    left: Image,
-    second: Image | DepthImage | None,
-    context: TrackingContext,
-    image_map: ImageMap = map,
-) -> Extracted:
-    """ORB features of the left image with their columns in the right image. If the left image is
-    black, the features are extracted from the right image and have no columns in the other one.
-
-    A pure function: the result does not depend on ``image_map``.
-
-    Args:
-        left: ``(H, W)`` uint8.
-        second: ``(H, W)``: the right image, uint8; for an RGB-D camera the depth in metres,
-            float32; None for a single image, whose features have no column in a right image.
-        image_map: applies a function to both images, in turn or in parallel.
-    """
-    return matched(find_corners(left, second, context, image_map), context)
-
-
 def find_corners(
     left: Image,
     second: Image | DepthImage | None,
@@ -159,9 +140,13 @@ def find_corners(
     sides: Sides | None = None,
     mask: Mask | None = None,
 ) -> Corners:
-    """The first step of ``extract_features``: the features of each image alone.
+    """The first step of extraction: the features of each image alone. If the left image is black,
+    they are extracted from the right image and have no columns in the other one.
 
     Args:
+        left: ``(H, W)`` uint8.
+        second: ``(H, W)``: the right image, uint8; for an RGB-D camera the depth in metres,
+            float32; None for a single image, whose features have no column in a right image.
         sides: the result of ``compare_sides``; None computes it.
         mask: of the image whose features are tracked, which is the right one if the left one is
             black. A right image is not masked for stereo matching: what is masked in the left image
@@ -186,7 +171,7 @@ def find_corners(
 def matched(
     corners: Corners, context: TrackingContext, keypoints: Keypoints | None = None
 ) -> Extracted:
-    """The second step of ``extract_features``: stereo matching.
+    """The second step of extraction: stereo matching.
 
     Args:
         keypoints: positions at which the left image gets features, too (``with_keypoints``).

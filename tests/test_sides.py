@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from vslam.camera import Camera
 from vslam.config import Config
-from vslam.frontend.extraction import extract_features
+from vslam.frontend.extraction import FrameImages
 from vslam.frontend.sides import ComparedSides, Sides, balanced, compare_sides
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_exp
@@ -147,7 +148,8 @@ def test_disparities_stay_true_when_a_side_is_dark(stops):
     left, right = scene()
     context = TrackingContext.create(CAMERA, Config())
     clean, dark = (
-        extract_features(left, r, context).features for r in (right, darker(right, stops))
+        FrameImages(left, partial(darker, right, by), context).extracted.features
+        for by in (0.0, stops)
     )
     for features, least in ((clean, 0.9), (dark, 0.7)):
         d = features.xy[:, 0] - features.u_right

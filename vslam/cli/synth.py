@@ -199,7 +199,7 @@ def synth(
                 on_frame=on_frame,
             )
         elif rgbd:
-            from vslam.datasets.synthetic.rgbd import render_rgbd
+            from vslam.datasets.synthetic.layouts import render_rgbd
 
             root = render_rgbd(
                 drive,
@@ -222,7 +222,7 @@ def synth(
             )
     if side_by_side is not None:
         from vslam.datasets.kitti import open_kitti
-        from vslam.datasets.synthetic.video import write_side_by_side
+        from vslam.datasets.synthetic.layouts import write_side_by_side
 
         frames = open_kitti(root, drive.name, max_frames=max_frames)
         calibration_file = write_side_by_side(frames, side_by_side)

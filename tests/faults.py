@@ -229,7 +229,7 @@ def write_ring(root: Path) -> None:
 def stage(*, learned: bool) -> None:
     """Let this process drive along the ring whatever the images show, with a detector that knows
     the way; ``learned``: learned descriptors may verify its loops."""
-    from vslam.cli import quiet
+    from vslam.cli.console import Console
     from vslam.frontend import extraction
     from vslam.loopclosure.registry import create_images
     from vslam.run import pipeline
@@ -255,13 +255,13 @@ def stage(*, learned: bool) -> None:
         return frame.read(image_map)
 
     @contextlib.contextmanager
-    def progress_bar(total: object) -> Iterator[Callable[[object], None]]:
+    def progress_bar(console: Console, total: object) -> Iterator[Callable[[object], None]]:
         yield lambda result: on_frame()
 
     extraction.find_corners, extraction.matched = find, see
     pipeline.detector_with_images = detector
     Source.frames = frames
-    quiet.progress_bar = progress_bar
+    Console.progress_bar = progress_bar
 
 
 @cache

@@ -378,6 +378,12 @@ def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
         f"error: {folder}: another process is still running here; wait until it is done.\n"
     )
     (folder / LOCK).touch()  # killed
+    options = read_options(folder)
+    write_options(folder, options.model_copy(update={"detector": "uninstalled"}))
+    unknown = vslam("run", "--resume", folder, *brief, cwd=tmp_path)
+    assert unknown.returncode == 2
+    assert f"--resume {folder}: detector uninstalled: unknown; choose one of none" in unknown.stderr
+    write_options(folder, options)
     elsewhere = tmp_path / "elsewhere.txt"
     elsewhere.write_text("kept")
     (folder / "report.md").symlink_to(elsewhere)
@@ -385,8 +391,12 @@ def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
     assert linked.returncode == 2
     assert f"{folder / 'report.md'}: this is a link" in linked.stderr
     (folder / "report.md").unlink()
-    resumed = vslam("run", "--resume", folder, *brief, "--save-map", "town.npz", cwd=tmp_path)
+    shown = ("--no-record", "--no-report", "--save-map", "town.npz")
+    resumed = vslam("run", "--resume", Path("runs/latest"), *shown, cwd=tmp_path)
     assert resumed.returncode == 0, resumed.stderr
+    assert "continuing at frame 12 ..." in resumed.stderr
+    assert f"runs/{folder.name}" in resumed.stdout
+    assert "runs/latest" not in resumed.stdout  # which is another run after the next one
     assert elsewhere.read_text() == "kept"
     assert (tmp_path / "town.npz").read_bytes() == (folder / "map.npz").read_bytes()
     assert not (folder / LOCK).exists()

@@ -545,7 +545,9 @@ def test_a_right_loop_on_a_revisit_too_short_to_count_is_explained() -> None:
     report = summarize(outcome, None, evaluate_loops(outcome), None)
     assert (report.revisit_stretches, report.loops_closed, report.loops[0].right) == (0, 1, True)
     note = headlines(report)[-1].note
-    assert note.startswith("no revisit of 20 m or more to be found (1 right on shorter ones), ")
+    assert note.startswith(
+        "the ground truth revisits no stretch of 20 m or more (1 right on shorter ones), "
+    )
 
 
 def test_before_is_drawn_in_the_frame_of_the_ground_truth() -> None:

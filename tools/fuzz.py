@@ -185,7 +185,7 @@ def _read_config(folder: Path) -> None:
 
 
 def _read_report(folder: Path) -> None:
-    from vslam.lab.overview import write_overview
+    from vslam.lab.overview.render import write_overview
     from vslam.report.finished_run import read_report
     from vslam.report.render import html, markdown
     from vslam.report.run_page import run_page

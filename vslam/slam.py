@@ -24,7 +24,7 @@ from vslam.frontend.tracker import Found, Tracker, TrackerStatus, result_of
 from vslam.frontend.tracking import TrackingContext, covariance_of
 from vslam.geometry import Matrix, inverse
 from vslam.loopclosure.detector import LoopDetector
-from vslam.loopclosure.learned_relocalization import LearnedRelocalisation
+from vslam.loopclosure.learned_verification import LearnedRelocalisation
 from vslam.loopclosure.registry import DEFAULT_DETECTOR, detector_with_images
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loopclosure.verifier import verifier_for

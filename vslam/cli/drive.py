@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Literal
 
 import typer
 
-from vslam.cli.console import console
+from vslam.cli.console import Console
 from vslam.cli.options import open_given
 from vslam.errors import InputError, ResultsError
 
 if TYPE_CHECKING:
-    from vslam.cli.console import Console
     from vslam.datasets.frames import Source
     from vslam.datasets.perturbation import Perturbation
     from vslam.run.autosave import Unfinished
@@ -52,7 +51,7 @@ def drive(
     """
     if options.localize and output.save_map is not None:
         raise InputError("--save-map: localising does not change the map; leave it out.")
-    told = console(shown=not output.quiet)
+    told = Console(shown=not output.quiet)
     source, perturbation = _open(options, told)
     _refuse_camera(source, resume)
 
@@ -71,6 +70,8 @@ def drive(
         _compile(settings, told)
         slam = begin(source.camera, settings, None if unfinished is None else unfinished.map)
         viewer = _viewer(output, told)
+        if unfinished is not None:
+            told.announce(f"continuing at frame {len(unfinished.progress.tracks)} ...")
         folder = resume or _new_folder(options, source, perturbation.name, out, lock)
         moments, pictures = MomentRecorder(), LoopPictureRecorder()
         recorder = _recorder(folder, output, unfinished, viewer, moments, pictures)
@@ -159,7 +160,7 @@ def _compile(settings: RunOptions, told: Console) -> None:
     from vslam.run.warmup import compile_kernels, is_cold
 
     if is_cold():
-        told.announce("first run: compiling the kernels, less than a minute ...")
+        told.announce("first run: compiling the kernels, about a minute ...")
     compile_kernels(processes=min(settings.threads, 2), load=settings.realtime)
 
 

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from vslam.maps.reconstruction import Reconstruction
     from vslam.maps.stored_map import StoredMap
 
-commands = typer.Typer(
+app = typer.Typer(
+    name="map",
     help="Show, merge and crop the maps of runs (docs/howto/maps.md).",
     no_args_is_help=True,
 )
@@ -30,12 +31,7 @@ Out = Annotated[Path, option(OUTPUT, "FILE", "Map to write; it must not exist ye
 MapFile = Annotated[Path, typer.Argument(metavar="MAP", help="Folder of a run, or a map.npz.")]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the application."""
-    app.add_typer(commands, name="map")
-
-
-@commands.command(epilog="[b]Example[/b]\n  vslam map info runs/latest")
+@app.command(epilog="[b]Example[/b]\n  vslam map info runs/latest")
 def info(
     map_file: MapFile,
 ) -> None:
@@ -104,9 +100,7 @@ def _extent(T_wc: NDArray[np.float64]) -> list[str]:
     return [f"{axis} {low[i]:.1f} to {high[i]:.1f}" for i, axis in ((0, "x"), (2, "z"))]
 
 
-@commands.command(
-    epilog="[b]Example[/b]\n  vslam map merge runs/monday runs/tuesday --out town.npz"
-)
+@app.command(epilog="[b]Example[/b]\n  vslam map merge runs/monday runs/tuesday --out town.npz")
 def merge(
     maps: Annotated[
         list[Path],
@@ -118,7 +112,7 @@ def merge(
     config: Thresholds = None,
     weights: Annotated[
         Path | None,
-        option(METHOD, "FILE", "ONNX file of the network of the detector that made the maps."),
+        option(METHOD, "FILE", "Weights or vocabulary of the detector that made the maps."),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -128,7 +122,7 @@ def merge(
     one, nothing is written and the exit code is 1. The files of the maps are not changed. Without
     --config, the thresholds are those that the first map was made with.
     """
-    from vslam.cli.console import console
+    from vslam.cli.console import Console
     from vslam.loopclosure.registry import detector_with_images
     from vslam.maps.storage import load_map, map_file_of
     from vslam.merging import Memory, merge_maps
@@ -158,7 +152,7 @@ def merge(
 
     keyframes = sum(one.map.n_keyframes for one in stored[1:])
     try:
-        with console(shown=not quiet).count_bar("keyframes", keyframes) as advance:
+        with Console(shown=not quiet).count_bar("keyframes", keyframes) as advance:
             merged = merge_maps(stored, thresholds, create, advance)
     except ValueError as error:
         raise InputError(f"{files[0]} and the others cannot be merged: {error}.") from error
@@ -188,7 +182,7 @@ def _thresholds_of(stored: list[StoredMap], files: list[Path]) -> Config:
     return as_config(thresholds, str(files[0]))
 
 
-@commands.command(
+@app.command(
     epilog="[b]Examples[/b]\n  vslam map crop town.npz --box=-50,50,0,200 --out street.npz\n"
     "  vslam map crop town.npz --point 20,140 --within 60 --out crossing.npz\n"
     "  vslam map crop town.npz --frames 300:500 --within 10 --out way.npz"

@@ -42,6 +42,10 @@ class Poses:
     T_wc: NDArray[np.float64]
     known: NDArray[np.bool_]
 
+    def bridged(self, times: NDArray[np.float64]) -> Trajectory:
+        """All poses at the ``(N,)`` times of the frames; unknown ones are interpolated."""
+        return bridge_gaps(Trajectory(times, self.T_wc), self.known)
+
 
 def check_template(name: str, template: str) -> None:
     """Refuse an invalid command template.
@@ -156,8 +160,10 @@ def _outcome(
     if not (out / "trajectory.txt").is_file():
         raise InputError(f"{settings.detector}: no trajectory.txt in {{out}}.")
     times = np.asarray(sequence.timestamps, np.float64)
-    final = _poses(out / "trajectory.txt", times, kept)
-    causal = _poses(out / "causal.txt", times, kept) if (out / "causal.txt").is_file() else final
+    final = read_poses(out / "trajectory.txt", times, kept)
+    causal = final
+    if (out / "causal.txt").is_file():
+        causal = read_poses(out / "causal.txt", times, kept)
     lost = ~final.known
     if (out / "states.txt").is_file():
         states = (out / "states.txt").read_text().split()
@@ -166,7 +172,7 @@ def _outcome(
         lost[kept] = np.array(states) != "OK"
     dropped = np.ones(len(times), bool)
     dropped[kept] = False
-    trajectory = bridge_gaps(Trajectory(times, final.T_wc), final.known)
+    trajectory = final.bridged(times)
     given = np.where(causal.known[:, None, None], causal.T_wc, _last_known(causal))
     tracks = [
         TrackResult(
@@ -194,8 +200,18 @@ def _outcome(
     )
 
 
-def _poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) -> Poses:
-    """Poses by frame; an unknown pose is the last known one before it, or the first one."""
+def read_poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) -> Poses:
+    """Read the poses that a system wrote. An unknown pose is the last known one before it, or the
+    first one.
+
+    Args:
+        path: file in KITTI's or TUM's format.
+        times: ``(N,)`` seconds of the frames.
+        kept: indices of the frames that the system got.
+
+    Raises:
+        InputError: the file is malformed.
+    """
     T_wc, known = np.tile(np.eye(4), (len(times), 1, 1)), np.zeros(len(times), bool)
     try:
         found = read_trajectory(path, times[kept] - times[0])

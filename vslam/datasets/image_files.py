@@ -46,8 +46,8 @@ def checked_files(
         check_not_empty(path)
     depth = depth_scale is not None
     sizes = tuple(image_size(side[0]) for side in (sides[:1] if depth else sides))
-    readers: list[Callable[[Path], Image | DepthImage]]
-    readers = [partial(_read_grey_of, size) for size in sizes]
+    grey = [partial(_read_grey_of, size) for size in sizes]
+    readers: list[Callable[[Path], Image | DepthImage]] = [*grey]
     if depth_scale is not None:
         readers.append(partial(_read_depth, sizes[0], depth_scale))
     decoders = [
@@ -61,8 +61,10 @@ def checked_files(
 
     stored = stored_frames(timestamps, read, sides[0], read_colour)
     if len(sizes) == 2:
-        pairs = zip(stored, decoders, strict=True)
-        stored = tuple(replace(frame, sides=alone) for frame, alone in pairs)
+        stored = tuple(
+            replace(frame, sides=(partial(grey[0], left), partial(grey[1], right)))
+            for frame, left, right in zip(stored, *sides, strict=True)
+        )
     source = RawSource(
         dataset=dataset,
         name=name,

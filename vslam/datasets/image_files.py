@@ -50,13 +50,10 @@ def checked_files(
     readers: list[Callable[[Path], Image | DepthImage]] = [*grey]
     if depth_scale is not None:
         readers.append(partial(_read_depth, sizes[0], depth_scale))
-    decoders = [
-        tuple(partial(read, path) for read, path in zip(readers, files, strict=True))
-        for files in zip(*sides, strict=True)
-    ]
 
     def read(index: int, image_map: ImageMap) -> Images:
-        left, *second = image_map(_call, decoders[index])
+        each = [partial(reader, side[index]) for reader, side in zip(readers, sides, strict=True)]
+        left, *second = image_map(_call, each)
         return np.asarray(left, np.uint8), second[0] if second else None
 
     stored = stored_frames(timestamps, read, sides[0], read_colour)

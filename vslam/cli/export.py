@@ -66,11 +66,11 @@ def colmap(
 ) -> None:
     """Write keyframe images and a sparse model in COLMAP's format."""
     from vslam.maps.colmap import save_colmap
-    from vslam.maps.new_output import new_folder
+    from vslam.maps.new_output import new_output
 
     finished, reconstruction = _read(run)
     target = out or run / "colmap"
-    with new_folder(target) as folder:
+    with new_output(target, folder=True) as folder:
         names, colours = _write_images(
             folder / "images", finished, data, reconstruction, link=link, quiet=quiet
         )
@@ -90,11 +90,11 @@ def nerfstudio(
 ) -> None:
     """Write keyframe images, poses and landmarks for nerfstudio."""
     from vslam.maps.formats import save_nerfstudio
-    from vslam.maps.new_output import new_folder
+    from vslam.maps.new_output import new_output
 
     finished, reconstruction = _read(run)
     target = out or run / "nerfstudio"
-    with new_folder(target) as folder:
+    with new_output(target, folder=True) as folder:
         names, colours = _write_images(
             folder / "images", finished, data, reconstruction, link=link, quiet=quiet
         )
@@ -119,14 +119,14 @@ def ply(
 ) -> None:
     """Write the landmarks with the colours that they have in the images."""
     from vslam.maps.formats import landmark_colours, save_ply
-    from vslam.maps.new_output import new_file
+    from vslam.maps.new_output import new_output
 
     if run.is_file() and not colours:
         reconstruction = _reconstruction_of_file(run)
     else:
         finished, reconstruction = _read(run)
     target = out or _beside(run, "landmarks.ply")
-    with new_file(target) as file:
+    with new_output(target) as file:
         seen = None
         if colours:
             frames = _keyframes(finished, data, quiet=quiet)
@@ -147,14 +147,14 @@ def g2o(
     from vslam.backend.pose_graph import LOOP
     from vslam.geometry import inverses
     from vslam.maps.formats import save_g2o
-    from vslam.maps.new_output import new_file
+    from vslam.maps.new_output import new_output
 
     graph, map_ = _graph(run)
     ids = graph.keyframes  # frames of several drives are not unique
     if len(set(map_.sessions)) == 1:
         ids = map_.frames[ids]
     target = out or _beside(run, "pose_graph.g2o")
-    with new_file(target) as file:
+    with new_output(target) as file:
         save_g2o(file, ids, inverses(graph.T_cw), graph.edges, graph.T_i_j, graph.sigmas)
     if not quiet:
         loops = np.count_nonzero(graph.kind == LOOP)
@@ -171,12 +171,12 @@ def euroc(
 
     Every run writes it in the formats of TUM and KITTI.
     """
-    from vslam.maps.new_output import new_file
+    from vslam.maps.new_output import new_output
     from vslam.trajectory import read_trajectory, write_euroc
 
     trajectory = read_trajectory(run / "trajectory.tum")
     target = out or run / "trajectory_euroc.csv"
-    with new_file(target) as file:
+    with new_output(target) as file:
         write_euroc(file, trajectory)
     if not quiet:
         typer.echo(f"{target}: {counted(len(trajectory), 'pose')}")
@@ -200,7 +200,7 @@ def ros(
     """Write odometry, transforms, path and landmarks as ROS 2 messages, in an MCAP file."""
     import numpy as np
 
-    from vslam.maps.new_output import new_file
+    from vslam.maps.new_output import new_output
     from vslam.maps.ros import frame_poses, save_bag
     from vslam.maps.storage import load_map
     from vslam.report.frame_table import read_covariances
@@ -218,7 +218,7 @@ def ros(
     if (run / "map.npz").is_file():  # a run that only localises has no map of its own
         map_ = load_map(run).map
         xyz = map_.arrays.xyz[map_.living_landmarks()]
-    with new_file(target) as file:
+    with new_output(target) as file:
         save_bag(file, poses, trajectory, xyz)
     if not quiet:
         typer.echo(f"{target}: {counted(len(poses), 'pose')}, {counted(len(xyz), 'landmark')}")

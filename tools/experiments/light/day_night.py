@@ -28,7 +28,7 @@ from vslam.datasets import open_sequence
 from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.features import TrackingState
-from vslam.frontend.extraction import extract_features
+from vslam.frontend.extraction import FrameImages
 from vslam.frontend.frame import Frame
 from vslam.frontend.relocaliser import Relocaliser
 from vslam.frontend.tracker import Found
@@ -101,7 +101,7 @@ class Localiser:
 
     def pose(self, image: Image) -> Matrix | None:
         """``(4, 4)`` pose T_wc in the world of the map, None if the image is not found."""
-        extracted = extract_features(image, None, self._context)
+        extracted = FrameImages(image, lambda: None, self._context).extracted
         frame = Frame.of(extracted, self._context.camera, image=image)
         lost = Found(TrackingState.LOST)
         found = self._relocaliser.relocalise_if_needed(frame, lost, self._map)
@@ -146,27 +146,6 @@ def rows_of(source: Source, n_map: int | None, options: argparse.Namespace) -> I
                     yield [source.name, law, detector, candidates, len(asked), right, wrong, recall]
 
 
-def table(path: Path) -> str:
-    """The table as Markdown: recalls with each number of candidates, and how many of all poses are
-    wrong."""
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    detectors = list(dict.fromkeys(row["detector"] for row in rows))
-    head = ["drive", "law", "images", *(f"`{name}`" for name in detectors), "wrong"]
-    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
-    for drive, law in dict.fromkeys((row["sequence"], row["law"]) for row in rows):
-        these = [row for row in rows if (row["sequence"], row["law"]) == (drive, law)]
-        recalls = [
-            ", ".join(f"{float(row['recall']):.2f}" for row in these if row["detector"] == name)
-            for name in detectors
-        ]
-        wrong = sum(int(row["wrong"]) for row in these)
-        poses = wrong + sum(int(row["right"]) for row in these)
-        cells = [f"`{drive}`", f"`{law}`", these[0]["images"], *recalls, f"{wrong} of {poses}"]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("dataset", choices=("kitti", "synthetic"))
@@ -189,7 +168,6 @@ def main() -> None:
             with options.out.open("a", newline="") as file:
                 csv.writer(file, lineterminator="\n").writerow(row)
             print(*row, sep="\t", flush=True)
-    print(table(options.out))
 
 
 if __name__ == "__main__":

@@ -32,28 +32,6 @@ def rows_of(folder: Path) -> list[list[object]]:
     return sorted(rows, key=lambda row: (row[2] != "none", row[:4]))
 
 
-def table(path: Path) -> str:
-    """The table as Markdown."""
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    systems = list(dict.fromkeys(row["system"] for row in rows))
-    found = {(row["law"], float(row["strength"]), row["system"]): row for row in rows}
-    lines = [f"| law | {' | '.join(f'`{name}`' for name in systems)} |"]
-    lines.append("|---" * (1 + len(systems)) + "|")
-    for law, strength in dict.fromkeys((law, strength) for law, strength, _ in found):
-        spec = law if law == "none" else f"{law}:{strength:g}"
-        cells = [_cell(found.get((law, strength, name))) for name in systems]
-        lines.append(f"| `{spec}` | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def _cell(row: dict[str, str] | None) -> str:
-    if row is None:
-        return "no result"
-    said = f"{row['lost']} lost, {float(row['ate_m']):.2f} m" if row["ate_m"] else "no ATE"
-    return f"{said}: **{row['fails']}**" if row["fails"] else said
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path)
@@ -66,7 +44,6 @@ def main() -> None:
         for *named, loss, ate, fails in rows_of(options.folder):
             rounded = ("" if x is None else round(x, 3) for x in (loss, ate))
             writer.writerow([*named, *rounded, fails])
-    print(table(options.table))
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from vslam.cli.options import (
     METHOD,
     OUTPUT,
     AllThreads,
+    Detectors,
     Quiet,
     Seed,
     Weights,
@@ -68,10 +69,7 @@ def bench(
             unset="three towns, or two drives",
         ),
     ] = None,
-    detectors: Annotated[
-        str,
-        option(METHOD, "NAMES", "Loop detectors, separated by commas; the first is the baseline."),
-    ] = "bow,capsule,capsule-pruned",
+    detectors: Detectors = "bow,capsule,capsule-pruned",
     weights: Weights = None,
     perturb: Annotated[
         str,

@@ -120,7 +120,6 @@ class LearnedVerifier(Verifier):
         self._trials = LearnedTrials(config.learned)
 
     def is_image_redundant(self, map_: Map, keyframe: int) -> bool:
-        """See :class:`Verifier`."""
         return is_image_redundant(map_, keyframe, self.images, self._config.learned)
 
     def add(self, map_: Map, keyframe: int, image: NDArray[np.uint8] | None) -> None:
@@ -161,11 +160,9 @@ class LearnedVerifier(Verifier):
         return replace(refusal, reason=f"{refusal.reason}; {edge.reason}")
 
     def state(self) -> VerifierState:
-        """See :class:`Verifier`."""
         return self._trials.state
 
     def restore(self, state: VerifierState) -> None:
-        """See :class:`Verifier`."""
         self._trials.state = state
 
 

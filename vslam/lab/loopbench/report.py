@@ -14,7 +14,7 @@ from vslam.lab.loopbench.schema import LoopsJson, OnlineScore, Score
 from vslam.report.page import Bullets, Page, Pairs, Section, Table
 from vslam.report.render import html, markdown, write_files
 
-_Scored = TypeVar("_Scored", Score, OnlineScore)
+_Scored = TypeVar("_Scored", bound=Score | OnlineScore)
 
 MEAN = "mean of all"
 _ABOUT_AP = (

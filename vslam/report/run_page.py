@@ -7,7 +7,7 @@ from html import escape
 
 from vslam.config import thresholds_in_words
 from vslam.errors import counted
-from vslam.evaluation.loops import LoopLimits
+from vslam.evaluation.loops import MIN_LENGTH_M
 from vslam.loopclosure.registry import about
 from vslam.report.loop_tables import loop_sections, seen_note
 from vslam.report.page import (
@@ -163,7 +163,7 @@ def _revisits(report: ReportJson) -> str:
     mentioned."""
     if report.revisit_stretches:
         return f"{report.loops_found} of {counted(report.revisit_stretches, 'revisit')} found"
-    none = f"no revisit of {LoopLimits().min_length_m:.0f} m or more to be found"
+    none = f"no revisit of {MIN_LENGTH_M:.0f} m or more to be found"
     right = sum(loop.accepted and loop.right is True for loop in report.loops)
     return f"{none} ({right} right on shorter ones)" if right else none
 

@@ -209,8 +209,7 @@ def epipolar_inliers(
 
     config = config or VerificationConfig()
     match = match_by_node(
-        *a.nodes, a.descriptors.view(np.uint64), np.ones(len(a.xy), np.bool_),
-        *b.nodes, b.descriptors.view(np.uint64), np.ones(len(b.xy), np.bool_),
+        *a.nodes, a.descriptors.view(np.uint64), *b.nodes, b.descriptors.view(np.uint64),
         config.match_distance, config.match_ratio,
     )  # fmt: skip
     rows = np.flatnonzero(match >= 0)

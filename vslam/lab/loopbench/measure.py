@@ -201,13 +201,11 @@ class Verification:
         return self._by_learned[key]
 
 
-def epipolar_inliers(
-    a: DescribedImage, b: DescribedImage, config: VerificationConfig | None = None
-) -> int:
+def epipolar_inliers(a: DescribedImage, b: DescribedImage) -> int:
     """Number of matches of two images that fit the best fundamental matrix found."""
     import cv2
 
-    config = config or VerificationConfig()
+    config = VerificationConfig()
     match = match_by_node(
         *a.nodes, a.descriptors.view(np.uint64), *b.nodes, b.descriptors.view(np.uint64),
         config.match_distance, config.match_ratio,

@@ -29,7 +29,7 @@ from vslam.lab.stress.run import Results, run_all
 from vslam.lab.stress.search import boundary, next_position, strength_at
 from vslam.lab.stress.summary import corruption_entries, mean_error, summarise
 from vslam.report.schema import Machine, ReportJson
-from vslam.run.outcome import RunSettings
+from vslam.run.options import RunOptions
 
 CONFIG = Config().model_dump_json(indent=2) + "\n"
 
@@ -324,8 +324,8 @@ def make_kitti(root: Path, frames: int = 12) -> Path:
     return root
 
 
-def settings(detector: str = "ruler") -> RunSettings:
-    return RunSettings("kitti", "00", "none", detector, "stereo", 0, 1, 0, 1, None, Config())
+def settings(detector: str = "ruler") -> RunOptions:
+    return RunOptions(detector=detector)
 
 
 RULER = """

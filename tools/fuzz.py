@@ -143,10 +143,10 @@ def _use_map_in(file: Path, other: Path, out: Path) -> None:
     from vslam.errors import InputError
     from vslam.loopclosure.registry import detector_with_images
     from vslam.maps.colmap import save_colmap
-    from vslam.maps.crop import in_box
-    from vslam.maps.ply import save_ply
+    from vslam.maps.formats import save_ply
     from vslam.maps.reconstruction import reconstruction_of
     from vslam.maps.storage import load_map
+    from vslam.maps.stored_map import in_box
     from vslam.merging import merge_maps
     from vslam.slam import Slam
 

@@ -1,4 +1,4 @@
-"""Write docs/reference/thresholds.md: every threshold of vslam/config/ with its unit and source.
+"""Write docs/reference/thresholds.md: every threshold of vslam/config.py with its unit and source.
 
 The docstring below a field ends with its source in brackets: paper, section and status of the
 value, as in "[OS1 V-D, customary]", or "[own]" where the rule has no paper either.
@@ -25,7 +25,7 @@ DESCRIPTION = re.compile(
 )
 HEAD = """# Thresholds
 
-Written by `python tools/threshold_table.py` from `vslam/config/`; `tests/test_threshold_table.py` compares the two. `vslam run --config FILE` reads them from a JSON file, `{"orb": {"n_features": 1500}}` or `{"orb.n_features": 1500}`, and `--config orb.n_features=1500,tracking.method=patches` sets them on the command line. In Python they are `Slam(camera, config={"orb.n_features": 1500})`. [design.md](../explanation/design.md) describes the methods.
+Written by `python tools/threshold_table.py` from `vslam/config.py`; `tests/test_threshold_table.py` compares the two. `vslam run --config FILE` reads them from a JSON file, `{"orb": {"n_features": 1500}}` or `{"orb.n_features": 1500}`, and `--config orb.n_features=1500,tracking.method=patches` sets them on the command line. In Python they are `Slam(camera, config={"orb.n_features": 1500})`. [design.md](../explanation/design.md) describes the methods.
 
 The source names the paper and section of the rule and says what the value is: *printed* in that section, *customary* in the programs and KITTI configurations of the ORB-SLAM family, or our *own*. OS1: Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2: Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017. ZS: Zhou and Sun, Sci Rep 15, 7644 (2025). Descriptor distances and ratios of best over second-best distance are upper bounds; a descriptor has 256 bits. A search radius at octave 0 grows with the scale of the pyramid level.
 

@@ -154,7 +154,7 @@ class Cells:
         from vslam.run.warmup import compile_kernels, is_cold
 
         if cells and is_cold():  # once, not in each run
-            self.told.announce("first run: compiling the kernels, less than a minute ...")
+            self.told.announce("first run: compiling the kernels, about a minute ...")
             compile_kernels(processes=min(available_cores(), 2))
         return run_here(cells, self.options, self.jobs, self.out)
 

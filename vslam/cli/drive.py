@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from vslam.run.autosave import Unfinished
     from vslam.run.moments import LoopPictureRecorder
     from vslam.run.options import RunOptions
-    from vslam.run.outcome import RunSettings
     from vslam.run.recorder import Recorder, Viewer
 
 
@@ -62,27 +61,29 @@ def drive(
     from vslam.report.folder import write_results
     from vslam.run.autosave import MAP, FolderAutosave, remove_autosave
     from vslam.run.moments import LoopPictureRecorder, MomentRecorder
-    from vslam.run.options import settings_of
     from vslam.run.pipeline import begin, run_sequence
 
-    settings = settings_of(options, source, perturbation.name)
+    as_applied = {"perturb": perturbation.name, "realtime": options.realtime or source.live}
+    settings = options.model_copy(update=as_applied)
     with ExitStack() as lock:
         unfinished = _unfinished(options, source, resume, lock)
         _compile(settings, told)
         slam = begin(source.camera, settings, None if unfinished is None else unfinished.map)
         viewer = _viewer(output, told)
-        folder = resume or _new_folder(options, settings, out, lock)
+        if unfinished is not None:
+            told.announce(f"continuing at frame {len(unfinished.progress.tracks)} ...")
+        folder = resume or _new_folder(options, source, perturbation.name, out, lock)
         moments, pictures = MomentRecorder(), LoopPictureRecorder()
         recorder = _recorder(folder, output, unfinished, viewer, moments, pictures)
         # Localising changes no map, so there are only poses to save.
         period = 0.0 if options.localize else options.autosave
-        autosave = FolderAutosave(folder, period, f"{settings.dataset} {source.name}")
+        autosave = FolderAutosave(folder, period, f"{source.dataset} {source.name}")
         with told.progress_bar(source.n_expected) as on_frame:
             outcome = run_sequence(
                 source, perturbation, settings, recorder,
                 on_frame=on_frame, autosave=autosave, resume=unfinished, slam=slam,
             )  # fmt: skip
-        if why := why_nothing_was_tracked(outcome, options):
+        if why := why_nothing_was_tracked(outcome):
             outcome = replace(outcome, warnings=[why, *outcome.warnings])
         report = write_results(
             folder, outcome, moments.moments, pictures.pictures,
@@ -155,23 +156,24 @@ def _viewer(output: Output, told: Console) -> Viewer | None:
     return viewer
 
 
-def _compile(settings: RunSettings, told: Console) -> None:
+def _compile(settings: RunOptions, told: Console) -> None:
     from vslam.run.warmup import compile_kernels, is_cold
 
     if is_cold():
-        told.announce("first run: compiling the kernels, less than a minute ...")
+        told.announce("first run: compiling the kernels, about a minute ...")
     compile_kernels(processes=min(settings.threads, 2), load=settings.realtime)
 
 
-def _new_folder(options: RunOptions, settings: RunSettings, out: Path, lock: ExitStack) -> Path:
+def _new_folder(
+    options: RunOptions, source: Source, perturb: str, out: Path, lock: ExitStack
+) -> Path:
     from vslam.config import changed_thresholds
     from vslam.report.folder import create_run_folder
     from vslam.run.autosave import lock_run
     from vslam.run.options import write_options
 
-    s = settings
-    changed = changed_thresholds(s.config.model_dump())
-    folder = create_run_folder(out, s.dataset, s.sequence, s.perturb, s.detector, changed)
+    changed = changed_thresholds(options.thresholds.model_dump())
+    folder = create_run_folder(out, source.dataset, source.name, perturb, options.detector, changed)
     lock.enter_context(lock_run(folder))
     write_options(folder, options)
     return folder

@@ -86,7 +86,7 @@ def nerfstudio(
     quiet: Quiet = False,
 ) -> None:
     """Write keyframe images, poses and landmarks for nerfstudio."""
-    from vslam.maps.nerfstudio import save_nerfstudio
+    from vslam.maps.formats import save_nerfstudio
 
     def save(folder: Path, model: Reconstruction, names: list[str], colours: Colours) -> None:
         save_nerfstudio(folder, model, [f"images/{name}" for name in names], colours)
@@ -110,9 +110,8 @@ def ply(
     quiet: Quiet = False,
 ) -> None:
     """Write the landmarks with the colours that they have in the images."""
-    from vslam.maps.keyframe_images import landmark_colours
+    from vslam.maps.formats import landmark_colours, save_ply
     from vslam.maps.new_output import new_file
-    from vslam.maps.ply import save_ply
 
     if run.is_file() and not colours:
         reconstruction = _reconstruction_of_file(run)
@@ -139,7 +138,7 @@ def g2o(
 
     from vslam.backend.pose_graph import LOOP
     from vslam.geometry import inverses
-    from vslam.maps.g2o import save_g2o
+    from vslam.maps.formats import save_g2o
     from vslam.maps.new_output import new_file
 
     graph, map_ = _graph(run)
@@ -275,7 +274,7 @@ def _export_images(
 ) -> None:
     """Write the keyframe images of a run into a new folder, and ``save`` a model beside them, given
     the names of the images and the colours of the landmarks."""
-    from vslam.maps.keyframe_images import landmark_colours, save_image
+    from vslam.maps.formats import landmark_colours, save_image
     from vslam.maps.new_output import new_folder
 
     finished, reconstruction = _read(run)

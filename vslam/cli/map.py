@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vslam.cli.tables import Rows
+    from vslam.config import Config
     from vslam.map import Map
     from vslam.maps.reconstruction import Reconstruction
     from vslam.maps.stored_map import StoredMap
@@ -120,7 +121,8 @@ def merge(
     """Merge several maps into one by verified loops between them.
 
     A map without a loop to the others is left out and named. If no map has a loop to the first
-    one, nothing is written and the exit code is 1. The files of the maps are not changed.
+    one, nothing is written and the exit code is 1. The files of the maps are not changed. Without
+    --config, the thresholds are those that the first map was made with.
     """
     from vslam.cli.console import Console
     from vslam.loopclosure.registry import detector_with_images
@@ -130,15 +132,15 @@ def merge(
     if len(maps) < 2:
         raise InputError(f"{maps[0]}: this is one map; name two or more to merge.")
     _require_free(out)
-    thresholds = read_thresholds(config)
-    # No camera waits for the network, which may see all keyframes at once.
-    seen = thresholds.siamese.model_copy(update={"embedded_at_once": sys.maxsize})
-    thresholds = thresholds.model_copy(update={"siamese": seen})
     files = [map_file_of(path) for path in maps]
     for number, file in enumerate(files):
         if file.resolve() in [other.resolve() for other in files[:number]]:
             raise InputError(f"{file}: named twice; a map cannot be merged with itself.")
     stored = [load_map(file) for file in files]
+    thresholds = _thresholds_of(stored, files) if config is None else read_thresholds(config)
+    # No camera waits for the network, which may see all keyframes at once.
+    seen = thresholds.siamese.model_copy(update={"embedded_at_once": sys.maxsize})
+    thresholds = thresholds.model_copy(update={"siamese": seen})
     if not stored[0].map.n_keyframes:
         raise InputError(f"{files[0]}: the map is empty; name one that others can be merged into.")
     name = stored[0].detector.name
@@ -164,6 +166,22 @@ def merge(
         typer.echo("no map has a loop to the first one: nothing was written")
         raise typer.Exit(1)
     _save(save_map, out, merged.stored)
+
+
+def _thresholds_of(stored: list[StoredMap], files: list[Path]) -> Config:
+    """The thresholds that the first map was made with; other maps with different ones are named."""
+    from vslam.config import as_config
+
+    thresholds = stored[0].thresholds
+    others = [
+        str(file) for one, file in zip(stored, files, strict=True) if one.thresholds != thresholds
+    ]
+    if others:
+        typer.echo(
+            f"{', '.join(others)}: made with other thresholds than {files[0]}, whose thresholds "
+            "are used; --config names others."
+        )
+    return as_config(thresholds, str(files[0]))
 
 
 @app.command(
@@ -208,8 +226,8 @@ def crop(
 
     x points to the right of the first camera and z ahead; the height does not matter.
     """
-    from vslam.maps.crop import in_box, near_frames, near_point
     from vslam.maps.storage import load_map, map_file_of, save_map
+    from vslam.maps.stored_map import in_box, near_frames, near_point
 
     if sum(map(bool, (box, point, frames))) != 1:
         raise InputError("--box, --point, --frames: give exactly one, which says what is kept.")

@@ -152,7 +152,11 @@ def run(
         _refuse_beside_resume(context)
         from vslam.run.options import resumed_options
 
-        drive(resumed_options(resume), output, resume=resume)
+        if resume.is_symlink():  # runs/latest names another run after the next one
+            resume = resume.parent / resume.readlink()
+        options = resumed_options(resume)
+        require_detector(options.detector, options.weights, f"--resume {resume}: detector")
+        drive(options, output, resume=resume)
         return
     if local_weights is not None and not local_weights.is_file():
         raise InputError(f"--local-weights {local_weights}: no such file; name an .onnx file.")

@@ -189,7 +189,7 @@ def foreign(
     from vslam.datasets.perturbation import parse_perturbation
     from vslam.lab.stress.external import run_external
     from vslam.report.folder import create_run_folder
-    from vslam.run.options import RunOptions, settings_of
+    from vslam.run.options import RunOptions
 
     options = RunOptions(
         **given.model_dump(), perturb=perturb, seed=seed, threads=threads, detector=name,
@@ -197,7 +197,7 @@ def foreign(
     )  # fmt: skip
     source = open_given(given, Console(shown=False))
     perturbation = parse_perturbation(perturb, seed)
-    settings = settings_of(options, source, perturbation.name)
+    settings = options.model_copy(update={"perturb": perturbation.name})
     folder = create_run_folder(out, source.dataset, source.name, perturbation.name, name)
     run_external(source, perturbation, settings, template, folder)
 

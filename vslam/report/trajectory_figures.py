@@ -144,7 +144,7 @@ def loop_closing(
 
 
 def _new_map(title: str, outcome: RunOutcome, evaluation: Evaluation | None) -> tuple[Figure, Axes]:
-    monocular = outcome.settings.sensor == "mono"
+    monocular = outcome.sequence.camera.monocular
     unit = "map units" if monocular and evaluation is None else "m"
     return new_figure(title, f"x ({unit})", f"z ({unit})", SQUARE)
 

@@ -28,7 +28,8 @@ from vslam.errors import DroppedFrameError, InputError, ResultsError
 from vslam.features import TrackingState, TrackResult
 from vslam.report.folder import write_results
 from vslam.report.schema import ReportJson
-from vslam.run.outcome import RunOutcome, RunSettings
+from vslam.run.options import RunOptions
+from vslam.run.outcome import RunOutcome
 from vslam.trajectory import Trajectory, bridge_gaps, read_trajectory
 
 _SAME_TIME_S = 1e-3
@@ -76,7 +77,7 @@ def check_template(name: str, template: str) -> None:
 def run_external(
     sequence: Source,
     perturbation: Perturbation,
-    settings: RunSettings,
+    settings: RunOptions,
     template: str,
     folder: Path,
 ) -> ReportJson:
@@ -154,7 +155,7 @@ def _call(template: str, sequence: Path, out: Path) -> None:
 
 
 def _outcome(
-    sequence: Source, settings: RunSettings, kept: NDArray[np.int64], out: Path, wall: float
+    sequence: Source, settings: RunOptions, kept: NDArray[np.int64], out: Path, wall: float
 ) -> RunOutcome:
     if not (out / "trajectory.txt").is_file():
         raise InputError(f"{settings.detector}: no trajectory.txt in {{out}}.")

@@ -202,6 +202,7 @@ def run_page(
                 [Bullets(report.skipped_messages)],
                 folded=True,
             ),
+            _gps(report),
             *explorer,
             Section("", [*figures], wide=False),
             Section("Time per stage (ms)", [stages], wide=False),
@@ -221,6 +222,28 @@ def run_page(
             Section("Configuration", [Markup(f"<pre>{escape(config)}</pre>")], folded=True),
         ),
     )
+
+
+def _gps(report: ReportJson) -> Section:
+    """The drive on the Earth; empty without GPS."""
+    if (found := report.gps_track) is None:
+        return Section("GPS", ())
+    latitude, longitude, altitude = found.datum
+    rows = [
+        ("origin", f"{latitude:.7f}°, {longitude:.7f}°, {altitude:.1f} m"),
+        ("fixes of tracked frames", f"{found.fixes}, {found.refused} of them refused"),
+        ("distance of the fixes used (RMS)", _number(found.residual_m, "m")),
+    ]
+    if report.sensor == "mono":
+        rows.append(("scale of the map", f"{found.metres_per_unit:.4g} m per unit"))
+    if found.ate_rmse_m is not None:
+        without = f"{_number(report.ate_rmse_m, 'm')} without ({report.alignment})"
+        rows.append(("ATE RMSE", f"{_number(found.ate_rmse_m, 'm')} with GPS (se3), {without}"))
+    note = (
+        "The drive is too straight for GPS to tell the rotation about it: the camera is taken to "
+    )
+    parts: list[Part] = [Pairs(rows)]
+    return Section("GPS", parts if found.level else [*parts, note + "stand upright."])
 
 
 def stage_rows(report: ReportJson) -> list[Row]:
@@ -244,6 +267,8 @@ def option_rows(report: ReportJson) -> list[tuple[str, str]]:
     realtime = [("realtime", "yes")] if report.realtime else []
     compare = [("compare", ", ".join(report.compare))] if report.compare else []
     files = [("calib", str(path)) for path in report.calib]
+    if report.gps:
+        files.append(("gps", str(report.gps)))
     if report.mask:
         files.append(("mask", str(report.mask)))
     return [*options, ("max-frames", limit), *thresholds, *weights, *realtime, *files, *compare]

@@ -23,6 +23,7 @@ class RunOptions(SourceOptions):
     seed: int = 0
     threads: int = 1
     detector: str = DEFAULT_DETECTOR
+    gps: Path | None = None
     weights: Path | None = None
     local_weights: Path | None = None
     thresholds: Config = Config()
@@ -56,6 +57,7 @@ def settings_of(options: RunOptions, source: Source, perturb: str) -> RunSetting
         realtime=options.realtime or source.live,
         calib=options.calib,
         mask=options.mask,
+        gps=options.gps,
         map=options.map_file,
         localize=options.localize,
         compare=options.compare,
@@ -71,7 +73,7 @@ def write_options(folder: Path, options: RunOptions) -> None:
     data = Path(options.data)
     absolute: dict[str, object] = {
         name: path.resolve()
-        for name in ("right", "depth", "mask", "weights", "local_weights", "map_file")
+        for name in ("right", "depth", "mask", "gps", "weights", "local_weights", "map_file")
         if (path := getattr(options, name)) is not None
     }
     if options.data and data.exists():

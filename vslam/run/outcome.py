@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,9 @@ from vslam.loops import LoopCorrection, LoopEdge
 from vslam.map import Map
 from vslam.maps.stored_map import StoredMap, World
 from vslam.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from vslam.run.gps import GpsTrack
 
 
 def alignment_of(sensor: str) -> str:
@@ -42,6 +46,7 @@ class RunSettings:
     realtime: bool = False
     calib: tuple[Path, ...] = ()
     mask: Path | None = None
+    gps: Path | None = None
     map: Path | None = None
     localize: bool = False
     compare: tuple[str, ...] = ()
@@ -81,6 +86,7 @@ class RunOutcome:
         keyframe_frames: ``(K,)`` int64, the frame of this run behind each keyframe, including
             culled ones; -1 for keyframes of earlier drives.
         n_submaps: how often a map or sub-map was started; 0 before the first keyframe.
+        gps_track: the drive on the Earth; None without GPS.
         interrupted: why the run ended early ("Ctrl-C", a truncated file), or None.
         compared: the runs of the detectors of ``settings.compare`` on the same frames, without
             their maps; empty for a resumed run.
@@ -108,6 +114,7 @@ class RunOutcome:
     corrections: list[LoopCorrection] = field(default_factory=list)
     keyframe_frames: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     n_submaps: int = 1
+    gps_track: GpsTrack | None = None
     interrupted: str | None = None
     step_s: float = 0.0
     compared: tuple[RunOutcome, ...] = ()

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.backend.pose_graph import GAP, WEAK, PoseGraph, edge_sigmas
+from vslam.backend.pose_graph import GAP, WEAK, PoseGraph, edge_sigmas, minimised
 from vslam.config import PoseGraphConfig
 from vslam.errors import InputError
 from vslam.geometry import inverses
@@ -154,13 +154,11 @@ class Alignment:
 
     Attributes:
         S_enu_w: ``(4, 4)``; a rigid motion for a metric map.
-        inliers: ``(M,)`` bool.
         unsure: standard deviation of the direction of the drive, rad.
         unsure_about: standard deviation of the rotation about this direction, rad.
     """
 
     S_enu_w: Array
-    inliers: NDArray[np.bool_]
     unsure: float
     unsure_about: float
 
@@ -190,12 +188,11 @@ def align(T_wk: Array, positions: Positions, *, metric: bool, seed: int = 0) -> 
             inliers[:] = True
         best = _umeyama(at[inliers], enu[inliers], up[inliers], metric=metric)
     path = _mapped(best, at[inliers])
-    spread = np.sort(np.linalg.eigvalsh(np.atleast_2d(np.cov(path.T, bias=True))))[::-1]
+    spread = np.linalg.eigvalsh(np.cov(path.T, bias=True))[::-1]
     independent = float(np.sum(1.0 / positions.select(inliers).crowding))
     error = sigma / np.sqrt(independent)
-    unsure = error / np.sqrt(max(spread[0], 1e-12))
-    unsure_about = error / np.sqrt(max(spread[1:].sum(), 1e-12))
-    return Alignment(best, inliers, float(unsure), float(unsure_about))
+    unsure, unsure_about = error / np.sqrt(np.maximum([spread[0], spread[1:].sum()], 1e-12))
+    return Alignment(best, float(unsure), float(unsure_about))
 
 
 def _umeyama(p: Array, q: Array, up: Array, *, metric: bool) -> Array:
@@ -321,8 +318,5 @@ def _optimised(
         loss = None if cauchy is None else noise.mEstimator.Cauchy.Create(cauchy / n)
         model = plain if loss is None else noise.Robust.Create(loss, plain)
         factors.add(gtsam.GPSFactorArm(i, positions.enu[k], arms[k], model))
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(config.iterations)
-    parameters.setRelativeErrorTol(1e-5)
-    result = gtsam.LevenbergMarquardtOptimizer(factors, start, parameters).optimize()
+    result = minimised(factors, start, config)
     return np.array([result.atPose3(i).matrix() for i in range(len(T_enu_k))])

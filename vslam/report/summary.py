@@ -191,12 +191,12 @@ def gps_figures(outcome: RunOutcome) -> GpsFigures | None:
     latitude, longitude, altitude = track.datum.tolist()
     return GpsFigures(
         datum=(latitude, longitude, altitude),
-        fixes=len(track.used),
-        refused=int(np.count_nonzero(~track.used)),
-        residual_m=track.residual_m,
-        metres_per_unit=track.scale,
+        fixes=len(track.fixes),
+        refused=int(np.count_nonzero(~track.anchored.used)),
+        residual_m=track.anchored.residual_m,
+        metres_per_unit=float(track.anchored.scale.mean()),
         ate_rmse_m=ate,
-        level=track.level,
+        level=track.anchored.level,
     )
 
 

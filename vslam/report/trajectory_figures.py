@@ -147,7 +147,8 @@ def loop_closing(
 def gps_map(track: GpsTrack) -> Figure:
     """The drive on the Earth, with and without GPS, and the fixes."""
     figure, axes = new_figure("With GPS", "east (m)", "north (m)", SQUARE)
-    fixes, refused = track.fixes[track.used], track.fixes[~track.used]
+    used = track.anchored.used
+    fixes, refused = track.fixes[used], track.fixes[~used]
     axes.plot(*fixes.T[:2], ".", color=GREY, markersize=4, label=f"fixes ({len(fixes)})")
     if len(refused):
         axes.plot(*refused.T[:2], "x", color=RED, markersize=4, label=f"refused ({len(refused)})")

@@ -30,10 +30,7 @@ class GpsTrack:
         datum: ``(3,)`` latitude, longitude and altitude of the origin: those of the first fix.
         visual: ``(N, 3)`` positions in ENU without GPS, after the alignment alone.
         fixes: ``(M, 3)`` the fixes of tracked frames, in ENU.
-        used: ``(M,)`` bool, those that passed the test.
-        residual_m: root mean square distance between the used fixes and the trajectory.
-        scale: metres per unit of the map, its mean over the frames; 1 in metric maps.
-        level: see `vslam.backend.gps.Anchored`.
+        anchored: the keyframes in ENU, and which of the fixes were used.
     """
 
     trajectory: Trajectory
@@ -41,10 +38,7 @@ class GpsTrack:
     datum: NDArray[np.float64]
     visual: NDArray[np.float64]
     fixes: NDArray[np.float64]
-    used: NDArray[np.bool_]
-    residual_m: float
-    scale: float
-    level: bool
+    anchored: Anchored
 
 
 def locate(stored: StoredMap, fixes: Fixes, config: PoseGraphConfig) -> GpsTrack:
@@ -71,7 +65,7 @@ def locate(stored: StoredMap, fixes: Fixes, config: PoseGraphConfig) -> GpsTrack
     positions, datum = _positions(table, map_.arrays.T_cw[: map_.n_keyframes], fixes)
     metric = not stored.camera.monocular
     found = anchor(graph, map_.timestamps[: map_.n_keyframes], positions, config, metric=metric)
-    trajectory = _trajectory(table, found)
+    trajectory = _in_map(table, inverses(found.T_enu_k), found.scale)
     S, visual = found.S_enu_w, _in_map(table, graph.T_cw).T_wc[:, :3, 3]
     return GpsTrack(
         trajectory=trajectory,
@@ -79,10 +73,7 @@ def locate(stored: StoredMap, fixes: Fixes, config: PoseGraphConfig) -> GpsTrack
         datum=datum,
         visual=visual @ S[:3, :3].T + S[:3, 3],
         fixes=positions.enu,
-        used=found.used,
-        residual_m=found.residual_m,
-        scale=float(found.scale[table.reference].mean()),
-        level=found.level,
+        anchored=found,
     )
 
 
@@ -103,10 +94,6 @@ def _in_map(
         first = int(np.argmax(table.tracked))
         T_wc[:first] = T_wc[first]
     return bridge_gaps(Trajectory(table.timestamp, T_wc), table.tracked)
-
-
-def _trajectory(table: FrameTable, found: Anchored) -> Trajectory:
-    return _in_map(table, inverses(found.T_enu_k), found.scale)
 
 
 def _positions(

@@ -83,6 +83,7 @@ def prepared_frames(
             yield frame.timestamp, prepare_frame(frame, context)
         return
     ahead: deque[tuple[float, Future[PreparedFrame]]] = deque()
+    asked = -1
     with ThreadPoolExecutor(threads, "extraction") as pool:
         try:
             for frame in frames:
@@ -91,8 +92,10 @@ def prepared_frames(
                     timestamp, prepared = ahead.popleft()
                     yield timestamp, prepared.result()
                     begin += 1
-                    if 0 <= (due := next_extraction() - begin) < len(ahead):
-                        pool.submit(_find_corners, ahead[due][1])
+                    due = next_extraction()
+                    if due > asked and 0 <= due - begin < len(ahead):
+                        pool.submit(_find_corners, ahead[due - begin][1])
+                        asked = due
             for timestamp, prepared in ahead:
                 yield timestamp, prepared.result()
         finally:

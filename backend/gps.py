@@ -35,6 +35,7 @@ _NARROWING = 3.0  # from one optimisation to the next
 _DRIFT = 0.02  # of the map, as a share of its radius, that the alignment allows
 _DRAWS, _MOST_DRAWN = 1000, 500  # of RANSAC: triples, and fixes that are drawn from
 _UP_WEIGHT = 1e-3  # see _umeyama
+_METRIC = 0.02  # standard deviation of the scale of a metric map, by errors of its calibration
 _MOST_UNSURE = 0.1  # rad, of the alignment
 _LOOSE = np.array([0.3, 0.3, 0.3, 100.0, 100.0, 100.0])  # rad and m, of the prior
 _STRETCH = 0.1  # of the edges of a monocular map while its local scale is sought
@@ -80,7 +81,7 @@ class Anchored:
 
     Attributes:
         T_enu_k: ``(N, 4, 4)`` poses of the keyframes, in metres.
-        scale: ``(N,)`` metres per unit of the map at each keyframe; 1 in metric maps.
+        scale: ``(N,)`` metres per unit of the map at each keyframe.
         used: ``(M,)`` bool, the fixes that passed the test.
         residual_m: root mean square of the distances between these and the trajectory.
         S_enu_w: ``(4, 4)`` the alignment of the whole map before the optimisation.
@@ -104,8 +105,8 @@ def anchor(
     Args:
         graph: the essential graph of the map.
         seconds: ``(N,)`` times of its keyframes.
-        metric: whether the unit of the map is the metre. The scale of a monocular map is estimated,
-            and its drift with it.
+        metric: whether the unit of the map is the metre, except for errors of the calibration. The
+            scale of a monocular map is estimated freely, and its drift with it.
 
     Raises:
         InputError: the drive is too short for its direction to be known.
@@ -118,13 +119,13 @@ def anchor(
             "the drive is too short for GPS: the fixes do not tell which way it went; drive "
             "farther, or use a receiver with a smaller error."
         )
-    T_enu_k, scale = _moved(T_wk, main.S_enu_w, metric=metric)
+    T_enu_k, scale = _moved(T_wk, main.S_enu_w)
     for label in np.unique(part) if part.any() else ():
         at = part[positions.keyframe] == label
         own = align(T_wk, positions.select(at), metric=metric) if at.sum() >= 3 else main
         if own.unsure <= _MOST_UNSURE:
             inside = part == label
-            T_enu_k[inside], scale[inside] = _moved(T_wk[inside], own.S_enu_w, metric=metric)
+            T_enu_k[inside], scale[inside] = _moved(T_wk[inside], own.S_enu_w)
 
     width = 2.0 * float(np.sqrt(np.median(_chi2(positions, T_enu_k, scale))))
     width = max(width, _CAUCHY * _NARROWING ** (1 if metric else 4))
@@ -153,7 +154,7 @@ class Alignment:
     """A similarity from the map to ENU, and how sure it is.
 
     Attributes:
-        S_enu_w: ``(4, 4)``; a rigid motion for a metric map.
+        S_enu_w: ``(4, 4)``.
         unsure: standard deviation of the direction of the drive, rad.
         unsure_about: standard deviation of the rotation about this direction, rad.
     """
@@ -165,6 +166,9 @@ class Alignment:
 
 def align(T_wk: Array, positions: Positions, *, metric: bool, seed: int = 0) -> Alignment:
     """Align a map with its fixes by RANSAC.
+
+    The scale of a metric map is estimated, too, as far as the fixes are surer of it than the
+    calibration (``_METRIC``): a baseline that is 1 % too long makes the map 1 % too large.
 
     Args:
         T_wk: ``(N, 4, 4)`` poses of the keyframes in the map.
@@ -179,24 +183,33 @@ def align(T_wk: Array, positions: Positions, *, metric: bool, seed: int = 0) -> 
     rng = np.random.default_rng(seed)
     drawn = np.unique(np.linspace(0, len(enu) - 1, min(len(enu), _MOST_DRAWN)).astype(int))
     triples = drawn[np.argsort(rng.random((_DRAWS, len(drawn))), axis=1)[:, :3]]
-    S = _umeyama(at[triples], enu[triples], up[triples], metric=metric)
+    fixed = 1.0 if metric else None
+    S = _umeyama(at[triples], enu[triples], up[triples], fixed)
     apart = np.linalg.norm(_mapped(S, at[drawn]) - enu[drawn], axis=-1)
     best = S[np.argmin(np.minimum(apart / near, 1.0).sum(axis=1))]
     for _ in range(3):
         inliers = np.linalg.norm(_mapped(best, at) - enu, axis=-1) <= near
         if inliers.sum() < 3:
             inliers[:] = True
-        best = _umeyama(at[inliers], enu[inliers], up[inliers], metric=metric)
+        best = _umeyama(at[inliers], enu[inliers], up[inliers], fixed)
     path = _mapped(best, at[inliers])
     spread = np.linalg.eigvalsh(np.cov(path.T, bias=True))[::-1]
     independent = float(np.sum(1.0 / positions.select(inliers).crowding))
     error = sigma / np.sqrt(independent)
+    if metric:
+        free = _umeyama(at[inliers], enu[inliers], up[inliers], None)
+        apart = np.sqrt(np.mean((_mapped(free, at[inliers]) - enu[inliers]) ** 2))
+        variance = max(sigma, apart) ** 2 / (independent * max(spread.sum(), 1e-12))
+        share = _METRIC**2 / (_METRIC**2 + variance)
+        scale = 1.0 + share * (_scale_of(free) - 1.0)
+        best = _umeyama(at[inliers], enu[inliers], up[inliers], scale)
     unsure, unsure_about = error / np.sqrt(np.maximum([spread[0], spread[1:].sum()], 1e-12))
     return Alignment(best, float(unsure), float(unsure_about))
 
 
-def _umeyama(p: Array, q: Array, up: Array, *, metric: bool) -> Array:
-    """``(..., 4, 4)`` similarities that map ``(..., M, 3)`` points p to q, with scale 1 if metric.
+def _umeyama(p: Array, q: Array, up: Array, fixed: float | None) -> Array:
+    """``(..., 4, 4)`` similarities that map ``(..., M, 3)`` points p to q; their scale is ``fixed``
+    unless that is None.
 
     Points on a line leave the rotation about it open. There, the camera's upward axes ``up``
     decide, with a weight that is too small to matter anywhere else.
@@ -210,14 +223,20 @@ def _umeyama(p: Array, q: Array, up: Array, *, metric: bool) -> Array:
     U, _, Vt = np.linalg.svd(cross + _UP_WEIGHT * size[..., None, None] * upward)
     U[..., 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
     R = U @ Vt
-    scale = np.ones(size.shape)
-    if not metric:
+    scale: Array | float
+    if fixed is not None:
+        scale = fixed
+    else:
         scale = np.einsum("...ij,...ij->...", R, cross) / np.maximum((p0**2).sum((-2, -1)), 1e-12)
     S = np.zeros((*size.shape, 4, 4))
-    S[..., :3, :3] = scale[..., None, None] * R
+    S[..., :3, :3] = np.asarray(scale)[..., None, None] * R
     S[..., :3, 3] = q_mean - np.einsum("...ij,...j->...i", S[..., :3, :3], p_mean)
     S[..., 3, 3] = 1.0
     return S
+
+
+def _scale_of(S: Array) -> float:
+    return float(np.cbrt(np.linalg.det(S[:3, :3])))
 
 
 def _mapped(S: Array, points: Array) -> Array:
@@ -225,9 +244,9 @@ def _mapped(S: Array, points: Array) -> Array:
     return points @ np.swapaxes(S[..., :3, :3], -2, -1) + S[..., None, :3, 3]
 
 
-def _moved(T_wk: Array, S_enu_w: Array, *, metric: bool) -> tuple[Array, Array]:
+def _moved(T_wk: Array, S_enu_w: Array) -> tuple[Array, Array]:
     """Poses ``T_enu_k`` and scales of keyframes after an alignment."""
-    scale = 1.0 if metric else float(np.cbrt(np.linalg.det(S_enu_w[:3, :3])))
+    scale = _scale_of(S_enu_w)
     T_enu_k = S_enu_w @ T_wk
     T_enu_k[:, :3, :3] /= scale
     return T_enu_k, np.full(len(T_wk), scale)

@@ -226,7 +226,7 @@ def test_the_test_refuses_what_has_jumped_and_little_else():
     assert without > 3.0
     assert error_of(anchored, enu) < 0.9
     assert anchored.level
-    assert (anchored.scale == 1.0).all()
+    assert anchored.scale == pytest.approx(1.0, abs=0.01)
     angles = Rotation.from_matrix(
         (R_ENU_CAMERA @ true[:, :3, :3]).transpose(0, 2, 1) @ anchored.T_enu_k[:, :3, :3]
     ).magnitude()
@@ -247,6 +247,18 @@ def test_the_alignment_ignores_wrong_fixes(metric):
     assert np.linalg.norm(T_wk[:, :3, 3] @ S[:3, :3].T + S[:3, 3] - enu, axis=1).max() < 1.5
     assert found.unsure < 0.01
     assert found.unsure_about < 0.02
+
+
+def test_an_error_of_the_calibration_is_found_where_the_drive_is_long_enough():
+    """A baseline that is 2 % too long."""
+    for n, share in ((500, 1.0), (15, 0.0)):
+        true, found = drive(n)
+        found[:, :3, 3] *= 1.02
+        positions, enu = measured(true)
+        graph = graph_of(found, positions.seconds)
+        anchored = anchor(graph, positions.seconds, positions, CONFIG, metric=True)
+        assert anchored.scale == pytest.approx(1.0 - share * (1.0 - 1.0 / 1.02), abs=0.008)
+        assert error_of(anchored, enu) < 1.0
 
 
 def test_fixes_within_the_time_of_their_bias_weigh_as_one():
@@ -351,6 +363,7 @@ def test_a_run_with_gps_lies_on_the_earth(call, corridor, kitti_tree, fixes, tmp
     assert figures["ate_rmse_m"] < 0.1
     page = (run / "report.md").read_text()
     assert "28, 1 of them refused" in page
+    assert "27 fixes" in page
     assert (run / "figures" / "gps_map.png").is_file()
     assert "too straight" in page or figures["level"]
 

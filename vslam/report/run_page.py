@@ -58,6 +58,7 @@ def headlines(report: ReportJson) -> list[Tile]:
             "bad" if lost else "good",
         ),
         *_in_map(report),
+        *_on_earth(report),
         *([Tile("Scale", "arbitrary", "as of any single camera")] if mono else []),
         Tile("ATE RMSE", _number(report.ate_rmse_m, "m"), evaluated),
         Tile(
@@ -114,6 +115,14 @@ def _in_map(report: ReportJson) -> list[Tile]:
         Tile("In the map", f"{found.in_map_percent:.1f} %", note),
         Tile("Error in the map", error, "RMSE of these frames, with the map's own alignment"),
     ]
+
+
+def _on_earth(report: ReportJson) -> list[Tile]:
+    if (found := report.gps_track) is None:
+        return []
+    apart = f"{_number(found.residual_m, 'm')} from the trajectory (RMS)"
+    used = f"{found.fixes - found.refused} fixes"
+    return [Tile("GPS", used, f"{found.refused} refused; {apart}")]
 
 
 def _latency(report: ReportJson) -> list[Tile]:
@@ -233,9 +242,8 @@ def _gps(report: ReportJson) -> Section:
         ("origin", f"{latitude:.7f}°, {longitude:.7f}°, {altitude:.1f} m"),
         ("fixes of tracked frames", f"{found.fixes}, {found.refused} of them refused"),
         ("distance of the fixes used (RMS)", _number(found.residual_m, "m")),
+        ("scale of the map", f"{found.metres_per_unit:.4g} m per unit"),
     ]
-    if report.sensor == "mono":
-        rows.append(("scale of the map", f"{found.metres_per_unit:.4g} m per unit"))
     if found.ate_rmse_m is not None:
         without = f"{_number(report.ate_rmse_m, 'm')} without ({report.alignment})"
         rows.append(("ATE RMSE", f"{_number(found.ate_rmse_m, 'm')} with GPS (se3), {without}"))

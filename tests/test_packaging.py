@@ -100,6 +100,13 @@ def test_its_metadata_are_complete(wheels):
     assert "# vslam" in str(metadata.get_payload())
 
 
+def test_an_old_python_is_refused_in_one_sentence():
+    code = "import sys, setuptools; sys.modules['tomllib'] = None; import setup"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith("vslam needs Python 3.11 or later; this is Python 3.")
+
+
 def readme_for(source: str, tmp_path: Path) -> str:
     """As setup.py makes it where pyproject.toml names this page of the repository."""
     for name in ("setup.py", "README.md"):

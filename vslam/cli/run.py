@@ -46,11 +46,10 @@ _EXAMPLES = """
 _OTHER_DETECTORS = ", ".join(name for name in DETECTOR_NAMES if name not in ("none", "both"))
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command(epilog=_EXAMPLES)(run)
+app = typer.Typer()
 
 
+@app.command(epilog=_EXAMPLES)
 @reads_source()
 def run(
     context: typer.Context,
@@ -79,7 +78,10 @@ def run(
     weights: Annotated[
         Path | None,
         option(
-            METHOD, "FILE", "ONNX file of the detector's network, written by [b]vslam train[/b]."
+            METHOD,
+            "FILE",
+            "ONNX file of the detector's network, written by [b]vslam train[/b], or the "
+            "vocabulary of [b]bow[/b], written by [b]vslam vocabulary[/b].",
         ),
     ] = None,
     local_weights: Annotated[
@@ -159,7 +161,11 @@ def run(
         _refuse_beside_resume(context)
         from vslam.run.options import resumed_options
 
-        drive(resumed_options(resume), output, resume=resume)
+        if resume.is_symlink():  # runs/latest names another run after the next one
+            resume = resume.parent / resume.readlink()
+        options = resumed_options(resume)
+        require_detector(options.detector, options.weights, f"--resume {resume}: detector")
+        drive(options, output, resume=resume)
         return
     if local_weights is not None and not local_weights.is_file():
         raise InputError(f"--local-weights {local_weights}: no such file; name an .onnx file.")

@@ -106,7 +106,8 @@ def require_overlap(fixes: Fixes, source: Source, path: Path) -> None:
     if source.seekable:
         first, last = source.timestamps[[0, -1]].tolist()
     else:
-        first, last = next(source.frames()).timestamp, np.inf
+        frame = next(source.frames(), None)
+        first, last = -np.inf if frame is None else frame.timestamp, np.inf
     if not len(fixes.between(first, last)):
         images = f"from {first:.3f}" + (f" to {last:.3f} s" if np.isfinite(last) else " s on")
         raise InputError(

@@ -156,7 +156,8 @@ def _revisits(report: ReportJson) -> str:
     mentioned."""
     if report.revisit_stretches:
         return f"{report.loops_found} of {counted(report.revisit_stretches, 'revisit')} found"
-    none = f"no revisit of {LoopLimits().min_length_m:.0f} m or more to be found"
+    shortest = f"{LoopLimits().min_length_m:.0f} m"
+    none = f"the ground truth revisits no stretch of {shortest} or more"
     right = sum(loop.accepted and loop.right is True for loop in report.loops)
     return f"{none} ({right} right on shorter ones)" if right else none
 
@@ -181,7 +182,7 @@ def run_page(
     """
     interrupted = f"Interrupted: {report.interrupted}."
     done = counted(report.frames, "frame")
-    alerts = [Alert(interrupted, f"The numbers are of the {done} before it.")]
+    alerts = [Alert(interrupted, f"The results cover the {done} before it.")]
     if not report.interrupted:
         alerts = []
     alerts += [Alert(f"Warning: {warning}") for warning in report.warnings]

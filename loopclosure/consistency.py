@@ -38,12 +38,6 @@ class LoopConsistency:
         self._verified: list[tuple[int, LoopEdge]] = []  # turn, edge
         self._turn = 0
 
-    @property
-    def n_groups(self) -> int:
-        """Number of remembered groups; at most the number of candidates of the last ``max_gap + 1``
-        keyframes."""
-        return len(self._groups)
-
     def update(
         self, keyframe: int, candidates: list[LoopCandidate], map_: Map
     ) -> tuple[list[LoopCandidate], list[LoopEdge]]:

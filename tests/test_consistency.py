@@ -97,11 +97,11 @@ def test_overlapping_groups_do_not_multiply():
     for query in range(110, 140):
         matches = [20 + (query + i) % 10 for i in range(10)]
         consistency.update(query, candidates(query, *matches), STREET)
-        assert consistency.n_groups <= 10
+        assert len(consistency.state().places) <= 10
     for query in range(140, 170):  # and those that nothing continues are forgotten
         apart = [1000 * query + 20 * i for i in range(10)]
         consistency.update(query, candidates(query, *apart), STREET)
-        assert consistency.n_groups <= 30
+        assert len(consistency.state().places) <= 30
 
 
 def test_the_same_group_twice_counts_once():
@@ -109,7 +109,7 @@ def test_the_same_group_twice_counts_once():
     consistent, rejected = consistency.update(110, candidates(110, 10, 10, 10, 11), STREET)
     assert consistent == []
     assert len(rejected) == 4
-    assert consistency.n_groups == 2
+    assert len(consistency.state().places) == 2
 
 
 # -- verified ones --------------------------------------------------------------------------------

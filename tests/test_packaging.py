@@ -198,7 +198,7 @@ def test_the_image_is_not_root_and_copies_what_exists():
     ("file", "at_least"),
     [
         (".devcontainer/devcontainer.json", {"dev", "demo", "test"}),
-        (".ci/run", {"check", "test"}),
+        (".ci/run", {"check", "figures-check", "test"}),
         (".github/workflows/ci.yml", {"test-fast"}),
         (".pre-commit-config.yaml", {"types", "dev"}),
     ],

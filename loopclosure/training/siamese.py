@@ -13,7 +13,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vslam.errors import InputError, ResultsError
+from vslam.errors import InputError, write_file
 from vslam.loopclosure.siamese.weights import NETWORKS
 from vslam.loopclosure.training.branches import CapsuleBranch, CapsuleShape
 from vslam.loopclosure.training.capsules import TINY
@@ -178,14 +178,8 @@ def save_network(
         "shape": network.branch.shape.model_dump_json(),
         "about": json.dumps(about),
     }
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_suffix(".part")
-        # Files of save_file would be readable only by their owner.
-        temporary.write_bytes(save({k: v.cpu().contiguous() for k, v in tensors.items()}, metadata))
-        temporary.replace(path)
-    except (OSError, SafetensorError) as error:
-        raise ResultsError(f"{path}: the weights cannot be written ({error}).") from error
+    # Files of save_file would be readable only by their owner.
+    write_file(path, save({k: v.cpu().contiguous() for k, v in tensors.items()}, metadata))
 
 
 def load_network(path: Path) -> tuple[SiameseNetwork, dict[str, Any]]:

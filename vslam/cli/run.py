@@ -23,6 +23,7 @@ from vslam.cli.options import (
     Thresholds,
     ViewerName,
     flag,
+    names_in,
     option,
     read_thresholds,
     reads_source,
@@ -230,7 +231,7 @@ def _compared(names: str, detector: str) -> tuple[str, ...]:
     """The detectors of ``--compare``, without repetitions."""
     from vslam.loopclosure.registry import require_detector
 
-    found = tuple(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
+    found = tuple(names_in(names))
     for name in found:
         require_detector(name, option="--compare")
     if detector in found:

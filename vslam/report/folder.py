@@ -294,9 +294,9 @@ def _write_pages(
     """Write the figures, and the pages with those that could be drawn."""
     from vslam.report.explorer import explorer
     from vslam.report.figures import draw_figures
+    from vslam.report.loop_tables import seen_loops
     from vslam.report.render import html, markdown
     from vslam.report.run_page import run_page
-    from vslam.report.seen_loops import seen_loops
 
     truth = matched_ground_truth(outcome)
     figures: list[Figure] = []

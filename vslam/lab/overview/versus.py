@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 
 from vslam.errors import counted
-from vslam.evaluation.loops import LoopLimits
+from vslam.evaluation.loops import MIN_LENGTH_M
 from vslam.lab.overview.collect import without_settings
 from vslam.lab.overview.schema import Comparison, Drive, OverviewJson, Row, Spread
 from vslam.lab.overview.summary import ALPHA, COMPARED, ROTATION, least_pairs
@@ -66,7 +66,7 @@ def _without_revisits(report: OverviewJson) -> str:
     counts = [row.measures[name] for row in judged for name in ("loops_found", "loops_missed")]
     if len(names) < 2 or any(count.greatest for count in counts if count is not None):
         return ""
-    none = f"No drive has a revisit of {LoopLimits().min_length_m:.0f} m or more"
+    none = f"No drive has a revisit of {MIN_LENGTH_M:.0f} m or more"
     compared = [c for c in report.comparisons if {c.first, c.second} <= names]
     if all(_is_tie(one) for one in compared):
         return f"{none}, so there is no loop to find and the loop detectors cannot differ."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import csv
 import importlib
 import sys
 from pathlib import Path
@@ -84,8 +85,9 @@ def test_what_people_wrote_stays_on_the_page(speed, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_runs_the_systems_in_turn(speed, kitti_tree, monkeypatch, capsys):
+def test_the_command_runs_the_systems_in_turn(speed, kitti_tree, monkeypatch, capsys, tmp_path):
     words = ["--case", f"ring={kitti_tree}:00:28", "--repeats", "1", "--also", "none"]
+    words += ["--csv", str(tmp_path / "speed.csv")]
     monkeypatch.setattr(sys, "argv", ["bench_speed.py", *words])
     speed.main()
     out, err = capsys.readouterr()
@@ -96,4 +98,10 @@ def test_the_command_runs_the_systems_in_turn(speed, kitti_tree, monkeypatch, ca
         *(f"ring, {system}" for system in (*turn[:2], "vslam --realtime", turn[2])),
     ]
     (memory,) = (line for line in out.splitlines() if line.startswith("| peak memory"))
-    assert all(float(cell) > 50 for cell in memory.split("|")[2:5])
+    cells = [cell.strip() for cell in memory.split("|")[2:5]]
+    assert all(float(cell) > 50 for cell in cells)
+    with (tmp_path / "speed.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["case"], row["system"], row["memory_mb"]) for row in rows] == [
+        ("ring", system, cell) for system, cell in zip(turn, cells, strict=True)
+    ]

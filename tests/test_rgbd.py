@@ -15,14 +15,14 @@ from vslam.cli.main import app
 from vslam.config import Config, DepthConfig, KeyframeConfig
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import parse_perturbation
-from vslam.datasets.synthetic.rgbd import render_rgbd
+from vslam.datasets.synthetic.layouts import render_rgbd
 from vslam.datasets.synthetic.routes import built_in_route
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.tum import associate, open_tum
 from vslam.errors import InputError, UnreadableImageError
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.frontend.depth import columns_of_depth
-from vslam.frontend.extraction import extract_features
+from vslam.frontend.extraction import FrameImages
 from vslam.frontend.keyframes import KeyframeEvidence, needs_keyframe
 from vslam.frontend.tracking import TrackingContext
 from vslam.maps.storage import load_map, save_map
@@ -116,7 +116,7 @@ def test_features_without_depth_are_monocular(corridor):
     context = TrackingContext.create(camera, Config())
     depth = corridor_depth(camera, corridor.T_wc[0]).astype(np.float32)
     depth[:, :240] = 0.0
-    extracted = extract_features(corridor.left[0], depth, context)
+    extracted = FrameImages(corridor.left[0], lambda: depth, context).extracted
     features = extracted.features
     rows, columns = np.rint(features.xy).astype(int).T[::-1]
     known = np.isfinite(features.u_right)

@@ -43,7 +43,7 @@ from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.image_folders import open_images
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.datasets.sources import SourceOptions
-from vslam.datasets.synthetic.video import write_side_by_side
+from vslam.datasets.synthetic.layouts import write_side_by_side
 from vslam.errors import InputError
 from vslam.features import TrackingState
 from vslam.report.folder import create_run_folder

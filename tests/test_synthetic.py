@@ -20,11 +20,10 @@ from vslam.datasets import open_sequence
 from vslam.datasets.kitti import open_kitti
 from vslam.datasets.synthetic import parse_drive, store, textures, vehicles
 from vslam.datasets.synthetic import town as town_module
-from vslam.datasets.synthetic.camera_effects import sensor_image
 from vslam.datasets.synthetic.files import lock_of
 from vslam.datasets.synthetic.pairs import render_pairs
 from vslam.datasets.synthetic.passes import Passes, pass_starts
-from vslam.datasets.synthetic.render import Light, Moment, Renderer
+from vslam.datasets.synthetic.render import Light, Moment, Renderer, sensor_image
 from vslam.datasets.synthetic.routes import (
     CAMERA_HEIGHT,
     ROUTES,

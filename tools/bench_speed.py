@@ -1,7 +1,7 @@
 """Measure the speed of vslam and ORB-SLAM3 (pyorbslam3), and write the results as Markdown.
 
     python tools/bench_speed.py --case "KITTI 00=/data/kitti:00:216" [--also capsule] \
-        [--repeats 3] [--write docs/research/performance.md] \
+        [--repeats 3] [--write docs/research/performance.md] [--csv docs/research/performance.csv] \
         [--orbslam3-python PY --vocabulary voc.txt]
 
 A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run one
@@ -18,6 +18,7 @@ is run by vslam/lab/stress/orbslam3.py, as in ``vslam stress``.
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import os
 import shlex
@@ -364,14 +365,24 @@ def memory(run: Run) -> str:
     )
 
 
-def section(case: Case, runs: dict[str, list[Run]]) -> str:
-    """The section of a case."""
-    reading = {system: reading_ms(case, system) for system in (FULL, ORBSLAM3)}
-    measured = {
+def measures(
+    case: Case, runs: dict[str, list[Run]], reading: dict[str, float]
+) -> dict[str, list[dict[str, float]]]:
+    """Every measure of the runs of each system, except those in real time."""
+    return {
         s: [figures(run, case, reading[ORBSLAM3 if s == ORBSLAM3 else FULL]) for run in runs[s]]
         for s in runs
         if s != LIVE
     }
+
+
+def section(
+    case: Case,
+    runs: dict[str, list[Run]],
+    reading: dict[str, float],
+    measured: dict[str, list[dict[str, float]]],
+) -> str:
+    """The section of a case."""
     return (
         f"## {case.title}\n\n{case.frames} frames. "
         f"Reading both images: {reading[FULL]:.1f} ms CPU, by OpenCV {reading[ORBSLAM3]:.1f}.\n\n"
@@ -413,6 +424,7 @@ def parse_options() -> argparse.Namespace:
     for name in ("--orbslam3-python", "--vocabulary"):
         parser.add_argument(name, type=lambda text: Path(text).absolute())
     parser.add_argument("--write", type=Path, help="file to write; printed unless given")
+    parser.add_argument("--csv", type=Path, help="table to write: a row for each case and system")
     options = parser.parse_args()
     if options.repeats < 1:
         parser.error("--repeats: at least 1")
@@ -451,18 +463,39 @@ def written(page: Path) -> tuple[str, str]:
     return (above, end + below) if begin else ("# Performance\n\n", "")
 
 
+def write_table(path: Path, cases: dict[str, dict[str, list[dict[str, float]]]]) -> None:
+    """Write a row for each case and system: median, least and greatest value of each measure."""
+    endings = {"": statistics.median, "_least": min, "_greatest": max}
+    names = [f"{key}{ending}" for key, *_ in MEASURES for ending in endings]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(["case", "system", "runs", *names])
+        for title, measured in cases.items():
+            for system, runs in measured.items():
+                cells = [
+                    format(of([run[key] for run in runs]), form).replace("nan", "")
+                    for key, _, form in MEASURES
+                    for of in endings.values()
+                ]
+                table.writerow([title, system, len(runs), *cells])
+
+
 def main() -> None:
     options = parse_options()
     load = os.getloadavg()[0]
     orbslam3 = orbslam3_of(options)
     with tempfile.TemporaryDirectory(prefix="vslam-speed-") as scratch:
         # No large package may be imported before the last run; see measure.
-        measured = [
+        done = [
             (case, measure_case(case, orbslam3, options.repeats, options.also, scratch))
             for case in options.case
         ]
-        sections = [section(case, runs) for case, runs in measured]
-    setting = setting_of(measured[0][1][FULL][0].report, orbslam3, options.repeats)
+        sections, tables = [], {}
+        for case, runs in done:
+            reading = {system: reading_ms(case, system) for system in (FULL, ORBSLAM3)}
+            tables[case.title] = measures(case, runs, reading)
+            sections.append(section(case, runs, reading, tables[case.title]))
+    setting = setting_of(done[0][1][FULL][0].report, orbslam3, options.repeats)
     text = "\n".join((
         HEAD, *sections, f"## Setting\n\n{setting} Load at the start: {load:.1f}.\n",
         f"```sh\npython {anonymous(shlex.join(sys.argv))}\n```\n",
@@ -472,6 +505,8 @@ def main() -> None:
         options.write.write_text(f"{above}{text}{below}", encoding="utf-8")
     else:
         print(text)
+    if options.csv:
+        write_table(options.csv, tables)
 
 
 if __name__ == "__main__":

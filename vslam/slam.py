@@ -57,7 +57,7 @@ class Slam:
     map later. With ``localize=True`` the map is not changed.
 
     Attributes:
-        context: camera, thresholds and pyramid scales, for ``extract_features``.
+        context: camera, thresholds and pyramid scales, for ``FrameImages``.
         detector: proposes loop candidates and places for relocalisation.
         rig: what has been measured of the stereo pair, such as the delay of its right camera.
         next_extraction: index of a coming frame whose features will probably be needed, so that
@@ -238,7 +238,7 @@ class Slam:
         image: Image | None = None,
         stage_ms: dict[str, float] | None = None,
     ) -> TrackResult:
-        """``step`` for a frame whose features were extracted before (``extract_features``).
+        """``step`` for a frame whose features were extracted before (``FrameImages.extracted``).
 
         Args:
             extracted: the features.

@@ -111,14 +111,14 @@ def ply(
 ) -> None:
     """Write the landmarks with the colours that they have in the images."""
     from vslam.maps.formats import landmark_colours, save_ply
-    from vslam.maps.new_output import new_file
+    from vslam.maps.new_output import new_output
 
     if run.is_file() and not colours:
         reconstruction = _reconstruction_of_file(run)
     else:
         finished, reconstruction = _read(run)
     target = out or _beside(run, "landmarks.ply")
-    with new_file(target) as file:
+    with new_output(target) as file:
         seen = None
         if colours:
             frames = _keyframes(finished, data, quiet=quiet)
@@ -139,14 +139,14 @@ def g2o(
     from vslam.backend.pose_graph import LOOP
     from vslam.geometry import inverses
     from vslam.maps.formats import save_g2o
-    from vslam.maps.new_output import new_file
+    from vslam.maps.new_output import new_output
 
     graph, map_ = _graph(run)
     ids = graph.keyframes  # frames of several drives are not unique
     if len(set(map_.sessions)) == 1:
         ids = map_.frames[ids]
     target = out or _beside(run, "pose_graph.g2o")
-    with new_file(target) as file:
+    with new_output(target) as file:
         save_g2o(file, ids, inverses(graph.T_cw), graph.edges, graph.T_i_j, graph.sigmas)
     if not quiet:
         loops = np.count_nonzero(graph.kind == LOOP)
@@ -163,12 +163,12 @@ def euroc(
 
     Every run writes it in the formats of TUM and KITTI.
     """
-    from vslam.maps.new_output import new_file
+    from vslam.maps.new_output import new_output
     from vslam.trajectory import read_trajectory, write_euroc
 
     trajectory = read_trajectory(run / "trajectory.tum")
     target = out or run / "trajectory_euroc.csv"
-    with new_file(target) as file:
+    with new_output(target) as file:
         write_euroc(file, trajectory)
     if not quiet:
         typer.echo(f"{target}: {counted(len(trajectory), 'pose')}")
@@ -192,7 +192,7 @@ def ros(
     """Write odometry, transforms, path and landmarks as ROS 2 messages, in an MCAP file."""
     import numpy as np
 
-    from vslam.maps.new_output import new_file
+    from vslam.maps.new_output import new_output
     from vslam.maps.ros import frame_poses, save_bag
     from vslam.maps.storage import load_map
     from vslam.report.frame_table import read_covariances
@@ -210,7 +210,7 @@ def ros(
     if (run / "map.npz").is_file():  # a run that only localises has no map of its own
         map_ = load_map(run).map
         xyz = map_.arrays.xyz[map_.living_landmarks()]
-    with new_file(target) as file:
+    with new_output(target) as file:
         save_bag(file, poses, trajectory, xyz)
     if not quiet:
         typer.echo(f"{target}: {counted(len(poses), 'pose')}, {counted(len(xyz), 'landmark')}")
@@ -275,7 +275,7 @@ def _export_images(
     """Write the keyframe images of a run into a new folder, and ``save`` a model beside them, given
     the names of the images and the colours of the landmarks."""
     from vslam.maps.formats import landmark_colours, save_image
-    from vslam.maps.new_output import new_folder
+    from vslam.maps.new_output import new_output
 
     finished, reconstruction = _read(run)
     names: list[str] = []
@@ -293,7 +293,7 @@ def _export_images(
                 save_image(image, images / names[-1])
             yield image
 
-    with new_folder(target) as folder:
+    with new_output(target, folder=True) as folder:
         (folder / "images").mkdir()
         colours = landmark_colours(reconstruction, saved(folder / "images"))
         save(folder, reconstruction, names, colours)

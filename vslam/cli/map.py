@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vslam.cli.options import METHOD, OUTPUT, Quiet, Thresholds, option, read_thresholds
-from vslam.errors import InputError, ResultsError, counted
+from vslam.errors import InputError, counted
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     import numpy as np
     from numpy.typing import NDArray
 
@@ -126,12 +124,12 @@ def merge(
     """
     from vslam.cli.console import Console
     from vslam.loopclosure.registry import detector_with_images
-    from vslam.maps.storage import load_map, map_file_of, save_map
+    from vslam.maps.storage import load_map, map_file_of
     from vslam.merging import Memory, merge_maps
 
     if len(maps) < 2:
         raise InputError(f"{maps[0]}: this is one map; name two or more to merge.")
-    _require_free(out)
+    _require_place(out)
     files = [map_file_of(path) for path in maps]
     for number, file in enumerate(files):
         if file.resolve() in [other.resolve() for other in files[:number]]:
@@ -165,7 +163,7 @@ def merge(
     if not merged.joined:
         typer.echo("no map has a loop to the first one: nothing was written")
         raise typer.Exit(1)
-    _save(save_map, out, merged.stored)
+    _save(out, merged.stored)
 
 
 def _thresholds_of(stored: list[StoredMap], files: list[Path]) -> Config:
@@ -226,12 +224,12 @@ def crop(
 
     x points to the right of the first camera and z ahead; the height does not matter.
     """
-    from vslam.maps.storage import load_map, map_file_of, save_map
+    from vslam.maps.storage import load_map, map_file_of
     from vslam.maps.stored_map import in_box, near_frames, near_point
 
     if sum(map(bool, (box, point, frames))) != 1:
         raise InputError("--box, --point, --frames: give exactly one, which says what is kept.")
-    _require_free(out)
+    _require_place(out)
     file = map_file_of(map_file)
     stored = load_map(file)
     if box:
@@ -243,7 +241,7 @@ def crop(
         kept = near_frames(stored.map, drive, first, last, within)
     if not len(kept):
         raise InputError(f"{file}: no keyframe lies there; 'vslam map info' shows its extent.")
-    _save(save_map, out, stored.select(kept))
+    _save(out, stored.select(kept))
 
 
 def _numbers(option: str, text: str, n: int, separator: str = ",") -> list[float]:
@@ -256,22 +254,19 @@ def _numbers(option: str, text: str, n: int, separator: str = ",") -> list[float
     return numbers
 
 
-def _require_free(out: Path) -> None:
-    from vslam.maps.new_output import require_place
+def _require_place(out: Path) -> None:
+    from vslam.maps.new_output import require_free, require_place
 
-    if out.exists():
-        raise InputError(f"{out}: exists already; remove it, or name another file with --out.")
+    require_free(out)
     require_place(out, "--out")
 
 
-def _save(save_map: Callable[[Path, StoredMap], None], out: Path, stored: StoredMap) -> None:
-    try:
-        save_map(out, stored)
-    except OSError as error:
-        raise ResultsError(
-            f"{out}: cannot be written ({error.strerror or error}); free some space or name "
-            "another place with --out."
-        ) from error
+def _save(out: Path, stored: StoredMap) -> None:
+    from vslam.maps.new_output import new_output
+    from vslam.maps.storage import save_map
+
+    with new_output(out) as file:
+        save_map(file, stored)
     map_ = stored.map
     keyframes = counted(map_.n_keyframes, "keyframe")
     typer.echo(f"{out}: {keyframes}, {counted(map_.n_landmarks, 'landmark')}")

@@ -188,7 +188,7 @@ def synth(
             render_pairs(drive, variation, root, pairs, moves, threads=threads, on_frame=on_frame)
         elif fisheye or rgbd:
             from vslam.datasets.synthetic.fisheye import render_fisheye
-            from vslam.datasets.synthetic.rgbd import render_rgbd
+            from vslam.datasets.synthetic.layouts import render_rgbd
 
             render, form = (render_fisheye, "fisheye") if fisheye else (render_rgbd, "rgbd")
             target = out or Path(f"{route}-{form}")
@@ -208,7 +208,7 @@ def synth(
             )
     if side_by_side is not None:
         from vslam.datasets.kitti import open_kitti
-        from vslam.datasets.synthetic.video import write_side_by_side
+        from vslam.datasets.synthetic.layouts import write_side_by_side
 
         frames = open_kitti(root, drive.name, max_frames=max_frames)
         calibration_file = write_side_by_side(frames, side_by_side)

@@ -20,7 +20,6 @@ from vslam.datasets.association import associate, poses_at
 from vslam.datasets.frames import Source
 from vslam.datasets.image_files import (
     checked_files,
-    depth_files,
     find_sequence,
     image_size,
     select_frames,
@@ -110,7 +109,7 @@ def open_tum(
     else:
         depth = tuple(files_of_depth[k] for k in partners[chosen])
         scale = depth_scale or calibration.depth_scale or _DEPTH_SCALE
-        raw = depth_files("tum", found, times, truth, colour, depth, scale)
+        raw = checked_files("tum", found, times, truth, [colour, depth], scale)
     return rectified(raw, calibration)
 
 

@@ -74,6 +74,7 @@ def headlines(report: ReportJson) -> list[Tile]:
             "bad" if lost else "good",
         ),
         *_in_map(report),
+        *_on_earth(report),
         *([Tile("Scale", "arbitrary", "as of any single camera")] if mono else []),
         Tile("ATE RMSE", _number(report.ate_rmse_m, "m"), evaluated),
         Tile(
@@ -130,6 +131,14 @@ def _in_map(report: ReportJson) -> list[Tile]:
         Tile("In the map", f"{found.in_map_percent:.1f} %", note),
         Tile("Error in the map", error, "RMSE of these frames, with the map's own alignment"),
     ]
+
+
+def _on_earth(report: ReportJson) -> list[Tile]:
+    if (found := report.gps_track) is None:
+        return []
+    apart = f"{_number(found.residual_m, 'm')} from the trajectory (RMS)"
+    used = f"{found.fixes - found.refused} fixes"
+    return [Tile("GPS", used, f"{found.refused} refused; {apart}")]
 
 
 def _latency(report: ReportJson) -> list[Tile]:
@@ -259,6 +268,7 @@ def run_page(
                 [Bullets(report.skipped_messages)],
                 folded=True,
             ),
+            _gps(report),
             *explorer,
             Section("", [*figures], wide=False),
             Section("Time per stage (ms)", [stages], wide=False),
@@ -278,6 +288,27 @@ def run_page(
             Section("Configuration", [Markup(f"<pre>{escape(config)}</pre>")], folded=True),
         ),
     )
+
+
+def _gps(report: ReportJson) -> Section:
+    """The drive on the Earth; empty without GPS."""
+    if (found := report.gps_track) is None:
+        return Section("GPS", ())
+    latitude, longitude, altitude = found.datum
+    rows = [
+        ("origin", f"{latitude:.7f}°, {longitude:.7f}°, {altitude:.1f} m"),
+        ("fixes of tracked frames", f"{found.fixes}, {found.refused} of them refused"),
+        ("distance of the fixes used (RMS)", _number(found.residual_m, "m")),
+        ("scale of the map", f"{found.metres_per_unit:.4g} m per unit"),
+    ]
+    if found.ate_rmse_m is not None:
+        without = f"{_number(report.ate_rmse_m, 'm')} without ({report.alignment})"
+        rows.append(("ATE RMSE", f"{_number(found.ate_rmse_m, 'm')} with GPS (se3), {without}"))
+    note = (
+        "The drive is too straight for GPS to tell the rotation about it: the camera is taken to "
+    )
+    parts: list[Part] = [Pairs(rows)]
+    return Section("GPS", parts if found.level else [*parts, note + "stand upright."])
 
 
 def stage_rows(report: ReportJson) -> list[Row]:
@@ -301,6 +332,8 @@ def option_rows(report: ReportJson) -> list[tuple[str, str]]:
     realtime = [("realtime", "yes")] if report.realtime else []
     compare = [("compare", ", ".join(report.compare))] if report.compare else []
     files = [("calib", str(path)) for path in report.calib]
+    if report.gps:
+        files.append(("gps", str(report.gps)))
     if report.mask:
         files.append(("mask", str(report.mask)))
     return [*options, ("max-frames", limit), *thresholds, *weights, *realtime, *files, *compare]

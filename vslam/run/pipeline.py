@@ -268,10 +268,10 @@ def _show(
     n_told: int,
 ) -> int:
     """Record a frame, and the map if nobody changes it; returns the number of recorded loops."""
-    recorder.frame(result, result.T_wc)
+    recorder.frame(result)
     images = None if played.made is None else played.made.images
     if result.is_keyframe and slam.frame is not None and images is not None:
-        recorder.keyframe(result, images.left, slam.frame.features, slam.frame.landmark >= 0)
+        recorder.keyframe(result, images.left, slam.frame.features.xy, slam.frame.landmark >= 0)
     if slam.is_mapping:
         return n_told
     recorder.map(slam.map)

@@ -340,7 +340,7 @@ COLD_PROBES: tuple[tuple[ModuleType, str], ...] = (
     (pnp, "ransac_pose"),
     (bow, "choose_candidates"),
     (local_matching, "_locate_near"),
-    (global_bundle_adjustment, "_step_cameras"),
+    (global_bundle_adjustment, "reduce_points_sparsely"),
     (block_cholesky, "factor_solve"),
     (global_mapping, "remove_unchanged"),
 )

@@ -14,10 +14,9 @@ from scipy.spatial import cKDTree
 
 from vslam.camera import Camera
 from vslam.datasets.synthetic import solids
-from vslam.datasets.synthetic.camera_effects import sensor_image
 from vslam.datasets.synthetic.files import check_disk, write_png, writing
 from vslam.datasets.synthetic.passes import Passes
-from vslam.datasets.synthetic.render import Renderer
+from vslam.datasets.synthetic.render import Renderer, sensor_image
 from vslam.datasets.synthetic.routes import Route
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.store import OnFrame

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vslam.datasets.synthetic.plan import CLEARANCE
 from vslam.datasets.synthetic.render import Light, Moment
 from vslam.datasets.synthetic.routes import CAMERA_HEIGHT, Route
 from vslam.datasets.synthetic.scene import Surfaces, join
@@ -19,6 +18,7 @@ from vslam.datasets.synthetic.shadows import (
     lamp_pools,
 )
 from vslam.datasets.synthetic.site import AFTER, BEFORE, Variation
+from vslam.datasets.synthetic.terrain import CLEARANCE
 from vslam.datasets.synthetic.town import Town
 
 _NEAR, _LEFT = 60.0, 75.0  # m: a place is passed within the first, and left beyond the second

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from vslam.datasets.synthetic import solids, textures
 from vslam.datasets.synthetic.ground import RoadStyle
-from vslam.datasets.synthetic.plan import Plan
 from vslam.datasets.synthetic.routes import Route
 from vslam.datasets.synthetic.scene import AtlasBuilder, Surfaces
-from vslam.datasets.synthetic.terrain import Roads
+from vslam.datasets.synthetic.terrain import Plan, Roads
 from vslam.datasets.synthetic.textures import Rng
 
 

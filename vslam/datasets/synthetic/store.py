@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from vslam.camera import Camera
-from vslam.datasets.synthetic.camera_effects import sensor_image
 from vslam.datasets.synthetic.files import (
     check_disk,
     checksum,
@@ -29,7 +28,7 @@ from vslam.datasets.synthetic.files import (
     writing,
 )
 from vslam.datasets.synthetic.passes import Passes
-from vslam.datasets.synthetic.render import Renderer
+from vslam.datasets.synthetic.render import Renderer, sensor_image
 from vslam.datasets.synthetic.routes import Route
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.town import build_town

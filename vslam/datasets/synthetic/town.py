@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 from vslam.datasets.synthetic import solids, streetside
 from vslam.datasets.synthetic.facades import facade, random_style
 from vslam.datasets.synthetic.ground import RoadStyle, make_ground
-from vslam.datasets.synthetic.plan import Plan, rectangle
 from vslam.datasets.synthetic.routes import Route
 from vslam.datasets.synthetic.scene import Atlas, AtlasBuilder, Surfaces, join
 from vslam.datasets.synthetic.site import (
@@ -24,7 +23,7 @@ from vslam.datasets.synthetic.site import (
     Variation,
     make_palette,
 )
-from vslam.datasets.synthetic.terrain import Roads, roads_of
+from vslam.datasets.synthetic.terrain import Plan, Roads, rectangle, roads_of
 from vslam.datasets.synthetic.textures import Rng
 from vslam.datasets.synthetic.vehicles import make_car
 

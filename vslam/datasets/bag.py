@@ -35,7 +35,7 @@ from vslam.datasets.bag_messages import (
     nav_sat_fix,
     stamp_of,
 )
-from vslam.datasets.frames import Images, RawSource, Size, TimedFrame
+from vslam.datasets.frames import Images, RawSource, Size, TimedFrame, decoded
 from vslam.datasets.image_files import size_text
 from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
 
@@ -132,11 +132,9 @@ def _play(
 ) -> Iterator[TimedFrame]:
     def read(messages: tuple[Message, ...], image_map: ImageMap) -> Images:
         sides = zip(messages, topics, sizes, (False, depth), strict=False)
-        left, *second = image_map(of_size, list(sides))
-        return np.asarray(left, np.uint8), second[0] if second else None
+        return decoded([partial(of_size, *side) for side in sides], image_map)
 
-    def of_size(side: tuple[Message, str, Size, bool]) -> Image | DepthImage:
-        message, topic, size, is_depth = side
+    def of_size(message: Message, topic: str, size: Size, is_depth: bool) -> Image | DepthImage:
         image = _decoded(path, topic, message, is_depth, scale)
         if image.shape[::-1] != size:
             raise UnreadableImageError(

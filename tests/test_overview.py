@@ -371,7 +371,7 @@ def test_what_a_run_does_not_have_is_not_made_up():
     assert len(points.sentences) == 2  # nothing to compare
 
 
-@pytest.mark.parametrize(("ate", "part"), [(1.0, "cannot differ"), (1.5, "on shorter revisits")])
+@pytest.mark.parametrize(("ate", "part"), [(1.0, "cannot differ"), (1.5, "on shorter stretches")])
 def test_drives_without_a_revisit_are_told_once(ate, part):
     runs = [
         entry(name, sequence, value, perturb=light, **loops(0, 0))
@@ -381,7 +381,7 @@ def test_drives_without_a_revisit_are_told_once(ate, part):
     ]
     first, section = versus(summarize(Found(runs, [])))
     (sentence,) = first.parts
-    assert sentence.startswith("No drive has a revisit of 20 m or more")
+    assert sentence.startswith("No drive revisits a stretch of 20 m or more")
     assert part in sentence
     assert section.parts[0].rows[0][-2:] == ("-", "-")
 

@@ -101,8 +101,8 @@ POINTS = (
     Point("image source", "faults.next_image", 200, EARLY),
     Point("image reader", "faults.read_image", 200, EARLY),
     Point("features thread", "vslam.frontend.extraction.find_corners", 200, EARLY),
-    Point("camera thread", "vslam.run.realtime._Mailbox.put", 8, EARLY, options=REALTIME),
-    Point("handing thread", "vslam.run.realtime._Mailbox.take", 8, EARLY, options=REALTIME),
+    Point("camera thread", "vslam.run.preparation._Mailbox.put", 8, EARLY, options=REALTIME),
+    Point("handing thread", "vslam.run.preparation._Mailbox.take", 8, EARLY, options=REALTIME),
     Point("progress of a frame", "faults.on_frame", 200, EARLY),
     Point("autosave, pose", "vslam.run.autosave.tum_line", 200, ON, ("trajectory_online.tum",)),
     Point("autosave, copy", "vslam.run.autosave._copy", 2, ON),
@@ -229,7 +229,7 @@ def write_ring(root: Path) -> None:
 def stage(*, learned: bool) -> None:
     """Let this process drive along the ring whatever the images show, with a detector that knows
     the way; ``learned``: learned descriptors may verify its loops."""
-    from vslam.cli import quiet
+    from vslam.cli.console import Console
     from vslam.frontend import extraction
     from vslam.loopclosure.registry import create_images
     from vslam.run import pipeline
@@ -255,13 +255,13 @@ def stage(*, learned: bool) -> None:
         return frame.read(image_map)
 
     @contextlib.contextmanager
-    def progress_bar(total: object) -> Iterator[Callable[[object], None]]:
+    def progress_bar(console: Console, total: object) -> Iterator[Callable[[object], None]]:
         yield lambda result: on_frame()
 
     extraction.find_corners, extraction.matched = find, see
     pipeline.detector_with_images = detector
     Source.frames = frames
-    quiet.progress_bar = progress_bar
+    Console.progress_bar = progress_bar
 
 
 @cache

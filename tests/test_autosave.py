@@ -39,7 +39,7 @@ from vslam.run.autosave import (
     remove_autosave,
 )
 from vslam.run.options import RunOptions, read_options, write_options
-from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
+from vslam.run.outcome import RunOutcome, ground_truth_of
 from vslam.run.pipeline import _with_earlier, run_sequence
 from vslam.run.progress import Progress, TrackLog, TrackTable, read_progress, write_progress
 from vslam.run.recorder import Recorder
@@ -75,9 +75,7 @@ def drive(
 ) -> RunOutcome:
     """Run over the corridor; with a folder, saving whenever that is possible."""
     sequence = change(open_sequence("kitti", root, "00"))
-    settings = RunSettings(
-        "kitti", "00", "none", "bow", "stereo", 0, 2, 0, 1, None, config, compare=compare
-    )
+    settings = RunOptions(detector="bow", threads=2, thresholds=config, compare=compare)
     autosave = {} if folder is None else {"autosave": FolderAutosave(folder, 1e-6, "kitti 00")}
     return run_sequence(
         sequence,

@@ -68,7 +68,7 @@ SIBLINGS = {
 # A benchmark starts the command line in processes of its own: nothing comes back but files.
 STARTED = {
     ("vslam.lab.bench.execute", "vslam.cli.child"),
-    ("vslam.cli.stress", "vslam.cli.child"),
+    ("vslam.cli.cells", "vslam.cli.child"),
     ("vslam.lab.loopbench.cost", "vslam.lab.loopbench.cost"),
     ("vslam.run.warmup", "vslam.run.warmup"),
 }

@@ -245,7 +245,8 @@ def server(run: Path, tmp_path: Path):
     bare = tmp_path / "bare"
     bare.mkdir()
     outcome = make_outcome(20)
-    settings = replace(outcome.settings, config=as_config({"orb.n_levels": 7}))
+    thresholds = as_config({"orb.n_levels": 7})
+    settings = outcome.settings.model_copy(update={"thresholds": thresholds})
     write_results(bare, replace(outcome, settings=settings), pages=False)
     (tmp_path / "secret.html").write_text("secret")
     made = make_server([run.parent, tmp_path])

@@ -31,10 +31,7 @@ from vslam.map import Map
 from vslam.map_kernels import erase_landmark, link_many, unlink
 from vslam.maps import new_output
 from vslam.maps.colmap import save_colmap
-from vslam.maps.g2o import save_g2o
-from vslam.maps.keyframe_images import landmark_colours
-from vslam.maps.nerfstudio import save_nerfstudio
-from vslam.maps.ply import save_ply
+from vslam.maps.formats import landmark_colours, save_g2o, save_nerfstudio, save_ply
 from vslam.maps.reconstruction import Reconstruction, reconstruction_of
 from vslam.maps.storage import load_map, save_map
 from vslam.maps.stored_map import StoredMap

@@ -8,15 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vslam.config import Config
 from vslam.datasets.kitti import open_kitti
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.datasets.synthetic.routes import built_in_route
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.store import render_sequence
 from vslam.evaluation.loops import evaluate_loops
-from vslam.loopclosure.registry import DEFAULT_DETECTOR
-from vslam.run.outcome import RunSettings
+from vslam.run.options import RunOptions
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
 from vslam.slam import Slam
@@ -46,10 +44,7 @@ def round_the_block(tmp_path_factory):
 @pytest.fixture(scope="module")
 def compared(round_the_block):
     """The drive with the default detector and, beside it, with ``bow``."""
-    settings = RunSettings(
-        "synthetic", "block", "none", DEFAULT_DETECTOR, "stereo", seed=0, threads=2, start=0,
-        every=1, max_frames=None, config=Config(), compare=("bow",),
-    )  # fmt: skip
+    settings = RunOptions(threads=2, compare=("bow",))
     return run_sequence(round_the_block, parse_perturbation("none", 0), settings, Recorder())
 
 

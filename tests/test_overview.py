@@ -18,9 +18,8 @@ from vslam.cli import main as cli
 from vslam.config import Config
 from vslam.errors import InputError
 from vslam.evaluation.trajectories import evaluate_trajectory
-from vslam.lab.overview import write_overview
 from vslam.lab.overview.collect import Found, collect, read_aligned
-from vslam.lab.overview.render import overview_page
+from vslam.lab.overview.render import overview_page, write_overview
 from vslam.lab.overview.schema import ALL, MEASURES, Drive, OverviewJson, RunEntry, Spread
 from vslam.lab.overview.summary import (
     compare,

@@ -10,7 +10,6 @@ import pytest
 from rich.console import Console
 
 from vslam.errors import InputError, ResultsError
-from vslam.report.document import Document
 from vslam.report.drawing import LOW, Drawing, draw, new_figure
 from vslam.report.page import (
     Alert,
@@ -26,6 +25,7 @@ from vslam.report.page import (
     Tiles,
 )
 from vslam.report.render import csv_text, html, markdown, show, write_files
+from vslam.report.schema import Document
 
 JPEG = b"\xff\xd8\xff"
 TABLE = Table(("what", "ATE (m), bow"), [("a | b", "1.0"), ("<b>", "12.5")], ("what",), "Medians.")

@@ -148,9 +148,8 @@ RULES = {
     ),
     "docs/research/local_descriptors.md": Rules(
         not_run=(
-            ("python tools/", HOURS),
             ("vslam loops bench", REAL),
-            ("vslam synth block", AGAIN),
+            ("vslam bench", HOURS),
         )
     ),
     "docs/research/uncertainty.md": Rules(
@@ -175,8 +174,7 @@ RULES = {
     "docs/research/motorway.md": Rules(
         not_run=(
             ("ORBSLAM3=", ORBSLAM),
-            ("TABLE=", ORBSLAM),
-            ("$TABLE", ORBSLAM),
+            ("vslam bench", ORBSLAM),
         )
     ),
     "docs/research/online.md": Rules(
@@ -189,9 +187,10 @@ RULES = {
         not_run=(
             ("ORBSLAM3=", ORBSLAM),
             ("python tools/bench_speed.py", ORBSLAM),
-            ("SYNTH=", ORBSLAM),
-            ("$SYNTH", ORBSLAM),
-            ("vslam bench --dataset synthetic", HOURS),
+            ("for n in 00", HOURS),
+            ("BENCH=", ORBSLAM),
+            ("$BENCH", ORBSLAM),
+            ("vslam bench", HOURS),
         )
     ),
     "docs/howto/rgbd.md": Rules(

@@ -22,7 +22,7 @@ from vslam.features import Features
 from vslam.loopclosure.registry import create_detector, problem_of, require_detector
 from vslam.map import Map
 from vslam.report.folder import create_run_folder, write_results
-from vslam.run.outcome import RunSettings
+from vslam.run.options import RunOptions
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
 
@@ -269,9 +269,7 @@ class Detector:
 def test_a_detector_that_fails_ends_the_run_with_what_it_has(broken, kitti_tree, tmp_path, threads):
     broken(FAILING, "[vslam.detectors]\nmine = broken:Detector\n")
     sequence = open_sequence("kitti", kitti_tree, "00")
-    settings = RunSettings(
-        "kitti", "00", "none", "mine", "stereo", 0, threads, 0, 1, None, Config()
-    )
+    settings = RunOptions(detector="mine", threads=threads)
     outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     assert outcome.interrupted is not None
     assert outcome.interrupted.startswith("the detector mine of the package broken 2.0 failed")
@@ -287,9 +285,7 @@ def test_a_detector_that_fails_ends_the_run_with_what_it_has(broken, kitti_tree,
 def test_a_compared_detector_that_fails_ends_alone(broken, kitti_tree, tmp_path, threads):
     broken(FAILING, "[vslam.detectors]\nmine = broken:Detector\n")
     sequence = open_sequence("kitti", kitti_tree, "00")
-    settings = RunSettings(
-        "kitti", "00", "none", "none", "stereo", 0, threads, 0, 1, None, Config(), compare=("mine",)
-    )
+    settings = RunOptions(detector="none", threads=threads, compare=("mine",))
     outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     assert outcome.interrupted is None
     assert len(outcome.trajectory) == len(sequence)
@@ -386,7 +382,7 @@ def test_a_reader_that_streams(broken, kitti_tree):
 def test_a_run_on_a_reader_that_streams(broken, kitti_tree):
     broken(STREAM.replace("LIVE", "False"), "[vslam.readers]\nmine = broken:reader\n")
     source = open_from("mine", kitti_tree, max_frames=6)
-    settings = RunSettings("mine", "x", "none", "none", "stereo", 0, 1, 0, 1, 6, Config())
+    settings = RunOptions(detector="none")
     outcome = run_sequence(source, Perturbation("none"), settings, Recorder())
     assert len(outcome.trajectory) == 6
 

@@ -26,7 +26,8 @@ from vslam.frontend.extraction import extract_features
 from vslam.frontend.keyframes import KeyframeEvidence, needs_keyframe
 from vslam.frontend.tracking import TrackingContext
 from vslam.maps.storage import load_map, save_map
-from vslam.run.outcome import RunOutcome, RunSettings
+from vslam.run.options import RunOptions
+from vslam.run.outcome import RunOutcome
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
 from vslam.slam import Slam
@@ -88,17 +89,13 @@ def refused(root: Path, *parts: str, **options) -> None:
 
 def run_on(tree: Path, *, threads: int = 1, **options) -> RunOutcome:
     sequence = open_tum(tree, "", **options)
-    settings = RunSettings(
-        dataset="tum", sequence=sequence.name, perturb="none", detector="bow",
-        sensor=sequence.camera.sensor, seed=0, threads=threads, start=0, every=1, max_frames=None,
-        config=Config(),
-    )  # fmt: skip
+    settings = RunOptions(detector="bow", threads=threads)
     return run_sequence(sequence, parse_perturbation("none", 0), settings, Recorder())
 
 
 def ate_of(outcome: RunOutcome) -> float:
     truth = Trajectory(outcome.sequence.timestamps, outcome.sequence.ground_truth)
-    return evaluate_trajectory(outcome.trajectory, truth, outcome.settings.alignment).ate_rmse_m
+    return evaluate_trajectory(outcome.trajectory, truth, outcome.alignment).ate_rmse_m
 
 
 # Depth as a column

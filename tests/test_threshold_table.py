@@ -1,4 +1,4 @@
-"""docs/reference/thresholds.md says what vslam/config/ says."""
+"""docs/reference/thresholds.md says what vslam/config.py says."""
 
 from __future__ import annotations
 

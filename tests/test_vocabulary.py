@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from vslam.cli import main as cli
+from vslam.config import Config
 from vslam.errors import InputError, ResultsError
+from vslam.loopclosure.registry import create_detector
 from vslam.loopclosure.vocabulary import (
     SHIPPED,
     BowVector,
@@ -207,6 +209,12 @@ def test_score_is_one_less_half_the_l1_distance():
 def test_npz_round_trip(small, tmp_path):
     save(small, tmp_path / "v.npz")
     assert same(load(tmp_path / "v.npz"), small)
+
+
+def test_a_detector_takes_another_vocabulary(small, tmp_path):
+    write_text(small, tmp_path / "own.txt")
+    detector = create_detector("bow", Config(), tmp_path / "own.txt")
+    assert detector.vocabulary.n_words == small.n_words
 
 
 def test_the_shipped_vocabulary_is_small():

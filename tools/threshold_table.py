@@ -1,4 +1,4 @@
-"""Write docs/reference/thresholds.md: every threshold of vslam/config/ with its unit and source.
+"""Write docs/reference/thresholds.md: every threshold of vslam/config.py with its unit and source.
 
     python tools/threshold_table.py            # writes it
     python tools/threshold_table.py --check    # exits 1 if the file differs
@@ -30,7 +30,7 @@ DESCRIPTION = re.compile(
 )
 HEAD = """# Thresholds
 
-Written by `python tools/threshold_table.py` from `vslam/config/`; `tests/test_threshold_table.py` compares the two. `vslam run --config FILE` reads them from a JSON file, `{"orb": {"n_features": 1500}}` or `{"orb.n_features": 1500}`, and `--config orb.n_features=1500,tracking.method=patches` sets them on the command line. In Python they are `Slam(camera, config={"orb.n_features": 1500})`. [design.md](../explanation/design.md) describes the methods.
+Written by `python tools/threshold_table.py` from `vslam/config.py`; `tests/test_threshold_table.py` compares the two. `vslam run --config FILE` reads them from a JSON file, `{"orb": {"n_features": 1500}}` or `{"orb.n_features": 1500}`, and `--config orb.n_features=1500,tracking.method=patches` sets them on the command line. In Python they are `Slam(camera, config={"orb.n_features": 1500})`. [design.md](../explanation/design.md) describes the methods.
 
 The source names the paper and section of the rule and says what the value is: *printed* in that section, *customary* in the programs and KITTI configurations of the ORB-SLAM family, or our *own*. OS1: Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2: Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017. ZS: Zhou and Sun, Sci Rep 15, 7644 (2025). Descriptor distances and ratios of best over second-best distance are upper bounds; a descriptor has 256 bits. A search radius at octave 0 grows with the scale of the pyramid level.
 
@@ -104,7 +104,7 @@ def main() -> None:
     if not options.check:
         options.out.write_text(text)
     elif not options.out.is_file() or options.out.read_text() != text:
-        sys.exit(f"{options.out} differs from vslam/config/: python tools/threshold_table.py")
+        sys.exit(f"{options.out} differs from vslam/config.py: python tools/threshold_table.py")
 
 
 if __name__ == "__main__":

@@ -21,10 +21,10 @@ from vslam.frontend.masks import Mask
 from vslam.frontend.relocaliser import Relocaliser
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracker import Found, Tracker, TrackerStatus, result_of
-from vslam.frontend.tracking import TrackingContext
+from vslam.frontend.tracking import TrackingContext, covariance_of
 from vslam.geometry import Matrix, inverse
 from vslam.loopclosure.detector import LoopDetector
-from vslam.loopclosure.learned_relocalization import LearnedRelocalisation
+from vslam.loopclosure.learned_verification import LearnedRelocalisation
 from vslam.loopclosure.registry import DEFAULT_DETECTOR, detector_with_images
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loopclosure.verifier import verifier_for
@@ -290,7 +290,7 @@ class Slam:
             found_again = found.relocalised or tracker.status is not TrackerStatus.TRACKING
             T_moved = T_predicted if found_again else frame.T_cw
             tracker.accept(frame, found, mapper.frames)
-            self._follow(frame, T_moved, frame.covariance)
+            self._follow(frame, T_moved, covariance_of(frame, self.context))
             placed = mapper.append_pose(frame, tracked=True, near=found.keyframe)
             is_keyframe = self._mode.update_map(placed, found)
             self.rig.observe(frame, frame.twist)

@@ -320,6 +320,11 @@ def _optimiser(network: SiameseNetwork, settings: TrainSettings) -> torch.optim.
     return torch.optim.Adam(groups, lr=settings.learning_rate, fused=True)
 
 
+def set_threads(threads: int) -> None:
+    """Set the number of threads with which torch computes."""
+    torch.set_num_threads(threads)
+
+
 def open_device(name: str) -> torch.device:
     """The device of that name.
 

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from vslam.maps.reconstruction import Reconstruction
     from vslam.report.finished_run import FinishedRun
 
-commands = typer.Typer(
+app = typer.Typer(
+    name="export",
     help="Export maps for other programs (docs/howto/exports.md), trained networks, and images to "
     "train on.",
     no_args_is_help=True,
@@ -41,11 +42,6 @@ Link = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the application."""
-    app.add_typer(commands, name="export")
-
-
 def _out(default: str) -> typer.models.OptionInfo:
     is_file = "." in default
     return option(
@@ -57,7 +53,7 @@ def _out(default: str) -> typer.models.OptionInfo:
     )
 
 
-@commands.command(epilog="[b]Example[/b]\n  vslam export colmap runs/latest")
+@app.command(epilog="[b]Example[/b]\n  vslam export colmap runs/latest")
 def colmap(
     run: Run,
     data: Data = None,
@@ -84,7 +80,7 @@ def colmap(
     _say(target, reconstruction, quiet=quiet)
 
 
-@commands.command(epilog="[b]Example[/b]\n  vslam export nerfstudio runs/latest")
+@app.command(epilog="[b]Example[/b]\n  vslam export nerfstudio runs/latest")
 def nerfstudio(
     run: Run,
     data: Data = None,
@@ -93,7 +89,7 @@ def nerfstudio(
     quiet: Quiet = False,
 ) -> None:
     """Write keyframe images, poses and landmarks for nerfstudio."""
-    from vslam.maps.nerfstudio import save_nerfstudio
+    from vslam.maps.formats import save_nerfstudio
     from vslam.maps.new_output import new_folder
 
     finished, reconstruction = _read(run)
@@ -106,7 +102,7 @@ def nerfstudio(
     _say(target, reconstruction, quiet=quiet)
 
 
-@commands.command(epilog="[b]Example[/b]\n  vslam export ply runs/latest")
+@app.command(epilog="[b]Example[/b]\n  vslam export ply runs/latest")
 def ply(
     run: RunOrFile,
     data: Data = None,
@@ -122,9 +118,8 @@ def ply(
     quiet: Quiet = False,
 ) -> None:
     """Write the landmarks with the colours that they have in the images."""
-    from vslam.maps.keyframe_images import landmark_colours
+    from vslam.maps.formats import landmark_colours, save_ply
     from vslam.maps.new_output import new_file
-    from vslam.maps.ply import save_ply
 
     if run.is_file() and not colours:
         reconstruction = _reconstruction_of_file(run)
@@ -140,7 +135,7 @@ def ply(
     _say(target, reconstruction, quiet=quiet)
 
 
-@commands.command(epilog="[b]Example[/b]\n  vslam export g2o runs/latest")
+@app.command(epilog="[b]Example[/b]\n  vslam export g2o runs/latest")
 def g2o(
     run: RunOrFile,
     out: Annotated[Path | None, _out("pose_graph.g2o")] = None,
@@ -151,7 +146,7 @@ def g2o(
 
     from vslam.backend.pose_graph import LOOP
     from vslam.geometry import inverses
-    from vslam.maps.g2o import save_g2o
+    from vslam.maps.formats import save_g2o
     from vslam.maps.new_output import new_file
 
     graph, map_ = _graph(run)
@@ -166,7 +161,7 @@ def g2o(
         typer.echo(f"{target}: {len(ids)} vertices, {len(graph.edges)} edges, {loops} from loops")
 
 
-@commands.command(epilog="[b]Example[/b]\n  vslam export euroc runs/latest")
+@app.command(epilog="[b]Example[/b]\n  vslam export euroc runs/latest")
 def euroc(
     run: Run,
     out: Annotated[Path | None, _out("trajectory_euroc.csv")] = None,
@@ -187,7 +182,7 @@ def euroc(
         typer.echo(f"{target}: {counted(len(trajectory), 'pose')}")
 
 
-@commands.command(epilog="[b]Example[/b]\n  vslam export ros runs/latest")
+@app.command(epilog="[b]Example[/b]\n  vslam export ros runs/latest")
 def ros(
     run: Run,
     out: Annotated[Path | None, _out("ros.mcap")] = None,
@@ -264,10 +259,10 @@ def _read(run: Path) -> tuple[FinishedRun, Reconstruction]:
 
 
 def _keyframes(finished: FinishedRun, data: str | None, *, quiet: bool) -> Iterator[TimedFrame]:
-    from vslam.cli.console import console
+    from vslam.cli.console import Console
     from vslam.report.finished_run import keyframe_frames, open_images
 
-    told = console(shown=not quiet)
+    told = Console(shown=not quiet)
     with told.render_bar() as on_render:
         source = open_images(finished, data, on_render)
     with told.count_bar("images", len(finished.map.frames)) as advance:
@@ -286,7 +281,7 @@ def _write_images(
     quiet: bool,
 ) -> tuple[list[str], NDArray[np.uint8]]:
     """Write the keyframe images; returns their names and the colours of the landmarks."""
-    from vslam.maps.keyframe_images import landmark_colours, save_image
+    from vslam.maps.formats import landmark_colours, save_image
 
     folder.mkdir()
     names: list[str] = []

@@ -42,20 +42,10 @@ DATA = ("town:demo[seed=101]", "town:05[seed=102]", "town:demo[seed=103,aliased=
 DRIVES = ("drive:05[seed=102]", "drive:demo[seed=103,aliased=1,every=5]")
 PERTURB, STRENGTHS = "none,light,clipping,viewpoint,occlusion,noise,blur,change,all", "0.5,1"
 WINDOW = "20s"
-commands = typer.Typer(help="Compare loop detectors.", no_args_is_help=True)
+app = typer.Typer(name="loops", help="Compare loop detectors.", no_args_is_help=True)
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the application."""
-    app.add_typer(commands, name="loops")
-
-
-@commands.callback()
-def _group() -> None:
-    """Keep the name of the only command, which typer would otherwise drop."""
-
-
-@commands.command("bench", epilog=_EXAMPLES)
+@app.command("bench", epilog=_EXAMPLES)
 def bench(
     protocol: Annotated[
         Literal["retrieval", "online"],
@@ -130,17 +120,18 @@ def bench(
         raise InputError("--window: only for --protocol online; add that or leave it out.")
 
     _require_writable(out)
-    from vslam.cli.console import console
-    from vslam.loopclosure.vocabulary import load
+    from vslam.cli.console import Console
+    from vslam.loopclosure.vocabulary import SHIPPED
+    from vslam.loopclosure.vocabulary_text import read_vocabulary
     from vslam.machine import available_cores
 
     asked = _Asked(
         names,
         files,
-        load(),
+        read_vocabulary(files.get("bow", SHIPPED)),
         seed,
         threads or available_cores(),
-        console(shown=not quiet).count_bar,
+        Console(shown=not quiet).count_bar,
     )
     write = partial(_write, out, seed)
     # The report is written after every set, so that a command that is stopped keeps its results.
@@ -195,7 +186,7 @@ def _on_sets(
     quiet: bool,
 ) -> str:
     """Measure queries against galleries; returns what was measured on."""
-    from vslam.cli.console import console
+    from vslam.cli.console import Console
     from vslam.datasets.synthetic import store
     from vslam.lab.loopbench.cost import cost
     from vslam.lab.loopbench.detectors import DetectorSet, open_scorer
@@ -209,7 +200,7 @@ def _on_sets(
         for spec in data
         for found in open_set(spec, store.cache_folder(), threads=threads, progress_bar=bar)
     ]
-    console(shown=not quiet).announce("time and memory of each detector ...")
+    Console(shown=not quiet).announce("time and memory of each detector ...")
     costs = [cost(name, asked.files.get(name)) for name in asked.names]
     scores: list[Score] = []
     gains: list[Gain] = []

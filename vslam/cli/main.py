@@ -95,11 +95,8 @@ def application(groups: Collection[ModuleType]) -> typer.Typer:
         rich_markup_mode="rich",
     )
     for group in groups:
-        group.register(made)
-    for several in made.registered_groups:
-        several.cls = _Group
-    for commands in (made, *(several.typer_instance for several in made.registered_groups)):
-        for command in commands.registered_commands if commands else ():
+        made.add_typer(group.app, cls=_Group)
+        for command in group.app.registered_commands:
             command.cls = _Command
     made.callback(invoke_without_command=True)(version)
     return made

@@ -113,6 +113,36 @@ Scheduler = Annotated[
         EXECUTION, "ADDRESS", "Dask scheduler, such as tcp://HOST:8786, whose workers do the runs."
     ),
 ]
+SystemNames = Annotated[
+    str,
+    option(
+        METHOD, "NAMES", "Systems to test: [b]vslam[/b], [b]orbslam3[/b] and those of --system."
+    ),
+]
+OtherSystems = Annotated[
+    list[str] | None,
+    option(
+        METHOD,
+        "NAME=COMMAND",
+        "Another system: a command that reads {folder}, in KITTI's format, and writes "
+        "{out} (docs/howto/stress.md).",
+        "--system",
+    ),
+]
+OrbSlam3Python = Annotated[
+    Path | None,
+    option(
+        METHOD,
+        "FILE",
+        "Python interpreter that has pyorbslam3.",
+        "--orbslam3-python",
+        unset="this one",
+    ),
+]
+OrbSlam3Vocabulary = Annotated[
+    Path | None,
+    option(METHOD, "FILE", "Vocabulary of ORB-SLAM3, in DBoW2's text format.", "--vocabulary"),
+]
 Quiet = Annotated[bool, flag(OUTPUT, "Show no progress and no summary.", "--quiet")]
 SensorName = Literal["stereo", "mono", "rgbd"]
 ViewerName = Literal["native", "web"]

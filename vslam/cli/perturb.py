@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.cli.console import console
+from vslam.cli.console import Console
 from vslam.cli.options import OUTPUT, Perturb, Seed, flag, open_given, option, reads_source
 from vslam.errors import InputError
 
@@ -22,11 +22,10 @@ _EXAMPLE = """
 """
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command("perturb", epilog=_EXAMPLE)(preview)
+app = typer.Typer()
 
 
+@app.command("perturb", epilog=_EXAMPLE)
 @reads_source(without=("mask",))
 def preview(
     given: SourceOptions,
@@ -63,7 +62,7 @@ def preview(
     )
 
     name = perturb if perturb == "all" else parse_perturbation(perturb, seed).name
-    opened = open_given(given, console(shown=True))
+    opened = open_given(given, Console(shown=True))
     sequence = first_frames(opened)
     if perturb == "all":
         fit, unfit = laws_for(opened)

@@ -45,11 +45,10 @@ _EXAMPLES = """
 _OTHER_DETECTORS = ", ".join(name for name in DETECTOR_NAMES if name not in ("none", "both"))
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command(epilog=_EXAMPLES)(run)
+app = typer.Typer()
 
 
+@app.command(epilog=_EXAMPLES)
 @reads_source()
 def run(
     context: typer.Context,
@@ -69,7 +68,10 @@ def run(
     weights: Annotated[
         Path | None,
         option(
-            METHOD, "FILE", "ONNX file of the detector's network, written by [b]vslam train[/b]."
+            METHOD,
+            "FILE",
+            "ONNX file of the detector's network, written by [b]vslam train[/b], or the "
+            "vocabulary of [b]bow[/b], written by [b]vslam vocabulary[/b].",
         ),
     ] = None,
     local_weights: Annotated[

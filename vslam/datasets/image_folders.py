@@ -25,9 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.datasets.association import associate
-from vslam.datasets.depth_images import depth_files
 from vslam.datasets.frames import RawSource
-from vslam.datasets.image_files import checked_files, image_size, list_images, select_frames
+from vslam.datasets.image_files import (
+    checked_files,
+    depth_files,
+    image_size,
+    list_images,
+    select_frames,
+)
 from vslam.errors import InputError
 from vslam.trajectory import read_table
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from vslam.calibration.models import Calibration
 from vslam.calibration.rectification import Rectification, rectify
 from vslam.camera import DepthImage, Image, ImageMap
-from vslam.datasets.depth_images import with_depth
 from vslam.datasets.frames import Images, RawSource, Size, Source, TimedFrame
+from vslam.datasets.image_files import with_depth
 from vslam.errors import InputError
 
 _CUT = {(1, 0): "column", (0, 1): "row", (1, 1): "column and row"}  # by missing (columns, rows)

@@ -188,7 +188,7 @@ def _open_stream(
         )
         own = None if o.calib else find_calibration(bag)
     else:
-        from vslam.datasets.live_camera import open_camera
+        from vslam.datasets.video import open_camera
 
         raw = open_camera(o.data, side_by_side=o.side_by_side, monocular=monocular)
     return selected(raw, start=o.start, every=o.every, max_frames=o.max_frames), own

@@ -16,11 +16,15 @@ from numpy.typing import NDArray
 
 from vslam.calibration.files import read_calibration
 from vslam.calibration.models import Calibration, CameraModel
-from vslam.datasets.association import associate
-from vslam.datasets.depth_images import depth_files
+from vslam.datasets.association import associate, poses_at
 from vslam.datasets.frames import Source
-from vslam.datasets.ground_truth import poses_at
-from vslam.datasets.image_files import checked_files, find_sequence, image_size, select_frames
+from vslam.datasets.image_files import (
+    checked_files,
+    depth_files,
+    find_sequence,
+    image_size,
+    select_frames,
+)
 from vslam.datasets.rectified import rectified
 from vslam.errors import InputError
 from vslam.trajectory import read_trajectory
@@ -56,7 +60,7 @@ def open_tum(
 
     A frame is a colour image with the depth image nearest in time, within 20 ms; each is used
     once, the nearest first, as by TUM's ``associate.py``. The ground truth is interpolated
-    (`vslam.datasets.ground_truth.poses_at`).
+    (`vslam.datasets.association.poses_at`).
 
     Args:
         root: folder of the sequence, or of several sequences.

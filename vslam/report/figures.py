@@ -88,7 +88,7 @@ def _drawings(
             _error_along_path(outcome, evaluation),
         )
         yield "error_histogram", "Number of frames by error.", _error_histogram(evaluation)
-    if ground_truth is not None and outcome.settings.sensor != "mono":
+    if ground_truth is not None and not outcome.sequence.camera.monocular:
         errors = motion_errors(outcome.tracks, ground_truth, _MOTION_S)
         if len(errors.first) > 1:
             yield (
@@ -197,7 +197,7 @@ def _tracked_points(outcome: RunOutcome) -> Figure:
 
 def _usable_features(outcome: RunOutcome) -> tuple[str, list[int]]:
     """The features that can give landmarks with this sensor, and their number in each frame."""
-    sensor = outcome.settings.sensor
+    sensor = outcome.sequence.camera.sensor
     if sensor == "mono":
         return "features", [track.n_features for track in outcome.tracks]
     name = "features with depth" if sensor == "rgbd" else "stereo features"

@@ -16,7 +16,7 @@ from vslam.errors import InputError, ResultsError
 from vslam.evaluation.loops import LoopEvaluation, evaluate_loops
 from vslam.evaluation.trajectories import Evaluation, evo_command
 from vslam.evaluation.worlds import world_of
-from vslam.maps.ply import save_ply
+from vslam.maps.formats import save_ply
 from vslam.maps.storage import save_map
 from vslam.report.frame_table import write_covariances, write_frames
 from vslam.report.schema import ReportJson
@@ -206,7 +206,7 @@ def _write_data(
     with written.part("the evaluation"):
         evaluation, remark = evaluate_run(outcome)
     if (stored := outcome.stored) is not None:
-        if outcome.settings.map is None and evaluation is not None:
+        if outcome.settings.map_file is None and evaluation is not None:
             with written.part("the map's place in the ground truth"):
                 stored = replace(stored, world=world_of(outcome, evaluation))
         with written.file("map.npz") as file:
@@ -225,7 +225,7 @@ def _write_data(
 
 
 def _config_text(outcome: RunOutcome) -> str:
-    return outcome.settings.config.model_dump_json(indent=2) + "\n"
+    return outcome.settings.thresholds.model_dump_json(indent=2) + "\n"
 
 
 def write_trajectories(written: Results, outcome: RunOutcome) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 from collections import Counter
-from dataclasses import asdict
 from datetime import UTC, datetime
 from itertools import takewhile
 from typing import Any
@@ -32,6 +31,11 @@ from vslam.report.schema import (
 )
 from vslam.run.outcome import RunOutcome, causal_trajectory, matched_ground_truth
 
+_OPTIONS = (
+    "perturb", "detector", "seed", "threads", "start", "every", "max_frames", "weights",
+    "local_weights", "realtime", "calib", "mask", "localize", "compare",
+)  # fmt: skip
+
 
 def summarize(
     outcome: RunOutcome,
@@ -50,8 +54,7 @@ def summarize(
     frames = len(outcome.tracks)
     states = Counter(track.state for track in outcome.tracks)
     done = frames - states[TrackingState.DROPPED]
-    options = asdict(outcome.settings)
-    options["thresholds"] = changed_thresholds(options.pop("config").model_dump())
+    settings, source = outcome.settings.model_dump(), outcome.sequence
     loops = _loops(outcome, verdict)
     return ReportJson(
         lost_before_map=_lost_before_map(outcome),
@@ -85,12 +88,17 @@ def summarize(
         versions=versions(),
         created=datetime.now(UTC).replace(microsecond=0),
         **_measures(outcome, evaluation, verdict),
-        **options,
+        dataset=source.dataset,
+        sequence=source.name,
+        sensor=source.camera.sensor,
+        map=settings["map_file"],
+        thresholds=changed_thresholds(settings["thresholds"]),
+        **{name: settings[name] for name in _OPTIONS},
     )
 
 
 def _lost_before_map(outcome: RunOutcome) -> int:
-    if outcome.settings.map is not None or not outcome.n_tracked:
+    if outcome.settings.map_file is not None or not outcome.n_tracked:
         return 0
     untracked = (TrackingState.LOST, TrackingState.DROPPED)
     before = takewhile(lambda track: track.state in untracked, outcome.tracks)
@@ -105,8 +113,7 @@ def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
     if not outcome.tracks:
         return None, "no frames"
     try:
-        alignment = outcome.settings.alignment
-        found = evaluate_trajectory(outcome.trajectory, ground_truth, alignment)
+        found = evaluate_trajectory(outcome.trajectory, ground_truth, outcome.alignment)
     except InputError as error:  # a clip too short to align is no reason to lose the run
         return None, str(error)
     if found.frames == len(outcome.trajectory):
@@ -121,7 +128,7 @@ def causal_ate(outcome: RunOutcome) -> float | None:
         return None
     try:
         given = causal_trajectory(outcome.tracks)
-        return evaluate_trajectory(given, ground_truth, outcome.settings.alignment).ate_rmse_m
+        return evaluate_trajectory(given, ground_truth, outcome.alignment).ate_rmse_m
     except InputError:
         return None
 

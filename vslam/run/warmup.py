@@ -53,7 +53,7 @@ from vslam.features import Extracted, Features
 from vslam.frontend import pnp
 from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.frame import Frame
-from vslam.frontend.relocalization import relocalise
+from vslam.frontend.relocaliser import relocalise
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracking import TrackingContext
 from vslam.loopclosure import bow, local_matching, sim3_ransac

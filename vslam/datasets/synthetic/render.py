@@ -9,7 +9,7 @@ pixel is shaded once for each surface that its four samples see.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -18,14 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera
-from vslam.datasets.synthetic.kernel_arrays import (
+from vslam.datasets.synthetic.rasterise import find_visible, rasterise
+from vslam.datasets.synthetic.scene import (
+    Atlas,
     LightValues,
     PosedCamera,
     SampleBand,
-    SurfaceArrays,
+    Surfaces,
 )
-from vslam.datasets.synthetic.rasterise import find_visible, rasterise
-from vslam.datasets.synthetic.scene import Atlas, Surfaces
 from vslam.datasets.synthetic.shade import shade
 from vslam.datasets.synthetic.shadows import NO_LAMPS, LampPools, ShadowMap
 
@@ -66,6 +66,17 @@ class Light:
         return LightValues(*(float(x) for x in (*self.sun, *sky, *air, self.headlight)))
 
 
+@dataclass(frozen=True)
+class Moment:
+    """The scene of one frame; ``night``, 0 to 1, raises the gain of the sensor."""
+
+    surfaces: Surfaces
+    shadows: ShadowMap
+    light: Light
+    night: float = 0.0
+    pools: LampPools = NO_LAMPS
+
+
 class RenderedView(NamedTuple):
     """A rendered view: ``image`` ``(H, W)`` float32 grey levels before the sensor (0 to above 255)
     and ``depth`` ``(H, W)`` float32 metres along z, 0 in the sky."""
@@ -88,31 +99,17 @@ class Renderer:
         self._pool.shutdown()
 
     def stereo(
-        self,
-        surfaces: Surfaces,
-        shadows: ShadowMap,
-        light: Light,
-        T_wc: NDArray[np.float64],
-        pools: LampPools = NO_LAMPS,
+        self, moment: Moment, T_wc: NDArray[np.float64]
     ) -> tuple[RenderedView, RenderedView]:
         """Left and right view of a rig whose left camera stands at ``T_wc`` ``(4, 4)``."""
         right = T_wc.copy()
         right[:3, 3] += T_wc[:3, 0] * self._camera.baseline
-        left_view, right_view = self.views(surfaces, shadows, light, (T_wc, right), pools)
+        left_view, right_view = self.views(moment, T_wc, right)
         return left_view, right_view
 
-    def views(
-        self,
-        surfaces: Surfaces,
-        shadows: ShadowMap,
-        light: Light,
-        T_wc: Iterable[NDArray[np.float64]],
-        pools: LampPools = NO_LAMPS,
-    ) -> list[RenderedView]:
+    def views(self, moment: Moment, *T_wc: NDArray[np.float64]) -> list[RenderedView]:
         """A view from each of the ``(4, 4)`` poses ``T_wc``."""
-        prepared = [
-            self._pool.submit(self._prepare, surfaces, shadows, light, T, pools) for T in T_wc
-        ]
+        prepared = [self._pool.submit(self._prepare, moment, T) for T in T_wc]
         views, jobs = [], []
         for preparation in prepared:
             view, bands = preparation.result()
@@ -123,20 +120,15 @@ class Renderer:
         return views
 
     def _prepare(
-        self,
-        surfaces: Surfaces,
-        shadows: ShadowMap,
-        light: Light,
-        T_wc: NDArray[np.float64],
-        pools: LampPools,
+        self, moment: Moment, T_wc: NDArray[np.float64]
     ) -> tuple[RenderedView, list[Callable[[], None]]]:
         fx, fy, cx, cy = (
             float(x) for x in (self._camera.fx, self._camera.fy, self._camera.cx, self._camera.cy)
         )
         height, width = self._camera.height, self._camera.width
         camera = PosedCamera(np.ascontiguousarray(T_wc), fx, fy, cx, cy, height, width)
-        values = light.values()
-        visible = find_visible(SurfaceArrays.of(surfaces), self._atlas, camera, values)
+        values = moment.light.values()
+        visible = find_visible(moment.surfaces, self._atlas, camera, values)
         view = RenderedView(
             np.empty((height, width), np.float32), np.empty((height, width), np.float32)
         )
@@ -147,7 +139,8 @@ class Renderer:
             inverse_depth, seen = np.zeros(shape, np.float32), np.full(shape, -1, np.int32)
             samples = SampleBand(first, SAMPLES, inverse_depth, seen)
             rasterise(visible, self._atlas, samples)
-            shade(visible, samples, self._atlas, self._sky, values, shadows, pools, camera, view)
+            shade(visible, samples, self._atlas, self._sky, values, moment.shadows, moment.pools,
+                  camera, view)  # fmt: skip
 
         # The defaults bind the present values of the loop variables.
         return (

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from vslam.lab.loopbench.curves import draw_curves
-from vslam.lab.loopbench.measure import MIN_MATCHES, MIN_SHARE
+from vslam.lab.loopbench.measure import LENGTH, MIN_MATCHES, MIN_SHARE
 from vslam.lab.loopbench.report_online import online_tables, online_words
 from vslam.lab.loopbench.schema import LoopsJson, Score
-from vslam.lab.loopbench.sequences import LENGTH
 from vslam.report.page import Bullets, Page, Pairs, Section, Table
 from vslam.report.render import html, markdown, write_files
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Literal
 
-from vslam.report.document import Document, Record
+from vslam.report.schema import Document, Record
 
 
 class Curve(Record):

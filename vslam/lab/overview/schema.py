@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from vslam.report.document import Document, Record
+from vslam.report.schema import Document, Record
 
 Measure = tuple[str, str, str, int]
 # Name in the JSON, title, unit, decimals.

@@ -5,14 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from vslam.datasets.synthetic.camera_effects import sensor_image
-from vslam.datasets.synthetic.files import check_disk, frame_files, write, write_png, writing
-from vslam.datasets.synthetic.passes import Passes
-from vslam.datasets.synthetic.render import Renderer
+from vslam.datasets.synthetic.files import check_disk, frame_files, write, writing
 from vslam.datasets.synthetic.routes import Route
 from vslam.datasets.synthetic.site import Variation
-from vslam.datasets.synthetic.store import OnFrame
-from vslam.datasets.synthetic.town import build_town
+from vslam.datasets.synthetic.store import OnFrame, render_frames
 from vslam.trajectory import write_kitti
 
 
@@ -49,25 +45,9 @@ def render_views(
         (folder / "image_0").mkdir(parents=True, exist_ok=True)
         (root / "poses").mkdir(exist_ok=True)
         if missing:
-            town = build_town(route, variation)
-            passes = Passes(route, town, variation)
-            renderer = Renderer(route.camera, town.atlas, town.sky, threads)
-            yaw_rate = route.yaw_rate
-            for done, k in enumerate(missing, len(files) - len(missing) + 1):
-                moment = passes.at(k)
-                (view,) = renderer.views(
-                    moment.surfaces, moment.shadows, moment.light, [route.T_wc[k]], moment.pools
-                )
-                image = sensor_image(
-                    view.image,
-                    route.camera,
-                    yaw_rate=float(yaw_rate[k]),
-                    night=moment.night,
-                    key=(variation.seed, k, 0),
-                )
-                write_png(files[k], image, 1)
-                if on_frame:
-                    on_frame(done, len(files))
-            renderer.close()
+            render_frames(
+                route, variation, folder, missing, False, threads, on_frame,
+                total=len(files), monocular=True,
+            )  # fmt: skip
         write(folder / "times.txt", "".join(f"{t:.6e}\n" for t in route.timestamps).encode())
         write_kitti(root / "poses" / f"{route.name}.txt", route.ground_truth)

@@ -1,4 +1,4 @@
-"""Local descriptors of the capsule network's extractor, coarse to fine.
+"""The network of the shipped local descriptors in torch, which its ONNX file is compared with.
 
 One extractor gives a global descriptor and local ones (HF-Net, Sarlin et al., CVPR 2019). Matches
 are found on a coarse grid and refined to subpixels on a fine one (LoFTR, Sun et al., CVPR 2021).

@@ -174,7 +174,8 @@ def _contrast(percent: float, stream: RandomStream) -> Law:
 
 KINDS = {
     "brightness": LawKind(
-        _brightness, "x", 1.0, 0.1, 10.0, "gain and offset drift and jump at random", logarithmic=True
+        _brightness, "x", 1.0, 0.1, 10.0, "gain and offset drift and jump at random",
+        logarithmic=True,
     ),
     "gamma": LawKind(_gamma, "x", 1.0, 0.1, 10.0, "gamma drifts at random", logarithmic=True),
     "flicker": LawKind(

@@ -48,7 +48,7 @@ class Surfaces(NamedTuple):
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Surfaces:
         """The surfaces ``rows``, a mask or indices."""
-        return Surfaces(*(np.ascontiguousarray(column[rows]) for column in self))
+        return Surfaces._make(np.ascontiguousarray(column[rows]) for column in self)
 
     def moved(self, R: Float, t: Float) -> Surfaces:
         """The surfaces turned by ``R`` ``(3, 3)`` and then shifted by ``t`` ``(3,)``."""

@@ -62,7 +62,8 @@ class LoopConsistency:
             if length >= self.config.min_keyframes:
                 consistent.append(candidate)
             else:
-                reason = f"resembled {length} of {self.config.min_keyframes} keyframes in a row"
+                needed = f"the {self.config.min_keyframes} consecutive keyframes needed"
+                reason = f"proposed for only {length} of {needed}"
                 rejected.append(LoopEdge.of(candidate, reason))
         waiting = [
             replace(g, age=g.age + 1)

@@ -55,7 +55,9 @@ def test_a_place_must_resemble_three_keyframes_in_a_row():
         consistent, rejected = consistency.update(query, candidates(query, 10 + turn), STREET)
         assert len(consistent) == (turn >= 2)
         assert [edge.reason for edge in rejected] == (
-            [] if turn >= 2 else [f"resembled {turn + 1} of 3 keyframes in a row"]
+            []
+            if turn >= 2
+            else [f"proposed for only {turn + 1} of the 3 consecutive keyframes needed"]
         )
         assert all((e.query, e.accepted) == (query, False) for e in rejected)
 

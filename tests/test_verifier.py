@@ -24,7 +24,7 @@ from vslam.states import VerifierState
 
 PLAIN = LoopCandidate(1, 0, 0.9, alike=0.5)
 PROMISING = replace(PLAIN, promising=True)
-REFUSAL = LoopEdge.of(PLAIN, "resembled 1 of 3 keyframes in a row")
+REFUSAL = LoopEdge.of(PLAIN, "proposed for only 1 of the 3 consecutive keyframes needed")
 BOTH = (LearnedVerifier, OrbThenLearnedVerifier)
 
 

@@ -90,8 +90,16 @@ class DistanceHead(nn.Module):
         return self.log_a.exp() - self.log_b.exp() * d
 
     def compare(self, query: Tensor, gallery: Tensor, lengths: Tensor) -> Tensor:
-        """Logits ``(M,)`` of one ``(V, d)`` descriptor with a gallery ``(M, V, d)``, both by view,
-        by one product; ``lengths`` ``(M, V)`` are those of the gallery's views."""
+        """Compare an image with a gallery by one matrix product.
+
+        Args:
+            query: ``(V, d)`` descriptors of the views of the image.
+            gallery: ``(M, V, d)`` descriptors of the views of M images.
+            lengths: ``(M, V)`` lengths of the gallery's descriptors.
+
+        Returns:
+            ``(M,)`` logits.
+        """
         alike = (gallery @ query.T).transpose(1, 2)
         most = _lengths(query[None])[:, :, None] * lengths[:, None]
         return self.of_cosine(aligned(alike, most))

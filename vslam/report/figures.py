@@ -101,7 +101,8 @@ def _drawings(
                 "odometry_error",
                 "Error of the motion over one second, by odometry alone (trajectory_odom.tum), and "
                 "twice the standard deviation that its covariance predicts: about one error in "
-                "twenty should lie above.",
+                "twenty should lie above, if the ground truth is accurate to that over a second "
+                "(KITTI's is not).",
                 _odometry_error(errors),
             )
     if outcome.tracks:

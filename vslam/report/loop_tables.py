@@ -19,6 +19,7 @@ _MAX_CLOSED = 60
 _MAX_REJECTED = 12
 _MAX_SEEN = 6  # loops in pictures: about 0.5 MB of the page
 _DESCRIPTORS = {"orb": "ORB descriptors", "learned": "learned descriptors"}
+_NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
 def loop_sections(report: ReportJson) -> list[Section]:
@@ -74,11 +75,16 @@ def _reasons(report: ReportJson) -> Table:
     groups: dict[str, list[LoopEntry]] = defaultdict(list)
     for loop in report.loops:
         if not loop.accepted:
-            groups[_without_numbers(loop.reason)].append(loop)
+            groups[_NUMBER.sub("0", loop.reason)].append(loop)
     ordered = sorted(groups.items(), key=lambda group: -len(group[1]))
     rows: list[Row] = [
-        (reason, str(len(loops)), str(max(loop.inliers for loop in loops)), _share_right(loops))
-        for reason, loops in ordered
+        (
+            _common(loops),
+            str(len(loops)),
+            str(max(one.inliers for one in loops)),
+            _right_of(loops),
+        )
+        for _, loops in ordered
     ]
     head = ("reason", "candidates", "most inliers", "pose right")
     note = f"{counted(report.loops_rejected, 'candidate')} in all; report.json lists each."
@@ -107,16 +113,19 @@ def _evidence(loop: LoopEntry) -> Row:
     )  # fmt: skip
 
 
-def _without_numbers(reason: str) -> str:
-    """Reasons that differ only in their numbers count as one."""
-    return re.sub(r"\d+(\.\d+)?", "N", reason)
+def _common(loops: list[LoopEntry]) -> str:
+    """The reason of loops whose reasons differ only in their numbers, with the ranges of these."""
+    columns = zip(*(_NUMBER.findall(loop.reason) for loop in loops), strict=True)
+    ends = [(min(column, key=float), max(column, key=float)) for column in columns]
+    ranges = iter([least if least == most else f"{least}-{most}" for least, most in ends])
+    return _NUMBER.sub(lambda _: next(ranges), loops[0].reason)
 
 
 def _right(loop: LoopEntry) -> str:
     return {True: "right", False: "wrong", None: "n/a"}[loop.right]
 
 
-def _share_right(loops: list[LoopEntry]) -> str:
+def _right_of(loops: list[LoopEntry]) -> str:
     judged = [loop.right for loop in loops if loop.right is not None]
     return f"{sum(judged)} of {len(judged)}" if judged else "n/a"
 

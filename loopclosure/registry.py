@@ -32,8 +32,8 @@ LEARNED_VERIFICATION = ("both", *(name for name in NETWORKS if name != TO_THE_LE
 
 
 def about(name: str) -> str:
-    """A description of a detector in a few words; for a plug-in, its name."""
-    return _ABOUT.get(name, name)
+    """A description of a detector in a few words."""
+    return _ABOUT.get(name, "a plug-in")
 
 
 def require_detector(name: str, weights: Path | None = None, option: str = "--detector") -> None:

@@ -128,7 +128,7 @@ POINTS = (
     Point("result: loops", "vslam.report.folder.evaluate_loops", 1, MISSING, LATER),
     Point("result: report.json", "vslam.report.folder.summarize", 1, MISSING, LATER),
     Point("result: figures", "vslam.report.figures.draw_figures", 1, MISSING, ("figures",)),
-    Point("result: seen loops", "vslam.report.seen_loops.seen_loops", 1, MISSING, ("figures",)),
+    Point("result: seen loops", "vslam.report.loop_tables.seen_loops", 1, MISSING, ("figures",)),
     Point("result: report.md", "vslam.report.render.markdown", 1, MISSING, ("report.md",)),
     Point("result: page", "vslam.report.render.html", 1, MISSING, ("report.html",)),
     Point("result: explorer", "vslam.report.explorer.explorer_data", 1, MISSING, ("report.html",)),
@@ -274,7 +274,7 @@ def load_everything() -> None:
     """Load the modules, kernels and features that forks need, without starting threads, which
     forks would lack."""
     from vslam.cli import main  # noqa: F401
-    from vslam.report import explorer, figures, render, seen_loops  # noqa: F401
+    from vslam.report import explorer, figures, loop_tables, render  # noqa: F401
 
     cv2.setNumThreads(1)
     detector = Oracle(RING, [float(k) for k in range(FRAMES)])

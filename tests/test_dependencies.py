@@ -83,6 +83,7 @@ ONLY_IN = {
     "evo": "vslam.evaluation.trajectories",
     "distributed": "vslam.lab.bench.cluster",
     "rosbags": ("vslam.datasets.bag", "vslam.datasets.bag_limits", "vslam.maps.ros"),
+    "pymap3d": "vslam.datasets.fixes",
     "PIL": "vslam.datasets.image_folders",
     "pyorbslam3": "vslam.lab.stress.orbslam3",
     "deflate": "vslam.datasets.png",

@@ -93,7 +93,7 @@ def test_its_metadata_are_complete(wheels):
     classifiers = metadata.get_all("Classifier") or []
     for version in ("3.11", "3.12", "3.13"):
         assert f"Programming Language :: Python :: {version}" in classifiers
-    assert {"bag", "cluster", "docs", "dev", "train"} == set(
+    assert {"bag", "cluster", "docs", "dev", "gps", "train"} == set(
         metadata.get_all("Provides-Extra") or []
     )
     assert "vslam = vslam.cli.main:main" in points
@@ -149,13 +149,14 @@ def test_a_plain_installation_stays_lean():
     assert not [name for name in extras if re.search(rf"\b{name}\b", plain)]
     for library, extra, where in (
         ("rosbags", "bag", "vslam/datasets/bag.py"),
+        ("pymap3d", "gps", "vslam/datasets/fixes.py"),
         ("distributed", "cluster", "vslam/lab/bench/cluster.py"),
         ("torch", "train", "vslam/cli/train.py"),
     ):
         assert library in extras
         assert f"vslam[{extra}]" in (ROOT / where).read_text()
     # `make test` installs all of them.
-    assert "vslam[bag,cluster,docs,train]" in PROJECT["optional-dependencies"]["dev"]
+    assert "vslam[bag,cluster,docs,gps,train]" in PROJECT["optional-dependencies"]["dev"]
 
 
 def test_a_comment_says_what_each_dependency_is_needed_for():

@@ -150,8 +150,8 @@ def test_files_that_cannot_be_written_are_named(tmp_path: Path):
     assert (tmp_path / "new" / "a.md").read_text("utf-8") == "ä"
     assert (tmp_path / "new" / "b.jpg").read_bytes() == JPEG
     (tmp_path / "file").touch()
-    with pytest.raises(ResultsError, match=r"file: the report cannot be written .*; free space\."):
-        write_files(tmp_path / "file", {}, "free space")
+    with pytest.raises(ResultsError, match=r"a\.md: cannot be written .*; free space\."):
+        write_files(tmp_path / "file", {"a.md": ""}, "free space")
 
 
 def test_csv():

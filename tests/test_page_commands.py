@@ -132,6 +132,7 @@ RULES = {
     ),
     "docs/howto/kitti.md": Rules(),
     "docs/howto/masks.md": Rules(),
+    "docs/howto/gps.md": Rules(),
     "docs/howto/tum.md": Rules(),
     "docs/howto/untrusted.md": Rules((("--inputs 1000", "--inputs 2 --readers trajectory"),)),
     "docs/howto/lifelong.md": Rules(
@@ -150,6 +151,12 @@ RULES = {
         not_run=(
             ("vslam loops bench", REAL),
             ("vslam bench", HOURS),
+        )
+    ),
+    "docs/research/gps.md": Rules(
+        not_run=(
+            ("vslam run", "test_gps.py runs a short drive"),
+            ("python tools/experiments/gps", "test_gps.py runs it"),
         )
     ),
     "docs/research/uncertainty.md": Rules(
@@ -403,6 +410,13 @@ def _video_and_mask(desk: Path, corridor) -> None:
     cv2.imwrite("hood.png", np.pad(np.full((110, 480), 255, np.uint8), ((0, 50), (0, 0))))
 
 
+def _fixes(desk: Path, corridor) -> None:
+    """A row north of one metre is 9 millionths of a degree."""
+    north = enumerate(corridor.T_wc[:N, 2, 3].tolist())
+    rows = [f"{0.1 * k},{48 + 9e-6 * metres:.9f},11,500,0.01" for k, metres in north]
+    (desk / "fixes.csv").write_text("\n".join(["time,latitude,longitude,altitude,sigma", *rows]))
+
+
 def _depth_sources(desk: Path, corridor) -> None:
     """Images in ``FOLDER``, a bag with depth."""
     c = corridor.camera
@@ -477,6 +491,7 @@ PREPARE: dict[str, Callable[[Path, object], None]] = {
     "docs/howto/bench.md": _earlier_run,
     "docs/howto/calibrate.md": _videos,
     "docs/explanation/design.md": _image,
+    "docs/howto/gps.md": _fixes,
     "docs/howto/masks.md": _video_and_mask,
     "docs/howto/rgbd.md": _depth_sources,
     "docs/howto/sources.md": _pair_sources,

@@ -422,7 +422,7 @@ def test_rejected_loops_do_not_drown_the_table(looped: tuple[RunOutcome, Path]) 
     assert "wrong" in rows[0]
     reasons = [line for line in blocks["Loops rejected"].splitlines() if line.startswith("|")][2:]
     assert len(reasons) == 2
-    assert "N inliers, N needed \\| <b>" in reasons[0]
+    assert "0-13 inliers, 20 needed \\| <b>" in reasons[0]
     assert [cell.strip() for cell in reasons[0].rsplit("|", 4)[1:4]] == ["299", "13", "n/a"]
     assert [cell.strip() for cell in reasons[1].rsplit("|", 4)[1:4]] == ["1", "84", "1 of 1"]
     assert text.count("needed") <= 14

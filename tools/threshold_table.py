@@ -1,19 +1,14 @@
 """Write docs/reference/thresholds.md: every threshold of vslam/config.py with its unit and source.
 
-    python tools/threshold_table.py            # writes it
-    python tools/threshold_table.py --check    # exits 1 if the file differs
-
 The docstring below a field ends with its source in brackets: paper, section and status of the
 value, as in "[OS1 V-D, customary]", or "[own]" where the rule has no paper either.
 """
 
 from __future__ import annotations
 
-import argparse
 import ast
 import inspect
 import re
-import sys
 import textwrap
 from itertools import pairwise
 from pathlib import Path
@@ -95,17 +90,5 @@ def page(config: Config) -> str:
     return "\n".join(lines).rstrip("\n") + "\n"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--check", action="store_true", help="compare, do not write")
-    parser.add_argument("--out", type=Path, default=PAGE)
-    options = parser.parse_args()
-    text = page(Config())
-    if not options.check:
-        options.out.write_text(text)
-    elif not options.out.is_file() or options.out.read_text() != text:
-        sys.exit(f"{options.out} differs from vslam/config.py: python tools/threshold_table.py")
-
-
 if __name__ == "__main__":
-    main()
+    PAGE.write_text(page(Config()))

@@ -775,10 +775,10 @@ def checked(model: type[_Model], given: object, where: str, what: str) -> _Model
     """Check thresholds or settings; those that are left out keep their defaults.
 
     Args:
-        model: what they describe.
+        model: the class that describes the values and their ranges.
         given: JSON as bytes, a dictionary, or a model, which is returned as it is.
-        where: the file or argument that they come from, for the messages.
-        what: a name for them, for the messages.
+        where: the file or argument that the values come from, for error messages.
+        what: what error messages call the values, such as ``thresholds``.
 
     Raises:
         InputError: as ``read_json``.

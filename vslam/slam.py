@@ -35,7 +35,7 @@ from vslam.map_frames import in_first_part, keyframe_trajectory
 from vslam.mapping import Mapper
 from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, World
-from vslam.modes import Localising, MapBuilding
+from vslam.modes import MapBuilding, Mode
 from vslam.odometry import Odometry
 from vslam.session import Session, open_map
 from vslam.shared_map import mapping_executor
@@ -114,7 +114,7 @@ class Slam:
         self._tracker = tracker = Tracker(context)
         recognise = LearnedRelocalisation(images, camera, config)
         self._relocaliser = Relocaliser(context, detector.locate, recognise)
-        self._mode = Localising(mapper) if localize else MapBuilding(context, mapper, tracker)
+        self._mode = Mode(mapper) if localize else MapBuilding(context, mapper, tracker)
         self._odometry = Odometry()
         self._session = Session(
             context, closing, mapper, tracker, rig, self._mode, self._odometry, opened

@@ -16,7 +16,7 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
-from vslam.errors import ResultsError
+from vslam.errors import ResultsError, write_file
 from vslam.loopclosure.siamese.inference import (
     ABOUT,
     COMPARISON,
@@ -133,19 +133,13 @@ def to_onnx(
 
 
 def write_onnx(model: onnx.ModelProto, path: Path, metadata: dict[str, str]) -> None:
-    """Write a graph with its metadata atomically.
+    """Write a graph with its metadata.
 
     Raises:
         ResultsError: the file cannot be written.
     """
     helper.set_model_props(model, metadata)
-    temporary = path.with_suffix(".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_bytes(model.SerializeToString())
-        temporary.replace(path)
-    except OSError as error:
-        raise ResultsError(f"{path}: cannot be written ({error.strerror}).") from error
+    write_file(path, model.SerializeToString())
 
 
 def _halve(graph: onnx.GraphProto) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vslam.errors import InputError, ResultsError
+from vslam.errors import InputError, ResultsError, write_file
 from vslam.loopclosure.training.augmentation import augment
 from vslam.loopclosure.training.checkpoint import (
     CHECKPOINT,
@@ -358,7 +358,4 @@ def write_log(path: Path, history: list[dict[str, float]]) -> None:
     rows = csv.DictWriter(table, list(history[0]), lineterminator="\n")
     rows.writeheader()
     rows.writerows(history)
-    try:
-        path.write_text(table.getvalue())
-    except OSError as error:
-        raise ResultsError(f"{path}: cannot be written ({error.strerror}).") from error
+    write_file(path, table.getvalue())

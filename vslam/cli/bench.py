@@ -12,6 +12,7 @@ from vslam.cli.cells import choose_systems, open_cells
 from vslam.cli.options import (
     METHOD,
     OUTPUT,
+    Detectors,
     Jobs,
     OrbSlam3Python,
     OrbSlam3Vocabulary,
@@ -66,10 +67,7 @@ def bench(
             "fog:60+blur:0.5 ([b]vslam perturb --list[/b]).",
         ),
     ] = "none,brightness",
-    detectors: Annotated[
-        str,
-        option(METHOD, "NAMES", "Loop detectors, separated by commas; the first is the baseline."),
-    ] = "bow,both",
+    detectors: Detectors = "bow,both",
     weights: Weights = None,
     systems: SystemNames = "vslam",
     system: OtherSystems = None,

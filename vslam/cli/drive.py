@@ -15,11 +15,13 @@ from vslam.cli.options import open_given
 from vslam.errors import InputError, ResultsError
 
 if TYPE_CHECKING:
+    from vslam.datasets.fixes import Fixes
     from vslam.datasets.frames import Source
     from vslam.datasets.perturbation import Perturbation
     from vslam.run.autosave import Unfinished
     from vslam.run.moments import LoopPictureRecorder
     from vslam.run.options import RunOptions
+    from vslam.run.outcome import RunOutcome
     from vslam.run.recorder import Recorder, Viewer
 
 
@@ -54,6 +56,7 @@ def drive(
     told = Console(shown=not output.quiet)
     source, perturbation = _open(options, told)
     _refuse_camera(source, resume)
+    fixes = None if options.gps is None else _fixes(options.gps, source)
 
     # These imports take a second, so they come after bad input has been refused.
     from vslam.cli.tables import print_summary
@@ -83,6 +86,9 @@ def drive(
                 source, perturbation, settings, recorder,
                 on_frame=on_frame, autosave=autosave, resume=unfinished, slam=slam,
             )  # fmt: skip
+        no_gps = ""
+        if fixes is not None:
+            outcome, no_gps = _located(outcome, fixes)
         if why := why_nothing_was_tracked(outcome):
             outcome = replace(outcome, warnings=[why, *outcome.warnings])
         report = write_results(
@@ -102,6 +108,8 @@ def drive(
     if outcome.interrupted and outcome.interrupted != "Ctrl-C":
         go_on = f"; vslam run --resume {folder} continues it" if (folder / MAP).exists() else ""
         raise ResultsError(f"{folder}: ended early: {outcome.interrupted}{go_on}.")
+    if no_gps and not why:
+        raise ResultsError(f"{folder}: no trajectory by GPS, all other results are there: {no_gps}")
     if why or outcome.interrupted:
         raise typer.Exit(1)
 
@@ -114,6 +122,31 @@ def _open(options: RunOptions, told: Console) -> tuple[Source, Perturbation]:
     source = open_given(options, told)
     perturbation.bound_to(source)
     return source, perturbation
+
+
+def _fixes(path: Path, source: Source) -> Fixes:
+    """The GPS fixes of ``--gps``, which must be of the time of the images."""
+    from vslam.datasets.fixes import read_fixes, require_overlap
+
+    fixes = read_fixes(path)
+    require_overlap(fixes, source, path)
+    return fixes
+
+
+def _located(outcome: RunOutcome, fixes: Fixes) -> tuple[RunOutcome, str]:
+    """The outcome with the drive on the Earth, or why it could not be put there."""
+    from vslam.plugins import reason
+    from vslam.run.gps import locate
+
+    if outcome.stored is None:
+        return outcome, "the run has no map."
+    try:
+        track = locate(outcome.stored, fixes, outcome.settings.thresholds.pose_graph)
+    except InputError as error:
+        return outcome, str(error)
+    except Exception as error:  # the results of the run must not be lost with it
+        return outcome, f"{reason(error)}."
+    return replace(outcome, gps_track=track), ""
 
 
 def _refuse_camera(source: Source, resume: Path | None) -> None:

@@ -11,7 +11,7 @@ from vslam.cli.options import INPUT, OUTPUT, Quiet, flag, option
 from vslam.errors import InputError, counted
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     import numpy as np
     from numpy.typing import NDArray
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from vslam.map import Map
     from vslam.maps.reconstruction import Reconstruction
     from vslam.report.finished_run import FinishedRun
+
+    Colours = NDArray[np.uint8]
 
 app = typer.Typer(
     name="export",
@@ -66,18 +68,13 @@ def colmap(
 ) -> None:
     """Write keyframe images and a sparse model in COLMAP's format."""
     from vslam.maps.colmap import save_colmap
-    from vslam.maps.new_output import new_output
 
-    finished, reconstruction = _read(run)
-    target = out or run / "colmap"
-    with new_output(target, folder=True) as folder:
-        names, colours = _write_images(
-            folder / "images", finished, data, reconstruction, link=link, quiet=quiet
-        )
-        model = folder / "sparse" / "0"
-        model.mkdir(parents=True)
-        save_colmap(model, reconstruction, names, colours, text=text)
-    _say(target, reconstruction, quiet=quiet)
+    def save(folder: Path, model: Reconstruction, names: list[str], colours: Colours) -> None:
+        sparse = folder / "sparse" / "0"
+        sparse.mkdir(parents=True)
+        save_colmap(sparse, model, names, colours, text=text)
+
+    _export_images(run, data, out or run / "colmap", save, link=link, quiet=quiet)
 
 
 @app.command(epilog="[b]Example[/b]\n  vslam export nerfstudio runs/latest")
@@ -90,16 +87,11 @@ def nerfstudio(
 ) -> None:
     """Write keyframe images, poses and landmarks for nerfstudio."""
     from vslam.maps.formats import save_nerfstudio
-    from vslam.maps.new_output import new_output
 
-    finished, reconstruction = _read(run)
-    target = out or run / "nerfstudio"
-    with new_output(target, folder=True) as folder:
-        names, colours = _write_images(
-            folder / "images", finished, data, reconstruction, link=link, quiet=quiet
-        )
-        save_nerfstudio(folder, reconstruction, [f"images/{name}" for name in names], colours)
-    _say(target, reconstruction, quiet=quiet)
+    def save(folder: Path, model: Reconstruction, names: list[str], colours: Colours) -> None:
+        save_nerfstudio(folder, model, [f"images/{name}" for name in names], colours)
+
+    _export_images(run, data, out or run / "nerfstudio", save, link=link, quiet=quiet)
 
 
 @app.command(epilog="[b]Example[/b]\n  vslam export ply runs/latest")
@@ -271,36 +263,41 @@ def _keyframes(finished: FinishedRun, data: str | None, *, quiet: bool) -> Itera
             advance()
 
 
-def _write_images(
-    folder: Path,
-    finished: FinishedRun,
+def _export_images(
+    run: Path,
     data: str | None,
-    reconstruction: Reconstruction,
+    target: Path,
+    save: Callable[[Path, Reconstruction, list[str], Colours], None],
     *,
     link: bool,
     quiet: bool,
-) -> tuple[list[str], NDArray[np.uint8]]:
-    """Write the keyframe images; returns their names and the colours of the landmarks."""
+) -> None:
+    """Write the keyframe images of a run into a new folder, and ``save`` a model beside them, given
+    the names of the images and the colours of the landmarks."""
     from vslam.maps.formats import landmark_colours, save_image
+    from vslam.maps.new_output import new_output
 
-    folder.mkdir()
+    finished, reconstruction = _read(run)
     names: list[str] = []
 
-    def saved() -> Iterator[NDArray[np.uint8]]:
+    def saved(images: Path) -> Iterator[NDArray[np.uint8]]:
         frames = _keyframes(finished, data, quiet=quiet)
         for index, frame in zip(reconstruction.frames.tolist(), frames, strict=True):
             image = _image_of(frame)
             if link:
                 file = _own_file(frame, finished)
                 names.append(f"{index:06d}{file.suffix}")
-                (folder / names[-1]).symlink_to(file.resolve())
+                (images / names[-1]).symlink_to(file.resolve())
             else:
                 names.append(f"{index:06d}.png")
-                save_image(image, folder / names[-1])
+                save_image(image, images / names[-1])
             yield image
 
-    colours = landmark_colours(reconstruction, saved())
-    return names, colours
+    with new_output(target, folder=True) as folder:
+        (folder / "images").mkdir()
+        colours = landmark_colours(reconstruction, saved(folder / "images"))
+        save(folder, reconstruction, names, colours)
+    _say(target, reconstruction, quiet=quiet)
 
 
 def _image_of(frame: TimedFrame) -> NDArray[np.uint8]:

@@ -49,13 +49,11 @@ class _Command(TyperCommand):
     """A command with our own help, which suggests a name for a misspelt choice."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """See ``TyperCommand.format_help``."""
         from vslam.cli.help import show_help
 
         show_help(self, ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """See ``TyperCommand.parse_args``."""
         try:
             return super().parse_args(ctx, args)
         except typer.BadParameter as error:
@@ -67,7 +65,6 @@ class _Group(TyperGroup):
     """Several commands under one name, with our own help."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """See ``TyperGroup.format_help``."""
         from vslam.cli.help import show_help
 
         show_help(self, ctx)

@@ -177,7 +177,7 @@ def _thresholds_of(stored: list[StoredMap], files: list[Path]) -> Config:
     if others:
         typer.echo(
             f"{', '.join(others)}: made with other thresholds than {files[0]}, whose thresholds "
-            "are used; --config names others."
+            "are used; --config gives others."
         )
     return as_config(thresholds, str(files[0]))
 

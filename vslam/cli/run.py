@@ -11,6 +11,7 @@ from vslam.cli.drive import Output, drive
 from vslam.cli.options import (
     DETECTOR_NAMES,
     EXECUTION,
+    INPUT,
     MAP,
     METHOD,
     OUTPUT,
@@ -22,6 +23,7 @@ from vslam.cli.options import (
     Thresholds,
     ViewerName,
     flag,
+    names_in,
     option,
     read_thresholds,
     reads_source,
@@ -53,6 +55,15 @@ app = typer.Typer()
 def run(
     context: typer.Context,
     given: SourceOptions,
+    gps: Annotated[
+        Path | None,
+        option(
+            INPUT,
+            "FILE",
+            "GPS fixes, which put the trajectory on the Earth: CSV, a bag, or the folder oxts of "
+            "KITTI raw (docs/howto/gps.md).",
+        ),
+    ] = None,
     perturb: Perturb = "none",
     seed: Seed = 0,
     detector: Annotated[
@@ -161,6 +172,8 @@ def run(
         raise InputError(f"--local-weights {local_weights}: no such file; name an .onnx file.")
     if localize and map_file is None:
         raise InputError("--localize: name the map to localise in with --map.")
+    if localize and gps is not None:
+        raise InputError("--gps: localising does not change the map; leave --localize out.")
     of_map: dict[str, object] = {}
     if map_file is not None:
         if compare:
@@ -185,6 +198,7 @@ def run(
         **given.model_dump(),
         perturb=perturb,
         seed=seed,
+        gps=gps,
         threads=threads or min(available_cores(), 4),
         detector=detector,
         weights=weights,
@@ -217,7 +231,7 @@ def _compared(names: str, detector: str) -> tuple[str, ...]:
     """The detectors of ``--compare``, without repetitions."""
     from vslam.loopclosure.registry import require_detector
 
-    found = tuple(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
+    found = tuple(names_in(names))
     for name in found:
         require_detector(name, option="--compare")
     if detector in found:

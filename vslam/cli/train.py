@@ -15,7 +15,7 @@ import typer
 
 from vslam.cli.export import app as export
 from vslam.cli.options import EXECUTION, INPUT, METHOD, OUTPUT, AllThreads, Quiet, flag, option
-from vslam.errors import counted
+from vslam.errors import InputError, counted, write_file
 
 _TRAIN_EXAMPLES = """
 [b]Examples[/b]
@@ -202,8 +202,6 @@ def _require_libraries(command: str) -> None:
     Raises:
         InputError: one of the packages of the extra ``train`` is not installed.
     """
-    from vslam.errors import InputError
-
     for name in ("torch", "safetensors", "onnx", "onnxscript"):
         if find_spec(name) is None:
             raise InputError(
@@ -240,9 +238,6 @@ def weights_(
 ) -> None:
     """Write weights as vslam ships them: in half precision, with model card and ONNX file."""
     _require_libraries("export weights")
-    import shutil
-
-    from vslam.errors import ResultsError
     from vslam.loopclosure.training.export import export_onnx
     from vslam.loopclosure.training.siamese import load_network, save_network
 
@@ -250,13 +245,8 @@ def weights_(
     save_network(network, out, about, half=True)
     export_onnx(load_network(out)[0], out.with_suffix(".onnx"), about)
     cards = [weights.with_suffix(end) for end in (".md", ".json")]
-    try:
-        for card in filter(Path.exists, cards):
-            shutil.copyfile(card, out.with_suffix(card.suffix))
-    except OSError as error:
-        raise ResultsError(
-            f"{out.parent}: the model card cannot be written ({error.strerror})."
-        ) from error
+    for card in filter(Path.exists, cards):
+        write_file(out.with_suffix(card.suffix), card.read_bytes())
     typer.echo(f"{out}: {network.name}, {out.stat().st_size / 1e6:.2f} MB")
 
 

@@ -45,9 +45,7 @@ def open_euroc(
     Args:
         root: folder of the sequence, or of several sequences.
         name: name of the sequence in ``root``; None for ``root`` itself, or its only sequence.
-        start: first frame, counted over the pairs.
-        every: take every N-th frame.
-        max_frames: largest number of frames, None for all.
+        start, every, max_frames: selects every N-th pair, from a first one on, up to a number.
         monocular: read the left camera alone.
         calib: calibration files, which replace the cameras' ``sensor.yaml``.
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vslam.calibration.models import Calibration
 from vslam.camera import Camera, DepthImage, Image, ImageMap
-from vslam.datasets.frames import Images, RawSource, Size, stored_frames
+from vslam.datasets.frames import Images, RawSource, Size, decoded, stored_frames
 from vslam.errors import InputError, UnreadableImageError
 from vslam.untrusted import MOST_PIXELS, require_utf8
 
@@ -53,8 +53,7 @@ def checked_files(
 
     def read(index: int, image_map: ImageMap) -> Images:
         each = [partial(reader, side[index]) for reader, side in zip(readers, sides, strict=True)]
-        left, *second = image_map(_call, each)
-        return np.asarray(left, np.uint8), second[0] if second else None
+        return decoded(each, image_map)
 
     stored = stored_frames(timestamps, read, sides[0], read_colour)
     if len(sizes) == 2:
@@ -73,10 +72,6 @@ def checked_files(
     if depth:
         source.read(0)
     return source
-
-
-def _call(decode: Callable[[], Image | DepthImage]) -> Image | DepthImage:
-    return decode()
 
 
 def image_size(path: Path) -> Size:

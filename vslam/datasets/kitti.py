@@ -44,9 +44,8 @@ def open_kitti(
         root: folder that holds ``sequences`` (or ``dataset/sequences``, as KITTI's archives unpack)
             and, optionally, ``poses``.
         name: name of the sequence, for example ``00``.
-        start: first frame, counted over the images present.
-        every: take every N-th frame.
-        max_frames: largest number of frames, None for all.
+        start, every, max_frames: selects every N-th of the images present, from a first one on, up
+            to a number.
         monocular: read the left camera alone; the right camera's images need not exist.
         calib: calibration files, which replace ``calib.txt``; the images are then rectified as they
             are read.

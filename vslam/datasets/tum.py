@@ -64,9 +64,7 @@ def open_tum(
     Args:
         root: folder of the sequence, or of several sequences.
         name: name of the sequence in ``root``; None for ``root`` itself, or its only sequence.
-        start: first frame, counted over the pairs.
-        every: take every N-th frame.
-        max_frames: largest number of frames, None for all.
+        start, every, max_frames: selects every N-th pair, from a first one on, up to a number.
         monocular: read the colour images alone; depth images need not exist.
         calib: calibration file, which replaces the folder's own and those of TUM's cameras.
         depth_scale: units of the depth images per metre; None takes the calibration's value, or

@@ -155,6 +155,27 @@ class MapFigures(Record):
     error_m: float | None
 
 
+class GpsFigures(Record):
+    """The drive on the Earth, also written as ``gps.json``.
+
+    ``datum`` is the origin of the local east-north-up frame: latitude and longitude in degrees and
+    altitude in metres, those of the first fix. ``fixes`` counts those of tracked frames,
+    ``refused`` those of them that failed the chi-square test. ``residual_m`` is the root mean
+    square distance of the others from the trajectory, ``metres_per_unit`` the mean scale of the
+    map. ``ate_rmse_m`` is the error of ``trajectory_enu.tum`` after its SE3 alignment, None without
+    ground truth. ``level`` is False where the drive is straight, so that the rotation about it is
+    unknown.
+    """
+
+    datum: tuple[float, float, float]
+    fixes: int
+    refused: int
+    residual_m: float
+    metres_per_unit: float
+    ate_rmse_m: float | None
+    level: bool
+
+
 class Machine(Record):
     """Where the times were measured; ``cores`` counts those that the process may use."""
 
@@ -216,6 +237,7 @@ class ReportJson(Measures, Document):
     loops: list[LoopEntry]
     detectors: tuple[DetectorFigures, ...] = ()
     in_map: MapFigures | None = None
+    gps_track: GpsFigures | None = None
 
     dataset: str
     sequence: str
@@ -232,6 +254,7 @@ class ReportJson(Measures, Document):
     realtime: bool = False
     calib: tuple[Path, ...] = ()
     mask: Path | None = None
+    gps: Path | None = None
     map: Path | None = None
     localize: bool = False
     compare: tuple[str, ...] = ()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections import Counter
+from contextlib import suppress
 from datetime import UTC, datetime
 from itertools import takewhile
 from typing import Any
@@ -22,6 +23,7 @@ from vslam.loops import LoopCorrection
 from vslam.machine import available_cores, cpu_name, versions
 from vslam.report.schema import (
     DetectorFigures,
+    GpsFigures,
     LoopEntry,
     Machine,
     MapFigures,
@@ -33,7 +35,7 @@ from vslam.run.outcome import RunOutcome, causal_trajectory, matched_ground_trut
 
 _OPTIONS = (
     "perturb", "detector", "seed", "threads", "start", "every", "max_frames", "weights",
-    "local_weights", "realtime", "calib", "mask", "localize", "compare",
+    "local_weights", "realtime", "calib", "mask", "gps", "localize", "compare",
 )  # fmt: skip
 
 
@@ -85,6 +87,7 @@ def summarize(
         loops=loops,
         detectors=_detectors(outcome, evaluation, verdict),
         in_map=_figures_in_map(outcome),
+        gps_track=gps_figures(outcome),
         machine=this_machine(),
         versions=versions(),
         created=datetime.now(UTC).replace(microsecond=0),
@@ -194,6 +197,26 @@ def _figures_in_map(outcome: RunOutcome) -> MapFigures | None:
         sought=sought,
         found=len(found),
         error_m=error_in_map(outcome),
+    )
+
+
+def gps_figures(outcome: RunOutcome) -> GpsFigures | None:
+    """The drive on the Earth in numbers, None without GPS."""
+    if (track := outcome.gps_track) is None:
+        return None
+    ate, ground_truth = None, matched_ground_truth(outcome)
+    if ground_truth is not None:
+        with suppress(InputError):
+            ate = evaluate_trajectory(track.trajectory, ground_truth, "se3").ate_rmse_m
+    latitude, longitude, altitude = track.datum.tolist()
+    return GpsFigures(
+        datum=(latitude, longitude, altitude),
+        fixes=len(track.fixes),
+        refused=int(np.count_nonzero(~track.anchored.used)),
+        residual_m=track.anchored.residual_m,
+        metres_per_unit=float(track.anchored.scale.mean()),
+        ate_rmse_m=ate,
+        level=track.anchored.level,
     )
 
 

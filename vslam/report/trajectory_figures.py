@@ -35,6 +35,8 @@ from vslam.trajectory import Trajectory
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from vslam.run.gps import GpsTrack
+
 Points = NDArray[np.float64]
 
 
@@ -139,6 +141,20 @@ def loop_closing(
         lines = _lines(_aligned(outcome, evaluation, np.concatenate(ends)).reshape(-1, 2, 3))
         label = f"loop, before ({len(ends)})"
         axes.plot(*lines, "o--", color=GREEN, linewidth=1.2, markersize=4, label=label, zorder=5)
+    finish_map(figure, axes)
+    return figure
+
+
+def gps_map(track: GpsTrack) -> Figure:
+    """The drive on the Earth, with and without GPS, and the fixes."""
+    figure, axes = new_figure("With GPS", "east (m)", "north (m)", SQUARE)
+    used = track.anchored.used
+    fixes, refused = track.fixes[used], track.fixes[~used]
+    axes.plot(*fixes.T[:2], ".", color=GREY, markersize=4, label=f"fixes ({len(fixes)})")
+    if len(refused):
+        axes.plot(*refused.T[:2], "x", color=RED, markersize=4, label=f"refused ({len(refused)})")
+    axes.plot(*track.visual.T[:2], color=AMBER, linewidth=1.2, label="vision alone")
+    axes.plot(*track.trajectory.T_wc[:, :2, 3].T, color=BLUE, linewidth=1.2, label="with GPS")
     finish_map(figure, axes)
     return figure
 

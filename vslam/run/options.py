@@ -19,6 +19,7 @@ class RunOptions(SourceOptions):
 
     perturb: str = "none"
     seed: int = 0
+    gps: Path | None = None
     threads: int = 1
     detector: str = DEFAULT_DETECTOR
     weights: Path | None = None
@@ -40,7 +41,7 @@ def write_options(folder: Path, options: RunOptions) -> None:
     data = Path(options.data)
     absolute: dict[str, object] = {
         name: path.resolve()
-        for name in ("right", "depth", "mask", "weights", "local_weights", "map_file")
+        for name in ("right", "depth", "mask", "gps", "weights", "local_weights", "map_file")
         if (path := getattr(options, name)) is not None
     }
     if options.data and data.exists():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,9 @@ from vslam.map import Map
 from vslam.maps.stored_map import StoredMap, World
 from vslam.run.options import RunOptions
 from vslam.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from vslam.run.gps import GpsTrack
 
 
 def alignment_of(sensor: str) -> str:
@@ -51,6 +55,7 @@ class RunOutcome:
         keyframe_frames: ``(K,)`` int64, the frame of this run behind each keyframe, including
             culled ones; -1 for keyframes of earlier drives.
         n_submaps: how often a map or sub-map was started; 0 before the first keyframe.
+        gps_track: the drive on the Earth; None without GPS.
         interrupted: why the run ended early ("Ctrl-C", a truncated file), or None.
         compared: the runs of the detectors of ``settings.compare`` on the same frames, without
             their maps; empty for a resumed run.
@@ -78,6 +83,7 @@ class RunOutcome:
     corrections: list[LoopCorrection] = field(default_factory=list)
     keyframe_frames: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     n_submaps: int = 1
+    gps_track: GpsTrack | None = None
     interrupted: str | None = None
     step_s: float = 0.0
     compared: tuple[RunOutcome, ...] = ()

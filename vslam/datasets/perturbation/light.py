@@ -199,12 +199,15 @@ def _contrast(percent: float, stream: RandomStream) -> Law:
 
 KINDS = {
     "brightness": LawKind(
-        _brightness, "x", 1.0, 0.1, 10.0, "gain and bias walk and jump", logarithmic=True
+        _brightness, "x", 1.0, 0.1, 10.0, "gain and offset drift and jump at random",
+        logarithmic=True,
     ),
-    "gamma": LawKind(_gamma, "x", 1.0, 0.1, 10.0, "gamma walks", logarithmic=True),
-    "flicker": LawKind(_flicker, "x", 1.0, 0.1, 10.0, "gain of each frame", logarithmic=True),
+    "gamma": LawKind(_gamma, "x", 1.0, 0.1, 10.0, "gamma drifts at random", logarithmic=True),
+    "flicker": LawKind(
+        _flicker, "x", 1.0, 0.1, 10.0, "a random gain for each frame", logarithmic=True
+    ),
     "exposure": LawKind(
-        _exposure, "s", 0.5, 0.02, 10.0, "lag of auto-exposure behind tunnels of 3 stops",
+        _exposure, "s", 0.5, 0.02, 10.0, "auto-exposure lags behind light changes of 3 stops",
         logarithmic=True,
     ),
     "night": LawKind(
@@ -219,11 +222,11 @@ KINDS = {
         least=1.0, most=3600.0, logarithmic=True,
     ),
     "bias": LawKind(
-        _bias, "grey levels", 50.0, 0.0, 255.0, "brighter by so much", least=-255.0, most=255.0,
-        drawn=False,
+        _bias, "grey levels", 50.0, 0.0, 255.0, "grey levels added to every pixel",
+        least=-255.0, most=255.0, drawn=False,
     ),
     "contrast": LawKind(
-        _contrast, "%", 30.0, 100.0, 1.0, "contrast left, about the mean", most=100.0,
+        _contrast, "%", 30.0, 100.0, 1.0, "share of the contrast that remains", most=100.0,
         logarithmic=True, drawn=False,
     ),
 }  # fmt: skip

@@ -90,14 +90,12 @@ class BowScorer:
         self._vocabulary = vocabulary
 
     def store(self, gallery: list[DescribedImage]) -> InvertedIndex:
-        """See :class:`Scorer`."""
         index = InvertedIndex(self._vocabulary.n_words)
         for number, one in enumerate(gallery):
             index.add(number, bow_vector(self._vocabulary, one.words))
         return index
 
     def scores(self, queries: list[DescribedImage], stored: InvertedIndex) -> NDArray[np.float64]:
-        """See :class:`Scorer`."""
         return np.stack(
             [stored.compare(bow_vector(self._vocabulary, one.words)).score for one in queries]
         ).astype(np.float64)
@@ -152,7 +150,6 @@ class NetworkScorer:
     def scores(
         self, queries: list[DescribedImage], stored: NDArray[np.float32]
     ) -> NDArray[np.float64]:
-        """See :class:`Scorer`."""
         embedded = self.store(queries)
         return np.stack([self.compare(one, stored) for one in embedded]).astype(np.float64)
 
@@ -213,5 +210,4 @@ class DetectorSet:
         return self._kept[digest]
 
     def describe(self, images: list[Image]) -> list[DescribedImage]:
-        """See :func:`describe`."""
         return describe(images, self._vocabulary, self._threads)

@@ -201,16 +201,13 @@ class Verification:
         return self._by_learned[key]
 
 
-def epipolar_inliers(
-    a: DescribedImage, b: DescribedImage, config: VerificationConfig | None = None
-) -> int:
+def epipolar_inliers(a: DescribedImage, b: DescribedImage) -> int:
     """Number of matches of two images that fit the best fundamental matrix found."""
     import cv2
 
-    config = config or VerificationConfig()
+    config = VerificationConfig()
     match = match_by_node(
-        *a.nodes, a.descriptors.view(np.uint64), np.ones(len(a.xy), np.bool_),
-        *b.nodes, b.descriptors.view(np.uint64), np.ones(len(b.xy), np.bool_),
+        *a.nodes, a.descriptors.view(np.uint64), *b.nodes, b.descriptors.view(np.uint64),
         config.match_distance, config.match_ratio,
     )  # fmt: skip
     rows = np.flatnonzero(match >= 0)

@@ -120,10 +120,10 @@ class LoopsJson(Document):
     schema_version: int = 3
 
     seed: int
-    cells: list[Score]
+    cells: tuple[Score, ...] = ()
     online: tuple[OnlineScore, ...] = ()
-    gains: list[Gain]
-    costs: list[Cost]
+    gains: tuple[Gain, ...] = ()
+    costs: tuple[Cost, ...] = ()
 
     machine: str
     versions: dict[str, str]

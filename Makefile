@@ -1,6 +1,7 @@
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help install dev demo test test-fast check types format docs clean
+.PHONY: help install dev demo test test-fast check types format docs figures figures-check \
+  method clean
 
 VENV ?= .venv
 BIN := $(abspath $(VENV))/bin
@@ -10,7 +11,7 @@ DEVELOPED := $(VENV)/.developed
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
 help:  ## show this list
-	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 22
 
 install: $(INSTALLED)  ## make .venv and install what a run needs into it
 
@@ -44,6 +45,15 @@ format: $(DEVELOPED)  ## format the code and repair what lint can
 
 docs: $(DEVELOPED)  ## build the documentation site, warnings are errors: build/site/index.html
 	$(BIN)/python -m sphinx -q -W --keep-going -b html docs build/site
+
+figures: $(INSTALLED)  ## make the tables and figures of the documents: hours (FIGURES=quick: minutes)
+	$(BIN)/python tools/figures.py $(if $(filter quick,$(FIGURES)),--quick)
+
+figures-check: $(INSTALLED)  ## check that each has a stamp; list those of another version of the method
+	$(BIN)/python tools/figures.py --check
+
+method: $(DEVELOPED)  ## write the trajectories that METHOD_VERSION stands for
+	WRITE_METHOD_REFERENCES=1 $(BIN)/python -m pytest -q tests/test_method_version.py
 
 clean:  ## remove build products and caches (.venv, data and runs stay)
 	rm -rf build dist vslam.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -1,10 +1,16 @@
 """The README as package registries show it: they have none of this repository's other files."""
 
+import platform
 import re
-import tomllib
+import sys
 from pathlib import Path
 
 from setuptools import setup
+
+try:
+    import tomllib
+except ModuleNotFoundError:  # pip runs this file before it compares requires-python
+    sys.exit(f"vslam needs Python 3.11 or later; this is Python {platform.python_version()}.")
 
 ROOT = Path(__file__).parent
 LINK = re.compile(r"(!?)\[([^]]*)\]\((?!https?:|#)([^)\s]+)\)")

@@ -158,7 +158,7 @@ def _in_camera(T, p, q):
         q[i] = T[i, 0] * p[0] + T[i, 1] * p[1] + T[i, 2] * p[2] + T[i, 3]
 
 
-@inner_kernel
+@kernel
 def robust_cost(T_cw, points, observations, inlier):
     """Half the sum of the Huber losses; sets ``inlier`` by the chi-square test."""
     first, camera, uvr, inverse_sigma2, disparity_weight, used, intrinsics = observations
@@ -218,7 +218,7 @@ def _adjust(T_start, n_free, points_start, observations, equations, iterations, 
     return T_cw, points, cost, inlier, done
 
 
-@inner_kernel
+@kernel
 def linearise(T_cw, n_free, points, observations, equations):
     """Write the normal equations at the current estimate into ``equations``."""
     first, camera, uvr, inverse_sigma2, disparity_weight, used, intrinsics = observations
@@ -347,7 +347,7 @@ def invert_damped(V, damping, N):
     N[1, 0], N[2, 0], N[2, 1] = N[0, 1], N[0, 2], N[1, 2]
 
 
-@inner_kernel
+@kernel
 def step_points(n_free, observations, equations, camera_step, V_inverse, points, points_trial):
     """Back-substitution: compute the step of each point from the steps of the cameras."""
     first, camera, used = observations.first, observations.camera, observations.used
@@ -368,7 +368,7 @@ def step_points(n_free, observations, equations, camera_step, V_inverse, points,
             points_trial[p, i] = points[p, i] + N[i, 0] * d0 + N[i, 1] * d1 + N[i, 2] * d2
 
 
-@inner_kernel
+@kernel
 def step_cameras(n_free, camera_step, T_cw, T_trial):
     """Move each free camera by its twist. Matrices are copied element by element, because for a
     whole-array assignment Numba compiles a broadcasting error message, which takes seconds."""

@@ -70,7 +70,7 @@ def adjust_globally(
     T_cw, points = problem.T_cw[cameras], problem.points[points_order]
     T_trial, points_trial = T_cw.copy(), points.copy()
     inlier = np.ones(n_observations, np.bool_)
-    cost = _robust_cost(T_cw, points, observations, inlier)
+    cost = robust_cost(T_cw, points, observations, inlier)
     equations = empty_equations(n_free, len(points), n_observations)
     S, x = np.empty(36 * len(structure.row)), np.empty((n_free, 6))
     V_inverse = np.empty((len(points), 3, 3))
@@ -78,16 +78,17 @@ def adjust_globally(
     for _ in range(iterations):
         if stop is not None and stop():
             break
-        _linearise(T_cw, n_free, points, observations, equations)
+        linearise(T_cw, n_free, points, observations, equations)
         improved, small = False, False
         for _ in range(8):
             reduce_points_sparsely(
                 structure, slots, n_free, observations, equations, damping, S, x, V_inverse
             )
             if factor_solve(structure, S, x):
-                _step_points(n_free, observations, equations, x, V_inverse, points, points_trial)
-                _step_cameras(n_free, x, T_cw, T_trial)
-                trial = _robust_cost(T_trial, points_trial, observations, inlier)
+                step = x.reshape(-1)
+                step_points(n_free, observations, equations, step, V_inverse, points, points_trial)
+                step_cameras(n_free, step, T_cw, T_trial)
+                trial = robust_cost(T_trial, points_trial, observations, inlier)
                 if trial < cost:
                     small = cost - trial < tolerance * cost
                     cost = trial
@@ -100,7 +101,7 @@ def adjust_globally(
         done += 1
         if not improved or small:
             break
-    cost = _robust_cost(T_cw, points, observations, inlier)
+    cost = robust_cost(T_cw, points, observations, inlier)
     points_trial[points_order] = points
     inlier_as_given = np.empty_like(inlier)
     inlier_as_given[order] = inlier
@@ -232,16 +233,6 @@ def pair_slots(structure, first, camera, used, n_free):
 
 
 @kernel
-def _robust_cost(T_cw, points, observations, inlier):
-    return robust_cost(T_cw, points, observations, inlier)
-
-
-@kernel
-def _linearise(T_cw, n_free, points, observations, equations):
-    linearise(T_cw, n_free, points, observations, equations)
-
-
-@kernel
 def reduce_points_sparsely(
     structure, slots, n_free, observations, equations, damping, S, x, V_inverse
 ):
@@ -291,13 +282,3 @@ def subtract_coupling(Y, W, o, S, offset, width):
         for j in range(np.uintp(6)):
             S[start + j] -= y0 * W[o, 0, j] + y1 * W[o, 1, j] + y2 * W[o, 2, j]
         start += step
-
-
-@kernel
-def _step_points(n_free, observations, equations, x, V_inverse, points, points_trial):
-    step_points(n_free, observations, equations, x.reshape(-1), V_inverse, points, points_trial)
-
-
-@kernel
-def _step_cameras(n_free, x, T_cw, T_trial):
-    step_cameras(n_free, x.reshape(-1), T_cw, T_trial)

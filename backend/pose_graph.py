@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -262,14 +263,21 @@ def optimise(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
         plain = noise.Diagonal.Sigmas(sigma)
         model = noise.Robust.Create(cauchy, plain) if kind == LOOP else plain
         factors.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(T_i_j), model))
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(config.iterations)
-    parameters.setRelativeErrorTol(1e-5)
-    result = gtsam.LevenbergMarquardtOptimizer(factors, start, parameters).optimize()
+    result = minimised(factors, start, config)
     T_wc = np.array([result.atPose3(i).matrix() for i in range(len(graph.T_cw))])
     T_cw = inverses(T_wc)
     T_cw[graph.fixed] = graph.T_cw[graph.fixed]
     return T_cw
+
+
+def minimised(factors: Any, start: Any, config: PoseGraphConfig) -> Any:
+    """``gtsam.Values`` that minimise a ``gtsam.NonlinearFactorGraph``, by Levenberg-Marquardt."""
+    import gtsam
+
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(config.iterations)
+    parameters.setRelativeErrorTol(1e-5)
+    return gtsam.LevenbergMarquardtOptimizer(factors, start, parameters).optimize()
 
 
 def check_pose_graph(

@@ -15,7 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.backend.loop_correction import carry_landmarks_by
-from vslam.backend.pose_graph import GAP, HOLD, LOOP, WEAK, GraphCheck, PoseGraph, check_edge_errors
+from vslam.backend.pose_graph import (
+    GAP,
+    HOLD,
+    LOOP,
+    WEAK,
+    GraphCheck,
+    PoseGraph,
+    check_edge_errors,
+    minimised,
+)
 from vslam.config import PoseGraphConfig
 from vslam.geometry import Matrix, inverses, se3_log
 from vslam.loops import LoopEdge
@@ -68,10 +77,7 @@ def optimise_similarities(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfi
         plain = noise.Diagonal.Sigmas(sigma)
         model = noise.Robust.Create(cauchy, plain) if kind == LOOP else plain
         factors.add(gtsam.BetweenFactorSimilarity3(i, j, as_gtsam(S_i_j), model))
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(config.iterations)
-    parameters.setRelativeErrorTol(1e-5)
-    result = gtsam.LevenbergMarquardtOptimizer(factors, start, parameters).optimize()
+    result = minimised(factors, start, config)
     found = [result.atSimilarity3(i) for i in range(len(S_wc))]
     R = np.array([pose.rotation().matrix() for pose in found])
     t = np.array([pose.translation() for pose in found])

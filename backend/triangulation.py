@@ -320,8 +320,10 @@ def world_ray(T_cw, xy, intrinsics, ray):
 
 @inner_kernel
 def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_cosine, point):
-    """Write a point in the world into ``point`` ``(3,)``: the intersection of two rays or, if
-    stereo at one of the keyframes has more parallax, its stereo point.
+    """Triangulate a landmark and write its position in the world into ``point`` ``(3,)``.
+
+    The position is the intersection of two rays, unless the stereo pair of one of the keyframes has
+    more parallax than the rays: then it is the stereo point of that keyframe.
 
     Args:
         depth_1, depth_2: stereo depths of the features, NaN without one.

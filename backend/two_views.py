@@ -1,4 +1,4 @@
-"""Starts a monocular map from two keyframes and their landmarks, and defines its unit of length.
+"""Adjusts the two views that a monocular map starts from, and defines its unit of length.
 
 Two views determine the direction of a translation but not its length. So the unit of length is
 chosen such that the median depth of the landmarks is ``initialization.median_depth``. With the
@@ -13,10 +13,7 @@ from numpy.typing import NDArray
 
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
 from vslam.camera import Camera
-from vslam.features import Features
-from vslam.geometry import Matrix, compose, inverse, transform
-from vslam.map import Map
-from vslam.map_kernels import link_many, refresh_landmarks
+from vslam.geometry import Matrix
 from vslam.reprojection import stack_uvr
 
 ITERATIONS = 20
@@ -58,36 +55,3 @@ def adjust_two_views(
         T_2_1[:3, 3] *= scale
         points = points * scale
     return T_2_1, points, kept
-
-
-def map_two_views(
-    map_: Map,
-    features: tuple[Features, Features],
-    matches: tuple[NDArray[np.int64], NDArray[np.int64]],
-    T_1_w: Matrix,
-    T_2_1: Matrix,
-    points: Matrix,
-    timestamps: tuple[float, float],
-    frames: tuple[int, int],
-) -> tuple[int, int]:
-    """Add two keyframes and the landmarks that both observe to the map.
-
-    Args:
-        features: the features of both views.
-        matches: ``(N,)`` indices of the matched features in each view.
-        T_1_w: ``(4, 4)`` pose of the first view.
-        T_2_1, points: results of ``adjust_two_views``; ``(N, 3)`` points in the frame of camera 1.
-        timestamps, frames: time in seconds and frame index of both views.
-
-    Returns:
-        The ids of both keyframes.
-    """
-    first = map_.add_keyframe(features[0], T_1_w, timestamps[0], frames[0])
-    second = map_.add_keyframe(features[1], compose(T_2_1, T_1_w), timestamps[1], frames[1])
-    xyz = transform(inverse(T_1_w), points)
-    rows = [map_.rows(k).start + match for k, match in zip((first, second), matches, strict=True)]
-    ids = map_.add_landmarks(xyz, map_.arrays.descriptor[rows[1]], first)
-    for of_view in rows:
-        link_many(map_.arrays, of_view, ids)
-    refresh_landmarks(map_.arrays, ids, map_.scales)
-    return first, second

@@ -12,7 +12,9 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 
+import figures
 from docutils import nodes
 from site_reference import write_reference
 
@@ -78,7 +80,7 @@ def _read(app, docname, source):
     if included:
         path = (path.parent / included[1]).resolve()
         source[0] = path.read_text()
-    source[0] = _mend_links(path, source[0])
+    source[0] = _mend_links(path, figures.mark_older(path, source[0], ROOT))
 
 
 _ARRAY = re.compile(

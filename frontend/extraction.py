@@ -32,12 +32,14 @@ class Corners(NamedTuple):
         right: those of the right image, to be matched with; None if there is nothing to match.
         depth: ``(H, W)`` float32 metres, of an RGB-D camera; else None.
         side: see ``Extracted``.
+        sides: the comparison of the left and the right image; None without a right image.
     """
 
     found: Extraction
     right: Extraction | None = None
     depth: DepthImage | None = None
     side: Side = Side.LEFT
+    sides: Sides | None = None
 
 
 class FrameImages:
@@ -67,7 +69,8 @@ class FrameImages:
         Args:
             left: ``(H, W)`` uint8.
             read_second: gives the second image, or raises UnreadableImageError.
-            context, image_map: see ``extract_features``.
+            image_map: applies a function to both images, in turn or in parallel; the result does
+                not depend on it.
             mask: of the left image; None uses all of it.
         """
         self.left = left
@@ -122,33 +125,9 @@ class FrameImages:
             self._second = self._read_second()
         except UnreadableImageError as error:
             self.problem = str(error)
-        context = self._context
-        if self._second is not None and not context.camera.depth:
-            right = np.asarray(self._second, np.uint8)
-            self.sides = compare_sides(self.left, right, context.config.stereo)
-        return find_corners(
-            self.left, self._second, context, self._image_map, self.sides, self.mask
-        )
-
-
-def extract_features(
-    left: Image,
-    second: Image | DepthImage | None,
-    context: TrackingContext,
-    image_map: ImageMap = map,
-) -> Extracted:
-    """ORB features of the left image with their columns in the right image. If the left image is
-    black, the features are extracted from the right image and have no columns in the other one.
-
-    A pure function: the result does not depend on ``image_map``.
-
-    Args:
-        left: ``(H, W)`` uint8.
-        second: ``(H, W)``: the right image, uint8; for an RGB-D camera the depth in metres,
-            float32; None for a single image, whose features have no column in a right image.
-        image_map: applies a function to both images, in turn or in parallel.
-    """
-    return matched(find_corners(left, second, context, image_map), context)
+        found = find_corners(self.left, self._second, self._context, self._image_map, self.mask)
+        self.sides = found.sides
+        return found
 
 
 def find_corners(
@@ -156,13 +135,15 @@ def find_corners(
     second: Image | DepthImage | None,
     context: TrackingContext,
     image_map: ImageMap = map,
-    sides: Sides | None = None,
     mask: Mask | None = None,
 ) -> Corners:
-    """The first step of ``extract_features``: the features of each image alone.
+    """The first step of extraction: the features of each image alone. If the left image is black,
+    they are extracted from the right image and have no columns in the other one.
 
     Args:
-        sides: the result of ``compare_sides``; None computes it.
+        left: ``(H, W)`` uint8.
+        second: ``(H, W)``: the right image, uint8; for an RGB-D camera the depth in metres,
+            float32; None for a single image, whose features have no column in a right image.
         mask: of the image whose features are tracked, which is the right one if the left one is
             black. A right image is not masked for stereo matching: what is masked in the left image
             has no match in it.
@@ -175,24 +156,25 @@ def find_corners(
         (found,) = extract_in_any_light([left], config, allowed=allowed)
         return Corners(found, depth=np.asarray(second, np.float32))
     right_image = np.asarray(second, np.uint8)
-    sides = sides or compare_sides(left, right_image, config.stereo)
+    sides = compare_sides(left, right_image, config.stereo)
     if sides.black == "left":
-        return _corners_alone(right_image, context, Side.RIGHT, allowed)
-    pair = balanced(left, right_image, config.stereo, sides)
+        alone = _corners_alone(right_image, context, Side.RIGHT, allowed)
+        return alone._replace(sides=sides)
+    pair = balanced(left, right_image, sides)
     found, right = extract_in_any_light(pair, config, image_map, allowed)
-    return Corners(found, right)
+    return Corners(found, right, sides=sides)
 
 
 def matched(
     corners: Corners, context: TrackingContext, keypoints: Keypoints | None = None
 ) -> Extracted:
-    """The second step of ``extract_features``: stereo matching.
+    """The second step of extraction: stereo matching.
 
     Args:
         keypoints: positions at which the left image gets features, too (``with_keypoints``).
     """
     camera, config = context.camera, context.config
-    found, right, depth, side = corners
+    found, right, depth, side, _ = corners
     if depth is not None:
         scale = context.scales[found.octave]
         u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)

@@ -65,8 +65,6 @@ class Frame:
             match was not aligned; None if no match was.
         twist: ``(6,)`` velocity of the camera when the frame was tracked, per second; None if
             unknown.
-        covariance: ``(6, 6)`` of ``T_cw`` relative to the landmarks that the frame tracks
-            (``pose_covariance``); None if the pose was not optimised.
         source: where ``extract`` takes the features from; None once they are there. Until then the
             features are those landmarks that were found by their patches.
         coarse: ``coarse_levels`` of the image, by which the next frame is aligned; None if it is
@@ -90,7 +88,6 @@ class Frame:
     delay_removed: bool = False
     shift: NDArray[np.float32] | None = None
     twist: Matrix | None = None
-    covariance: Matrix | None = None
     source: FeatureSource | None = None
     coarse: Pyramid | None = None
     mask: Mask | None = None

@@ -107,44 +107,28 @@ def needs_monocular_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig)
     return evidence.mapping_idle or urgent or late
 
 
-class CloseGain:
-    """How many close points a keyframe provides: a running mean of the number of close points that
-    the first frame after each keyframe tracks.
+def count_close(
+    state: PolicyState, tracked_close: int, frame: int, config: KeyframeConfig
+) -> PolicyState:
+    """The state after frame ``frame``, which tracks a number of close points, if it is the first
+    one after a keyframe.
 
     A single frame may track few by chance; only several in a row show that close points are scarce.
-    So this is an exponential moving average, and it starts at a high value.
-
-    Attributes:
-        mean: the moving average.
-        latest: the number of the last keyframe.
-        frame: index of the first frame after it.
-        awaited: whether the next frame is the first one after a keyframe.
+    So their mean is an exponential moving average, and it starts at a high value.
     """
+    if not state.gain_awaited:
+        return state
+    mean = state.gained_close + config.gain_weight * (tracked_close - state.gained_close)
+    return PolicyState(mean, False, tracked_close, frame, state.due)
 
-    def __init__(self, config: KeyframeConfig) -> None:
-        self.mean = config.first_gain * config.min_tracked_close
-        self.latest = 0
-        self.frame = -1
-        self.awaited = False
-        self._weight = config.gain_weight
 
-    def begin(self) -> None:
-        """Note that a keyframe was made."""
-        self.awaited = True
-
-    def add(self, tracked_close: int, frame: int) -> None:
-        """Add the number of close points that frame ``frame`` tracks, if it is the first one after
-        a keyframe."""
-        if self.awaited:
-            self.mean += self._weight * (tracked_close - self.mean)
-            self.latest, self.frame, self.awaited = tracked_close, frame, False
-
-    def ratio(self, tracked_close: int, frame: int) -> float:
-        """By which factor the number falls from frame to frame, since the first one after the last
-        keyframe, if ``frame`` tracks ``tracked_close``."""
-        if not 0 < tracked_close < self.latest:
-            return 1.0
-        return float((tracked_close / self.latest) ** (1 / max(1, frame - self.frame)))
+def close_ratio(state: PolicyState, tracked_close: int, frame: int) -> float:
+    """By which factor the number of tracked close points falls from frame to frame, since the first
+    frame after the last keyframe, if ``frame`` tracks ``tracked_close``."""
+    if not 0 < tracked_close < state.first_close:
+        return 1.0
+    share = tracked_close / state.first_close
+    return float(share ** (1 / max(1, frame - state.first_frame)))
 
 
 @dataclass(frozen=True)
@@ -180,17 +164,18 @@ def is_known_place(evidence: PlaceEvidence, config: KeyframeConfig) -> bool:
 
 class KeyframePolicy:
     """Decides whether a tracked frame becomes a keyframe. Only ``observe``, ``is_due``,
-    ``keyframe_made`` and ``restore`` change its state.
-
-    Attributes:
-        due: index of the frame that is to become a keyframe; -1 if none is planned.
-    """
+    ``keyframe_made`` and ``restore`` change its state."""
 
     def __init__(self, context: TrackingContext) -> None:
         self._context = context
         self._config = context.config.keyframes
-        self._gain = CloseGain(self._config)
-        self.due = -1
+        first = self._config.first_gain * self._config.min_tracked_close
+        self._state = PolicyState(first, gain_awaited=False)
+
+    @property
+    def due(self) -> int:
+        """Index of the frame that is to become a keyframe; -1 if none is planned."""
+        return self._state.due
 
     def observe(
         self, frame: Frame, view: MapView, *, seconds_since_keyframe: float, mapping_idle: bool
@@ -205,8 +190,8 @@ class KeyframePolicy:
             close = transform(frame.T_cw, frame.xyz)[:, 2] < self._context.close_depth
             untracked_close = None
         tracked_close = int(np.count_nonzero(close & tracked))
-        gain = self._gain
-        gain.add(tracked_close, frame.index)
+        state = count_close(self._state, tracked_close, frame.index, self._config)
+        self._state = state
         return KeyframeEvidence(
             seconds_since_keyframe=seconds_since_keyframe,
             n_inliers=int(np.count_nonzero(tracked)),
@@ -214,9 +199,9 @@ class KeyframePolicy:
             tracked_close=tracked_close,
             untracked_close=untracked_close,
             mapping_idle=mapping_idle,
-            gained_close=gain.mean,
-            first_close=gain.latest,
-            close_ratio=gain.ratio(tracked_close, frame.index),
+            gained_close=state.gained_close,
+            first_close=state.first_close,
+            close_ratio=close_ratio(state, tracked_close, frame.index),
         )
 
     def wants_keyframe(self, evidence: KeyframeEvidence) -> bool:
@@ -237,24 +222,20 @@ class KeyframePolicy:
         if self.due < 0:
             soon = range(self._config.patch_lead_frames + 1)
             wanted = (index + k for k in soon if self.wants_keyframe(evidence.ahead(k)))
-            self.due = next(wanted, -1)
+            self._state = replace(self._state, due=next(wanted, -1))
         if not 0 <= self.due <= index:
             return False
-        self.due = -1
+        self._state = replace(self._state, due=-1)
         return True
 
     def keyframe_made(self) -> None:
         """Note that a keyframe was made."""
-        self._gain.begin()
-        self.due = -1
+        self._state = replace(self._state, gain_awaited=True, due=-1)
 
     def state(self) -> PolicyState:
         """The state, for a saved map or a checkpoint."""
-        gain = self._gain
-        return PolicyState(gain.mean, gain.awaited, gain.latest, gain.frame, self.due)
+        return self._state
 
     def restore(self, state: PolicyState) -> None:
         """Continue from a state that ``state`` returned."""
-        self._gain.mean, self._gain.awaited = state.gained_close, state.gain_awaited
-        self._gain.latest, self._gain.frame = state.first_close, state.first_frame
-        self.due = state.due
+        self._state = state

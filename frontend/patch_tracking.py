@@ -16,7 +16,7 @@ from vslam.features import PATCH_RADIUS, Features, Pyramid
 from vslam.frontend.alignment import find_patches
 from vslam.frontend.masks import Mask
 from vslam.frontend.matching import predict_view
-from vslam.frontend.pose import optimise_pose, pose_covariance
+from vslam.frontend.pose import optimise_pose
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import Matrix, orthonormalised
 from vslam.map_view import MapView
@@ -27,14 +27,12 @@ _MARGIN = PATCH_RADIUS + 2  # of a patch from the border of its level, pixels
 class PatchTrack(NamedTuple):
     """Landmarks that were found by their patches, and the pose that follows.
 
-    ``T_cw`` (4, 4) and its (6, 6) ``covariance`` (``pose_covariance``); ``ids`` (N,) i4 and ``xyz``
-    (N, 3) of the inliers; ``features`` of these, where they were found, with the descriptors of the
-    landmarks and without columns in a right image; ``n_matches`` before outliers were removed;
-    ``visible`` (M,) i4 landmarks that were looked for.
+    ``T_cw`` (4, 4); ``ids`` (N,) i4 and ``xyz`` (N, 3) of the inliers; ``features`` of these, where
+    they were found, with the descriptors of the landmarks and without columns in a right image;
+    ``n_matches`` before outliers were removed; ``visible`` (M,) i4 landmarks that were looked for.
     """
 
     T_cw: Matrix
-    covariance: Matrix
     ids: NDArray[np.int32]
     xyz: Matrix
     features: Features
@@ -90,9 +88,6 @@ def track_patches(
     uvr[:, :2] = xy
     certain = config.certainty * scale**-2.0
     T_found, inlier = optimise_pose(T_cw, xyz[seen], uvr, certain, camera.intrinsics)
-    covariance = pose_covariance(
-        T_found, xyz[seen[inlier]], uvr[inlier], certain[inlier], camera.intrinsics
-    )
     seen, xy, level = seen[inlier], xy[inlier], level[inlier]
     features = Features(
         xy=xy,
@@ -103,7 +98,6 @@ def track_patches(
     )
     return PatchTrack(
         orthonormalised(T_found),
-        covariance,
         known.ids[seen],
         xyz[seen],
         features,

@@ -1,4 +1,5 @@
-"""Image patches around keypoints, and a store of the patches of the newest keyframes.
+"""Image patches around keypoints, to which matches are aligned, and a store of those of the newest
+keyframes.
 
 Only the newest keyframes keep their patches: they observe nearly all landmarks that tracking
 follows, and a patch takes more memory than the rest of an observation.
@@ -9,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.config import AlignmentConfig
 from vslam.features import (
     PATCH_PIXELS,
     PATCH_RADIUS,
@@ -18,6 +20,7 @@ from vslam.features import (
     Pyramid,
     level_pixel,
 )
+from vslam.frontend.frame import Frame
 from vslam.kernels import kernel
 from vslam.map import Map
 
@@ -53,7 +56,10 @@ def _cut(pixels, offsets, shapes, xy, octave):
 
 
 class RecentPatches:
-    """Stores the patches of the newest keyframes."""
+    """Stores the patches of the newest keyframes.
+
+    Frames without an image pyramid (those of an RGB-D camera, for example) have none.
+    """
 
     def __init__(self, capacity: int) -> None:
         """``capacity`` is the number of keyframes whose patches are remembered."""
@@ -62,6 +68,23 @@ class RecentPatches:
         self._pixels = np.empty((capacity, 0, PATCH_PIXELS), np.uint8)
         self._shift = np.empty((capacity, 0, 2), np.float32)
         self._next = 0
+
+    def remember(self, frame: Frame, keyframe: int, scales: NDArray[np.float64]) -> None:
+        """Remember the patches around the features of a frame that became a keyframe.
+
+        Args:
+            keyframe: id of the new keyframe.
+            scales: ``(levels,)`` full-resolution pixels per pixel of each octave.
+        """
+        features = frame.features
+        if frame.pyramid is None:
+            return
+        shift = np.zeros((len(features), 2), np.float32)
+        if frame.shift is not None:
+            aligned = frame.aligned
+            shift[aligned] = frame.shift[aligned] / scales[features.octave[aligned]][:, None]
+        pixels = patches_around(frame.pyramid, features.xy, features.octave)
+        self.add(KeyframePatches(keyframe, pixels, shift))
 
     def add(self, one: KeyframePatches) -> None:
         """Remember the patches of another keyframe and, if all slots are full, forget those of the
@@ -75,7 +98,7 @@ class RecentPatches:
         self._next = (slot + 1) % len(self._keyframes)
 
     def all(self) -> tuple[KeyframePatches, ...]:
-        """The patches of all remembered keyframes, oldest first."""
+        """The patches of all remembered keyframes, oldest first, for a checkpoint."""
         slots = np.roll(np.arange(len(self._keyframes)), -self._next)
         return tuple(
             KeyframePatches(
@@ -112,6 +135,19 @@ def _widened(array: NDArray, n: int) -> NDArray:
     wide = np.zeros((len(array), n, array.shape[2]), array.dtype)
     wide[:, : array.shape[1]] = array
     return wide
+
+
+def certainty_of(frame: Frame, config: AlignmentConfig) -> NDArray[np.uint8] | int:
+    """``(N,)`` uint8, the factor by which the variance of each feature's position is smaller than
+    that of a keypoint (``Arrays.certainty``); 1 for all features of a frame without a pyramid.
+
+    An aligned match is certain. So is a feature without a match: the landmark that it creates is
+    defined by this very position. A match that was not aligned is about half a pixel off.
+    """
+    if frame.pyramid is None:
+        return 1
+    unaligned = (frame.landmark >= 0) & ~frame.aligned
+    return np.where(unaligned, 1, config.certainty).astype(np.uint8)
 
 
 @kernel

@@ -41,8 +41,11 @@ def coarse_levels(pyramid: Pyramid) -> Pyramid:
 
 
 def coarse_shapes(shapes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """``(3, 2)`` heights and widths of ``coarse_levels``, from those of the ``(L, 2)`` levels of
-    the whole pyramid."""
+    """The ``(3, 2)`` heights and widths of ``coarse_levels``.
+
+    Args:
+        shapes: ``(L, 2)`` heights and widths of the levels of the whole pyramid.
+    """
     smallest, middle = shapes[-1], shapes[len(shapes) // 2]
     return np.array([np.maximum(smallest // 2, 1), smallest, middle])
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vslam.camera import Camera
 from vslam.config import StereoConfig
 from vslam.features import shifted_columns
-from vslam.frontend.frame import FeatureSource, Frame
+from vslam.frontend.frame import Frame
 from vslam.frontend.side_delay import DelayState, SideDelay
 from vslam.frontend.sides import ComparedSides
 from vslam.geometry import Matrix
@@ -48,23 +48,17 @@ class RigCalibration:
         self._scales = scales
 
     def extract(self, frame: Frame, twist: Matrix | None) -> None:
-        """Extract the features of a frame, if that has not been done, ``compare`` its sides and
+        """Extract the features of a frame, if that has not been done, note what its sides show and
         ``prepare`` it."""
         source = frame.source
         frame.extract(self._camera)
-        self.compare(source, frame.index)
-        self.prepare(frame, twist)
-
-    def compare(self, source: FeatureSource | None, index: int) -> None:
-        """Note what the images of frame ``index``, whose features were extracted, show."""
-        if source is None:
-            return
-        if source.sides is not None:
+        if source is not None and source.sides is not None:
             self.sides.add(source.sides)
-        if source.problem is not None:
+        if source is not None and source.problem is not None:
             self.problems.append(
-                f"Frame {index} has only its left image: {source.problem.rstrip('.')}."
+                f"Frame {frame.index} has only its left image: {source.problem.rstrip('.')}."
             )
+        self.prepare(frame, twist)
 
     def prepare(self, frame: Frame, twist: Matrix | None) -> None:
         """Correct ``u_right`` of a frame for the disparity offset and, if the motion is known, for

@@ -14,6 +14,7 @@ it in every frame whose motion is known.
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
@@ -136,7 +137,7 @@ def _between(image, x, y, a, b):
     return (1.0 - b) * upper + b * lower
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class DelayState:
     """The state of ``SideDelay``. "Moments" are weighted second moments, see ``_moments``.
 
@@ -218,12 +219,6 @@ class SideDelay:
             groups.
     """
 
-    _solution: NDArray[np.float64]
-    _twist: NDArray[np.float64]
-    _waiting: NDArray[np.float64]
-    _group: NDArray[np.float64]
-    _groups: list[NDArray[np.float64]]
-
     def __init__(self, camera: Camera, config: StereoConfig) -> None:
         self._camera, self._config = camera, config
         self.restore(DelayState.nothing())
@@ -251,34 +246,22 @@ class SideDelay:
                 previous camera frame to this one. None if unknown; then the frame is skipped.
             scales: ``(levels,)`` pyramid scale factors.
         """
+        state = self._state
         if row_offset is None or twist is None:
-            self._waiting[:] = 0.0
+            state.waiting[:] = 0.0
             return
-        self._take_in(0.5 * (self._twist + twist))
-        self._twist = twist
-        self._waiting = self._moments(features, row_offset, twist, scales)
+        self._take_in(0.5 * (state.twist + twist))
+        state.twist = twist
+        state.waiting = self._moments(features, row_offset, twist, scales)
 
     def state(self) -> DelayState:
         """The state, for a saved map or a checkpoint."""
-        return DelayState(
-            self._n_group,
-            self._length,
-            self._solution.copy(),
-            self._twist.copy(),
-            self._waiting.copy(),
-            self._group.copy(),
-            np.array(self._groups).reshape(-1, *_GROUP),
-        )
+        return deepcopy(self._state)
 
     def restore(self, state: DelayState) -> None:
         """Continue from a state that ``state`` returned."""
         self.seconds, self.sigma = 0.0, np.inf
-        self._n_group, self._length = state.n_group, state.length
-        self._solution = state.solution.copy()
-        self._twist = state.twist.copy()
-        self._waiting = state.waiting.copy()
-        self._group = state.group.copy()
-        self._groups = list(state.groups.copy())
+        self._state = deepcopy(state)
         self._conclude()
 
     def _moments(
@@ -299,7 +282,8 @@ class SideDelay:
         powers = [x**i * y**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
         found = row_offset[chosen].astype(np.float64)
         A = np.column_stack([speeds, *powers, found])
-        residual = found - (speeds @ twist) * self._solution[0] - A[:, 6:-1] @ self._solution[1:]
+        solution = self._state.solution
+        residual = found - (speeds @ twist) * solution[0] - A[:, 6:-1] @ solution[1:]
         robust = np.minimum(1.0, HUBER_PX / np.maximum(np.abs(residual), 1e-9))
         weight = robust * scales[features.octave[chosen]] ** -2.0
         moments: NDArray[np.float64] = (A * weight[:, None]).T @ A
@@ -307,31 +291,30 @@ class SideDelay:
 
     def _take_in(self, twist: Matrix) -> None:
         """Add the moments of the waiting frame to its group, with ``twist`` as its velocity."""
-        if not self._waiting.any():
+        state = self._state
+        if not state.waiting.any():
             return
-        project = np.zeros((len(self._group), len(self._waiting)))
+        project = np.zeros((len(state.group), len(state.waiting)))
         project[0, :6] = twist
         project[1:, 6:] = np.eye(1 + _NUISANCES)
-        self._group += project @ self._waiting @ project.T
-        self._n_group += 1
-        if self._n_group == self._length:
-            self._groups.append(self._group)
-            self._group, self._n_group = np.zeros_like(self._group), 0
-            if len(self._groups) == MOST_GROUPS:  # merge them in pairs
-                self._groups = [
-                    a + b for a, b in zip(self._groups[::2], self._groups[1::2], strict=True)
-                ]
-                self._length *= 2
+        state.group += project @ state.waiting @ project.T
+        state.n_group += 1
+        if state.n_group == state.length:
+            state.groups = np.concatenate([state.groups, state.group[None]])
+            state.group, state.n_group = np.zeros_like(state.group), 0
+            if len(state.groups) == MOST_GROUPS:  # merge them in pairs
+                state.groups = state.groups[::2] + state.groups[1::2]
+                state.length *= 2
             self._conclude()
 
     def _conclude(self) -> None:
-        if len(self._groups) < FEWEST_GROUPS:
+        groups = self._state.groups
+        if len(groups) < FEWEST_GROUPS:
             return
-        groups = np.stack(self._groups)
         total = groups.sum(axis=0)
         inverse = np.linalg.pinv(total[:-1, :-1], rcond=1e-12, hermitian=True)
-        self._solution = inverse @ total[:-1, -1]
-        self.seconds = float(self._solution[0])
-        pulls = (groups[:, :-1, -1] - groups[:, :-1, :-1] @ self._solution) @ inverse[0]
+        self._state.solution = solution = inverse @ total[:-1, -1]
+        self.seconds = float(solution[0])
+        pulls = (groups[:, :-1, -1] - groups[:, :-1, :-1] @ solution) @ inverse[0]
         n = len(pulls)
         self.sigma = float(np.sqrt(n / (n - 1) * pulls @ pulls))

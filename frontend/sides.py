@@ -93,15 +93,10 @@ def compare_sides(left: Grey, right: Grey, config: StereoConfig) -> Sides:
     return Sides(_stops(ours, theirs, config))
 
 
-def balanced(
-    left: Grey, right: Grey, config: StereoConfig, sides: Sides | None = None
-) -> tuple[Grey, Grey]:
-    """Both images; if they differ by a gain, the darker one is brightened.
-
-    Args:
-        sides: the result of ``compare_sides``; None computes it.
-    """
-    stops = (sides or compare_sides(left, right, config)).darker_stops
+def balanced(left: Grey, right: Grey, sides: Sides) -> tuple[Grey, Grey]:
+    """Both images; if they differ by a gain, according to ``compare_sides``, the darker one is
+    brightened."""
+    stops = sides.darker_stops
     if stops > 0:
         return left, _brightened(right, left, stops)
     if stops < 0:

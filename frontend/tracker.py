@@ -155,7 +155,6 @@ class Tracker:
             return Found(TrackingState.LOST, track.n_matches, n_inliers)
         frame.T_cw, frame.features = track.T_cw, track.features
         frame.landmark, frame.xyz = track.ids, track.xyz
-        frame.covariance = track.covariance
         return Found(TrackingState.OK, track.n_matches, n_inliers, track.visible)
 
     def match_features(self, frame: Frame, view: MapView) -> bool:

@@ -26,7 +26,7 @@ from vslam.frontend.matching import (
 )
 from vslam.frontend.orb import scale_factors
 from vslam.frontend.pose import optimise_pose, pose_covariance
-from vslam.geometry import compose, inverse, transform
+from vslam.geometry import Matrix, compose, inverse, transform
 from vslam.map_view import LocalMap
 from vslam.odometry import adjoint
 from vslam.reprojection import stack_uvr
@@ -268,35 +268,42 @@ def refine(
     """
     frame.shift = shift
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
-    uvr, weight = observations(frame, matched, context)
-    certainty = np.ones(len(matched))
-    if shift is not None:
-        moved = shift[matched]
-        aligned = np.isfinite(moved[:, 0])
-        uvr[aligned] += moved[aligned][:, [0, 1, 0]]
-        certainty[aligned] = context.config.alignment.certainty
-    certain, disparity_weight = weight * certainty, DISPARITY_WEIGHT / np.sqrt(certainty)
-    intrinsics, xyz = context.camera.intrinsics, frame.xyz[matched]
     T_camera_w, inlier = optimise_pose(
-        frame.T_camera_left @ T_cw, xyz, uvr, certain, intrinsics, disparity_weight
+        frame.T_camera_left @ T_cw, *_observed_points(frame, matched, context)
     )
     frame.set_camera_pose(T_camera_w)
-    covariance = pose_covariance(
-        T_camera_w,
-        xyz[inlier],
-        uvr[inlier],
-        certain[inlier],
-        intrinsics,
-        disparity_weight[inlier],
-    )
-    if frame.side == Side.RIGHT:
-        A = adjoint(inverse(frame.T_camera_left))
-        covariance = A @ covariance @ A.T
-    frame.covariance = covariance
     outliers = matched[~inlier]
     frame.landmark[outliers] = -1
     frame.xyz[outliers] = np.nan
     return int(np.count_nonzero(inlier))
+
+
+def covariance_of(frame: Frame, context: TrackingContext) -> Matrix:
+    """``(6, 6)`` covariance of the ``T_cw`` of a tracked frame relative to the points that it
+    tracks, as ``pose_covariance``."""
+    matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
+    covariance = pose_covariance(frame.T_camera_w, *_observed_points(frame, matched, context))
+    if frame.side == Side.LEFT:
+        return covariance
+    A = adjoint(inverse(frame.T_camera_left))
+    return A @ covariance @ A.T
+
+
+def _observed_points(
+    frame: Frame, matched: NDArray[np.integer], context: TrackingContext
+) -> tuple[NDArray[np.float64], ...]:
+    """The arguments of ``optimise_pose`` after the pose, for the points that the ``matched``
+    features track, with aligned positions where there are any."""
+    uvr, weight = observations(frame, matched, context)
+    certainty = np.ones(len(matched))
+    if frame.shift is not None:
+        moved = frame.shift[matched]
+        aligned = np.isfinite(moved[:, 0])
+        uvr[aligned] += moved[aligned][:, [0, 1, 0]]
+        certainty[aligned] = context.config.alignment.certainty
+    disparity_weight = DISPARITY_WEIGHT / np.sqrt(certainty)
+    intrinsics = context.camera.intrinsics
+    return frame.xyz[matched], uvr, weight * certainty, intrinsics, disparity_weight
 
 
 def observations(

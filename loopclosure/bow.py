@@ -85,7 +85,6 @@ class BowDetector:
         return DetectorMemory(self.name, self._fingerprint, {"words": words})
 
     def restore(self, memory: DetectorMemory) -> None:
-        """See :class:`LoopDetector`."""
         require_same(self.memory(), memory)
         words = memory.tables["words"]
         known = words.values.dtype == np.int32 and words.values.ndim == 1

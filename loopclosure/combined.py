@@ -29,18 +29,15 @@ class CombinedDetector:
         self._detectors, self._min_shared = detectors, min_shared
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
-        """See :class:`LoopDetector`."""
         for one in self._detectors:
             one.add(keyframe, image, features)
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
-        """See :class:`LoopDetector`."""
         return self._merged([one.query(keyframe, map_) for one in self._detectors], map_)
 
     def locate(
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
-        """See :class:`LoopDetector`."""
         return self._merged([one.locate(image, features, map_) for one in self._detectors], map_)
 
     def memory(self) -> DetectorMemory:
@@ -55,7 +52,6 @@ class CombinedDetector:
         return DetectorMemory(self.name, fingerprint, tables)
 
     def restore(self, memory: DetectorMemory) -> None:
-        """See :class:`LoopDetector`."""
         require_same(self.memory(), memory)
         for one in self._detectors:
             own = one.memory()

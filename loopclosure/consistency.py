@@ -38,12 +38,6 @@ class LoopConsistency:
         self._verified: list[tuple[int, LoopEdge]] = []  # turn, edge
         self._turn = 0
 
-    @property
-    def n_groups(self) -> int:
-        """Number of remembered groups; at most the number of candidates of the last ``max_gap + 1``
-        keyframes."""
-        return len(self._groups)
-
     def update(
         self, keyframe: int, candidates: list[LoopCandidate], map_: Map
     ) -> tuple[list[LoopCandidate], list[LoopEdge]]:
@@ -68,7 +62,8 @@ class LoopConsistency:
             if length >= self.config.min_keyframes:
                 consistent.append(candidate)
             else:
-                reason = f"resembled {length} of {self.config.min_keyframes} keyframes in a row"
+                needed = f"the {self.config.min_keyframes} consecutive keyframes needed"
+                reason = f"proposed for only {length} of {needed}"
                 rejected.append(LoopEdge.of(candidate, reason))
         waiting = [
             replace(g, age=g.age + 1)

@@ -1,5 +1,5 @@
-"""Verification of loop candidates by learned local descriptors, for changes of appearance that ORB
-descriptors do not survive.
+"""Verification of loop candidates, and relocalisation, by learned local descriptors, for changes of
+appearance that ORB descriptors do not survive.
 
 The steps are those of :mod:`vslam.loopclosure.verification`: an initial pose, guided matching with
 all landmarks of the place, refinement, and the same tests against similar-looking places.
@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
+from vslam.camera import Camera, Image
 from vslam.config import Config, LearnedMatchingConfig, VerificationConfig
 from vslam.features import Features
 from vslam.geometry import Matrix, inverse, orthonormalised, transform
@@ -337,3 +337,32 @@ def _seen_of_query(
     off = np.linalg.norm(found.xy - expected, axis=1) * match.scale
     # For a two-dimensional normal distribution, 95 % of the distances are below 2.45 sigma.
     return int(np.count_nonzero(off < 2.45 * config.sigma)), int(np.isfinite(expected[:, 0]).sum())
+
+
+class LearnedRelocalisation:
+    """Implements ``Recognise`` by the images of keyframes; finds nothing if there are no images."""
+
+    def __init__(self, images: KeyframeImages | None, camera: Camera, config: Config) -> None:
+        self._images = images
+        self._camera = camera
+        self._config = config
+
+    def __call__(
+        self, map_: Map, image: Image | None, features: Features, candidates: list[LoopCandidate]
+    ) -> Sighting | None:
+        """Search for a frame at the candidates whose images are most similar to it; returns None if
+        it is found at none of them."""
+        images, config = self._images, self._config
+        if images is None or image is None:
+            return None
+        candidates = rated(candidates, lambda: images.glance_at(image), images, config.learned)
+        alike = [one for one in candidates if one.alike is not None]
+        alike.sort(key=lambda one: -(one.alike or 0.0))
+        if not alike:
+            return None
+        maps = images.network.describe(image)
+        for candidate in alike[: config.learned.max_candidates]:
+            found = recognise(map_, maps, features, candidate.match, images, self._camera, config)
+            if found is not None:
+                return found
+        return None

@@ -47,12 +47,23 @@ def precision_recall(same: NDArray, score: NDArray) -> PrecisionRecall:
         raise InputError("precision-recall: empty ground truth, no pair shows the same place.")
     if np.isnan(score).any():
         raise InputError("precision-recall: a score is NaN; check the weights of the detector.")
+    return curve_of(same, score, int(same.sum()))
+
+
+def curve_of(right: NDArray[np.bool_], score: NDArray[np.float64], total: int) -> PrecisionRecall:
+    """The curve of N decisions.
+
+    Args:
+        right: ``(N,)`` bool, decisions that are right if they are accepted.
+        score: ``(N,)`` float64.
+        total: number of right decisions that recall is relative to.
+    """
     order = np.argsort(-score, kind="stable")
     ranked = score[order]
     # The last index of each distinct score.
-    last = np.append(np.flatnonzero(np.diff(ranked)), len(ranked) - 1)
-    right = np.cumsum(same[order])[last]
-    precision, recall = right / (last + 1), right / right[-1]
+    last = np.flatnonzero(np.append(np.diff(ranked) != 0, len(ranked) > 0))
+    found = np.cumsum(right[order])[last]
+    precision, recall = found / (last + 1), found / total
     return PrecisionRecall(
         np.append(precision[::-1], 1.0), np.append(recall[::-1], 0.0), ranked[last][::-1]
     )

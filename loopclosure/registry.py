@@ -32,8 +32,8 @@ LEARNED_VERIFICATION = ("both", *(name for name in NETWORKS if name != TO_THE_LE
 
 
 def about(name: str) -> str:
-    """A description of a detector in a few words; for a plug-in, its name."""
-    return _ABOUT.get(name, name)
+    """A description of a detector in a few words."""
+    return _ABOUT.get(name, "a plug-in")
 
 
 def require_detector(name: str, weights: Path | None = None, option: str = "--detector") -> None:
@@ -58,8 +58,10 @@ def require_detector(name: str, weights: Path | None = None, option: str = "--de
         open_plugin(others[name], Config(), weights)
     elif name in (*NETWORKS, "both"):
         find_weights(_network_of(name), weights)
-    elif weights is not None:
-        raise InputError(f"--weights: the detector {name} has no weights; leave the option out.")
+    elif weights is not None and name == "none":
+        raise InputError("--weights: the detector none has no weights; leave the option out.")
+    elif weights is not None and not weights.is_file():
+        raise InputError(f"--weights {weights}: no such file; name a vocabulary, .npz or .txt.")
 
 
 def problem_of(detector: LoopDetector) -> str | None:
@@ -103,7 +105,8 @@ def create_detector(
     """Create a detector without any keyframes. Its dependencies are imported only here.
 
     Args:
-        weights: weights of a learned detector; None takes those that vslam ships.
+        weights: weights of a learned detector, or the vocabulary of ``bow``; None takes those that
+            vslam ships.
         images: the store of keyframe images from :func:`create_images`, which ``verifier_for``
             must be given as well.
         late: whether to load a network that vslam ships only when it gets its first image.
@@ -116,9 +119,10 @@ def create_detector(
         return NoDetector()
     if name == "bow":
         from vslam.loopclosure.bow import BowDetector
-        from vslam.loopclosure.vocabulary import load
+        from vslam.loopclosure.vocabulary import SHIPPED
+        from vslam.loopclosure.vocabulary_text import read_vocabulary
 
-        return BowDetector(load(), config.bow)
+        return BowDetector(read_vocabulary(weights or SHIPPED), config.bow)
     if name == "both":
         from vslam.loopclosure.combined import CombinedDetector
 

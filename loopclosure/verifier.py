@@ -1,13 +1,12 @@
 """Verifiers of loop candidates: by ORB descriptors, by learned ones, or by ORB and, if that fails,
 by learned ones.
 
-Loop closing knows only the interface :class:`Verifier`, so it is the same for all of them.
+Loop closing knows only the methods of :class:`Verifier`, so it is the same for all of them.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,26 +27,29 @@ from vslam.map import Map
 from vslam.states import VerifierState
 
 
-class Verifier(Protocol):
-    """Decides by geometry whether a keyframe shows the place that a detector proposes.
+class Verifier:
+    """Decides by geometry whether a keyframe shows the place that a detector proposes, here by ORB
+    descriptors alone.
 
     Methods are called in the order of the keyframes, by one thread at a time.
+
+    Attributes:
+        images: the images of keyframes that verification needs; None if it needs none.
+        verified_memory: for how many keyframes a verified loop waits for other loops that agree
+            with it.
     """
 
-    @property
-    def images(self) -> KeyframeImages | None:
-        """The images of keyframes that verification needs; None if it needs none."""
-        ...
+    images: KeyframeImages | None = None
 
-    @property
-    def verified_memory(self) -> int:
-        """For how many keyframes a verified loop waits for other loops that agree with it."""
-        ...
+    def __init__(self, config: Config, camera: Camera) -> None:
+        self.verified_memory = config.consistency.verified_memory
+        self._config = config
+        self._camera = camera
 
     def is_image_redundant(self, map_: Map, keyframe: int) -> bool:
         """Whether the image of a keyframe is not needed, because other images show nearly the same
         view."""
-        ...
+        return False
 
     def add(self, map_: Map, keyframe: int, image: NDArray[np.uint8] | None) -> None:
         """Remember the image of a new keyframe if verification needs images.
@@ -55,14 +57,13 @@ class Verifier(Protocol):
         Args:
             image: ``(H, W)`` uint8 left image; None if there is none or it is not needed.
         """
-        ...
 
     def rate(
         self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
     ) -> list[LoopCandidate]:
         """The candidates of a keyframe in the same order, with ``alike`` and ``promising`` set if
         this verifier uses them."""
-        ...
+        return candidates
 
     def verify(
         self, map_: Map, candidate: LoopCandidate, refusal: LoopEdge | None = None
@@ -70,20 +71,22 @@ class Verifier(Protocol):
         """Decide whether a rated candidate is a loop. The map is not changed.
 
         Args:
-            refusal: the rejected edge if the candidate has failed an earlier test, else None.
+            refusal: the rejected edge if the candidate has failed an earlier test, else None. ORB
+                does not try such a candidate.
 
         Returns:
             An accepted edge with a pose, or one that is not accepted, with the reason.
         """
-        ...
+        if refusal is not None:
+            return refusal
+        return verification.verify(map_, candidate, self._camera, self._config.verification)
 
     def state(self) -> VerifierState:
         """The state, for a saved map or a checkpoint, without the images."""
-        ...
+        return VerifierState()
 
     def restore(self, state: VerifierState) -> None:
         """Continue from a state that ``state`` returned."""
-        ...
 
 
 def verifier_for(config: Config, camera: Camera, images: KeyframeImages | None = None) -> Verifier:
@@ -94,70 +97,29 @@ def verifier_for(config: Config, camera: Camera, images: KeyframeImages | None =
             whatever the configuration says (see ``vslam.loopclosure.registry.create_images``).
     """
     if images is None:
-        return OrbVerifier(config, camera)
+        return Verifier(config, camera)
     if config.verification.descriptors == "learned":
         return LearnedVerifier(config, camera, images)
     return OrbThenLearnedVerifier(config, camera, images)
 
 
-class OrbVerifier:
-    """Implements :class:`Verifier` by ORB descriptors alone."""
-
-    images = None
-
-    def __init__(self, config: Config, camera: Camera) -> None:
-        self.verified_memory = config.consistency.verified_memory
-        self._config = config.verification
-        self._camera = camera
-
-    def is_image_redundant(self, map_: Map, keyframe: int) -> bool:
-        """False: ORB descriptors need no images."""
-        return False
-
-    def add(self, map_: Map, keyframe: int, image: NDArray[np.uint8] | None) -> None:
-        """Do nothing: the map already has the descriptors."""
-
-    def rate(
-        self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
-    ) -> list[LoopCandidate]:
-        """The candidates, unchanged."""
-        return candidates
-
-    def verify(
-        self, map_: Map, candidate: LoopCandidate, refusal: LoopEdge | None = None
-    ) -> LoopEdge:
-        """See :class:`Verifier`; a candidate that failed an earlier test is not tried."""
-        if refusal is not None:
-            return refusal
-        return verification.verify(map_, candidate, self._camera, self._config)
-
-    def state(self) -> VerifierState:
-        """The default state: nothing is remembered."""
-        return VerifierState()
-
-    def restore(self, state: VerifierState) -> None:
-        """Do nothing: there is no state."""
-
-
-class LearnedVerifier:
-    """Implements :class:`Verifier` by learned local descriptors alone.
+class LearnedVerifier(Verifier):
+    """A verifier by learned local descriptors alone.
 
     This takes forty times as long as verification by ORB, so :class:`LearnedTrials` chooses
     promising candidates. These are tried even if only one keyframe resembled the place, because a
     camera that crosses a place by night may get only one good view of it.
     """
 
+    images: KeyframeImages
+
     def __init__(self, config: Config, camera: Camera, images: KeyframeImages) -> None:
+        super().__init__(config, camera)
         self.images = images
-        self.verified_memory = max(
-            config.consistency.verified_memory, config.learned.verified_memory
-        )
-        self._config = config
-        self._camera = camera
+        self.verified_memory = max(self.verified_memory, config.learned.verified_memory)
         self._trials = LearnedTrials(config.learned)
 
     def is_image_redundant(self, map_: Map, keyframe: int) -> bool:
-        """See :class:`Verifier`."""
         return is_image_redundant(map_, keyframe, self.images, self._config.learned)
 
     def add(self, map_: Map, keyframe: int, image: NDArray[np.uint8] | None) -> None:
@@ -198,25 +160,19 @@ class LearnedVerifier:
         return replace(refusal, reason=f"{refusal.reason}; {edge.reason}")
 
     def state(self) -> VerifierState:
-        """See :class:`Verifier`."""
         return self._trials.state
 
     def restore(self, state: VerifierState) -> None:
-        """See :class:`Verifier`."""
         self._trials.state = state
 
 
 class OrbThenLearnedVerifier(LearnedVerifier):
-    """Implements :class:`Verifier` by ORB descriptors and, if these fail, by learned ones."""
-
-    def __init__(self, config: Config, camera: Camera, images: KeyframeImages) -> None:
-        super().__init__(config, camera, images)
-        self._orb = OrbVerifier(config, camera)
+    """A verifier by ORB descriptors and, if these fail, by learned ones."""
 
     def verify(
         self, map_: Map, candidate: LoopCandidate, refusal: LoopEdge | None = None
     ) -> LoopEdge:
         """See :class:`Verifier`; a promising candidate that ORB rejects is tried again by learned
         descriptors."""
-        edge = self._orb.verify(map_, candidate, refusal)
+        edge = Verifier.verify(self, map_, candidate, refusal)
         return edge if edge.accepted else super().verify(map_, candidate, edge)

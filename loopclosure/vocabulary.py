@@ -9,6 +9,7 @@ in memory and descending a level reads one block of 32 k bytes.
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError, ResultsError
+from vslam.errors import InputError, write_file
 from vslam.kernels import hamming, kernel
 from vslam.untrusted import read_npz
 
@@ -196,19 +197,17 @@ def save(vocabulary: Vocabulary, path: Path) -> None:
     Raises:
         ResultsError: the file cannot be written.
     """
-    try:
-        with path.open("wb") as file:
-            np.savez(
-                file,
-                schema=np.int64(SCHEMA),
-                branching=np.int64(vocabulary.branching),
-                levels=np.int64(vocabulary.levels),
-                descriptors=vocabulary.descriptors,
-                n_children=vocabulary.n_children,
-                weight=vocabulary.weight,
-            )
-    except OSError as error:
-        raise ResultsError(f"{path}: cannot be written ({error.strerror}).") from error
+    content = io.BytesIO()
+    np.savez(
+        content,
+        schema=np.int64(SCHEMA),
+        branching=np.int64(vocabulary.branching),
+        levels=np.int64(vocabulary.levels),
+        descriptors=vocabulary.descriptors,
+        n_children=vocabulary.n_children,
+        weight=vocabulary.weight,
+    )
+    write_file(path, content.getvalue())
 
 
 def load(path: Path = SHIPPED) -> Vocabulary:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError, ResultsError
+from vslam.errors import InputError, write_file
 from vslam.loopclosure.vocabulary import (
     MAX_BRANCHING,
     MAX_LEVELS,
@@ -120,10 +120,7 @@ def write_text(vocabulary: Vocabulary, path: Path) -> None:
     )
     for parent, leaf, values, idf in rows:
         lines.append(f"{parent} {leaf:d}{''.join([byte[value] for value in values])} {idf:.9g}")
-    try:
-        path.write_text("\n".join(lines), encoding="ascii")
-    except OSError as error:
-        raise ResultsError(f"{path}: cannot be written ({error.strerror}).") from error
+    write_file(path, "\n".join(lines))
 
 
 def _read_header(path: Path, header: bytes) -> tuple[int, int]:

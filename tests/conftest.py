@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -14,6 +14,10 @@ import pytest
 
 from vslam.camera import Camera
 from vslam.cli import main as cli
+from vslam.datasets.kitti import open_kitti
+from vslam.datasets.synthetic.routes import built_in_route
+from vslam.datasets.synthetic.site import Variation
+from vslam.datasets.synthetic.store import render_sequence
 from vslam.geometry import se3_exp
 from vslam.map import Map
 from vslam.trajectory import write_kitti
@@ -117,6 +121,25 @@ def corridor() -> StereoSequence:
     left = [render(mipmaps, camera, T) for T in poses]
     right = [render(mipmaps, camera, T @ T_left_right) for T in poses]
     return StereoSequence(camera, left, right, 100.0 + 0.1 * np.arange(frames), poses)
+
+
+@pytest.fixture(scope="session")
+def round_the_block(tmp_path_factory):
+    """Once round a block at half the resolution, from noon to midnight: every second frame."""
+    route = built_in_route("block")
+    camera = route.camera
+    camera = replace(
+        camera,
+        fx=camera.fx / 2,
+        fy=camera.fy / 2,
+        cx=(camera.cx - 0.5) / 2,
+        cy=(camera.cy - 0.5) / 2,
+        width=camera.width // 2,
+        height=camera.height // 2,
+    )
+    smaller = replace(route, camera=camera, T_wc=route.T_wc[::2])
+    cache = tmp_path_factory.mktemp("night")
+    return open_kitti(render_sequence(smaller, Variation(seed=3, change=1.0), cache), "block")
 
 
 @pytest.fixture(scope="session")

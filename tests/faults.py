@@ -101,8 +101,8 @@ POINTS = (
     Point("image source", "faults.next_image", 200, EARLY),
     Point("image reader", "faults.read_image", 200, EARLY),
     Point("features thread", "vslam.frontend.extraction.find_corners", 200, EARLY),
-    Point("camera thread", "vslam.run.realtime._Mailbox.put", 8, EARLY, options=REALTIME),
-    Point("handing thread", "vslam.run.realtime._Mailbox.take", 8, EARLY, options=REALTIME),
+    Point("camera thread", "vslam.run.preparation._Mailbox.put", 8, EARLY, options=REALTIME),
+    Point("handing thread", "vslam.run.preparation._Mailbox.take", 8, EARLY, options=REALTIME),
     Point("progress of a frame", "faults.on_frame", 200, EARLY),
     Point("autosave, pose", "vslam.run.autosave.tum_line", 200, ON, ("trajectory_online.tum",)),
     Point("autosave, copy", "vslam.run.autosave._copy", 2, ON),
@@ -128,7 +128,7 @@ POINTS = (
     Point("result: loops", "vslam.report.folder.evaluate_loops", 1, MISSING, LATER),
     Point("result: report.json", "vslam.report.folder.summarize", 1, MISSING, LATER),
     Point("result: figures", "vslam.report.figures.draw_figures", 1, MISSING, ("figures",)),
-    Point("result: seen loops", "vslam.report.seen_loops.seen_loops", 1, MISSING, ("figures",)),
+    Point("result: seen loops", "vslam.report.loop_tables.seen_loops", 1, MISSING, ("figures",)),
     Point("result: report.md", "vslam.report.render.markdown", 1, MISSING, ("report.md",)),
     Point("result: page", "vslam.report.render.html", 1, MISSING, ("report.html",)),
     Point("result: explorer", "vslam.report.explorer.explorer_data", 1, MISSING, ("report.html",)),
@@ -229,7 +229,7 @@ def write_ring(root: Path) -> None:
 def stage(*, learned: bool) -> None:
     """Let this process drive along the ring whatever the images show, with a detector that knows
     the way; ``learned``: learned descriptors may verify its loops."""
-    from vslam.cli import quiet
+    from vslam.cli.console import Console
     from vslam.frontend import extraction
     from vslam.loopclosure.registry import create_images
     from vslam.run import pipeline
@@ -255,13 +255,13 @@ def stage(*, learned: bool) -> None:
         return frame.read(image_map)
 
     @contextlib.contextmanager
-    def progress_bar(total: object) -> Iterator[Callable[[object], None]]:
+    def progress_bar(console: Console, total: object) -> Iterator[Callable[[object], None]]:
         yield lambda result: on_frame()
 
     extraction.find_corners, extraction.matched = find, see
     pipeline.detector_with_images = detector
     Source.frames = frames
-    quiet.progress_bar = progress_bar
+    Console.progress_bar = progress_bar
 
 
 @cache
@@ -274,7 +274,7 @@ def load_everything() -> None:
     """Load the modules, kernels and features that forks need, without starting threads, which
     forks would lack."""
     from vslam.cli import main  # noqa: F401
-    from vslam.report import explorer, figures, render, seen_loops  # noqa: F401
+    from vslam.report import explorer, figures, loop_tables, render  # noqa: F401
 
     cv2.setNumThreads(1)
     detector = Oracle(RING, [float(k) for k in range(FRAMES)])

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 
 from vslam.camera import Camera
-from vslam.config import Config
 from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.datasets.sources import SourceOptions, open_source
-from vslam.run.outcome import RunOutcome, RunSettings
+from vslam.run.options import RunOptions
+from vslam.run.outcome import RunOutcome
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
 
@@ -222,8 +222,5 @@ def source_path(root: Path, kind: str) -> Path:
 
 def run_source(source, *, threads: int = 2, perturb: str = "none", **more) -> RunOutcome:
     """Odometry over a whole source; ``more`` goes to the settings."""
-    settings = RunSettings(
-        source.dataset, source.name, perturb, "none", "stereo", 0, threads, 0, 1, None, Config(),
-        **more,
-    )  # fmt: skip
+    settings = RunOptions(detector="none", perturb=perturb, threads=threads, **more)
     return run_sequence(source, parse_perturbation(perturb, 0), settings, Recorder())

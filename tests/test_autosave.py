@@ -39,7 +39,7 @@ from vslam.run.autosave import (
     remove_autosave,
 )
 from vslam.run.options import RunOptions, read_options, write_options
-from vslam.run.outcome import RunOutcome, RunSettings, ground_truth_of
+from vslam.run.outcome import RunOutcome, ground_truth_of
 from vslam.run.pipeline import _with_earlier, run_sequence
 from vslam.run.progress import Progress, TrackLog, TrackTable, read_progress, write_progress
 from vslam.run.recorder import Recorder
@@ -75,9 +75,7 @@ def drive(
 ) -> RunOutcome:
     """Run over the corridor; with a folder, saving whenever that is possible."""
     sequence = change(open_sequence("kitti", root, "00"))
-    settings = RunSettings(
-        "kitti", "00", "none", "bow", "stereo", 0, 2, 0, 1, None, config, compare=compare
-    )
+    settings = RunOptions(detector="bow", threads=2, thresholds=config, compare=compare)
     autosave = {} if folder is None else {"autosave": FolderAutosave(folder, 1e-6, "kitti 00")}
     return run_sequence(
         sequence,
@@ -380,6 +378,12 @@ def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
         f"error: {folder}: another process is still running here; wait until it is done.\n"
     )
     (folder / LOCK).touch()  # killed
+    options = read_options(folder)
+    write_options(folder, options.model_copy(update={"detector": "uninstalled"}))
+    unknown = vslam("run", "--resume", folder, *brief, cwd=tmp_path)
+    assert unknown.returncode == 2
+    assert f"--resume {folder}: detector uninstalled: unknown; choose one of none" in unknown.stderr
+    write_options(folder, options)
     elsewhere = tmp_path / "elsewhere.txt"
     elsewhere.write_text("kept")
     (folder / "report.md").symlink_to(elsewhere)
@@ -387,8 +391,12 @@ def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
     assert linked.returncode == 2
     assert f"{folder / 'report.md'}: this is a link" in linked.stderr
     (folder / "report.md").unlink()
-    resumed = vslam("run", "--resume", folder, *brief, "--save-map", "town.npz", cwd=tmp_path)
+    shown = ("--no-record", "--no-report", "--save-map", "town.npz")
+    resumed = vslam("run", "--resume", Path("runs/latest"), *shown, cwd=tmp_path)
     assert resumed.returncode == 0, resumed.stderr
+    assert "continuing at frame 12 ..." in resumed.stderr
+    assert f"runs/{folder.name}" in resumed.stdout
+    assert "runs/latest" not in resumed.stdout  # which is another run after the next one
     assert elsewhere.read_text() == "kept"
     assert (tmp_path / "town.npz").read_bytes() == (folder / "map.npz").read_bytes()
     assert not (folder / LOCK).exists()

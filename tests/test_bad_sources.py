@@ -24,7 +24,7 @@ from source_files import (
     write_video,
 )
 
-from vslam.datasets import live_camera, video
+from vslam.datasets import video
 from vslam.datasets.frames import selected
 from vslam.datasets.sources import SourceOptions
 from vslam.errors import InputError
@@ -250,7 +250,7 @@ def test_cameras(folder, tmp_path, monkeypatch, side_by_side):
     refused("camera 127.0.0.1/a: cannot be opened", "camera", url, side_by_side)
     refused("--side-by-side .* or run with --sensor mono", "camera", "77", SourceOptions())
     (tmp_path / "video77").touch()
-    monkeypatch.setattr(live_camera, "_DEVICES", tmp_path)
+    monkeypatch.setattr(video, "_DEVICES", tmp_path)
     refused("the device is busy or not a camera; end other", "camera", "77", side_by_side)
     refused("no such device; there are 77", "camera", "76", side_by_side)
 

@@ -376,7 +376,11 @@ def test_other_thresholds_are_other_rows_and_overwrite_nothing(bench, stub: Path
 
 def test_help_begins_with_the_table_of_the_mission():
     text = CliRunner().invoke(app, ["bench", "--help"], env={"COLUMNS": "100"}).output
-    examples = [line.split("(")[0].split() for line in text.splitlines() if "  vslam" in line]
+    examples = [
+        line.split("(")[0].split()
+        for line in text.splitlines()
+        if line.strip().startswith("vslam ")
+    ]
     assert examples[:2] == [["vslam", "bench"], ["vslam", "bench", "--dataset", "synthetic"]]
 
 

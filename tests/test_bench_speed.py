@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import csv
 import importlib
 import sys
 from pathlib import Path
@@ -16,13 +17,12 @@ TOOLS = Path(__file__).parents[1] / "tools"
 def speed(monkeypatch):
     monkeypatch.syspath_prepend(str(TOOLS))
     yield importlib.import_module("bench_speed")
-    for name in ("bench_speed", "systems"):
-        sys.modules.pop(name, None)
+    sys.modules.pop("bench_speed", None)
 
 
 def made_run(speed, report, held=(), memory_mb=300.0):
-    process = speed.systems.Process("", 10.0, 15.0, memory_mb, list(held))
-    return speed.Run(process, report, 0, (0, 0, 0), "")
+    process = speed.Process("", 10.0, 15.0, memory_mb, list(held))
+    return speed.Run(process, report, 0, 0, Path("trajectory.txt"))
 
 
 def test_a_case_is_a_title_and_a_place(speed, kitti_tree):
@@ -58,18 +58,15 @@ def test_comparison_has_medians_and_ratios(speed):
     assert alone.splitlines()[2] == "| frames/s, whole process ↑ | 10.0 |"
 
 
-def test_latency_of_orbslam3_is_left_out_where_it_is_silent(speed, kitti_tree):
+def test_latency_of_both_systems(speed, kitti_tree):
     case = speed.Case("", kitti_tree, "00", 28)
     report = {"latency_ms": {"median": 40.0, "p95": 50.0, "p99": 55.0}, "dropped_frames": 0}
     ours = made_run(speed, report)
-    silent, talking = (
-        made_run(speed, {}),
-        made_run(speed, {"track_ms_median": 60.0, "track_ms_p95": 90.0}),
-    )
-    short = speed.latency({speed.LIVE: [ours], speed.ORBSLAM3: [silent]}, case)
-    assert short.splitlines()[2] == "| vslam, image to pose, 10 Hz | 40 | 50 | 55 | 0 |"
-    assert "ORB-SLAM3" not in short
-    assert "| 60 | 90 | | |" in speed.latency({speed.LIVE: [ours], speed.ORBSLAM3: [talking]}, case)
+    theirs = made_run(speed, {"track_ms_median": 60.0, "track_ms_p95": 90.0})
+    alone = speed.latency({speed.LIVE: [ours]}, case)
+    assert alone.splitlines()[2] == "| vslam, image to pose, 10 Hz | 40 | 50 | 55 | 0 |"
+    assert "ORB-SLAM3" not in alone
+    assert "| 60 | 90 | | |" in speed.latency({speed.LIVE: [ours], speed.ORBSLAM3: [theirs]}, case)
 
 
 def test_a_keyframe_costs_what_memory_grew_by(speed):
@@ -88,8 +85,9 @@ def test_what_people_wrote_stays_on_the_page(speed, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_runs_the_systems_in_turn(speed, kitti_tree, monkeypatch, capsys):
+def test_the_command_runs_the_systems_in_turn(speed, kitti_tree, monkeypatch, capsys, tmp_path):
     words = ["--case", f"ring={kitti_tree}:00:28", "--repeats", "1", "--also", "none"]
+    words += ["--csv", str(tmp_path / "speed.csv")]
     monkeypatch.setattr(sys, "argv", ["bench_speed.py", *words])
     speed.main()
     out, err = capsys.readouterr()
@@ -100,4 +98,10 @@ def test_the_command_runs_the_systems_in_turn(speed, kitti_tree, monkeypatch, ca
         *(f"ring, {system}" for system in (*turn[:2], "vslam --realtime", turn[2])),
     ]
     (memory,) = (line for line in out.splitlines() if line.startswith("| peak memory"))
-    assert all(float(cell) > 50 for cell in memory.split("|")[2:5])
+    cells = [cell.strip() for cell in memory.split("|")[2:5]]
+    assert all(float(cell) > 50 for cell in cells)
+    with (tmp_path / "speed.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["case"], row["system"], row["memory_mb"]) for row in rows] == [
+        ("ring", system, cell) for system, cell in zip(turn, cells, strict=True)
+    ]

@@ -235,13 +235,11 @@ def test_features_are_grouped_by_node(tree):
     assert len(index_nodes(np.empty(0, np.int32)).node) == 0
 
 
-def match_in_plain_python(a, b, use_a, use_b, node_a, node_b, max_distance, ratio):
+def match_in_plain_python(a, b, node_a, node_b, max_distance, ratio):
     """Closest of the same node, then each of b to the closest of a, the earlier node of equals."""
     bits_a, bits_b = (np.unpackbits(x.view(np.uint8), axis=1) for x in (a, b))
     table = (bits_a[:, None] != bits_b[None]).sum(axis=2)
     table[node_a[:, None] != node_b[None]] = 999
-    table[~use_a] = 999
-    table[:, ~use_b] = 999
     wishes: dict[int, list[tuple[int, int, int]]] = {}
     for i in range(len(a)):
         order = np.sort(table[i])
@@ -261,14 +259,12 @@ def test_matching_by_node_is_matching_within_nodes():
     noise = np.packbits(rng.random((len(b), 256)) < 0.04, axis=1)
     b = (b ^ noise)[rng.permutation(len(b))]
     tree = train([a], 4, 2)
-    use_a, use_b = rng.random(len(a)) < 0.9, rng.random(len(b)) < 0.9
     node = tree.ancestors(1)
     node_a, node_b = node[tree.words(a)], node[tree.words(b)]
     for max_distance, ratio in ((50, 0.75), (256, 1.0), (10, 0.9)):
-        expected = match_in_plain_python(a, b, use_a, use_b, node_a, node_b, max_distance, ratio)
+        expected = match_in_plain_python(a, b, node_a, node_b, max_distance, ratio)
         got = match_by_node(
-            *index_nodes(node_a), a.view(np.uint64), use_a,
-            *index_nodes(node_b), b.view(np.uint64), use_b,
+            *index_nodes(node_a), a.view(np.uint64), *index_nodes(node_b), b.view(np.uint64),
             max_distance, ratio,
         )  # fmt: skip
         np.testing.assert_array_equal(got, expected)

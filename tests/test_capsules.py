@@ -74,10 +74,16 @@ def test_routing_turns_to_the_majority():
     assert later[0] > 0.3
 
 
+def routed(u, W, iterations, over="primary", alive=None):
+    """Output capsules and coupling coefficients."""
+    v, e, total = capsules.route(u, W, iterations, over, alive)
+    return v, capsules.couplings(e, total)
+
+
 def test_one_iteration_by_hand():
     u = torch.tensor([[[[1.0, 0.0], [0.0, 1.0]]]])  # one image, one type, two places
     W = torch.tensor([[[[2.0, 0.0], [0.0, 4.0]]]])  # (J, T, A, D) = (1, 1, 2, 2)
-    v, c = capsules.route(u, W, iterations=2)
+    v, c = routed(u, W, iterations=2)
     # s = (1, 2), |s|² = 5; agreement of (2, 0) and (0, 4) with v = s sqrt(5) / 6
     b = torch.tensor([2.0, 8.0]) * 5**0.5 / 6
     expected = torch.softmax(b, 0)
@@ -94,7 +100,7 @@ def test_factored_routing_is_the_paper_s_routing(over, iterations, some_dead):
     u, W = capsules.squash(torch.randn(3, 5, 9, 4) * 2), torch.randn(6, 5, 4, 7)
     alive = torch.rand(45) > 0.3 if some_dead else None
     wanted = reference_routing.route(reference_routing.predict(u, W), iterations, over, alive)
-    for mine, reference in zip(capsules.route(u, W, iterations, over, alive), wanted, strict=True):
+    for mine, reference in zip(routed(u, W, iterations, over, alive), wanted, strict=True):
         assert torch.allclose(mine, reference, atol=1e-5)
 
 
@@ -106,7 +112,7 @@ def test_gradients_are_finite_and_pass_through_the_last_iteration_only(over, ite
     u = capsules.squash(torch.randn(2, 3, 4, 5)).requires_grad_()
     W = torch.randn(2, 3, 5, 6, requires_grad=True)
     alive = torch.rand(12) > 0.3 if some_dead else None
-    v, c = capsules.route(u, W, iterations, over, alive)
+    v, c = routed(u, W, iterations, over, alive)
     assert not c.requires_grad
     by_hand = capsules.squash(reference_routing.combine(c, reference_routing.predict(u, W)))
     weight = torch.randn_like(v)

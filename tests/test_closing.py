@@ -18,7 +18,7 @@ from vslam.geometry import inverse
 from vslam.hypotheses import Hypothesis, joined_submaps, solve
 from vslam.loopclosure.detector import NoDetector
 from vslam.loopclosure.verification import verify
-from vslam.loopclosure.verifier import OrbVerifier
+from vslam.loopclosure.verifier import Verifier
 from vslam.loops import LoopCandidate
 from vslam.map import UNPREDICTED
 from vslam.slam import Slam
@@ -239,7 +239,7 @@ def test_two_seconds_of_darkness_lose_no_pose(check_map):
     check_map(slam.map)
 
 
-class Accepting(OrbVerifier):
+class Accepting(Verifier):
     """Takes every candidate for one and the same verified loop."""
 
     def __init__(self, edge):
@@ -364,7 +364,7 @@ def test_loop_closing_restored_from_its_state_closes_the_loop_that_waits():
     config = Config(consistency=ConsistencyConfig(min_keyframes=1, min_verified=2))
 
     def create():
-        return LoopClosing(NoDetector(), OrbVerifier(config, CAMERA), CAMERA, config, threads=1)
+        return LoopClosing(NoDetector(), Verifier(config, CAMERA), CAMERA, config, threads=1)
 
     stopped, restored, fresh = create(), create(), create()
     stopped.count_reused_keyframe(last - 1)

@@ -55,7 +55,9 @@ def test_a_place_must_resemble_three_keyframes_in_a_row():
         consistent, rejected = consistency.update(query, candidates(query, 10 + turn), STREET)
         assert len(consistent) == (turn >= 2)
         assert [edge.reason for edge in rejected] == (
-            [] if turn >= 2 else [f"resembled {turn + 1} of 3 keyframes in a row"]
+            []
+            if turn >= 2
+            else [f"proposed for only {turn + 1} of the 3 consecutive keyframes needed"]
         )
         assert all((e.query, e.accepted) == (query, False) for e in rejected)
 
@@ -97,11 +99,11 @@ def test_overlapping_groups_do_not_multiply():
     for query in range(110, 140):
         matches = [20 + (query + i) % 10 for i in range(10)]
         consistency.update(query, candidates(query, *matches), STREET)
-        assert consistency.n_groups <= 10
+        assert len(consistency.state().places) <= 10
     for query in range(140, 170):  # and those that nothing continues are forgotten
         apart = [1000 * query + 20 * i for i in range(10)]
         consistency.update(query, candidates(query, *apart), STREET)
-        assert consistency.n_groups <= 30
+        assert len(consistency.state().places) <= 30
 
 
 def test_the_same_group_twice_counts_once():
@@ -109,7 +111,7 @@ def test_the_same_group_twice_counts_once():
     consistent, rejected = consistency.update(110, candidates(110, 10, 10, 10, 11), STREET)
     assert consistent == []
     assert len(rejected) == 4
-    assert consistency.n_groups == 2
+    assert len(consistency.state().places) == 2
 
 
 # -- verified ones --------------------------------------------------------------------------------

@@ -68,7 +68,7 @@ SIBLINGS = {
 # A benchmark starts the command line in processes of its own: nothing comes back but files.
 STARTED = {
     ("vslam.lab.bench.execute", "vslam.cli.child"),
-    ("vslam.cli.stress", "vslam.cli.child"),
+    ("vslam.cli.cells", "vslam.cli.child"),
     ("vslam.lab.loopbench.cost", "vslam.lab.loopbench.cost"),
     ("vslam.run.warmup", "vslam.run.warmup"),
 }
@@ -83,6 +83,7 @@ ONLY_IN = {
     "evo": "vslam.evaluation.trajectories",
     "distributed": "vslam.lab.bench.cluster",
     "rosbags": ("vslam.datasets.bag", "vslam.datasets.bag_limits", "vslam.maps.ros"),
+    "pymap3d": "vslam.datasets.fixes",
     "PIL": "vslam.datasets.image_folders",
     "pyorbslam3": "vslam.lab.stress.orbslam3",
     "deflate": "vslam.datasets.png",

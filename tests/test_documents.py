@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import csv
-import json
 import re
 import subprocess
 from pathlib import Path
@@ -107,17 +106,6 @@ def test_tables_are_rectangular(table):
     rows = list(csv.reader(table.open(encoding="utf-8")))
     assert len(rows) > 1
     assert {len(row) for row in rows} == {len(rows[0])}
-
-
-def test_the_table_of_drives_is_made_from_its_figures(monkeypatch, tmp_path):
-    """drives.csv is what tools/synth_table.py writes of the rows kept beside it."""
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
-    import synth_table
-
-    kept = ROOT / "docs" / "research" / "results" / "drives.json"
-    synth_table._write(tmp_path / "drives.csv", json.loads(kept.read_text()))
-    assert (tmp_path / "drives.csv").read_text() == kept.with_suffix(".csv").read_text()
-    assert (tmp_path / "drives.json").read_text() == kept.read_text()
 
 
 def test_the_table_of_modules_is_made_from_their_docstrings(monkeypatch):

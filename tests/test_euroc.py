@@ -11,14 +11,13 @@ import pytest
 from conftest import StereoSequence
 from scipy.spatial.transform import Rotation
 
-from vslam.config import Config
 from vslam.datasets import open_sequence
+from vslam.datasets.association import poses_at
 from vslam.datasets.euroc import open_euroc
-from vslam.datasets.ground_truth import poses_at
 from vslam.datasets.perturbation import Perturbation
 from vslam.errors import InputError, UnreadableImageError
 from vslam.geometry import se3_exp
-from vslam.run.outcome import RunSettings
+from vslam.run.options import RunOptions
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
 from vslam.trajectory import Trajectory
@@ -229,10 +228,6 @@ def test_missing_data_and_images(root):
 def test_the_real_vehicle_stands_still():
     sequence = open_euroc(REAL, "", start=21, max_frames=25)
     assert sequence.ground_truth is not None
-    settings = RunSettings(
-        dataset="euroc", sequence=sequence.name, perturb="none", detector="none", sensor="stereo",
-        seed=0, threads=1, start=21, every=1, max_frames=25, config=Config(),
-    )  # fmt: skip
-    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
+    outcome = run_sequence(sequence, Perturbation("none"), RunOptions(detector="none"), Recorder())
     moved = np.linalg.norm(outcome.trajectory.T_wc[:, :3, 3], axis=1)
     assert moved.max() < 0.005

@@ -23,7 +23,6 @@ from test_report import make_outcome
 
 from vslam.config import as_config
 from vslam.errors import InputError
-from vslam.features import Features
 from vslam.lab.overview.serve import list_runs, make_server
 from vslam.report.explorer import explorer_data
 from vslam.report.folder import evaluate_run, matched_ground_truth, write_results
@@ -37,13 +36,11 @@ def filled(n_keyframes: int, every: int = 1) -> MomentRecorder:
     recorder, outcome = MomentRecorder(), make_outcome(n_keyframes * every)
     rng = np.random.default_rng(0)
     xy = np.stack([rng.uniform(0, 720, 50), rng.uniform(0, 200, 50)], axis=1).astype(np.float32)
-    none = np.zeros(50, np.float32)
-    features = Features(xy, none.astype(np.uint8), none, np.zeros((50, 32), np.uint8), none)
     for k, track in enumerate(outcome.tracks):
-        recorder.frame(track, np.eye(4))
+        recorder.frame(track)
         if k % every == 0:
             image = np.full((200, 720), k % 250, np.uint8)
-            recorder.keyframe(track, image, features, np.arange(50) < 20)
+            recorder.keyframe(track, image, xy, np.arange(50) < 20)
     return recorder
 
 
@@ -83,11 +80,10 @@ def test_a_moment_is_the_small_image_with_its_keypoints():
 def test_a_moment_knows_its_frame_where_others_were_dropped():
     some = MomentRecorder()
     tracks = make_outcome(12).tracks
-    features = Features.none()
     for frame in (0, 4, 8):  # a recorder is told of no dropped frame
-        some.frame(tracks[frame], np.eye(4))
+        some.frame(tracks[frame])
         image = np.zeros((200, 720), np.uint8)
-        some.keyframe(tracks[frame], image, features, np.zeros(0, np.bool_))
+        some.keyframe(tracks[frame], image, np.zeros((0, 2)), np.zeros(0, np.bool_))
     assert [moment.frame for moment in some.moments] == [0, 4, 8]
 
 
@@ -245,7 +241,8 @@ def server(run: Path, tmp_path: Path):
     bare = tmp_path / "bare"
     bare.mkdir()
     outcome = make_outcome(20)
-    settings = replace(outcome.settings, config=as_config({"orb.n_levels": 7}))
+    thresholds = as_config({"orb.n_levels": 7})
+    settings = outcome.settings.model_copy(update={"thresholds": thresholds})
     write_results(bare, replace(outcome, settings=settings), pages=False)
     (tmp_path / "secret.html").write_text("secret")
     made = make_server([run.parent, tmp_path])

@@ -6,6 +6,7 @@ import errno
 import json
 import struct
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -29,12 +30,9 @@ from vslam.geometry import inverses, se3_exp
 from vslam.loops import LoopEdge
 from vslam.map import Map
 from vslam.map_kernels import erase_landmark, link_many, unlink
-from vslam.maps import new_output
 from vslam.maps.colmap import save_colmap
-from vslam.maps.g2o import save_g2o
-from vslam.maps.keyframe_images import landmark_colours
-from vslam.maps.nerfstudio import save_nerfstudio
-from vslam.maps.ply import save_ply
+from vslam.maps.formats import landmark_colours, save_g2o, save_nerfstudio, save_ply
+from vslam.maps.new_output import new_output
 from vslam.maps.reconstruction import Reconstruction, reconstruction_of
 from vslam.maps.storage import load_map, save_map
 from vslam.maps.stored_map import StoredMap
@@ -361,7 +359,7 @@ def test_evo_reads_the_csv_of_euroc(tmp_path):
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
 def test_what_is_there_is_never_replaced(tmp_path, kind):
-    begin = new_output.new_file if kind == "file" else new_output.new_folder
+    begin = partial(new_output, folder=kind == "folder")
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "mine").write_text("mine")
     (tmp_path / "link").symlink_to("nowhere")
@@ -377,7 +375,7 @@ def test_what_is_there_is_never_replaced(tmp_path, kind):
 @pytest.mark.parametrize("kind", ["file", "folder"])
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), KeyError()])
 def test_a_failed_export_leaves_nothing(tmp_path, kind, error):
-    begin = new_output.new_file if kind == "file" else new_output.new_folder
+    begin = partial(new_output, folder=kind == "folder")
     told = ResultsError if isinstance(error, OSError) else KeyError
 
     def fail() -> None:
@@ -394,7 +392,7 @@ def test_a_failed_export_leaves_nothing(tmp_path, kind, error):
 
 def test_an_empty_folder_is_filled(tmp_path):
     (tmp_path / "made").mkdir()
-    with new_output.new_folder(tmp_path / "made") as part:
+    with new_output(tmp_path / "made", folder=True) as part:
         (part / "x").write_text("x")
     assert [path.name for path in tmp_path.rglob("*")] == ["made", "x"]
 

@@ -11,7 +11,7 @@ from vslam.camera import Camera
 from vslam.config import Config
 from vslam.features import Extracted, Features, Side
 from vslam.frontend.frame import Frame
-from vslam.frontend.relocalization import relocalise
+from vslam.frontend.relocaliser import relocalise
 from vslam.frontend.tracking import TrackingContext, refine
 from vslam.geometry import compose, se3_exp, transform
 from vslam.map import Map

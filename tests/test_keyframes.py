@@ -11,10 +11,10 @@ from parts import CAMERA, Points
 from vslam.config import Config, KeyframeConfig
 from vslam.frontend.frame import Frame
 from vslam.frontend.keyframes import (
-    CloseGain,
     KeyframeEvidence,
     KeyframePolicy,
     PlaceEvidence,
+    count_close,
     is_known_place,
     needs_keyframe,
     needs_monocular_keyframe,
@@ -98,13 +98,11 @@ def test_where_keyframes_bring_few_close_points_losing_most_of_those_makes_one()
 
 
 def test_that_close_points_are_few_by_nature_takes_several_keyframes_to_show():
-    gain = CloseGain(CONFIG)
-    means = []
+    state, means = policy().state(), []
     for _ in range(6):
-        gain.begin()
-        gain.add(50, 1)
-        gain.add(3, 2)  # later frames do not count
-        means.append(gain.mean)
+        state = count_close(replace(state, gain_awaited=True), 50, 1, CONFIG)
+        state = count_close(state, 3, 2, CONFIG)  # later frames do not count
+        means.append(state.gained_close)
     np.testing.assert_allclose(means, 50 + 150 * 0.8 ** np.arange(1, 7), rtol=1e-12)
     assert [mean < 100 for mean in means] == [False] * 4 + [True] * 2
 

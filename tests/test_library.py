@@ -22,7 +22,7 @@ from vslam.datasets.image_folders import open_images
 from vslam.datasets.kitti import list_kitti
 from vslam.errors import InputError
 from vslam.evaluation.trajectories import read_pair
-from vslam.maps.ply import save_ply
+from vslam.maps.formats import save_ply
 from vslam.maps.storage import load_map, made_with, map_file_of
 from vslam.report.finished_run import read_report, read_run
 from vslam.slam import Slam

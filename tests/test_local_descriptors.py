@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from reference_local import LocalHead, LocalNetwork, doubled
 from safetensors.torch import load_file
 
 from vslam.errors import InputError
@@ -13,9 +14,7 @@ from vslam.loopclosure.local_matching import positions
 from vslam.loopclosure.siamese import local_descriptors
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors, resized
 from vslam.loopclosure.siamese.weights import SHIPPED
-from vslam.loopclosure.training.export import export_local
-from vslam.loopclosure.training.local import LocalHead, LocalNetwork, doubled
-from vslam.loopclosure.training.siamese import build_network, load_network
+from vslam.loopclosure.training.siamese import load_network
 
 
 @pytest.fixture(scope="module")
@@ -120,12 +119,6 @@ def test_images_of_culled_keyframes_are_forgotten(network):
         images.maps(1)
 
 
-@pytest.mark.slow
-def test_export_reads_any_size(tmp_path):
-    torch.manual_seed(0)
-    branch = build_network("capsule", load_network(SHIPPED / "capsule.safetensors")[0].branch.shape)
-    path = tmp_path / "local.onnx"
-    export_local(LocalNetwork(branch.branch.extractor, LocalHead()), path)
-    found = LocalDescriptors(path)
-    assert found.describe(picture(0, 100, 640)).coarse.shape == (7, 40, 64)
-    assert found.describe(picture(0, 480, 640)).fine.shape == (120, 160, 32)
+def test_the_network_reads_any_size(network):
+    assert network.describe(picture(0, 100, 640)).coarse.shape == (7, 40, 64)
+    assert network.describe(picture(0, 480, 640)).fine.shape == (120, 160, 32)

@@ -101,7 +101,7 @@ def told(frames: list[int]) -> LoopPictureRecorder:
     pictures.begin(CAMERA, None)
     for frame in frames:
         image = np.full((CAMERA.height, CAMERA.width), frame, np.uint8)
-        pictures.keyframe(result(frame), image, features(8), np.ones(8, np.bool_))
+        pictures.keyframe(result(frame), image, features(8).xy, np.ones(8, np.bool_))
     return pictures
 
 

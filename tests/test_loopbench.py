@@ -20,9 +20,15 @@ from vslam.lab.loopbench import report as reporting
 from vslam.lab.loopbench.conditions import Condition, apply, clipped, parse_conditions, turned
 from vslam.lab.loopbench.cost import cost
 from vslam.lab.loopbench.detectors import BowScorer, DetectorSet, describe
-from vslam.lab.loopbench.measure import epipolar_inliers, measure, thinned
+from vslam.lab.loopbench.measure import (
+    LENGTH,
+    epipolar_inliers,
+    log_odds,
+    measure,
+    sequence_scores,
+    thinned,
+)
 from vslam.lab.loopbench.schema import LoopsJson, Verified
-from vslam.lab.loopbench.sequences import LENGTH, log_odds, sequence_scores
 from vslam.lab.loopbench.sets import QuerySet, TestSet, open_set
 from vslam.loopclosure.precision_recall import average_precision, precision_recall
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,8 @@ from vslam.errors import InputError
 from vslam.features import Extracted
 from vslam.geometry import inverse, inverses
 from vslam.loopclosure.registry import create_detector
-from vslam.maps.crop import in_box, near_frames, near_point
 from vslam.maps.storage import load_map, save_map
-from vslam.maps.stored_map import StoredMap, appended
+from vslam.maps.stored_map import StoredMap, appended, in_box, near_frames, near_point
 from vslam.merging import merge_maps
 from vslam.slam import Slam
 
@@ -193,6 +193,29 @@ def test_merge_names_what_meets_and_what_does_not(files, tmp_path):
     assert f"{files[3]}: left out" in result.output
     assert load_map(out).drives == ("ring 0", "ring 55")
     assert "drives 2: ring 0, ring 55" in " ".join(run("map", "info", out).output.split())
+
+
+def test_maps_are_merged_with_the_thresholds_of_the_first(drives, tmp_path):
+    strict = {"verification.min_inliers": 100_000}
+    for name, stored in (
+        ("usual", drives[0]),
+        ("strict", replace(drives[0], thresholds=strict)),
+        ("other", drives[2]),
+    ):
+        save_map(tmp_path / f"{name}.npz", stored)
+    usual, strict_file, other = (tmp_path / f"{n}.npz" for n in ("usual", "strict", "other"))
+    merge = ("map", "merge", "--quiet", "--out", tmp_path / "town.npz")
+    result = run(*merge, strict_file, other)
+    assert result.exit_code == 1
+    assert f"{other}: made with other thresholds than {strict_file}" in result.output
+    (tmp_path / "config.json").write_text("{}")
+    result = run(*merge, strict_file, other, "--config", tmp_path / "config.json")
+    assert result.exit_code == 0
+    assert "other thresholds" not in result.output
+    (tmp_path / "town.npz").unlink()
+    result = run(*merge, usual, other)
+    assert result.exit_code == 0
+    assert "other thresholds" not in result.output
 
 
 def test_a_merged_map_is_exported(drives, tmp_path):

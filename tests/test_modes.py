@@ -12,7 +12,7 @@ from vslam.features import Side, TrackingState
 from vslam.frontend.frame import Frame
 from vslam.frontend.tracker import Found, Tracker
 from vslam.map_frames import OldPlace
-from vslam.modes import Localising, MapBuilding
+from vslam.modes import MapBuilding, Mode
 from vslam.states import PolicyState
 
 POINTS = Points.create()
@@ -64,7 +64,7 @@ def found(frame: Frame) -> Found:
 def test_localising_leaves_the_map_alone():
     """To the byte, the counts of what frames saw included."""
     drive = Building.with_a_map()
-    mapper, mode = drive.mapper, Localising(drive.mapper)
+    mapper, mode = drive.mapper, Mode(drive.mapper)
     lost, tracked = drive.lost_frame(10), drive.placed_frame()
     before = bytes_of_map(mapper.complete())
     assert not mode.begin(lost)
@@ -85,7 +85,7 @@ def test_localising_tracks_by_the_keyframe_that_shares_the_most_with_a_frame():
     drive.mapper.merge()
     frame = drive.next_frame()
     drive.mapper.refer_to(0)
-    Localising(drive.mapper).update_map(frame, found(frame))
+    Mode(drive.mapper).update_map(frame, found(frame))
     assert drive.mapper.reference == 1
 
 

@@ -3,20 +3,12 @@ and does not with the bag of words."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from vslam.config import Config
-from vslam.datasets.kitti import open_kitti
 from vslam.datasets.perturbation import parse_perturbation
-from vslam.datasets.synthetic.routes import built_in_route
-from vslam.datasets.synthetic.site import Variation
-from vslam.datasets.synthetic.store import render_sequence
 from vslam.evaluation.loops import evaluate_loops
-from vslam.loopclosure.registry import DEFAULT_DETECTOR
-from vslam.run.outcome import RunSettings
+from vslam.run.options import RunOptions
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
 from vslam.slam import Slam
@@ -25,31 +17,9 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def round_the_block(tmp_path_factory):
-    """Once round a block at half the resolution, from noon to midnight: every second frame."""
-    route = built_in_route("block")
-    camera = route.camera
-    camera = replace(
-        camera,
-        fx=camera.fx / 2,
-        fy=camera.fy / 2,
-        cx=(camera.cx - 0.5) / 2,
-        cy=(camera.cy - 0.5) / 2,
-        width=camera.width // 2,
-        height=camera.height // 2,
-    )
-    smaller = replace(route, camera=camera, T_wc=route.T_wc[::2])
-    cache = tmp_path_factory.mktemp("night")
-    return open_kitti(render_sequence(smaller, Variation(seed=3, change=1.0), cache), "block")
-
-
-@pytest.fixture(scope="module")
 def compared(round_the_block):
     """The drive with the default detector and, beside it, with ``bow``."""
-    settings = RunSettings(
-        "synthetic", "block", "none", DEFAULT_DETECTOR, "stereo", seed=0, threads=2, start=0,
-        every=1, max_frames=None, config=Config(), compare=("bow",),
-    )  # fmt: skip
+    settings = RunOptions(threads=2, compare=("bow",))
     return run_sequence(round_the_block, parse_perturbation("none", 0), settings, Recorder())
 
 

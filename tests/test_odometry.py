@@ -13,7 +13,6 @@ from ring import Oracle
 from test_closing import DRIFTING, EXACT, ROUND, run
 from test_pose import CAMERA, TRUTH, observations
 
-from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import Perturbation
 from vslam.evaluation.odometry import motion_errors
@@ -31,7 +30,8 @@ from vslam.odometry import (
 )
 from vslam.report.figures import draw_figures
 from vslam.report.frame_table import write_covariances, write_frames
-from vslam.run.outcome import RunSettings, matched_ground_truth
+from vslam.run.options import RunOptions
+from vslam.run.outcome import matched_ground_truth
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
 from vslam.slam import Slam
@@ -240,13 +240,13 @@ def test_numbers_come_back_as_the_same_uncertainty():
 
 def test_the_report_draws_the_error_of_odometry_beside_two_sigma(kitti_tree):
     sequence = open_sequence("kitti", kitti_tree, "00")
-    settings = RunSettings("kitti", "00", "none", "none", "stereo", 0, 1, 0, 1, None, Config())
-    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
+    outcome = run_sequence(sequence, Perturbation("none"), RunOptions(detector="none"), Recorder())
     truth = matched_ground_truth(outcome)
     errors = motion_errors(outcome.tracks, truth, 1.0)
     assert len(errors.first) == 18  # of 28 frames in 2.7 s
     assert errors.distance.max() < 0.05
     drawn = [figure.name for figure in draw_figures(outcome, None, truth, None)]
     assert "odometry_error" in drawn
-    alone = replace(outcome, settings=replace(settings, sensor="mono"))
+    left = replace(sequence, camera=sequence.camera.left_camera())
+    alone = replace(outcome, sequence=left)
     assert "odometry_error" not in [f.name for f in draw_figures(alone, None, truth, None)]

@@ -21,9 +21,9 @@ from vslam.frontend.orb import (
     extract,
     features_per_level,
     orientations,
+    smoothed,
     with_keypoints,
 )
-from vslam.frontend.smoothing import smoothed
 
 
 def textured(height: int = 240, width: int = 320, seed: int = 0) -> np.ndarray:

@@ -18,9 +18,8 @@ from vslam.cli import main as cli
 from vslam.config import Config
 from vslam.errors import InputError
 from vslam.evaluation.trajectories import evaluate_trajectory
-from vslam.lab.overview import write_overview
 from vslam.lab.overview.collect import Found, collect, read_aligned
-from vslam.lab.overview.render import overview_page
+from vslam.lab.overview.render import overview_page, write_overview
 from vslam.lab.overview.schema import ALL, MEASURES, Drive, OverviewJson, RunEntry, Spread
 from vslam.lab.overview.summary import (
     compare,
@@ -33,6 +32,7 @@ from vslam.lab.overview.summary import (
 from vslam.lab.overview.versus import versus
 from vslam.report.page import Table
 from vslam.report.render import show
+from vslam.report.schema import DetectorFigures
 from vslam.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
 
 LAWS = ("none", "brightness:0.5", "brightness:1")
@@ -131,6 +131,28 @@ def test_rows_are_medians_with_spread(written):
     lights = [r.drive.perturb for r in report.rows if r.drive.sequence == "00"]
     assert list(dict.fromkeys(lights)) == list(LAWS)
     assert systems(report.rows) == ["none", "bow", "ORB-SLAM3"]
+
+
+def test_detectors_that_were_compared_in_a_run_are_systems_of_their_own(run_folder, tmp_path):
+    figures = json.loads((run_folder / "report.json").read_text())
+    known = DetectorFigures.model_fields
+    own = {k: figures[k] for k in known if k in figures} | {"seconds": 2.0}
+    others = [own | {"detector": "bow", "ate_rmse_m": 0.75}, own | {"detector": "none"}]
+    others[1]["interrupted"] = "failed"
+    folder = copy_run(
+        run_folder,
+        tmp_path / "run",
+        detector="both",
+        detectors=[own | {"detector": "both"}, *others],
+    )
+    shutil.copyfile(folder / "trajectory.tum", folder / "trajectory_bow.tum")
+    found = collect([tmp_path], [])
+    assert [run.system for run in found.runs] == ["both", "bow"]
+    assert [run.measures["fps"] for run in found.runs] == [None, None]
+    assert found.runs[1].measures["ate_rmse_m"] == 0.75
+    assert found.runs[1].drive == found.runs[0].drive
+    assert len(read_aligned(found, found.runs[1])[0]) == found.runs[1].frames
+    assert found.notes == [f"left out: none in {folder} (failed)"]
 
 
 def test_what_is_left_out_is_noted(written, runs: Path):
@@ -278,7 +300,7 @@ def test_a_row_for_each_sequence_and_condition_and_who_wins_over_all(two_conditi
         ("RPE (mm), bow", "20.0"), ("RPE (mm), both", "20.0"), ("RPE (°), bow", "0.050"),
         ("RPE (°), both", "0.050"), ("loops, bow", "0 of 1"), ("loops, both", "1 of 1"),
     ]  # fmt: skip
-    assert "Loops: revisits that were found, of those in the ground truth" in table.note
+    assert "Loops: revisits found, of those in the ground truth" in table.note
     lost, found, ate, rpe = points.sentences
     assert lost == "Lost frames: bow 6 in 18 runs, both 6 in 18 runs."
     assert found.endswith(": bow found 6 of 18, 0 wrong; both found 18 of 18, 0 wrong.")
@@ -371,7 +393,7 @@ def test_what_a_run_does_not_have_is_not_made_up():
     assert len(points.sentences) == 2  # nothing to compare
 
 
-@pytest.mark.parametrize(("ate", "part"), [(1.0, "cannot differ"), (1.5, "on shorter revisits")])
+@pytest.mark.parametrize(("ate", "part"), [(1.0, "cannot differ"), (1.5, "on shorter stretches")])
 def test_drives_without_a_revisit_are_told_once(ate, part):
     runs = [
         entry(name, sequence, value, perturb=light, **loops(0, 0))
@@ -381,7 +403,7 @@ def test_drives_without_a_revisit_are_told_once(ate, part):
     ]
     first, section = versus(summarize(Found(runs, [])))
     (sentence,) = first.parts
-    assert sentence.startswith("No drive has a revisit of 20 m or more")
+    assert sentence.startswith("No drive revisits a stretch of 20 m or more")
     assert part in sentence
     assert section.parts[0].rows[0][-2:] == ("-", "-")
 

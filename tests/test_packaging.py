@@ -93,11 +93,18 @@ def test_its_metadata_are_complete(wheels):
     classifiers = metadata.get_all("Classifier") or []
     for version in ("3.11", "3.12", "3.13"):
         assert f"Programming Language :: Python :: {version}" in classifiers
-    assert {"bag", "cluster", "docs", "dev", "train"} == set(
+    assert {"bag", "cluster", "docs", "dev", "gps", "train"} == set(
         metadata.get_all("Provides-Extra") or []
     )
     assert "vslam = vslam.cli.main:main" in points
     assert "# vslam" in str(metadata.get_payload())
+
+
+def test_an_old_python_is_refused_in_one_sentence():
+    code = "import sys, setuptools; sys.modules['tomllib'] = None; import setup"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith("vslam needs Python 3.11 or later; this is Python 3.")
 
 
 def readme_for(source: str, tmp_path: Path) -> str:
@@ -142,13 +149,14 @@ def test_a_plain_installation_stays_lean():
     assert not [name for name in extras if re.search(rf"\b{name}\b", plain)]
     for library, extra, where in (
         ("rosbags", "bag", "vslam/datasets/bag.py"),
+        ("pymap3d", "gps", "vslam/datasets/fixes.py"),
         ("distributed", "cluster", "vslam/lab/bench/cluster.py"),
         ("torch", "train", "vslam/cli/train.py"),
     ):
         assert library in extras
         assert f"vslam[{extra}]" in (ROOT / where).read_text()
     # `make test` installs all of them.
-    assert "vslam[bag,cluster,docs,train]" in PROJECT["optional-dependencies"]["dev"]
+    assert "vslam[bag,cluster,docs,gps,train]" in PROJECT["optional-dependencies"]["dev"]
 
 
 def test_a_comment_says_what_each_dependency_is_needed_for():
@@ -190,7 +198,7 @@ def test_the_image_is_not_root_and_copies_what_exists():
     ("file", "at_least"),
     [
         (".devcontainer/devcontainer.json", {"dev", "demo", "test"}),
-        (".ci/run", {"check", "test"}),
+        (".ci/run", {"check", "figures-check", "test"}),
         (".github/workflows/ci.yml", {"test-fast"}),
         (".pre-commit-config.yaml", {"types", "dev"}),
     ],

@@ -10,7 +10,6 @@ import pytest
 from rich.console import Console
 
 from vslam.errors import InputError, ResultsError
-from vslam.report.document import Document
 from vslam.report.drawing import LOW, Drawing, draw, new_figure
 from vslam.report.page import (
     Alert,
@@ -26,6 +25,7 @@ from vslam.report.page import (
     Tiles,
 )
 from vslam.report.render import csv_text, html, markdown, show, write_files
+from vslam.report.schema import Document
 
 JPEG = b"\xff\xd8\xff"
 TABLE = Table(("what", "ATE (m), bow"), [("a | b", "1.0"), ("<b>", "12.5")], ("what",), "Medians.")
@@ -150,8 +150,8 @@ def test_files_that_cannot_be_written_are_named(tmp_path: Path):
     assert (tmp_path / "new" / "a.md").read_text("utf-8") == "ä"
     assert (tmp_path / "new" / "b.jpg").read_bytes() == JPEG
     (tmp_path / "file").touch()
-    with pytest.raises(ResultsError, match=r"file: the report cannot be written .*; free space\."):
-        write_files(tmp_path / "file", {}, "free space")
+    with pytest.raises(ResultsError, match=r"a\.md: cannot be written .*; free space\."):
+        write_files(tmp_path / "file", {"a.md": ""}, "free space")
 
 
 def test_csv():

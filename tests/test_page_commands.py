@@ -132,6 +132,7 @@ RULES = {
     ),
     "docs/howto/kitti.md": Rules(),
     "docs/howto/masks.md": Rules(),
+    "docs/howto/gps.md": Rules(),
     "docs/howto/tum.md": Rules(),
     "docs/howto/untrusted.md": Rules((("--inputs 1000", "--inputs 2 --readers trajectory"),)),
     "docs/howto/lifelong.md": Rules(
@@ -148,9 +149,14 @@ RULES = {
     ),
     "docs/research/local_descriptors.md": Rules(
         not_run=(
-            ("python tools/", HOURS),
             ("vslam loops bench", REAL),
-            ("vslam synth block", AGAIN),
+            ("vslam bench", HOURS),
+        )
+    ),
+    "docs/research/gps.md": Rules(
+        not_run=(
+            ("vslam run", "test_gps.py runs a short drive"),
+            ("python tools/experiments/gps", "test_gps.py runs it"),
         )
     ),
     "docs/research/uncertainty.md": Rules(
@@ -175,8 +181,7 @@ RULES = {
     "docs/research/motorway.md": Rules(
         not_run=(
             ("ORBSLAM3=", ORBSLAM),
-            ("TABLE=", ORBSLAM),
-            ("$TABLE", ORBSLAM),
+            ("vslam bench", ORBSLAM),
         )
     ),
     "docs/research/online.md": Rules(
@@ -189,9 +194,10 @@ RULES = {
         not_run=(
             ("ORBSLAM3=", ORBSLAM),
             ("python tools/bench_speed.py", ORBSLAM),
-            ("SYNTH=", ORBSLAM),
-            ("$SYNTH", ORBSLAM),
-            ("vslam bench --dataset synthetic", HOURS),
+            ("for n in 00", HOURS),
+            ("BENCH=", ORBSLAM),
+            ("$BENCH", ORBSLAM),
+            ("vslam bench", HOURS),
         )
     ),
     "docs/howto/rgbd.md": Rules(
@@ -404,6 +410,13 @@ def _video_and_mask(desk: Path, corridor) -> None:
     cv2.imwrite("hood.png", np.pad(np.full((110, 480), 255, np.uint8), ((0, 50), (0, 0))))
 
 
+def _fixes(desk: Path, corridor) -> None:
+    """A row north of one metre is 9 millionths of a degree."""
+    north = enumerate(corridor.T_wc[:N, 2, 3].tolist())
+    rows = [f"{0.1 * k},{48 + 9e-6 * metres:.9f},11,500,0.01" for k, metres in north]
+    (desk / "fixes.csv").write_text("\n".join(["time,latitude,longitude,altitude,sigma", *rows]))
+
+
 def _depth_sources(desk: Path, corridor) -> None:
     """Images in ``FOLDER``, a bag with depth."""
     c = corridor.camera
@@ -478,6 +491,7 @@ PREPARE: dict[str, Callable[[Path, object], None]] = {
     "docs/howto/bench.md": _earlier_run,
     "docs/howto/calibrate.md": _videos,
     "docs/explanation/design.md": _image,
+    "docs/howto/gps.md": _fixes,
     "docs/howto/masks.md": _video_and_mask,
     "docs/howto/rgbd.md": _depth_sources,
     "docs/howto/sources.md": _pair_sources,

@@ -18,7 +18,7 @@ from vslam.frontend.orb import build_pyramid, level_shapes
 from vslam.frontend.pose_alignment import align_pose, coarse_levels, coarse_pyramid, coarse_shapes
 from vslam.frontend.tracking import TrackingContext, feature_depth
 from vslam.geometry import inverse, se3_exp, se3_log, transform
-from vslam.run.outcome import RunSettings
+from vslam.run.options import RunOptions
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
 from vslam.slam import Slam
@@ -124,7 +124,7 @@ def run(kitti_tree, threads=1, sequence=None):
         return replace(frame, sides=(frame.sides[0], right))
 
     sequence = replace(sequence, stored=tuple(map(counted, sequence.stored)))
-    settings = RunSettings("kitti", "00", "none", "none", "stereo", 0, threads, 0, 1, None, CONFIG)
+    settings = RunOptions(detector="none", threads=threads, thresholds=CONFIG)
     outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     return outcome, reads
 

@@ -30,7 +30,8 @@ from vslam.frontend.tracking import TrackingContext
 from vslam.loops import LoopEdge
 from vslam.maps.storage import load_map, save_map
 from vslam.maps.stored_map import StoredMap
-from vslam.run.outcome import RunOutcome, RunSettings
+from vslam.run.options import RunOptions
+from vslam.run.outcome import RunOutcome
 from vslam.run.pipeline import _tell_loops, run_sequence
 from vslam.run.preparation import prepare_frame
 from vslam.run.recorder import Recorder
@@ -45,10 +46,7 @@ def run(root: Path, sequence: str = "00", *, threads: int = 2, perturb: str = "n
         compare: tuple[str, ...] = (), **options: object) -> RunOutcome:  # fmt: skip
     frames = open_sequence("kitti", root, sequence, max_frames=max_frames)
     perturbation = parse_perturbation(perturb, seed)
-    settings = RunSettings(
-        "kitti", sequence, perturb, detector, "stereo", seed, threads, 0, 1, max_frames, Config(),
-        compare=compare,
-    )  # fmt: skip
+    settings = RunOptions(detector=detector, threads=threads, compare=compare)
     return run_sequence(frames, perturbation, settings, Recorder(), **options)
 
 
@@ -67,9 +65,7 @@ def test_a_run_warns_of_the_calibration_of_other_images(kitti_tree):
     frames = open_sequence("kitti", kitti_tree, "00", max_frames=3)
     c = frames.camera
     twice = replace(c, fx=2 * c.fx, fy=2 * c.fy, cx=2 * c.cx, cy=2 * c.cy)
-    settings = RunSettings(
-        "kitti", "00", "none", "none", "stereo", 0, 1, 0, 1, 3, Config(), calib=(Path("a.yaml"),)
-    )
+    settings = RunOptions(detector="none", calib=(Path("a.yaml"),))
     source = replace(frames, camera=twice)
     outcome = run_sequence(source, parse_perturbation("none", 0), settings, Recorder())
     (said,) = outcome.warnings

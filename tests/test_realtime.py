@@ -19,9 +19,9 @@ from vslam.datasets import open_sequence
 from vslam.datasets.frames import TimedFrame
 from vslam.datasets.perturbation import Perturbation
 from vslam.features import TrackingState
-from vslam.run.outcome import RunSettings
+from vslam.run.options import RunOptions
 from vslam.run.pipeline import run_sequence
-from vslam.run.realtime import play
+from vslam.run.preparation import play
 from vslam.run.recorder import Recorder
 from vslam.slam import Slam
 
@@ -155,9 +155,7 @@ def test_frames_that_were_dropped_are_not_lost(corridor, check_map):
 @pytest.mark.parametrize("threads", [1, 2])
 def test_one_camera_in_real_time(kitti_tree, threads):
     sequence = open_sequence("kitti", kitti_tree, "00", max_frames=6, monocular=True)
-    settings = RunSettings(
-        "kitti", "00", "none", "none", "mono", 0, threads, 0, 1, 6, Config(), realtime=True
-    )
+    settings = RunOptions(detector="none", threads=threads, realtime=True)
     outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     assert len(outcome.tracks) == 6
     assert len(outcome.latency_ms) == sum(track.n_features > 0 for track in outcome.tracks) > 0
@@ -171,9 +169,7 @@ def test_an_unreadable_image_in_real_time(kitti_tree, threads, tmp_path):
     image = root / "sequences" / "00" / "image_0" / "000005.png"
     image.write_bytes(image.read_bytes()[:2000])
     sequence = open_sequence("kitti", root, "00", max_frames=6)
-    settings = RunSettings(
-        "kitti", "00", "none", "none", "stereo", 0, threads, 0, 1, 6, Config(), realtime=True
-    )
+    settings = RunOptions(detector="none", threads=threads, realtime=True)
     outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     assert len(outcome.trajectory) == len(outcome.tracks) == 6
     assert outcome.tracks[5].state == TrackingState.LOST
@@ -183,10 +179,7 @@ def test_an_unreadable_image_in_real_time(kitti_tree, threads, tmp_path):
 def test_a_compared_detector_drops_the_frames_that_the_main_one_drops(kitti_tree):
     """As a live camera has it, whose frames come once."""
     sequence = open_sequence("kitti", kitti_tree, "00", max_frames=8)
-    settings = RunSettings(
-        "kitti", "00", "none", "bow", "stereo", 0, 2, 0, 1, 8, Config(),
-        realtime=True, compare=("none",),
-    )  # fmt: skip
+    settings = RunOptions(detector="bow", threads=2, realtime=True, compare=("none",))
     outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
     (other,) = outcome.compared
     assert len(outcome.tracks) == len(other.tracks) == 8

@@ -98,12 +98,12 @@ def record(recorder: Recorder, frames: int = FRAMES, camera: Camera = CAMERA) ->
     map_ = Map(np.ones(8))
     for frame in range(frames):
         result = _result(frame)
-        recorder.frame(result, result.T_wc)
+        recorder.frame(result)
         if result.is_keyframe:
             features = _features(rng)
             # Equal images would be compressed away.
             image = np.roll(image, rng.integers(1, 100), axis=1)
-            recorder.keyframe(result, image, features, rng.random(2000) < 0.25)
+            recorder.keyframe(result, image, features.xy, rng.random(2000) < 0.25)
             new = rng.normal(0.0, 20.0, (LANDMARKS_PER_KEYFRAME, 3)) + result.T_wc[:3, 3]
             descriptors = np.zeros((LANDMARKS_PER_KEYFRAME, 4), np.uint64)
             T_cw = np.linalg.inv(result.T_wc)

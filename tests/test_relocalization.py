@@ -10,7 +10,7 @@ from test_verification import forward, in_strip, link_pass
 from vslam.config import Config, RelocalizationConfig
 from vslam.features import Extracted, Features
 from vslam.frontend.frame import Frame
-from vslam.frontend.relocalization import relocalise
+from vslam.frontend.relocaliser import relocalise
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_exp, se3_log
 from vslam.map_view import local_map

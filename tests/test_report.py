@@ -25,7 +25,8 @@ from vslam.report.schema import DetectorFigures, ReportJson
 from vslam.report.summary import summarize
 from vslam.report.trajectory_figures import loop_closing, top_view
 from vslam.run.loop_pictures import LoopPicture
-from vslam.run.outcome import RunOutcome, RunSettings, matched_ground_truth
+from vslam.run.options import RunOptions
+from vslam.run.outcome import RunOutcome, matched_ground_truth
 from vslam.trajectory import Trajectory, read_trajectory
 
 FIGURES = {
@@ -39,16 +40,16 @@ FIGURES = {
 }
 
 
+CAMERA = Camera(718.9, 718.9, 607.2, 185.2, 0.537, 1241, 376)
+
+
 @dataclass(frozen=True)
 class _Sequence:
     timestamps: NDArray[np.float64]
     ground_truth: NDArray[np.float64] | None
     dataset: str = "kitti"
+    camera: Camera = CAMERA
     name: str = "00"
-
-    @property
-    def camera(self) -> Camera:
-        return Camera(718.9, 718.9, 607.2, 185.2, 0.537, 1241, 376)
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -114,21 +115,10 @@ def make_outcome(
                 stage_ms=stage_ms,
             )
         )
-    settings = RunSettings(
-        dataset="kitti",
-        sequence="00",
-        perturb="brightness:1",
-        detector="none",
-        sensor="stereo",
-        seed=3,
-        threads=2,
-        start=0,
-        every=1,
-        max_frames=frames,
-        config=Config(),
-    )
     return RunOutcome(
-        settings=settings,
+        settings=RunOptions(
+            perturb="brightness:1", detector="none", seed=3, threads=2, max_frames=frames
+        ),
         sequence=_Sequence(timestamps, truth if ground_truth else None),
         trajectory=Trajectory(timestamps, T_wc),
         keyframes=Trajectory(timestamps[::keyframe_every], T_wc[::keyframe_every]),
@@ -184,10 +174,9 @@ def two_laps(frames: int = 500, *, keyframe_every: int = 4) -> RunOutcome:
         T_wc[:, 0, 3] += 8.0 * living / len(keyframe_frames)  # drift before, none after
         corrections.append(LoopCorrection(loop, living, np.linalg.inv(T_wc), T_cw_after, 0.12))
     timestamps = np.arange(frames) * 0.1
-    settings = replace(plain.settings, detector="bow", perturb="none")
     return replace(
         plain,
-        settings=settings,
+        settings=plain.settings.model_copy(update={"detector": "bow", "perturb": "none"}),
         sequence=_Sequence(timestamps, truth),
         trajectory=Trajectory(timestamps, estimate),
         keyframes=Trajectory(timestamps[keyframe_frames], estimate[keyframe_frames]),
@@ -433,7 +422,7 @@ def test_rejected_loops_do_not_drown_the_table(looped: tuple[RunOutcome, Path]) 
     assert "wrong" in rows[0]
     reasons = [line for line in blocks["Loops rejected"].splitlines() if line.startswith("|")][2:]
     assert len(reasons) == 2
-    assert "N inliers, N needed \\| <b>" in reasons[0]
+    assert "0-13 inliers, 20 needed \\| <b>" in reasons[0]
     assert [cell.strip() for cell in reasons[0].rsplit("|", 4)[1:4]] == ["299", "13", "n/a"]
     assert [cell.strip() for cell in reasons[1].rsplit("|", 4)[1:4]] == ["1", "84", "1 of 1"]
     assert text.count("needed") <= 14
@@ -556,7 +545,9 @@ def test_a_right_loop_on_a_revisit_too_short_to_count_is_explained() -> None:
     report = summarize(outcome, None, evaluate_loops(outcome), None)
     assert (report.revisit_stretches, report.loops_closed, report.loops[0].right) == (0, 1, True)
     note = headlines(report)[-1].note
-    assert note.startswith("no revisit of 20 m or more to be found (1 right on shorter ones), ")
+    assert note.startswith(
+        "the ground truth revisits no stretch of 20 m or more (1 right on shorter ones), "
+    )
 
 
 def test_before_is_drawn_in_the_frame_of_the_ground_truth() -> None:
@@ -582,9 +573,9 @@ def test_before_is_drawn_in_the_frame_of_the_ground_truth() -> None:
 
 
 def monocular(outcome: RunOutcome) -> RunOutcome:
-    settings = replace(outcome.settings, sensor="mono")
+    left = replace(outcome.sequence, camera=outcome.sequence.camera.left_camera())
     tracks = [replace(track, n_stereo=0) for track in outcome.tracks]
-    return replace(outcome, settings=settings, tracks=tracks)
+    return replace(outcome, sequence=left, tracks=tracks)
 
 
 @pytest.mark.parametrize("make", [make_outcome, two_laps])
@@ -613,7 +604,8 @@ def test_frames_lost_before_the_map_began_are_explained(tmp_path: Path) -> None:
     )
     stereo = headlines(report.model_copy(update={"sensor": "stereo"}))[0].note
     assert "2 of them before the map began; " in stereo
-    continued = replace(outcome, settings=replace(outcome.settings, map=tmp_path / "map.npz"))
+    settings = outcome.settings.model_copy(update={"map_file": tmp_path / "map.npz"})
+    continued = replace(outcome, settings=settings)
     assert report_of(continued, tmp_path).lost_before_map == 0
 
 
@@ -700,7 +692,8 @@ def test_many_lost_frames_send_the_reader_to_the_doctor(tmp_path, lost, expected
 @pytest.mark.slow
 def test_calibration_files_are_among_the_options(tmp_path):
     outcome = make_outcome(40)
-    settings = replace(outcome.settings, calib=(Path("left.yaml"), Path("right.yaml")))
+    files = (Path("left.yaml"), Path("right.yaml"))
+    settings = outcome.settings.model_copy(update={"calib": files})
     report = report_of(replace(outcome, settings=settings), tmp_path)
     assert report.calib == settings.calib
     assert "right.yaml" in (tmp_path / "report.md").read_text()

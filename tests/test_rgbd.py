@@ -15,18 +15,19 @@ from vslam.cli.main import app
 from vslam.config import Config, DepthConfig, KeyframeConfig
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import parse_perturbation
-from vslam.datasets.synthetic.rgbd import render_rgbd
+from vslam.datasets.synthetic.layouts import render_rgbd
 from vslam.datasets.synthetic.routes import built_in_route
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.tum import associate, open_tum
 from vslam.errors import InputError, UnreadableImageError
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.frontend.depth import columns_of_depth
-from vslam.frontend.extraction import extract_features
+from vslam.frontend.extraction import FrameImages
 from vslam.frontend.keyframes import KeyframeEvidence, needs_keyframe
 from vslam.frontend.tracking import TrackingContext
 from vslam.maps.storage import load_map, save_map
-from vslam.run.outcome import RunOutcome, RunSettings
+from vslam.run.options import RunOptions
+from vslam.run.outcome import RunOutcome
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
 from vslam.slam import Slam
@@ -88,17 +89,13 @@ def refused(root: Path, *parts: str, **options) -> None:
 
 def run_on(tree: Path, *, threads: int = 1, **options) -> RunOutcome:
     sequence = open_tum(tree, "", **options)
-    settings = RunSettings(
-        dataset="tum", sequence=sequence.name, perturb="none", detector="bow",
-        sensor=sequence.camera.sensor, seed=0, threads=threads, start=0, every=1, max_frames=None,
-        config=Config(),
-    )  # fmt: skip
+    settings = RunOptions(detector="bow", threads=threads)
     return run_sequence(sequence, parse_perturbation("none", 0), settings, Recorder())
 
 
 def ate_of(outcome: RunOutcome) -> float:
     truth = Trajectory(outcome.sequence.timestamps, outcome.sequence.ground_truth)
-    return evaluate_trajectory(outcome.trajectory, truth, outcome.settings.alignment).ate_rmse_m
+    return evaluate_trajectory(outcome.trajectory, truth, outcome.alignment).ate_rmse_m
 
 
 # Depth as a column
@@ -119,7 +116,7 @@ def test_features_without_depth_are_monocular(corridor):
     context = TrackingContext.create(camera, Config())
     depth = corridor_depth(camera, corridor.T_wc[0]).astype(np.float32)
     depth[:, :240] = 0.0
-    extracted = extract_features(corridor.left[0], depth, context)
+    extracted = FrameImages(corridor.left[0], lambda: depth, context).extracted
     features = extracted.features
     rows, columns = np.rint(features.xy).astype(int).T[::-1]
     known = np.isfinite(features.u_right)

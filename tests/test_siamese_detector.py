@@ -25,12 +25,12 @@ from vslam.closing import LoopClosing
 from vslam.config import Config, SiameseConfig
 from vslam.errors import InputError
 from vslam.features import Features
+from vslam.lab.loopbench.detectors import NetworkScorer
 from vslam.loopclosure.reach import beyond_reach
 from vslam.loopclosure.registry import detector_with_images
 from vslam.loopclosure.siamese.detector import SiameseDetector, open_detector
 from vslam.loopclosure.siamese.inference import LateNetwork, OnnxNetwork, open_network
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
-from vslam.loopclosure.siamese.scoring import NetworkScorer
 from vslam.loopclosure.siamese.weights import SHIPPED
 from vslam.loopclosure.training.export import (
     SIMILARITY_TOLERANCE,
@@ -379,8 +379,9 @@ def test_shipped_weights_know_a_place_again(name):
     about = open_network(name).about
     assert about["validation"]["average_precision"] > 0.4
     again = [np.uint8(np.roll(wall, 12, 1) * 0.7) for wall in WALLS]
-    network = NetworkScorer(name, None, "squash")
-    p = network.scores(network.embed(again), network.embed(WALLS))
+    network = NetworkScorer(name)
+    gallery = network.embed(WALLS)
+    p = np.stack([network.compare(one, gallery) for one in network.embed(again)])
     assert network.parameters < 3e6
     assert (p.argmax(1) == np.arange(len(WALLS))).mean() > 0.8
     assert sum(path.stat().st_size for path in SHIPPED.iterdir()) < 14e6

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from vslam.camera import Camera
 from vslam.config import Config
-from vslam.frontend.extraction import extract_features
+from vslam.frontend.extraction import FrameImages
 from vslam.frontend.sides import ComparedSides, Sides, balanced, compare_sides
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_exp
@@ -31,10 +32,14 @@ def darker(image: np.ndarray, stops: float, bias: float = 0.0) -> np.ndarray:
     return np.clip(np.rint(image * 2.0**-stops + bias), 0, 255).astype(np.uint8)
 
 
+def balance(left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return balanced(left, right, compare_sides(left, right, CONFIG))
+
+
 def test_sides_alike_stay_the_same_objects():
     left, right = scene()
     assert compare_sides(left, right, CONFIG) == Sides()
-    one, two = balanced(left, right, CONFIG)
+    one, two = balance(left, right)
     assert one is left
     assert two is right
 
@@ -45,14 +50,14 @@ def test_a_dark_side_is_measured_in_stops_and_brightened(stops):
     for ours, theirs, sign in ((left, darker(right, stops), 1), (darker(left, stops), right, -1)):
         found = compare_sides(ours, theirs, CONFIG)
         assert found.darker_stops == pytest.approx(sign * stops, abs=0.08)
-        one, two = balanced(ours, theirs, CONFIG)
+        one, two = balance(ours, theirs)
         for image, clean in ((one, left), (two, right)):
             assert np.abs(image.astype(float) - clean).mean() < 0.6 + 0.6 * 2**stops
 
 
 def test_a_shift_of_the_black_level_is_undone_with_the_gain():
     left, right = scene()
-    _, mended = balanced(left, darker(right, 1.0, bias=30.0), CONFIG)
+    _, mended = balance(left, darker(right, 1.0, bias=30.0))
     assert np.abs(mended.astype(float) - right).mean() < 2.0
 
 
@@ -72,7 +77,7 @@ def test_a_side_that_is_white_in_part_is_no_brighter_one(columns):
     glare[:, :columns] = 255
     for ours, theirs in ((glare, right), (right, glare)):
         assert compare_sides(ours, theirs, CONFIG) == Sides()
-    assert balanced(glare, right, CONFIG)[0] is glare
+    assert balance(glare, right)[0] is glare
 
 
 @pytest.mark.parametrize("side", [0, 1])
@@ -83,7 +88,7 @@ def test_a_bright_strip_that_one_side_sees_is_no_gain(side):
         image[:50] = 255  # the sky
     pair[side][50:66] = 150  # beyond the edge of the other image
     assert compare_sides(*pair, CONFIG) == Sides()
-    assert balanced(*pair, CONFIG)[side] is pair[side]
+    assert balance(*pair)[side] is pair[side]
 
 
 @pytest.mark.parametrize("side", [0, 1])
@@ -97,7 +102,7 @@ def test_a_sky_that_one_side_sees_is_no_gain(side, share, sky, noise):
     grain = noise * np.random.default_rng(1).normal(size=(rows, 400))
     pair[side][:rows] = np.clip(sky + grain, 0, 255)
     assert compare_sides(*pair, CONFIG) == Sides()
-    assert balanced(*pair, CONFIG)[1 - side] is pair[1 - side]
+    assert balance(*pair)[1 - side] is pair[1 - side]
 
 
 def test_a_gain_is_told_beside_glare_on_both_sides():
@@ -111,7 +116,7 @@ def test_what_is_no_gain_is_left_alone():
     left, right = scene()
     covered = right.copy()
     covered[:, :160] = 20
-    assert balanced(left, covered, CONFIG)[1] is covered
+    assert balance(left, covered)[1] is covered
     assert compare_sides(left, np.full_like(left, 90), CONFIG) == Sides()
 
 
@@ -147,7 +152,8 @@ def test_disparities_stay_true_when_a_side_is_dark(stops):
     left, right = scene()
     context = TrackingContext.create(CAMERA, Config())
     clean, dark = (
-        extract_features(left, r, context).features for r in (right, darker(right, stops))
+        FrameImages(left, partial(darker, right, by), context).extracted.features
+        for by in (0.0, stops)
     )
     for features, least in ((clean, 0.9), (dark, 0.7)):
         d = features.xy[:, 0] - features.u_right

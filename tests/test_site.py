@@ -35,7 +35,7 @@ LOADS = {"script": "src", "img": "src", "iframe": "src", "source": "src", "link"
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Built as ``make docs`` does, from a copy: the build writes pages beside the others."""
     root = tmp_path_factory.mktemp("site")
-    for name in ("docs", "loopclosure"):
+    for name in ("docs", "loopclosure", "tools"):
         shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
     for path in ROOT.glob("*.md"):
         shutil.copy(path, root)

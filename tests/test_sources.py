@@ -36,7 +36,6 @@ from typer.testing import CliRunner
 
 from vslam.camera import Camera
 from vslam.cli.main import app
-from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.bag_messages import grey_of
 from vslam.datasets.detection import detect_dataset
@@ -44,11 +43,12 @@ from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.image_folders import open_images
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.datasets.sources import SourceOptions
-from vslam.datasets.synthetic.video import write_side_by_side
+from vslam.datasets.synthetic.layouts import write_side_by_side
 from vslam.errors import InputError
 from vslam.features import TrackingState
 from vslam.report.folder import create_run_folder
-from vslam.run.outcome import RunOutcome, RunSettings
+from vslam.run.options import RunOptions
+from vslam.run.outcome import RunOutcome
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
 
@@ -316,9 +316,7 @@ def test_ctrl_c_is_the_regular_end_of_a_camera(folder, corridor, monkeypatch):
     monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
     options = SourceOptions(calib=(folder / "stereo.yaml",), side_by_side=True)
     source = open_from("camera", "0", options)
-    settings = RunSettings(
-        "camera", "0", "none", "none", "stereo", 0, 2, 0, 1, None, Config(), realtime=True
-    )
+    settings = RunOptions(detector="none", threads=2, realtime=True)
 
     def on_frame(result):
         if result.index == 30:

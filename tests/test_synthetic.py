@@ -18,13 +18,12 @@ from vslam.camera import Camera
 from vslam.cli.main import app
 from vslam.datasets import open_sequence
 from vslam.datasets.kitti import open_kitti
-from vslam.datasets.synthetic import houses, parse_drive, store, textures, vehicles, views
+from vslam.datasets.synthetic import parse_drive, store, textures, vehicles
 from vslam.datasets.synthetic import town as town_module
-from vslam.datasets.synthetic.camera_effects import sensor_image
 from vslam.datasets.synthetic.files import lock_of
 from vslam.datasets.synthetic.pairs import render_pairs
 from vslam.datasets.synthetic.passes import Passes, pass_starts
-from vslam.datasets.synthetic.render import Light, Renderer
+from vslam.datasets.synthetic.render import Light, Moment, Renderer, sensor_image
 from vslam.datasets.synthetic.routes import (
     CAMERA_HEIGHT,
     ROUTES,
@@ -37,6 +36,7 @@ from vslam.datasets.synthetic.site import ALIASES, Variation
 from vslam.datasets.synthetic.solids import turn
 from vslam.datasets.synthetic.town import build_town
 from vslam.errors import InputError
+from vslam.lab.loopbench import views
 
 CAMERA = Camera(360.0, 360.0, 300.3, 95.7, 0.54, 620, 190)
 BY_DAY = Light(np.array([0.0, -0.8, -0.6]), visibility=1e9, haze=0.0)
@@ -93,7 +93,7 @@ def dotted_world():
 def draw(surfaces, atlas, sky, T_wc, threads=1):
     renderer = Renderer(CAMERA, atlas, sky, threads)
     empty = cast_shadows(surfaces.select(surfaces.thing < -1), atlas, BY_DAY.sun)
-    views = renderer.stereo(surfaces, empty, BY_DAY, T_wc)
+    views = renderer.stereo(Moment(surfaces, empty, BY_DAY), T_wc)
     renderer.close()
     return views
 
@@ -183,7 +183,8 @@ def test_shadow_falls_away_from_the_sun():
     built = atlas.build()
     light = Light(np.array([-0.6, -0.8, 0.0]), visibility=1e9, haze=0.0)  # from the left
     renderer = Renderer(CAMERA, built, grey)
-    left, _ = renderer.stereo(scene, cast_shadows(scene, built, light.sun), light, np.eye(4))
+    moment = Moment(scene, cast_shadows(scene, built, light.sun), light)
+    left, _ = renderer.stereo(moment, np.eye(4))
     u, v, _ = CAMERA.project(np.array([[-1.5, 1.65, 13.0], [1.5, 1.65, 13.0], [4.0, 1.65, 13.0]])).T
     sunny, shaded, beyond = left.image[np.rint(v).astype(int), np.rint(u).astype(int)]
     assert shaded < 0.5 * sunny
@@ -196,7 +197,7 @@ def unpainted(monkeypatch):
     plain = np.full((2, 2), 99.0, np.float32)
     twice = (plain, plain)
     for module, names, value in (
-        (houses, ["facade"], twice),
+        (town_module, ["facade"], twice),
         (vehicles, ["_paint_side"], twice),
         (vehicles, ["_paint_end", "_paint_strip", "_paint_glass"], plain),
         (textures, ["foliage", "hedge", "fence", "sign"], twice),
@@ -228,14 +229,14 @@ def clearance(surfaces, cameras):
 def test_nothing_stands_near_a_camera_of_any_route(name, unpainted):
     route = built_in_route(name)
     town = build_town(route, Variation(change=0.5))
-    built = town.surfaces.select(np.arange(1, len(town.surfaces)))
-    assert len(built) > 1000
+    built = town.surfaces.select(np.arange(1, len(town.surfaces.origin)))
+    assert len(built.origin) > 1000
     assert clearance(built, route.T_wc[:, :3, 3]) >= 2.5
 
 
 def test_pairs_keep_clear_of_the_town_beside_the_route(route, unpainted):
     town = build_town(route, Variation(), aside=(-1.4, 1.4, 0.0))
-    built = town.surfaces.select(np.arange(1, len(town.surfaces)))
+    built = town.surfaces.select(np.arange(1, len(town.surfaces.origin)))
     for aside in (-1.4, -0.7, 0.7, 1.4):
         cameras = route.T_wc[:, :3, 3] + aside * route.T_wc[:, :3, 0]
         assert clearance(built, cameras) >= 2.5
@@ -246,12 +247,12 @@ def test_moving_cars_keep_clear(unpainted):
     route = built_in_route("demo")
     variation = Variation(moving=5)
     passes = Passes(route, town := build_town(route, variation), variation)
-    standing = len(town.surfaces)
+    standing = len(town.surfaces.origin)
     seen = 0
     for frame in range(0, len(route.T_wc), 6):
         moment = passes.at(frame)
-        cars = moment.surfaces.select(np.arange(standing, len(moment.surfaces)))
-        seen += len(cars) > 0
+        cars = moment.surfaces.select(np.arange(standing, len(moment.surfaces.origin)))
+        seen += len(cars.origin) > 0
         assert clearance(cars, route.T_wc[frame : frame + 1, :3, 3]) >= 2.5
     assert seen > 20
 
@@ -265,7 +266,7 @@ def test_sight_lines_are_closed_at_bends(unpainted):
     moment = Passes(route, town, Variation()).at(0)
     horizon = round(route.camera.cy) - 6
     for frame in range(5, len(route.T_wc), 50):
-        left, _ = renderer.stereo(moment.surfaces, moment.shadows, moment.light, route.T_wc[frame])
+        left, _ = renderer.stereo(moment, route.T_wc[frame])
         row = left.depth[horizon - 12 : horizon].max(axis=0)
         assert (row > 0).mean() > 0.97, frame
     renderer.close()
@@ -275,7 +276,7 @@ def test_sight_lines_are_closed_at_bends(unpainted):
 def test_aliased_facades_repeat(route, monkeypatch, unpainted):
     painted = []
     monkeypatch.setattr(
-        houses, "facade", lambda rng, *rest, **_: painted.append((rng.random(), rest[2]))
+        town_module, "facade", lambda rng, *rest, **_: painted.append((rng.random(), rest[2]))
         or (np.full((2, 2), 9.0),) * 2,
     )  # fmt: skip
     build_town(route, Variation())
@@ -295,7 +296,7 @@ def test_places_match_themselves_only(route, town):
     for frame, aside in ((4, 0.0), (4, 0.5), (56, 0.0)):
         T = route.T_wc[frame].copy()
         T[0, 3] += aside
-        view, _ = renderer.stereo(moment.surfaces, moment.shadows, moment.light, T)
+        view, _ = renderer.stereo(moment, T)
         image = sensor_image(view.image, route.camera, yaw_rate=0.0, night=0.0, key=(0, frame, 0))
         described.append(orb.detectAndCompute(image, None))
 
@@ -337,7 +338,7 @@ def test_same_seed_same_bytes_on_any_number_of_threads(route, rendered, tmp_path
 
 @pytest.mark.slow
 def test_views_are_the_left_images_of_the_drive(route, town, rendered, tmp_path, monkeypatch):
-    monkeypatch.setattr(views, "build_town", lambda *_: town)
+    monkeypatch.setattr(store, "build_town", lambda *_: town)
     seen = []
     for _ in range(2):
         args = (route, Variation(seed=3), tmp_path, (0, 2))
@@ -385,7 +386,7 @@ def test_rendering_resumes_after_a_kill(route, town, rendered, tmp_path, monkeyp
 
 def test_whole_sequence_has_a_manifest_and_is_not_rendered_twice(tmp_path, monkeypatch):
     small = route_of_poses(straight(24), "short")
-    monkeypatch.setattr(store, "_render", fake := Renderings())
+    monkeypatch.setattr(store, "render_frames", fake := Renderings())
     root = store.render_sequence(small, Variation(), tmp_path)
     store.render_sequence(small, Variation(), tmp_path)
     assert fake.calls == 1
@@ -397,7 +398,7 @@ def test_whole_sequence_has_a_manifest_and_is_not_rendered_twice(tmp_path, monke
 
 def test_damaged_frames_are_found_and_rendered_again(tmp_path, monkeypatch, caplog):
     small = route_of_poses(straight(24), "short")
-    monkeypatch.setattr(store, "_render", fake := Renderings())
+    monkeypatch.setattr(store, "render_frames", fake := Renderings())
     root = store.render_sequence(small, Variation(), tmp_path)
     images = root / "sequences/short/image_0"
     (images / "000007.png").write_bytes(b"pn")  # another size
@@ -414,7 +415,7 @@ def test_damaged_frames_are_found_and_rendered_again(tmp_path, monkeypatch, capl
 
 
 def test_another_calibration_is_another_sequence(tmp_path, monkeypatch):
-    monkeypatch.setattr(store, "_render", fake := Renderings())
+    monkeypatch.setattr(store, "render_frames", fake := Renderings())
     for calibration in ("00-02", "04-12", "04-12"):
         route = route_of_poses(straight(24), "short", calibration)
         store.render_sequence(route, Variation(), tmp_path)
@@ -425,7 +426,7 @@ def test_another_calibration_is_another_sequence(tmp_path, monkeypatch):
 
 def test_two_processes_do_not_render_one_sequence(tmp_path, monkeypatch):
     small = route_of_poses(straight(24), "short")
-    monkeypatch.setattr(store, "_render", fake := Renderings())
+    monkeypatch.setattr(store, "render_frames", fake := Renderings())
     folder = tmp_path / store.folder_name(Variation()) / "sequences"
     folder.mkdir(parents=True)
     with (
@@ -445,7 +446,7 @@ class Renderings:
     calls = 0
     missing = None
 
-    def __call__(self, route, variation, folder, missing, depth, *_):
+    def __call__(self, route, variation, folder, missing, depth, *_, total):
         self.calls += 1
         self.missing = missing
         for k in missing:

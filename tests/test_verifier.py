@@ -16,7 +16,7 @@ from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDes
 from vslam.loopclosure.verifier import (
     LearnedVerifier,
     OrbThenLearnedVerifier,
-    OrbVerifier,
+    Verifier,
     verifier_for,
 )
 from vslam.loops import LoopCandidate, LoopEdge
@@ -24,7 +24,7 @@ from vslam.states import VerifierState
 
 PLAIN = LoopCandidate(1, 0, 0.9, alike=0.5)
 PROMISING = replace(PLAIN, promising=True)
-REFUSAL = LoopEdge.of(PLAIN, "resembled 1 of 3 keyframes in a row")
+REFUSAL = LoopEdge.of(PLAIN, "proposed for only 1 of the 3 consecutive keyframes needed")
 BOTH = (LearnedVerifier, OrbThenLearnedVerifier)
 
 
@@ -56,7 +56,7 @@ def test_the_configuration_chooses_the_verifier(network, descriptors, expected):
     assert type(verifier_for(config, CAMERA, images)) is expected
     assert verifier_for(config, CAMERA, images).images is images
     alone = verifier_for(config, CAMERA)
-    assert (type(alone), alone.images) == (OrbVerifier, None)
+    assert (type(alone), alone.images) == (Verifier, None)
 
 
 def test_learned_descriptors_may_wait_longer_for_a_second_loop(network):
@@ -69,16 +69,16 @@ def test_learned_descriptors_may_wait_longer_for_a_second_loop(network):
 
 
 def test_orb_verifies_a_candidate_unless_it_was_refused(by_night):
-    verifier, map_ = OrbVerifier(CONFIG, STREET_CAMERA), street().map
+    verifier, map_ = Verifier(CONFIG, STREET_CAMERA), street().map
     candidate = LoopCandidate(6, 1, 0.5, promising=True)
     edge = verifier.verify(map_, candidate)
     assert (edge.accepted, edge.matched_by) == (True, "orb")
     assert verifier.verify(map_, candidate, REFUSAL) is REFUSAL
-    assert "descriptors match" in OrbVerifier(CONFIG, CAMERA).verify(by_night.map, PROMISING).reason
+    assert "descriptors match" in Verifier(CONFIG, CAMERA).verify(by_night.map, PROMISING).reason
 
 
 def test_orb_needs_no_image_and_rates_nothing():
-    verifier, map_ = OrbVerifier(CONFIG, STREET_CAMERA), street().map
+    verifier, map_ = Verifier(CONFIG, STREET_CAMERA), street().map
     verifier.add(map_, 6, np.zeros((192, 640), np.uint8))
     assert not verifier.is_image_redundant(map_, 7)
     assert verifier.rate(map_, 6, [PLAIN]) == [PLAIN]
@@ -109,7 +109,7 @@ def test_orb_comes_first_where_both_verify(network, by_night):
     edge = verifier.verify(map_, LoopCandidate(6, 1, 0.5, promising=True))
     assert (edge.accepted, edge.matched_by) == (True, "orb")
     refused = OrbThenLearnedVerifier(CONFIG, CAMERA, by_night.images).verify(by_night.map, PLAIN)
-    assert refused == OrbVerifier(CONFIG, CAMERA).verify(by_night.map, PLAIN)
+    assert refused == Verifier(CONFIG, CAMERA).verify(by_night.map, PLAIN)
 
 
 @pytest.mark.parametrize(

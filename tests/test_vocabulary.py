@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from vslam.cli import main as cli
+from vslam.config import Config
 from vslam.errors import InputError, ResultsError
+from vslam.loopclosure.registry import create_detector
 from vslam.loopclosure.vocabulary import (
     SHIPPED,
     BowVector,
@@ -209,6 +211,12 @@ def test_npz_round_trip(small, tmp_path):
     assert same(load(tmp_path / "v.npz"), small)
 
 
+def test_a_detector_takes_another_vocabulary(small, tmp_path):
+    write_text(small, tmp_path / "own.txt")
+    detector = create_detector("bow", Config(), tmp_path / "own.txt")
+    assert detector.vocabulary.n_words == small.n_words
+
+
 def test_the_shipped_vocabulary_is_small():
     assert SHIPPED.stat().st_size <= 5_000_000
     tree = load()
@@ -278,7 +286,7 @@ def test_files_that_are_no_npz(small, tmp_path):
     with pytest.raises(InputError, match=r"v\.npz: "):
         load(path)
     with pytest.raises(ResultsError, match="cannot be written"):
-        save(small, tmp_path / "missing" / "v.npz")
+        save(small, path / "v.npz")
 
 
 # -- DBoW2's text ---------------------------------------------------------------------------------
@@ -327,7 +335,7 @@ def test_text_round_trip(small, tmp_path):
     write_text(read_text(path), tmp_path / "again.txt")
     assert (tmp_path / "again.txt").read_bytes() == path.read_bytes()
     with pytest.raises(ResultsError, match="cannot be written"):
-        write_text(small, tmp_path / "missing" / "voc.txt")
+        write_text(small, path / "voc.txt")
 
 
 @pytest.mark.parametrize(

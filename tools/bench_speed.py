@@ -1,32 +1,41 @@
 """Measure the speed of vslam and ORB-SLAM3 (pyorbslam3), and write the results as Markdown.
 
     python tools/bench_speed.py --case "KITTI 00=/data/kitti:00:216" [--also capsule] \
-        [--repeats 3] [--write docs/research/performance.md] \
-        [--orbslam3-python PY --orbslam3-script run_orbslam3.py --vocabulary voc.txt]
+        [--repeats 3] [--write docs/research/performance.md] [--csv docs/research/performance.csv] \
+        [--orbslam3-python PY --vocabulary voc.txt]
 
 A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run one
 at a time and alternate, after one round that is not counted. vslam runs with its report, with
 ``--no-report``, with ``--no-report`` and each detector of ``--also`` instead of ``bow``, and in the
-last round with ``--realtime``, which takes as long as the drive. systems.py describes what the
-script of ORB-SLAM3 takes and prints; its ``track_ms_median`` and ``track_ms_p95`` are optional. The
-hand-written parts of the page, at its beginning and from "Limits" on, are kept.
+last round with ``--realtime``, which takes as long as the drive. The hand-written parts of the
+page, at its beginning and from "Limits" on, are kept.
+
+Wall time, CPU time and peak memory are those of the whole process, as the kernel reports them. The
+errors of both are computed by vslam.evaluation.trajectories from their trajectory files. ORB-SLAM3
+is run by vslam/lab/stress/orbslam3.py, as in ``vslam stress``.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import json
 import os
 import shlex
 import statistics
 import subprocess
 import sys
 import tempfile
+import threading
+import time
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import systems
-from systems import Case, OrbSlam3, Run
-
+VSLAM = str(Path(sys.executable).with_name("vslam"))
+SCRIPT = Path(__file__).parents[1] / "vslam" / "lab" / "stress" / "orbslam3.py"
+PACKAGE = "pyorbslam3"
+LOOP_MESSAGE = "*Loop detected"  # ORB-SLAM3 prints it once for each loop that it closes
 FULL, LEAN, LIVE, ORBSLAM3 = "vslam", "vslam --no-report", "vslam --realtime", "ORB-SLAM3"
 HEAD = """## How it was measured
 
@@ -62,7 +71,7 @@ print(time.process_time() - start)
 """
 
 
-MEASURES = (  # key of systems.figures, title with an arrow to the better side, format
+MEASURES = (  # key of figures, title with an arrow to the better side, format
     ("process_fps", "frames/s, whole process ↑", ".1f"),
     ("loop_fps", "frames/s, frame loop ↑", ".1f"),
     ("process_cpu_ms", "CPU ms/frame, whole process ↓", ".1f"),
@@ -75,6 +84,85 @@ MEASURES = (  # key of systems.figures, title with an arrow to the better side, 
     ("ate_m", "ATE, aligned, m ↓", ".3f"),
     ("rpe_m", "RPE per frame, m ↓", ".4f"),
 )
+
+
+class Case(NamedTuple):
+    """Frames to run on: ``frames`` of a sequence in KITTI's format, from the first one."""
+
+    title: str
+    data: Path
+    seq: str
+    frames: int
+
+
+class OrbSlam3(NamedTuple):
+    """The interpreter that has pyorbslam3, and its vocabulary."""
+
+    python: Path
+    vocabulary: Path
+
+
+class Process(NamedTuple):
+    """A process that has ended: its output, and the resources used by it and its children;
+    ``held`` has its memory over time, as (s, MB)."""
+
+    output: str
+    wall_s: float
+    cpu_s: float
+    memory_mb: float
+    held: list[tuple[float, float]]
+
+
+class Run(NamedTuple):
+    """One run: the system's own report (``frames``, ``fps`` and ``cpu_ms_per_frame`` of the frame
+    loop, and more), lost frames, closed loops, and the file of the trajectory in KITTI's or TUM's
+    format, which lives as long as the folder of the run."""
+
+    process: Process
+    report: dict[str, Any]
+    lost: int
+    loops_closed: int
+    trajectory: Path
+
+
+def measure(command: list[str], folder: Path) -> Process:
+    """Run a command to its end and measure it. No large package may be imported before, because
+    the peak memory of a child starts at that of its parent."""
+    log = folder / "output.txt"
+    # Modules are compiled once, as when pip installs them.
+    environment = {key: os.environ[key] for key in os.environ if key != "PYTHONDONTWRITEBYTECODE"}
+    start = time.perf_counter()
+    with log.open("wb") as output:
+        child = subprocess.Popen(
+            command, cwd=folder, env=environment, stdout=output, stderr=subprocess.STDOUT,
+            stdin=subprocess.PIPE,  # ORB-SLAM3's script ends when it closes
+        )  # fmt: skip
+        ended, held = threading.Event(), []
+        watch = threading.Thread(target=sample_memory, args=(child.pid, ended, start, held))
+        watch.start()
+        try:
+            _, status, usage = os.wait4(child.pid, 0)
+            wall = time.perf_counter() - start
+        finally:  # also after Ctrl-C
+            ended.set()
+            watch.join()
+        child.returncode = os.waitstatus_to_exitcode(status)
+        child.stdin.close()
+    text = log.read_text(errors="replace")
+    if child.returncode:
+        sys.exit(f"{text}\n{' '.join(command)}: exit code {child.returncode}")
+    return Process(text, wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024, held)
+
+
+def sample_memory(
+    pid: int, ended: threading.Event, start: float, held: list[tuple[float, float]]
+) -> None:
+    """Record the memory of a process twice a second."""
+    while not ended.wait(0.5):
+        with suppress(OSError):
+            status = Path(f"/proc/{pid}/status").read_text()
+            kilobytes = [line.split()[1] for line in status.splitlines() if "VmRSS" in line]
+            held += [(time.perf_counter() - start, int(kb) / 1024) for kb in kilobytes]
 
 
 def parse_case(text: str) -> Case:
@@ -109,20 +197,37 @@ def reading_ms(case: Case, system: str) -> float:
     return 1e3 * float(done.stdout) / case.frames
 
 
-def run_vslam(case: Case, scratch: str, *words: str) -> Run:
-    """Run vslam. Without a report, it gets no ground truth, as ORB-SLAM3 evaluates nothing."""
+def run_vslam(case: Case, folder: Path, *words: str) -> Run:
+    """Run vslam, with more ``words`` on its command line. Without a report, it gets no ground
+    truth, as ORB-SLAM3 evaluates nothing."""
+    data = case.data
     if "--no-report" in words:
-        data = Path(scratch, "data")
+        data = folder / "data"
         data.mkdir()
         (data / "sequences").symlink_to(case.data / "sequences")
-        case = case._replace(data=data)
-    return systems.run_vslam(case, Path(scratch), "--detector", "bow", *words)
+    command = [VSLAM, "run", "--data", str(data), "--seq", case.seq, "--no-record", "--quiet"]
+    command += ["--max-frames", str(case.frames), "--out", "runs", "--detector", "bow"]
+    process = measure([*command, *words], folder)
+    results = folder / "runs" / "latest"
+    report = json.loads((results / "report.json").read_text())
+    file = results / "trajectory_kitti.txt"
+    return Run(process, report, report["lost_frames"], report["loops_closed"], file)
+
+
+def run_orbslam3(case: Case, system: OrbSlam3, folder: Path) -> Run:
+    command = [str(system.python), str(SCRIPT), str(system.vocabulary)]
+    command += [str(case.data / "sequences" / case.seq), "out", "--frames", str(case.frames)]
+    process = measure(command, folder)
+    said = next(line for line in reversed(process.output.splitlines()) if line.startswith("{"))
+    report = json.loads(said)
+    loops = process.output.count(LOOP_MESSAGE)
+    return Run(process, report, report["lost"], loops, folder / "out" / "trajectory.txt")
 
 
 def measure_case(
-    case: Case, orbslam3: OrbSlam3 | None, repeats: int, also: list[str]
+    case: Case, orbslam3: OrbSlam3 | None, repeats: int, also: list[str], scratch: str
 ) -> dict[str, list[Run]]:
-    """All counted runs of each system."""
+    """All counted runs of each system, in folders of their own in ``scratch``."""
     runs: dict[str, list[Run]] = {FULL: [], ORBSLAM3: [], LEAN: [], LIVE: []}
     words = {FULL: (), LEAN: ("--no-report",), LIVE: ("--no-report", "--realtime")}
     for name in also:
@@ -135,12 +240,12 @@ def measure_case(
         for system, done in runs.items():
             if system == LIVE and repeat < repeats:
                 continue
-            with tempfile.TemporaryDirectory(prefix="vslam-speed-") as scratch:
-                if system == ORBSLAM3:
-                    assert orbslam3 is not None
-                    run = systems.run_orbslam3(case, orbslam3, Path(scratch))
-                else:
-                    run = run_vslam(case, scratch, *words[system])
+            folder = Path(tempfile.mkdtemp(dir=scratch))
+            if system == ORBSLAM3:
+                assert orbslam3 is not None
+                run = run_orbslam3(case, orbslam3, folder)
+            else:
+                run = run_vslam(case, folder, *words[system])
             counted = f"{repeat} of {repeats}" if repeat else "not counted"
             print(f"{case.title}, {system}: {run.process.wall_s:.1f} s, {counted}", file=sys.stderr)
             if repeat:
@@ -149,10 +254,38 @@ def measure_case(
 
 
 def figures(run: Run, case: Case, reading: float) -> dict[str, float]:
-    """Every measure of one run."""
-    found = systems.figures(run, case)
-    for name in ("process", "loop"):
-        found[f"{name}_bare_ms"] = found[f"{name}_cpu_ms"] - reading
+    """Every measure of one run; NaN where it has no value."""
+    import numpy as np
+
+    from vslam.datasets import open_sequence
+    from vslam.errors import InputError
+    from vslam.evaluation.trajectories import evaluate_trajectory
+    from vslam.lab.stress.external import read_poses
+    from vslam.trajectory import Trajectory
+
+    process, frames = run.process, run.report["frames"]
+    whole, loop = 1e3 * process.cpu_s / frames, run.report["cpu_ms_per_frame"]
+    found = {
+        "process_fps": frames / process.wall_s,
+        "loop_fps": run.report["fps"],
+        "process_cpu_ms": whole,
+        "process_bare_ms": whole - reading,
+        "loop_cpu_ms": loop,
+        "loop_bare_ms": loop - reading,
+        "memory_mb": process.memory_mb,
+        "lost": float(run.lost),
+        "loops_closed": float(run.loops_closed),
+        "ate_m": float("nan"),
+        "rpe_m": float("nan"),
+    }
+    sequence = open_sequence("kitti", case.data, case.seq, max_frames=case.frames)
+    if sequence.ground_truth is not None:
+        times = sequence.timestamps
+        with suppress(InputError):  # hardly a frame has a pose
+            # Frames without a pose get an interpolated one, as in ``vslam stress``.
+            estimate = read_poses(run.trajectory, times, np.arange(len(times))).bridged(times)
+            errors = evaluate_trajectory(estimate, Trajectory(times, sequence.ground_truth))
+            found |= {"ate_m": errors.ate_rmse_m, "rpe_m": errors.rpe_m}
     return found
 
 
@@ -167,7 +300,7 @@ def comparison(measured: dict[str, list[dict[str, float]]]) -> str:
     lines = [f"| | {' | '.join(head)} |", "|---" * (len(head) + 1) + "|"]
     for name, title, form in MEASURES:
         medians = {s: statistics.median(run[name] for run in measured[s]) for s in columns}
-        cells = [systems.spread([run[name] for run in measured[s]], form) for s in columns]
+        cells = [spread([run[name] for run in measured[s]], form) for s in columns]
         if ORBSLAM3 in columns:
             theirs = medians[ORBSLAM3]
             cells += [f"{medians[s] / theirs:.2f}" if theirs else "-" for s in ours]
@@ -175,21 +308,27 @@ def comparison(measured: dict[str, list[dict[str, float]]]) -> str:
     return "\n".join(lines)
 
 
+def spread(values: list[float], form: str) -> str:
+    """Median (least - greatest), or the median alone if both are equal as printed."""
+    low, high = format(min(values), form), format(max(values), form)
+    median = format(statistics.median(values), form)
+    return median if low == high else f"{median} ({low} - {high})"
+
+
 def latency(runs: dict[str, list[Run]], case: Case) -> str:
     """Milliseconds from the time of an image to its pose, and ORB-SLAM3's own tracking times."""
     ours = [run.report for run in runs[LIVE]]
     values = [
-        systems.spread([report["latency_ms"][key] for report in ours], ".0f")
+        spread([report["latency_ms"][key] for report in ours], ".0f")
         for key in ("median", "p95", "p99")
     ]
-    dropped = systems.spread([report["dropped_frames"] for report in ours], ".0f")
+    dropped = spread([report["dropped_frames"] for report in ours], ".0f")
     lines = ["| ms per frame | p50 | p95 | p99 | dropped |", "|---|---|---|---|---|"]
     row = f"| vslam, image to pose, {rate(case):.0f} Hz | {' | '.join(values)} | {dropped} |"
     lines.append(row)
-    theirs = [run.report for run in runs.get(ORBSLAM3, [])]
-    if theirs and "track_ms_median" in theirs[0]:
+    if theirs := [run.report for run in runs.get(ORBSLAM3, [])]:
         cells = [
-            systems.spread([report[key] for report in theirs], ".0f")
+            spread([report[key] for report in theirs], ".0f")
             for key in ("track_ms_median", "track_ms_p95")
         ]
         lines.append(
@@ -226,14 +365,24 @@ def memory(run: Run) -> str:
     )
 
 
-def section(case: Case, runs: dict[str, list[Run]]) -> str:
-    """The section of a case."""
-    reading = {system: reading_ms(case, system) for system in (FULL, ORBSLAM3)}
-    measured = {
+def measures(
+    case: Case, runs: dict[str, list[Run]], reading: dict[str, float]
+) -> dict[str, list[dict[str, float]]]:
+    """Every measure of the runs of each system, except those in real time."""
+    return {
         s: [figures(run, case, reading[ORBSLAM3 if s == ORBSLAM3 else FULL]) for run in runs[s]]
         for s in runs
         if s != LIVE
     }
+
+
+def section(
+    case: Case,
+    runs: dict[str, list[Run]],
+    reading: dict[str, float],
+    measured: dict[str, list[dict[str, float]]],
+) -> str:
+    """The section of a case."""
     return (
         f"## {case.title}\n\n{case.frames} frames. "
         f"Reading both images: {reading[FULL]:.1f} ms CPU, by OpenCV {reading[ORBSLAM3]:.1f}.\n\n"
@@ -252,6 +401,16 @@ def profile(case: Case) -> str:
     return done.stdout
 
 
+def orbslam3_of(options: argparse.Namespace) -> OrbSlam3 | None:
+    """ORB-SLAM3 that the options name; None without them."""
+    given = (options.orbslam3_python, options.vocabulary)
+    if not any(given):
+        return None
+    if missing := [path for path in given if path is None or not path.exists()]:
+        sys.exit(f"ORB-SLAM3 needs --orbslam3-python and --vocabulary: {missing[0]}")
+    return OrbSlam3(*given)
+
+
 def parse_options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     shape = "TITLE=DATA:SEQ:FRAMES"
@@ -260,12 +419,32 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument(
         "--also", action="append", default=[], metavar="DETECTOR", help="run with it as well"
     )
-    systems.add_orbslam3_options(parser)
+    # Paths must be absolute, because each run has its own working folder. Links must not be
+    # resolved, because the link to the interpreter determines the virtual environment.
+    for name in ("--orbslam3-python", "--vocabulary"):
+        parser.add_argument(name, type=lambda text: Path(text).absolute())
     parser.add_argument("--write", type=Path, help="file to write; printed unless given")
+    parser.add_argument("--csv", type=Path, help="table to write: a row for each case and system")
     options = parser.parse_args()
     if options.repeats < 1:
         parser.error("--repeats: at least 1")
     return options
+
+
+def setting_of(report: dict[str, Any], system: OrbSlam3 | None, repeats: int) -> str:
+    """Machine, versions and the number of runs, as one paragraph, from a report of vslam."""
+    ask = f"from importlib.metadata import version; print(version('{PACKAGE}'))"
+    version = ""
+    if system is not None:
+        said = subprocess.run([system.python, "-c", ask], capture_output=True, text=True)
+        version = f"; {PACKAGE} {said.stdout.strip() or '(version unknown)'}"
+    machine = report["machine"]
+    ours = ", ".join(f"{name} {number}" for name, number in report["versions"].items())
+    return (
+        f"Median (least - greatest) of {repeats} runs each, alternating, "
+        f"{time.strftime('%Y-%m-%d')}. "
+        f"{machine['cpu']}, {machine['cores']} cores, {machine['platform']}. {ours}{version}."
+    )
 
 
 def anonymous(command: str) -> str:
@@ -284,18 +463,41 @@ def written(page: Path) -> tuple[str, str]:
     return (above, end + below) if begin else ("# Performance\n\n", "")
 
 
+def write_table(path: Path, cases: dict[str, dict[str, list[dict[str, float]]]]) -> None:
+    """Write a row for each case and system: median, least and greatest value of each measure."""
+    endings = {"": statistics.median, "_least": min, "_greatest": max}
+    names = [f"{key}{ending}" for key, *_ in MEASURES for ending in endings]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(["case", "system", "runs", *names])
+        for title, measured in cases.items():
+            for system, runs in measured.items():
+                cells = [
+                    format(of([run[key] for run in runs]), form).replace("nan", "")
+                    for key, _, form in MEASURES
+                    for of in endings.values()
+                ]
+                table.writerow([title, system, len(runs), *cells])
+
+
 def main() -> None:
     options = parse_options()
     load = os.getloadavg()[0]
-    orbslam3 = systems.orbslam3_of(options)
-    # No large package may be imported before the last run; see systems.measure.
-    measured = [
-        (case, measure_case(case, orbslam3, options.repeats, options.also)) for case in options.case
-    ]
-    setting = systems.setting(measured[0][1][FULL][0].report, orbslam3, options.repeats)
+    orbslam3 = orbslam3_of(options)
+    with tempfile.TemporaryDirectory(prefix="vslam-speed-") as scratch:
+        # No large package may be imported before the last run; see measure.
+        done = [
+            (case, measure_case(case, orbslam3, options.repeats, options.also, scratch))
+            for case in options.case
+        ]
+        sections, tables = [], {}
+        for case, runs in done:
+            reading = {system: reading_ms(case, system) for system in (FULL, ORBSLAM3)}
+            tables[case.title] = measures(case, runs, reading)
+            sections.append(section(case, runs, reading, tables[case.title]))
+    setting = setting_of(done[0][1][FULL][0].report, orbslam3, options.repeats)
     text = "\n".join((
-        HEAD, *(section(case, runs) for case, runs in measured),
-        f"## Setting\n\n{setting} Load at the start: {load:.1f}.\n",
+        HEAD, *sections, f"## Setting\n\n{setting} Load at the start: {load:.1f}.\n",
         f"```sh\npython {anonymous(shlex.join(sys.argv))}\n```\n",
     ))  # fmt: skip
     if options.write:
@@ -303,6 +505,8 @@ def main() -> None:
         options.write.write_text(f"{above}{text}{below}", encoding="utf-8")
     else:
         print(text)
+    if options.csv:
+        write_table(options.csv, tables)
 
 
 if __name__ == "__main__":

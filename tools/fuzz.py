@@ -143,10 +143,10 @@ def _use_map_in(file: Path, other: Path, out: Path) -> None:
     from vslam.errors import InputError
     from vslam.loopclosure.registry import detector_with_images
     from vslam.maps.colmap import save_colmap
-    from vslam.maps.crop import in_box
-    from vslam.maps.ply import save_ply
+    from vslam.maps.formats import save_ply
     from vslam.maps.reconstruction import reconstruction_of
     from vslam.maps.storage import load_map
+    from vslam.maps.stored_map import in_box
     from vslam.merging import merge_maps
     from vslam.slam import Slam
 
@@ -185,7 +185,7 @@ def _read_config(folder: Path) -> None:
 
 
 def _read_report(folder: Path) -> None:
-    from vslam.lab.overview import write_overview
+    from vslam.lab.overview.render import write_overview
     from vslam.report.finished_run import read_report
     from vslam.report.render import html, markdown
     from vslam.report.run_page import run_page

@@ -1,7 +1,4 @@
-"""Write docs/reference/thresholds.md: every threshold of vslam/config/ with its unit and source.
-
-    python tools/threshold_table.py            # writes it
-    python tools/threshold_table.py --check    # exits 1 if the file differs
+"""Write docs/reference/thresholds.md: every threshold of vslam/config.py with its unit and source.
 
 The docstring below a field ends with its source in brackets: paper, section and status of the
 value, as in "[OS1 V-D, customary]", or "[own]" where the rule has no paper either.
@@ -9,11 +6,9 @@ value, as in "[OS1 V-D, customary]", or "[own]" where the rule has no paper eith
 
 from __future__ import annotations
 
-import argparse
 import ast
 import inspect
 import re
-import sys
 import textwrap
 from itertools import pairwise
 from pathlib import Path
@@ -30,7 +25,7 @@ DESCRIPTION = re.compile(
 )
 HEAD = """# Thresholds
 
-Written by `python tools/threshold_table.py` from `vslam/config/`; `tests/test_threshold_table.py` compares the two. `vslam run --config FILE` reads them from a JSON file, `{"orb": {"n_features": 1500}}` or `{"orb.n_features": 1500}`, and `--config orb.n_features=1500,tracking.method=patches` sets them on the command line. In Python they are `Slam(camera, config={"orb.n_features": 1500})`. [design.md](../explanation/design.md) describes the methods.
+Written by `python tools/threshold_table.py` from `vslam/config.py`; `tests/test_threshold_table.py` compares the two. `vslam run --config FILE` reads them from a JSON file, `{"orb": {"n_features": 1500}}` or `{"orb.n_features": 1500}`, and `--config orb.n_features=1500,tracking.method=patches` sets them on the command line. In Python they are `Slam(camera, config={"orb.n_features": 1500})`. [design.md](../explanation/design.md) describes the methods.
 
 The source names the paper and section of the rule and says what the value is: *printed* in that section, *customary* in the programs and KITTI configurations of the ORB-SLAM family, or our *own*. OS1: Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2: Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017. ZS: Zhou and Sun, Sci Rep 15, 7644 (2025). Descriptor distances and ratios of best over second-best distance are upper bounds; a descriptor has 256 bits. A search radius at octave 0 grows with the scale of the pyramid level.
 
@@ -95,17 +90,5 @@ def page(config: Config) -> str:
     return "\n".join(lines).rstrip("\n") + "\n"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--check", action="store_true", help="compare, do not write")
-    parser.add_argument("--out", type=Path, default=PAGE)
-    options = parser.parse_args()
-    text = page(Config())
-    if not options.check:
-        options.out.write_text(text)
-    elif not options.out.is_file() or options.out.read_text() != text:
-        sys.exit(f"{options.out} differs from vslam/config/: python tools/threshold_table.py")
-
-
 if __name__ == "__main__":
-    main()
+    PAGE.write_text(page(Config()))

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 from vslam.untrusted import limit_images
 
 __version__ = "0.1.0"
-__all__ = ["Camera", "Slam", "TrackResult", "TrackingState", "__version__"]
+# Raise it with every change of what the method computes; tests/test_method_version.py notices one.
+METHOD_VERSION = 1
+__all__ = ["METHOD_VERSION", "Camera", "Slam", "TrackResult", "TrackingState", "__version__"]
 
 _HOME = {
     "Slam": "vslam.slam",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -37,6 +38,23 @@ class BrokenSourceError(InputError):
 
 class ResultsError(Exception):
     """Results cannot be written, for example because the disk is full. The CLI exits with 1."""
+
+
+def write_file(path: Path, content: str | bytes, fix: str = "free some space") -> None:
+    """Write a file, which appears only when it is complete, into a folder that is made if needed.
+
+    Raises:
+        ResultsError: it cannot be written; the message ends with ``fix``.
+    """
+    part = path.with_name(f"{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(content.encode() if isinstance(content, str) else content)
+        part.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            part.unlink()
+        raise ResultsError(f"{path}: cannot be written ({error.strerror}); {fix}.") from error
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

@@ -11,14 +11,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.backend.two_views import map_two_views
 from vslam.frame_poses import FrameTable
 from vslam.frontend.frame import Frame
-from vslam.geometry import inverses
+from vslam.geometry import compose, inverse, inverses, transform
 from vslam.hypotheses import joined_submaps
 from vslam.loops import LoopEdge
 from vslam.map import Map
-from vslam.map_kernels import count_seen_by, gather_observations, link_many, resolve
+from vslam.map_kernels import (
+    count_seen_by,
+    gather_observations,
+    link_many,
+    refresh_landmarks,
+    resolve,
+)
 from vslam.starter import TwoViewStart
 from vslam.trajectory import Trajectory
 
@@ -61,17 +66,19 @@ def add_two_views(map_: Map, start: TwoViewStart, reference: int) -> tuple[int, 
     Returns:
         The ids of the two keyframes.
     """
-    frames = start.first, start.second
-    first, second = map_two_views(
-        map_,
-        (frames[0].features, frames[1].features),
-        start.features,
-        start.first.T_cw,
-        start.T_2_1,
-        start.points,
-        (frames[0].timestamp, frames[1].timestamp),
-        (frames[0].index, frames[1].index),
-    )
+    one, two, T_1_w = start.first, start.second, start.first.T_cw
+    first = map_.add_keyframe(one.features, T_1_w, one.timestamp, one.index)
+    T_2_w = compose(start.T_2_1, T_1_w)
+    second = map_.add_keyframe(two.features, T_2_w, two.timestamp, two.index)
+    rows = [
+        map_.rows(keyframe).start + features
+        for keyframe, features in zip((first, second), start.features, strict=True)
+    ]
+    xyz = transform(inverse(T_1_w), start.points)
+    ids = map_.add_landmarks(xyz, map_.arrays.descriptor[rows[1]], first)
+    for of_view in rows:
+        link_many(map_.arrays, of_view, ids)
+    refresh_landmarks(map_.arrays, ids, map_.scales)
     if first > 0:
         map_.begin_submap(first, reference, predicted=start.predicted)
     map_.parents[second] = first

@@ -22,8 +22,8 @@ from vslam.backend.triangulation import map_stereo_points
 from vslam.closing import LoopClosing
 from vslam.features import Features
 from vslam.frame_poses import FramePoses, FrameTable
-from vslam.frontend.aligner import Aligner
 from vslam.frontend.frame import Frame, PlacedFrame
+from vslam.frontend.patches import RecentPatches, certainty_of
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import Matrix, inverse, orthonormalised
@@ -83,7 +83,7 @@ class Mapper:
         self._config = context.config
         self._closing = closing
         self.rig = rig
-        self._aligner = Aligner(context.config.alignment)
+        self._patches = RecentPatches(context.config.alignment.keyframes)
         self._is_merged = True
         self._held: tuple[Frame, ...] = ()
         self._counts = LandmarkCounts()
@@ -233,7 +233,7 @@ class Mapper:
         """
         with self._changing() as map_:
             self._make_room(map_, frame)
-            certainty = self._aligner.certainty(frame)
+            certainty = certainty_of(frame, self._config.alignment)
             keyframe = add_frame(map_, frame, certainty, self.reference, predicted=predicted)
             map_stereo_points(map_, keyframe, self._camera, self._config)
             refresh_keyframe(map_, keyframe)
@@ -304,7 +304,7 @@ class Mapper:
         """Make a keyframe the reference, so that tracking sees the landmarks around it."""
         map_, config = self.map, self._config.tracking
         local = local_map(map_, keyframe, config.local_keyframes)
-        patches = self._aligner.patches_of(map_, local.ids)
+        patches = self._patches.of(map_, local.ids)
         self.view = view_of(map_, keyframe, local, patches, monocular=self._camera.monocular)
         self.rig.disparity_offset = map_.scalars.disparity_offset
 
@@ -320,13 +320,15 @@ class Mapper:
 
     def state(self) -> MapperState:
         """The state of the mapper without the map."""
-        patches = self._aligner.state()
-        return MapperState(self.reference, self.last_frame, self.last_timestamp, patches)
+        return MapperState(
+            self.reference, self.last_frame, self.last_timestamp, self._patches.all()
+        )
 
     def restore(self, state: MapperState) -> None:
         """Restore what ``state`` returned; the map must be the one that it was taken with."""
         self.last_frame, self.last_timestamp = state.last_frame, state.last_timestamp
-        self._aligner.restore(state.patches)
+        for patches in state.patches:
+            self._patches.add(patches)
         self.refer_to(state.reference)
 
     def continue_drive(self) -> None:
@@ -352,7 +354,7 @@ class Mapper:
     def _set_newest(self, keyframe: int, frame: Frame) -> None:
         """Record that a frame became the newest keyframe, and make it the reference."""
         map_ = self.map
-        self._aligner.remember(frame, keyframe, map_.scales)
+        self._patches.remember(frame, keyframe, map_.scales)
         self.last_frame, self.last_timestamp = frame.index, frame.timestamp
         self.refer_to(keyframe)
         observe_keyframe(frame, map_, keyframe)

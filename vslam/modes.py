@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
 from vslam.frontend.frame import PlacedFrame
@@ -15,77 +13,52 @@ from vslam.starter import OneViewStart, Starter
 from vslam.states import PolicyState
 
 
-class Mode(Protocol):
-    """How frames change the map.
+class Mode:
+    """How frames change the map. This base class leaves it as it is, and only localises in it.
 
     Attributes:
         changes_map: whether a drive in this mode changes the map.
-        due: index of the frame that is to become a keyframe; -1 if none is planned.
     """
 
-    changes_map: bool
-
-    @property
-    def due(self) -> int: ...
-
-    def begin(self, frame: PlacedFrame) -> bool:
-        """Try to begin a map or sub-map with a frame that has a pose but was not tracked; returns
-        whether it did."""
-        ...
-
-    def begin_after_loss(self, frame: PlacedFrame) -> bool:
-        """``begin``, but only if the camera has been lost for long enough."""
-        ...
-
-    def map_far_points(self) -> bool:
-        """Map the far stereo points of the first keyframe of a map or sub-map if the frame right
-        after it was lost; returns whether points were added, so that tracking can be retried."""
-        ...
-
-    def update_map(self, frame: PlacedFrame, found: Found) -> bool:
-        """Count the landmarks that a tracked frame saw, and insert the frame as a keyframe if the
-        policy wants one; returns whether it was inserted."""
-        ...
-
-    def state(self) -> PolicyState | None:
-        """The state for a checkpoint; None if no checkpoint is possible now."""
-        ...
-
-    def restore(self, state: PolicyState) -> None:
-        """Restore what ``state`` returned."""
-        ...
-
-
-class Localising:
-    """Leaves the map as it is."""
-
     changes_map = False
-    due = -1
 
     def __init__(self, mapper: Mapper) -> None:
         self._mapper = mapper
 
+    @property
+    def due(self) -> int:
+        """Index of the frame that is to become a keyframe; -1 if none is planned."""
+        return -1
+
     def begin(self, frame: PlacedFrame) -> bool:
+        """Try to begin a map or sub-map with a frame that has a pose but was not tracked; returns
+        whether it did."""
         return False
 
     def begin_after_loss(self, frame: PlacedFrame) -> bool:
+        """``begin``, but only if the camera has been lost for long enough."""
         return False
 
     def map_far_points(self) -> bool:
+        """Map the far stereo points of the first keyframe of a map or sub-map if the frame right
+        after it was lost; returns whether points were added, so that tracking can be retried."""
         return False
 
     def update_map(self, frame: PlacedFrame, found: Found) -> bool:
+        """Count the landmarks that a tracked frame saw, and insert the frame as a keyframe if the
+        policy wants one; returns whether it was inserted."""
         self._mapper.refer_to_nearest(frame)
         return False
 
     def state(self) -> PolicyState | None:
+        """The state for a checkpoint; None if no checkpoint is possible now."""
         return None
 
     def restore(self, state: PolicyState) -> None:
-        pass
+        """Restore what ``state`` returned."""
 
 
-class MapBuilding:
+class MapBuilding(Mode):
     """Inserts frames that see something new as keyframes.
 
     Attributes:
@@ -96,11 +69,11 @@ class MapBuilding:
     changes_map = True
 
     def __init__(self, context: TrackingContext, mapper: Mapper, tracker: Tracker) -> None:
+        super().__init__(mapper)
         self.starter = Starter(context)
         self.policy = KeyframePolicy(context)
         self._monocular = context.camera.monocular
         self._config = context.config.tracking
-        self._mapper = mapper
         self._tracker = tracker
 
     @property

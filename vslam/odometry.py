@@ -123,19 +123,13 @@ class Odometry:
 
     Attributes:
         T_odom_camera: ``(4, 4)`` pose of the last frame; the first frame is the origin.
+        now: its uncertainty.
     """
 
     def __init__(self) -> None:
         self.T_odom_camera = np.eye(4)
-        self._local = np.zeros((6, 6))
-        self._drift = np.zeros((6, 6))
-        self._n_keyframes = 0
+        self.now = PoseUncertainty(np.zeros((6, 6)), np.zeros((6, 6)), 0)
         self._lost_s = 0.0
-
-    @property
-    def now(self) -> PoseUncertainty:
-        """The uncertainty of the last frame."""
-        return PoseUncertainty(self._local, self._drift, self._n_keyframes)
 
     def move(self, T_now_last: Matrix, elapsed: float, covariance: Matrix | None) -> None:
         """Advance to the next frame.
@@ -150,25 +144,25 @@ class Odometry:
         """
         self.T_odom_camera = orthonormalised(self.T_odom_camera @ inverse(T_now_last))
         A = adjoint(T_now_last)
-        self._drift = _symmetric(A @ self._drift @ A.T)
         if covariance is not None and np.isfinite(covariance).all():
-            self._local, self._lost_s = _symmetric(covariance), 0.0
-            return
-        before = self._lost_s
-        self._lost_s += elapsed
-        deviation = 0.5 * np.repeat([ACCELERATION, TURNING], 3)
-        grown = np.diag(deviation**2 * (self._lost_s**4 - before**4))
-        self._local = _symmetric(A @ self._local @ A.T) + grown
+            local, self._lost_s = _symmetric(covariance), 0.0
+        else:
+            before = self._lost_s
+            self._lost_s += elapsed
+            deviation = 0.5 * np.repeat([ACCELERATION, TURNING], 3)
+            grown = np.diag(deviation**2 * (self._lost_s**4 - before**4))
+            local = _symmetric(A @ self.now.local @ A.T) + grown
+        drift = _symmetric(A @ self.now.drift @ A.T)
+        self.now = PoseUncertainty(local, drift, self.now.n_keyframes)
 
     def keyframe(self) -> None:
         """Note that the last frame became a keyframe, so that new landmarks inherit its error."""
-        self._drift = self._drift + self._local
-        self._n_keyframes += 1
+        now = self.now
+        self.now = PoseUncertainty(now.local, now.drift + now.local, now.n_keyframes + 1)
 
     def resume(self, T_odom_camera: Matrix, uncertainty: PoseUncertainty) -> None:
         """Continue from the last frame of a drive whose state was not saved."""
-        self.T_odom_camera, self._local = T_odom_camera, uncertainty.local
-        self._drift, self._n_keyframes = uncertainty.drift, uncertainty.n_keyframes
+        self.T_odom_camera, self.now = T_odom_camera, uncertainty
 
     def state(self) -> tuple[float, ...]:
         """The state between two frames, for a checkpoint."""
@@ -177,6 +171,4 @@ class Odometry:
     def restore(self, state: tuple[float, ...]) -> None:
         """Continue from a state that ``state`` returned."""
         self.T_odom_camera = np.array(state[:16]).reshape(4, 4)
-        found = PoseUncertainty.of_numbers(np.array(state[16:-1]))
-        self._local, self._drift, self._n_keyframes = found.local, found.drift, found.n_keyframes
-        self._lost_s = state[-1]
+        self.now, self._lost_s = PoseUncertainty.of_numbers(np.array(state[16:-1])), state[-1]

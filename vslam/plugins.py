@@ -11,6 +11,8 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import Distribution, EntryPoint, distributions
+from pathlib import Path
+from traceback import walk_tb
 from typing import Any
 
 from vslam.errors import InputError
@@ -81,8 +83,19 @@ class PlugIn:
             raise
         except Exception as error:  # foreign code may raise anything
             raise InputError(
-                f"{self} failed ({reason(error)}); repair or uninstall the package."
+                f"{self} failed ({reason(error)}{self._line(error)}); repair or uninstall the "
+                "package."
             ) from error
+
+    def _line(self, error: Exception) -> str:
+        """The line of the package at which it failed, empty if the call did not get that far."""
+        package = self.entry_point.module.partition(".")[0]
+        lines = [
+            f"; {Path(frame.f_code.co_filename).name}, line {line}"
+            for frame, line in walk_tb(error.__traceback__)
+            if str(frame.f_globals.get("__name__")).partition(".")[0] == package
+        ]
+        return lines[-1] if lines else ""
 
 
 def reason(error: Exception) -> str:

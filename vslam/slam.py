@@ -21,10 +21,10 @@ from vslam.frontend.masks import Mask
 from vslam.frontend.relocaliser import Relocaliser
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracker import Found, Tracker, TrackerStatus, result_of
-from vslam.frontend.tracking import TrackingContext
+from vslam.frontend.tracking import TrackingContext, covariance_of
 from vslam.geometry import Matrix, inverse
 from vslam.loopclosure.detector import LoopDetector
-from vslam.loopclosure.learned_relocalization import LearnedRelocalisation
+from vslam.loopclosure.learned_verification import LearnedRelocalisation
 from vslam.loopclosure.registry import DEFAULT_DETECTOR, detector_with_images
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loopclosure.verifier import verifier_for
@@ -35,7 +35,7 @@ from vslam.map_frames import in_first_part, keyframe_trajectory
 from vslam.mapping import Mapper
 from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, World
-from vslam.modes import Localising, MapBuilding
+from vslam.modes import MapBuilding, Mode
 from vslam.odometry import Odometry
 from vslam.session import Session, open_map
 from vslam.shared_map import mapping_executor
@@ -57,7 +57,7 @@ class Slam:
     map later. With ``localize=True`` the map is not changed.
 
     Attributes:
-        context: camera, thresholds and pyramid scales, for ``extract_features``.
+        context: camera, thresholds and pyramid scales, for ``FrameImages``.
         detector: proposes loop candidates and places for relocalisation.
         rig: what has been measured of the stereo pair, such as the delay of its right camera.
         next_extraction: index of a coming frame whose features will probably be needed, so that
@@ -114,7 +114,7 @@ class Slam:
         self._tracker = tracker = Tracker(context)
         recognise = LearnedRelocalisation(images, camera, config)
         self._relocaliser = Relocaliser(context, detector.locate, recognise)
-        self._mode = Localising(mapper) if localize else MapBuilding(context, mapper, tracker)
+        self._mode = Mode(mapper) if localize else MapBuilding(context, mapper, tracker)
         self._odometry = Odometry()
         self._session = Session(
             context, closing, mapper, tracker, rig, self._mode, self._odometry, opened
@@ -238,7 +238,7 @@ class Slam:
         image: Image | None = None,
         stage_ms: dict[str, float] | None = None,
     ) -> TrackResult:
-        """``step`` for a frame whose features were extracted before (``extract_features``).
+        """``step`` for a frame whose features were extracted before (``FrameImages.extracted``).
 
         Args:
             extracted: the features.
@@ -290,7 +290,7 @@ class Slam:
             found_again = found.relocalised or tracker.status is not TrackerStatus.TRACKING
             T_moved = T_predicted if found_again else frame.T_cw
             tracker.accept(frame, found, mapper.frames)
-            self._follow(frame, T_moved, frame.covariance)
+            self._follow(frame, T_moved, covariance_of(frame, self.context))
             placed = mapper.append_pose(frame, tracked=True, near=found.keyframe)
             is_keyframe = self._mode.update_map(placed, found)
             self.rig.observe(frame, frame.twist)

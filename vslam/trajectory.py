@@ -178,26 +178,20 @@ def write_kitti(path: Path | str, T_wc: NDArray[np.float64]) -> None:
 
 def tum_line(timestamp: float, T_wc: NDArray[np.float64]) -> str:
     """One ``(4, 4)`` pose as a line of TUM's format."""
-    quaternion = quaternions(T_wc[None, :3, :3])[0].tolist()
-    # Twelve digits keep the norm of the quaternion at 1 within the rounding of the poses.
-    numbers = [f"{x:.9f}" for x in T_wc[:3, 3].tolist()] + [f"{x:.12f}" for x in quaternion]
-    return " ".join([f"{timestamp:.9f}", *numbers]) + "\n"
+    return _tum_lines(np.array([timestamp]), T_wc[None])
 
 
 def write_tum(path: Path | str, trajectory: Trajectory) -> None:
     """Write a trajectory in TUM's format with nine decimals and quaternions with qw >= 0."""
-    T_wc = trajectory.T_wc
-    rows = np.column_stack([T_wc[:, :3, 3], quaternions(T_wc[:, :3, :3])]).tolist()
-    Path(path).write_text(
-        "".join(
-            f"{t:.9f} "
-            + " ".join(f"{x:.9f}" for x in row[:3])
-            + " "
-            + " ".join(f"{x:.12f}" for x in row[3:])  # digits as in tum_line
-            + "\n"
-            for t, row in zip(trajectory.timestamps.tolist(), rows, strict=True)
-        )
-    )
+    Path(path).write_text(_tum_lines(trajectory.timestamps, trajectory.T_wc))
+
+
+def _tum_lines(timestamps: NDArray[np.float64], T_wc: NDArray[np.float64]) -> str:
+    rows = np.column_stack([timestamps, T_wc[:, :3, 3], quaternions(T_wc[:, :3, :3])]).tolist()
+    # Twelve digits keep the norm of the quaternion at 1 within the rounding of the poses.
+    digits = (9, 9, 9, 9, 12, 12, 12, 12)
+    words = ([f"{x:.{n}f}" for x, n in zip(row, digits, strict=True)] for row in rows)
+    return "".join(" ".join(line) + "\n" for line in words)
 
 
 def write_euroc(path: Path | str, trajectory: Trajectory) -> None:

@@ -115,7 +115,6 @@ class SiameseDetector:
         return DetectorMemory(self.name, self._network.fingerprint, {"descriptors": table})
 
     def restore(self, memory: DetectorMemory) -> None:
-        """See :class:`LoopDetector`."""
         require_same(self.memory(), memory)
         table = memory.tables["descriptors"]
         known, values = np.diff(table.first), table.values

@@ -111,22 +111,18 @@ class LateNetwork:
 
     @property
     def size(self) -> Size:
-        """See :class:`OnnxNetwork`."""
         return self._loaded.size
 
     @property
     def dimensions(self) -> int:
-        """See :class:`OnnxNetwork`."""
         return self._loaded.dimensions
 
     def embed(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """See :class:`OnnxNetwork`."""
         return self._loaded.embed(image)
 
     def compare(
         self, query: NDArray[np.float32], gallery: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """See :class:`OnnxNetwork`."""
         return self._loaded.compare(query, gallery)
 
 

@@ -103,21 +103,15 @@ def _times(path: Path, number: NDArray[np.int64]) -> NDArray[np.float64] | None:
     return times[number]
 
 
-def relation_of_poses(
-    T_wc: NDArray[np.float64],
-    *,
-    near: float = 5.0,
-    turned: float = 30.0,
-    far: float = _FAR,
-) -> NDArray[np.int8]:
+def relation_of_poses(T_wc: NDArray[np.float64], near: float = 5.0) -> NDArray[np.int8]:
     """``(N, N)`` int8 relation of images by their ``(N, 4, 4)`` poses: the same place if less than
-    ``near`` metres and ``turned`` degrees apart, different places if more than ``far`` metres
-    apart, otherwise unknown."""
+    ``near`` metres and 30 degrees apart, different places if more than 25 m apart, otherwise
+    unknown."""
     centre, forward = T_wc[:, :3, 3], T_wc[:, :3, 2]
     apart = np.linalg.norm(centre[:, None] - centre[None], axis=2)
     cosine = forward @ forward.T
     relation = np.zeros(apart.shape, np.int8)
-    relation[(apart < near) & (cosine > np.cos(np.radians(turned)))] = SAME
-    relation[apart > far] = DIFFERENT
+    relation[(apart < near) & (cosine > np.cos(np.radians(30.0)))] = SAME
+    relation[apart > _FAR] = DIFFERENT
     np.fill_diagonal(relation, SAME)
     return relation

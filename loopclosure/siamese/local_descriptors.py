@@ -31,7 +31,7 @@ class LocalDescriptors:
     def __init__(self, path: Path = SHIPPED_LOCAL) -> None:
         """
         Args:
-            path: ONNX file of ``vslam.loopclosure.training.export.export_local``.
+            path: ONNX file of a network from an image to coarse and fine descriptors.
 
         Raises:
             InputError: there is no such file.

@@ -3,12 +3,13 @@ images."""
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError, ResultsError
+from vslam.errors import InputError, write_file
 from vslam.loopclosure.siamese.image_source import ImageSource
 from vslam.loopclosure.siamese.images import Fit, Size
 from vslam.untrusted import read_npz
@@ -34,10 +35,9 @@ def write_pack(sources: list[ImageSource], path: Path, size: Size, fit: Fit) -> 
         arrays[f"{k}_sizes"] = np.array([len(e) for e in encoded])
         arrays[f"{k}_bytes"] = np.concatenate([e.ravel() for e in encoded])
         arrays[f"{k}_relation"], arrays[f"{k}_unit"] = source.relation, source.unit
-    try:
-        np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
-    except OSError as error:
-        raise ResultsError(f"{path}: cannot be written ({error.strerror}).") from error
+    content = io.BytesIO()
+    np.savez_compressed(content, **arrays)  # type: ignore[arg-type]
+    write_file(path, content.getvalue())
 
 
 def read_pack(path: Path) -> list[ImageSource]:

@@ -67,21 +67,13 @@ def read_pairs(folder: Path) -> list[ImageSource]:
     ]
 
 
-def relation_of_views(
-    views: NDArray[np.float64],
-    *,
-    near: float = 5.0,
-    turned: float = 35.0,
-    far: float = 40.0,
-    sight: float = 160.0,
-    street: float = 25.0,
-) -> NDArray[np.int8]:
+def relation_of_views(views: NDArray[np.float64]) -> NDArray[np.int8]:
     """``(N, N)`` int8 relation of images by their poses.
 
-    Two images show the same place if they are less than ``near`` metres and ``turned`` degrees
-    apart. They show different places if they are more than ``far`` metres apart, unless both look
-    along the same street, in the same or in opposite directions, less than ``sight`` metres apart
-    and less than ``street`` metres to the side. Otherwise the relation is unknown.
+    Two images show the same place if they are less than 5 m and 35 degrees apart. They show
+    different places if they are more than 40 m apart, unless both look along the same street, in
+    the same or in opposite directions, less than 160 m apart and less than 25 m to the side.
+    Otherwise the relation is unknown.
 
     Args:
         views: ``(N, 3)`` x and z in metres, yaw in degrees from z towards x.
@@ -92,8 +84,8 @@ def relation_of_views(
     distance = np.linalg.norm(away, axis=2)
     aside = np.abs(away[..., 0] * ahead[:, None, 1] - away[..., 1] * ahead[:, None, 0])
     cosine = ahead @ ahead.T
-    along = (np.abs(cosine) > 0.7) & (aside < street) & (distance < sight)
+    along = (np.abs(cosine) > 0.7) & (aside < 25.0) & (distance < 160.0)
     relation = np.zeros(distance.shape, np.int8)
-    relation[(distance < near) & (cosine > np.cos(np.radians(turned)))] = SAME
-    relation[(distance > far) & ~(along | along.T)] = DIFFERENT
+    relation[(distance < 5.0) & (cosine > np.cos(np.radians(35.0)))] = SAME
+    relation[(distance > 40.0) & ~(along | along.T)] = DIFFERENT
     return relation

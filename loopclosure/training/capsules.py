@@ -33,7 +33,7 @@ def length(v: Tensor) -> Tensor:
 
 def route(
     u: Tensor, W: Tensor, iterations: int = 3, over: Over = "primary", alive: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Dynamic routing; gradients flow through the last iteration only.
 
     ``s_j = Σ_t W_tj (Σ_p c_tpj u_tp)`` and ``û_j|i · v_j = u_tp · (W_tjᵀ v_j)``: sums of A numbers
@@ -48,24 +48,9 @@ def route(
         alive: ``(I,)`` bool; capsules that are False are ignored, as if they were removed.
 
     Returns:
-        Output capsules ``v`` ``(N, J, D)`` and their coupling coefficients ``(N, J, I)``.
-    """
-    v, e, total = _route_undivided(u, W, iterations, over, alive)
-    return v, _divided(e, total)
-
-
-def _divided(e: Tensor, total: Tensor) -> Tensor:
-    """Couplings ``(N, J, I)``."""
-    return (e / total).transpose(1, 2).flatten(2)
-
-
-def _route_undivided(
-    u: Tensor, W: Tensor, iterations: int, over: Over, alive: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Output capsules ``(N, J, D)``, and couplings as ``e / total``.
-
-    ``e`` is ``(N, T, J, P)``, ``total`` ``(N, 1, J, 1)`` or ``(1,)``. Dividing sums over P instead
-    of ``e`` takes a sixth of the divisions.
+        Output capsules ``v`` ``(N, J, D)``, and their coupling coefficients as ``e / total`` with
+        ``e`` ``(N, T, J, P)`` and ``total`` ``(N, 1, J, 1)`` or ``(1,)``; see :func:`couplings`.
+        Dividing sums over P instead of ``e`` takes a sixth of the divisions.
     """
     n, types, places, size = u.shape
     outputs, _, _, depth = W.shape
@@ -86,7 +71,7 @@ def _route_undivided(
         back = back.permute(1, 2, 0, 3).reshape(n * types, outputs, size)
         return torch.bmm(back, rows.transpose(1, 2)).view(n, types, outputs, places)
 
-    def couplings(b: Tensor) -> tuple[Tensor, Tensor]:
+    def undivided(b: Tensor) -> tuple[Tensor, Tensor]:
         """Eq. 6 for logits ``(N, T, J, P)``.
 
         Works in place and subtracts a constant from each output, which does not change a softmax.
@@ -103,7 +88,7 @@ def _route_undivided(
 
     with torch.no_grad():
         if iterations == 1:
-            e, total = couplings(u.new_zeros((n, types, outputs, places)))
+            e, total = undivided(u.new_zeros((n, types, outputs, places)))
         else:
             # With b = 0, all couplings are equal: the first sums are means, the same for all
             # outputs, and need no softmax.
@@ -116,9 +101,14 @@ def _route_undivided(
             s = torch.bmm(means.expand(outputs, -1, -1), W_j).transpose(0, 1)
             b = agreements(squash(s))
             for _ in range(iterations - 2):
-                b += agreements(squash(combined(*couplings(b))))
-            e, total = couplings(b)
+                b += agreements(squash(combined(*undivided(b))))
+            e, total = undivided(b)
     return squash(combined(e, total)), e, total
+
+
+def couplings(e: Tensor, total: Tensor) -> Tensor:
+    """Coupling coefficients ``(N, J, I)`` of :func:`route`."""
+    return (e / total).transpose(1, 2).flatten(2)
 
 
 class CapsuleLayer(nn.Module):
@@ -170,7 +160,7 @@ class CapsuleLayer(nn.Module):
     def routed(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Output capsules and the couplings ``(N, J, T K)`` that led to them."""
         v, e, total = self._route(u)
-        return v, _divided(e, total)
+        return v, couplings(e, total)
 
     def _route(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         if self.place.shape[1] < self.places:
@@ -182,4 +172,4 @@ class CapsuleLayer(nn.Module):
         # Never in half precision, because it sums thousands of products.
         with torch.autocast(u.device.type, enabled=False):
             u = u.float() * self.gains
-            return _route_undivided(u, self.W, self.iterations, self.over, alive)
+            return route(u, self.W, self.iterations, self.over, alive)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 from pydantic import ValidationError
 
-from vslam.errors import InputError, ResultsError
+from vslam.errors import InputError, write_file
 from vslam.loopclosure.training.data import Pairs
 from vslam.loopclosure.training.settings import TrainSettings
 from vslam.loopclosure.training.siamese import SiameseNetwork
@@ -53,13 +54,9 @@ def save_checkpoint(
         "progress": vars(progress),
         "pairs": None if pairs is None else [torch.from_numpy(x) for x in vars(pairs).values()],
     }
-    temporary = path.with_suffix(".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        torch.save(content, temporary)
-        temporary.replace(path)
-    except (OSError, RuntimeError) as error:
-        raise ResultsError(f"{path}: the checkpoint cannot be written ({error}).") from error
+    file = io.BytesIO()
+    torch.save(content, file)
+    write_file(path, file.getvalue())
 
 
 def load_checkpoint(

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError, ResultsError
+from vslam.errors import InputError, write_file
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN, ImageSource
 from vslam.loopclosure.siamese.images import Fit, Size
 
@@ -238,8 +238,4 @@ def write_pairs(path: Path, collection: Collection, pairs: Pairs, seed: int) -> 
     rows.writerow(["a", "b", "same"])
     for a, b, same in zip(pairs.a, pairs.b, pairs.same, strict=True):
         rows.writerow([collection.names[a], collection.names[b], int(same)])
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(table.getvalue())
-    except OSError as error:
-        raise ResultsError(f"{path}: cannot be written ({error.strerror}).") from error
+    write_file(path, table.getvalue())

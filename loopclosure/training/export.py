@@ -16,7 +16,7 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
-from vslam.errors import ResultsError
+from vslam.errors import ResultsError, write_file
 from vslam.loopclosure.siamese.inference import (
     ABOUT,
     COMPARISON,
@@ -25,7 +25,6 @@ from vslam.loopclosure.siamese.inference import (
     VERSION,
     OnnxNetwork,
 )
-from vslam.loopclosure.training.local import LocalNetwork
 from vslam.loopclosure.training.siamese import SiameseNetwork, for_inference
 
 TOLERANCE = 1e-4  # of a descriptor of length 1
@@ -134,19 +133,13 @@ def to_onnx(
 
 
 def write_onnx(model: onnx.ModelProto, path: Path, metadata: dict[str, str]) -> None:
-    """Write a graph with its metadata atomically.
+    """Write a graph with its metadata.
 
     Raises:
         ResultsError: the file cannot be written.
     """
     helper.set_model_props(model, metadata)
-    temporary = path.with_suffix(".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_bytes(model.SerializeToString())
-        temporary.replace(path)
-    except OSError as error:
-        raise ResultsError(f"{path}: cannot be written ({error.strerror}).") from error
+    write_file(path, model.SerializeToString())
 
 
 def _halve(graph: onnx.GraphProto) -> None:
@@ -165,20 +158,3 @@ def _halve(graph: onnx.GraphProto) -> None:
     nodes = [*widened, *graph.node]
     del graph.node[:]
     graph.node.extend(nodes)
-
-
-def export_local(network: LocalNetwork, path: Path) -> None:
-    """Write local descriptors in the format that :class:`local_descriptors.LocalDescriptors` reads.
-
-    The graph maps ``image``, grey ``(H, W)`` uint8 of any size, to ``coarse`` and ``fine``.
-
-    Raises:
-        ResultsError: the file cannot be written.
-    """
-    image = torch.from_numpy(np.random.default_rng(0).integers(0, 256, (194, 640), np.uint8))
-    height, width = torch.export.Dim("H", min=64, max=4096), torch.export.Dim("W", min=64, max=4096)
-    model = to_onnx(
-        network.eval().requires_grad_(False), (image,), ["image"], ["coarse", "fine"],
-        dynamic_shapes={"image": {0: height, 1: width}},
-    )  # fmt: skip
-    write_onnx(model, path, {FORMAT: VERSION, NAME: "local"})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import time
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,6 @@ from vslam.loopclosure.training.pruning import (
     pruned,
     with_iterations,
 )
-from vslam.loopclosure.training.runtime import milliseconds_per_image
 from vslam.loopclosure.training.settings import TrainSettings
 from vslam.loopclosure.training.siamese import (
     SiameseNetwork,
@@ -145,3 +145,25 @@ def _prune(
     report |= dict(zip(timed, milliseconds_per_image(*copies), strict=True))
     settings = settings.model_copy(update={"shape": smaller.branch.shape})
     return smaller, settings, report
+
+
+@torch.no_grad()
+def milliseconds_per_image(*networks: SiameseNetwork, repeats: int = 50) -> list[float]:
+    """Shortest time to embed one image on one core for each network.
+
+    Networks take turns, so that the load of the machine affects all of them equally. The shortest
+    time counts, because other processes can only add to it.
+    """
+    best = [float("inf")] * len(networks)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        for _ in range(repeats):
+            for k, network in enumerate(networks):
+                image = torch.rand(1, 3, *network.size)
+                began = time.perf_counter()
+                network.embed(image)
+                best[k] = min(best[k], time.perf_counter() - began)
+    finally:
+        torch.set_num_threads(threads)
+    return [1e3 * seconds for seconds in best]

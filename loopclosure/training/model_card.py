@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from vslam.errors import ResultsError
+from vslam.errors import write_file
 from vslam.loopclosure.training.data import Collection
 from vslam.loopclosure.training.settings import TrainSettings
 from vslam.loopclosure.training.siamese import SiameseNetwork
@@ -83,11 +83,8 @@ def write_card(card: dict[str, Any], weights: Path) -> tuple[Path, Path]:
         f"## Settings\n\n```json\n{json.dumps(card['settings'], indent=1)}\n```\n"
     )
     paths = weights.with_suffix(".json"), weights.with_suffix(".md")
-    try:
-        paths[0].write_text(json.dumps(card, indent=2) + "\n")
-        paths[1].write_text(text)
-    except OSError as error:
-        raise ResultsError(f"{weights.parent}: cannot be written ({error.strerror}).") from error
+    write_file(paths[0], json.dumps(card, indent=2) + "\n")
+    write_file(paths[1], text)
     return paths
 
 

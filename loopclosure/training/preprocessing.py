@@ -56,7 +56,7 @@ class Unrolling(nn.Module):
         self.register_buffer("grid", grid, persistent=False)
 
     def forward(self, images: Tensor) -> Tensor:
-        """``(N, 1, H, W)`` to the same shape."""
+        """Unroll ``(N, 1, H, W)`` images; the result has the same shape."""
         if self.grid is None:
             return images
         grid = self.grid.expand(len(images), -1, -1, -1)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from vslam.config.section import read_json
+from vslam.config import read_json
 from vslam.loopclosure.training.augmentation import STRONG, Augmentation
 from vslam.loopclosure.training.branches import CapsuleShape
 

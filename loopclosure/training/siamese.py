@@ -13,7 +13,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vslam.errors import InputError, ResultsError
+from vslam.errors import InputError, write_file
 from vslam.loopclosure.siamese.weights import NETWORKS
 from vslam.loopclosure.training.branches import CapsuleBranch, CapsuleShape
 from vslam.loopclosure.training.capsules import TINY
@@ -90,8 +90,16 @@ class DistanceHead(nn.Module):
         return self.log_a.exp() - self.log_b.exp() * d
 
     def compare(self, query: Tensor, gallery: Tensor, lengths: Tensor) -> Tensor:
-        """Logits ``(M,)`` of one ``(V, d)`` descriptor with a gallery ``(M, V, d)``, both by view,
-        by one product; ``lengths`` ``(M, V)`` are those of the gallery's views."""
+        """Compare an image with a gallery by one matrix product.
+
+        Args:
+            query: ``(V, d)`` descriptors of the views of the image.
+            gallery: ``(M, V, d)`` descriptors of the views of M images.
+            lengths: ``(M, V)`` lengths of the gallery's descriptors.
+
+        Returns:
+            ``(M,)`` logits.
+        """
         alike = (gallery @ query.T).transpose(1, 2)
         most = _lengths(query[None])[:, :, None] * lengths[:, None]
         return self.of_cosine(aligned(alike, most))
@@ -178,14 +186,8 @@ def save_network(
         "shape": network.branch.shape.model_dump_json(),
         "about": json.dumps(about),
     }
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_suffix(".part")
-        # Files of save_file would be readable only by their owner.
-        temporary.write_bytes(save({k: v.cpu().contiguous() for k, v in tensors.items()}, metadata))
-        temporary.replace(path)
-    except (OSError, SafetensorError) as error:
-        raise ResultsError(f"{path}: the weights cannot be written ({error}).") from error
+    # Files of save_file would be readable only by their owner.
+    write_file(path, save({k: v.cpu().contiguous() for k, v in tensors.items()}, metadata))
 
 
 def load_network(path: Path) -> tuple[SiameseNetwork, dict[str, Any]]:

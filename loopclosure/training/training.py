@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vslam.errors import InputError, ResultsError
+from vslam.errors import InputError, ResultsError, write_file
 from vslam.loopclosure.training.augmentation import augment
 from vslam.loopclosure.training.checkpoint import (
     CHECKPOINT,
@@ -320,6 +320,11 @@ def _optimiser(network: SiameseNetwork, settings: TrainSettings) -> torch.optim.
     return torch.optim.Adam(groups, lr=settings.learning_rate, fused=True)
 
 
+def set_threads(threads: int) -> None:
+    """Set the number of threads with which torch computes."""
+    torch.set_num_threads(threads)
+
+
 def open_device(name: str) -> torch.device:
     """The device of that name.
 
@@ -353,7 +358,4 @@ def write_log(path: Path, history: list[dict[str, float]]) -> None:
     rows = csv.DictWriter(table, list(history[0]), lineterminator="\n")
     rows.writeheader()
     rows.writerows(history)
-    try:
-        path.write_text(table.getvalue())
-    except OSError as error:
-        raise ResultsError(f"{path}: cannot be written ({error.strerror}).") from error
+    write_file(path, table.getvalue())

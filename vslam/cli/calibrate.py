@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
 
 import typer
 
-from vslam.cli.console import console
+from vslam.cli.console import Console
 from vslam.cli.options import reads_source
 from vslam.errors import BrokenSourceError, InputError, ResultsError
 
@@ -48,11 +48,10 @@ else:
     ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command(epilog=_EXAMPLES)(calibrate)
+app = typer.Typer()
 
 
+@app.command(epilog=_EXAMPLES)
 @reads_source(without=("calib", "depth", "depth_scale", "mask"))
 def calibrate(
     given: SourceOptions,
@@ -259,7 +258,7 @@ def _search(raw: RawSource, board: Board) -> tuple[int, list[tuple[View | None, 
     seen: list[tuple[View | None, ...]] = []
     examined: list[Image] = []
     n = 0
-    with console(shown=True).count_bar("images", total) as advance:
+    with Console(shown=True).count_bar("images", total) as advance:
         for frame in _frames(raw, _MOST_SEARCHED):
             name = frame.file.name if frame.file else f"{frame.timestamp:.2f} s"
             images = [cast("Image", image) for image in frame.read(map) if image is not None]

@@ -1,33 +1,107 @@
-"""Progress of a command: ``progress.py`` draws bars on stderr, ``quiet.py`` shows nothing."""
+"""Progress of a command, drawn on stderr so that stdout stays for results."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Protocol, cast
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from vslam.features import TrackResult
 
 
-class Console(Protocol):
-    """The functions that both modules have."""
+class Console:
+    """Draws progress bars and prints messages, or does nothing if it is not ``shown``.
 
-    def progress_bar(
-        self, total: int | None
-    ) -> AbstractContextManager[Callable[[TrackResult], None]]: ...
-    def render_bar(self) -> AbstractContextManager[Callable[[int, int], None]]: ...
-    def training_bar(self) -> AbstractContextManager[Callable[[int, int, int, float], None]]: ...
-    def count_bar(self, what: str, total: int) -> AbstractContextManager[Callable[[], None]]: ...
-    def announce(self, message: str) -> None: ...
+    It imports rich only to show something, which takes as long as tracking forty frames. A bar
+    appears with its first step.
+    """
 
+    def __init__(self, *, shown: bool) -> None:
+        self._shown = shown
 
-def console(*, shown: bool) -> Console:
-    """The module that shows progress, or the one that shows nothing and imports nothing slow."""
-    if shown:
-        from vslam.cli import progress
+    def announce(self, message: str) -> None:
+        """Print a message."""
+        if self._shown:
+            from rich.console import Console as RichConsole
 
-        return cast("Console", progress)
-    from vslam.cli import quiet
+            RichConsole(stderr=True).print(message)
 
-    return cast("Console", quiet)
+    @contextmanager
+    def progress_bar(self, total: int | None) -> Iterator[Callable[[TrackResult], None]]:
+        """Show frames, fps, tracking state and time left; yield the callable that takes each frame.
+
+        Args:
+            total: approximate number of frames, None if unknown.
+        """
+        with self._bar(after=("{task.fields[state]}",), fps=True) as update:
+            update(total=total, state="starting")
+            yield lambda result: update(completed=result.index + 1, state=str(result.state))
+
+    @contextmanager
+    def render_bar(self) -> Iterator[Callable[[int, int], None]]:
+        """Yield the callable that takes the number of rendered frames and of all frames."""
+        with self._bar("rendering", fps=True) as update:
+            yield lambda done, total: update(total=total, completed=done)
+
+    @contextmanager
+    def training_bar(self) -> Iterator[Callable[[int, int, int, float], None]]:
+        """Yield the callable that takes epoch, step, steps per epoch and loss of a training."""
+        with self._bar("epoch {task.fields[epoch]}", ("loss {task.fields[loss]:.3f}",)) as update:
+            yield lambda epoch, step, steps, loss: update(
+                anew=step == 1, total=steps, completed=step, epoch=epoch, loss=loss
+            )
+
+    @contextmanager
+    def count_bar(self, what: str, total: int) -> Iterator[Callable[[], None]]:
+        """Yield the callable that counts one of ``total`` items as done."""
+        with self._bar(what) as update:
+            update(total=total)
+            yield lambda: update(advance=1)
+
+    @contextmanager
+    def _bar(
+        self, before: str = "", after: tuple[str, ...] = (), *, fps: bool = False
+    ) -> Iterator[Callable[..., None]]:
+        """Yield a function that takes the arguments of rich's ``Progress.update``, and whether the
+        bar begins ``anew``."""
+        if not self._shown:
+            yield lambda **changes: None
+            return
+        from rich.console import Console as RichConsole
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TaskID,
+            TextColumn,
+            TimeRemainingColumn,
+        )
+
+        class Speed(TextColumn):
+            def render(self, task: Any) -> Any:
+                task.fields["fps"] = f"{task.speed:.1f}" if task.speed else "-"
+                return super().render(task)
+
+        first = [before] if before else []
+        last = [Speed("{task.fields[fps]} fps")] if fps else []
+        progress = Progress(
+            *first, MofNCompleteColumn(), BarColumn(), *last, *after, TimeRemainingColumn(),
+            console=RichConsole(stderr=True),
+        )  # fmt: skip
+        tasks: list[TaskID] = []
+
+        def update(*, anew: bool = False, **changes: Any) -> None:
+            if not tasks:
+                tasks.append(progress.add_task("", **{"total": None, **changes}))
+                progress.start()
+                return
+            if anew:
+                progress.reset(tasks[0])
+            progress.update(tasks[0], **changes)
+
+        try:
+            yield update
+        finally:
+            if tasks:
+                progress.stop()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.cli.console import console
+from vslam.cli.console import Console
 from vslam.cli.options import (
     OUTPUT,
     Thresholds,
@@ -31,11 +31,10 @@ _EXAMPLES = """
 """
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command(epilog=_EXAMPLES)(doctor)
+app = typer.Typer()
 
 
+@app.command(epilog=_EXAMPLES)
 @reads_source()
 def doctor(
     given: SourceOptions,
@@ -59,7 +58,7 @@ def doctor(
     require_data(given)
     thresholds = read_thresholds(config)
     try:
-        diagnosis = examine(first_frames(open_given(given, console(shown=True))), thresholds.orb)
+        diagnosis = examine(first_frames(open_given(given, Console(shown=True))), thresholds.orb)
     except InputError as error:
         measured, _, fix = str(error).rstrip(".").rpartition("; ")
         diagnosis = Diagnosis([Finding("input", "fault", measured or fix, fix if measured else "")])

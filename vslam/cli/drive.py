@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Literal
 
 import typer
 
-from vslam.cli.console import console
+from vslam.cli.console import Console
 from vslam.cli.options import open_given
 from vslam.errors import InputError, ResultsError
 
 if TYPE_CHECKING:
-    from vslam.cli.console import Console
+    from vslam.datasets.fixes import Fixes
     from vslam.datasets.frames import Source
     from vslam.datasets.perturbation import Perturbation
     from vslam.run.autosave import Unfinished
     from vslam.run.moments import LoopPictureRecorder
     from vslam.run.options import RunOptions
-    from vslam.run.outcome import RunSettings
+    from vslam.run.outcome import RunOutcome
     from vslam.run.recorder import Recorder, Viewer
 
 
@@ -53,9 +53,10 @@ def drive(
     """
     if options.localize and output.save_map is not None:
         raise InputError("--save-map: localising does not change the map; leave it out.")
-    told = console(shown=not output.quiet)
+    told = Console(shown=not output.quiet)
     source, perturbation = _open(options, told)
     _refuse_camera(source, resume)
+    fixes = None if options.gps is None else _fixes(options.gps, source)
 
     # These imports take a second, so they come after bad input has been refused.
     from vslam.cli.tables import print_summary
@@ -63,27 +64,32 @@ def drive(
     from vslam.report.folder import write_results
     from vslam.run.autosave import MAP, FolderAutosave, remove_autosave
     from vslam.run.moments import LoopPictureRecorder, MomentRecorder
-    from vslam.run.options import settings_of
     from vslam.run.pipeline import begin, run_sequence
 
-    settings = settings_of(options, source, perturbation.name)
+    as_applied = {"perturb": perturbation.name, "realtime": options.realtime or source.live}
+    settings = options.model_copy(update=as_applied)
     with ExitStack() as lock:
         unfinished = _unfinished(options, source, resume, lock)
         _compile(settings, told)
         slam = begin(source.camera, settings, None if unfinished is None else unfinished.map)
         viewer = _viewer(output, told)
-        folder = resume or _new_folder(options, settings, out, lock)
+        if unfinished is not None:
+            told.announce(f"continuing at frame {len(unfinished.progress.tracks)} ...")
+        folder = resume or _new_folder(options, source, perturbation.name, out, lock)
         moments, pictures = MomentRecorder(), LoopPictureRecorder()
         recorder = _recorder(folder, output, unfinished, viewer, moments, pictures)
         # Localising changes no map, so there are only poses to save.
         period = 0.0 if options.localize else options.autosave
-        autosave = FolderAutosave(folder, period, f"{settings.dataset} {source.name}")
+        autosave = FolderAutosave(folder, period, f"{source.dataset} {source.name}")
         with told.progress_bar(source.n_expected) as on_frame:
             outcome = run_sequence(
                 source, perturbation, settings, recorder,
                 on_frame=on_frame, autosave=autosave, resume=unfinished, slam=slam,
             )  # fmt: skip
-        if why := why_nothing_was_tracked(outcome, options):
+        no_gps = ""
+        if fixes is not None:
+            outcome, no_gps = _located(outcome, fixes)
+        if why := why_nothing_was_tracked(outcome):
             outcome = replace(outcome, warnings=[why, *outcome.warnings])
         report = write_results(
             folder, outcome, moments.moments, pictures.pictures,
@@ -102,6 +108,8 @@ def drive(
     if outcome.interrupted and outcome.interrupted != "Ctrl-C":
         go_on = f"; vslam run --resume {folder} continues it" if (folder / MAP).exists() else ""
         raise ResultsError(f"{folder}: ended early: {outcome.interrupted}{go_on}.")
+    if no_gps and not why:
+        raise ResultsError(f"{folder}: no trajectory by GPS, all other results are there: {no_gps}")
     if why or outcome.interrupted:
         raise typer.Exit(1)
 
@@ -114,6 +122,31 @@ def _open(options: RunOptions, told: Console) -> tuple[Source, Perturbation]:
     source = open_given(options, told)
     perturbation.bound_to(source)
     return source, perturbation
+
+
+def _fixes(path: Path, source: Source) -> Fixes:
+    """The GPS fixes of ``--gps``, which must be of the time of the images."""
+    from vslam.datasets.fixes import read_fixes, require_overlap
+
+    fixes = read_fixes(path)
+    require_overlap(fixes, source, path)
+    return fixes
+
+
+def _located(outcome: RunOutcome, fixes: Fixes) -> tuple[RunOutcome, str]:
+    """The outcome with the drive on the Earth, or why it could not be put there."""
+    from vslam.plugins import reason
+    from vslam.run.gps import locate
+
+    if outcome.stored is None:
+        return outcome, "the run has no map."
+    try:
+        track = locate(outcome.stored, fixes, outcome.settings.thresholds.pose_graph)
+    except InputError as error:
+        return outcome, str(error)
+    except Exception as error:  # the results of the run must not be lost with it
+        return outcome, f"{reason(error)}."
+    return replace(outcome, gps_track=track), ""
 
 
 def _refuse_camera(source: Source, resume: Path | None) -> None:
@@ -156,23 +189,24 @@ def _viewer(output: Output, told: Console) -> Viewer | None:
     return viewer
 
 
-def _compile(settings: RunSettings, told: Console) -> None:
+def _compile(settings: RunOptions, told: Console) -> None:
     from vslam.run.warmup import compile_kernels, is_cold
 
     if is_cold():
-        told.announce("first run: compiling the kernels, less than a minute ...")
+        told.announce("first run: compiling the kernels, about a minute ...")
     compile_kernels(processes=min(settings.threads, 2), load=settings.realtime)
 
 
-def _new_folder(options: RunOptions, settings: RunSettings, out: Path, lock: ExitStack) -> Path:
+def _new_folder(
+    options: RunOptions, source: Source, perturb: str, out: Path, lock: ExitStack
+) -> Path:
     from vslam.config import changed_thresholds
     from vslam.report.folder import create_run_folder
     from vslam.run.autosave import lock_run
     from vslam.run.options import write_options
 
-    s = settings
-    changed = changed_thresholds(s.config.model_dump())
-    folder = create_run_folder(out, s.dataset, s.sequence, s.perturb, s.detector, changed)
+    changed = changed_thresholds(options.thresholds.model_dump())
+    folder = create_run_folder(out, source.dataset, source.name, perturb, options.detector, changed)
     lock.enter_context(lock_run(folder))
     write_options(folder, options)
     return folder

@@ -18,11 +18,10 @@ _EXAMPLES = """
 """
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command("eval", epilog=_EXAMPLES)(evaluate_files)
+app = typer.Typer()
 
 
+@app.command("eval", epilog=_EXAMPLES)
 def evaluate_files(
     estimate: Annotated[
         Path,

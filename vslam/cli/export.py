@@ -11,7 +11,7 @@ from vslam.cli.options import INPUT, OUTPUT, Quiet, flag, option
 from vslam.errors import InputError, counted
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     import numpy as np
     from numpy.typing import NDArray
@@ -22,7 +22,10 @@ if TYPE_CHECKING:
     from vslam.maps.reconstruction import Reconstruction
     from vslam.report.finished_run import FinishedRun
 
-commands = typer.Typer(
+    Colours = NDArray[np.uint8]
+
+app = typer.Typer(
+    name="export",
     help="Export maps for other programs (docs/howto/exports.md), trained networks, and images to "
     "train on.",
     no_args_is_help=True,
@@ -41,11 +44,6 @@ Link = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the application."""
-    app.add_typer(commands, name="export")
-
-
 def _out(default: str) -> typer.models.OptionInfo:
     is_file = "." in default
     return option(
@@ -57,7 +55,7 @@ def _out(default: str) -> typer.models.OptionInfo:
     )
 
 
-@commands.command(epilog="[b]Example[/b]\n  vslam export colmap runs/latest")
+@app.command(epilog="[b]Example[/b]\n  vslam export colmap runs/latest")
 def colmap(
     run: Run,
     data: Data = None,
@@ -70,21 +68,16 @@ def colmap(
 ) -> None:
     """Write keyframe images and a sparse model in COLMAP's format."""
     from vslam.maps.colmap import save_colmap
-    from vslam.maps.new_output import new_folder
 
-    finished, reconstruction = _read(run)
-    target = out or run / "colmap"
-    with new_folder(target) as folder:
-        names, colours = _write_images(
-            folder / "images", finished, data, reconstruction, link=link, quiet=quiet
-        )
-        model = folder / "sparse" / "0"
-        model.mkdir(parents=True)
-        save_colmap(model, reconstruction, names, colours, text=text)
-    _say(target, reconstruction, quiet=quiet)
+    def save(folder: Path, model: Reconstruction, names: list[str], colours: Colours) -> None:
+        sparse = folder / "sparse" / "0"
+        sparse.mkdir(parents=True)
+        save_colmap(sparse, model, names, colours, text=text)
+
+    _export_images(run, data, out or run / "colmap", save, link=link, quiet=quiet)
 
 
-@commands.command(epilog="[b]Example[/b]\n  vslam export nerfstudio runs/latest")
+@app.command(epilog="[b]Example[/b]\n  vslam export nerfstudio runs/latest")
 def nerfstudio(
     run: Run,
     data: Data = None,
@@ -93,20 +86,15 @@ def nerfstudio(
     quiet: Quiet = False,
 ) -> None:
     """Write keyframe images, poses and landmarks for nerfstudio."""
-    from vslam.maps.nerfstudio import save_nerfstudio
-    from vslam.maps.new_output import new_folder
+    from vslam.maps.formats import save_nerfstudio
 
-    finished, reconstruction = _read(run)
-    target = out or run / "nerfstudio"
-    with new_folder(target) as folder:
-        names, colours = _write_images(
-            folder / "images", finished, data, reconstruction, link=link, quiet=quiet
-        )
-        save_nerfstudio(folder, reconstruction, [f"images/{name}" for name in names], colours)
-    _say(target, reconstruction, quiet=quiet)
+    def save(folder: Path, model: Reconstruction, names: list[str], colours: Colours) -> None:
+        save_nerfstudio(folder, model, [f"images/{name}" for name in names], colours)
+
+    _export_images(run, data, out or run / "nerfstudio", save, link=link, quiet=quiet)
 
 
-@commands.command(epilog="[b]Example[/b]\n  vslam export ply runs/latest")
+@app.command(epilog="[b]Example[/b]\n  vslam export ply runs/latest")
 def ply(
     run: RunOrFile,
     data: Data = None,
@@ -122,16 +110,15 @@ def ply(
     quiet: Quiet = False,
 ) -> None:
     """Write the landmarks with the colours that they have in the images."""
-    from vslam.maps.keyframe_images import landmark_colours
-    from vslam.maps.new_output import new_file
-    from vslam.maps.ply import save_ply
+    from vslam.maps.formats import landmark_colours, save_ply
+    from vslam.maps.new_output import new_output
 
     if run.is_file() and not colours:
         reconstruction = _reconstruction_of_file(run)
     else:
         finished, reconstruction = _read(run)
     target = out or _beside(run, "landmarks.ply")
-    with new_file(target) as file:
+    with new_output(target) as file:
         seen = None
         if colours:
             frames = _keyframes(finished, data, quiet=quiet)
@@ -140,7 +127,7 @@ def ply(
     _say(target, reconstruction, quiet=quiet)
 
 
-@commands.command(epilog="[b]Example[/b]\n  vslam export g2o runs/latest")
+@app.command(epilog="[b]Example[/b]\n  vslam export g2o runs/latest")
 def g2o(
     run: RunOrFile,
     out: Annotated[Path | None, _out("pose_graph.g2o")] = None,
@@ -151,22 +138,22 @@ def g2o(
 
     from vslam.backend.pose_graph import LOOP
     from vslam.geometry import inverses
-    from vslam.maps.g2o import save_g2o
-    from vslam.maps.new_output import new_file
+    from vslam.maps.formats import save_g2o
+    from vslam.maps.new_output import new_output
 
     graph, map_ = _graph(run)
     ids = graph.keyframes  # frames of several drives are not unique
     if len(set(map_.sessions)) == 1:
         ids = map_.frames[ids]
     target = out or _beside(run, "pose_graph.g2o")
-    with new_file(target) as file:
+    with new_output(target) as file:
         save_g2o(file, ids, inverses(graph.T_cw), graph.edges, graph.T_i_j, graph.sigmas)
     if not quiet:
         loops = np.count_nonzero(graph.kind == LOOP)
         typer.echo(f"{target}: {len(ids)} vertices, {len(graph.edges)} edges, {loops} from loops")
 
 
-@commands.command(epilog="[b]Example[/b]\n  vslam export euroc runs/latest")
+@app.command(epilog="[b]Example[/b]\n  vslam export euroc runs/latest")
 def euroc(
     run: Run,
     out: Annotated[Path | None, _out("trajectory_euroc.csv")] = None,
@@ -176,18 +163,18 @@ def euroc(
 
     Every run writes it in the formats of TUM and KITTI.
     """
-    from vslam.maps.new_output import new_file
+    from vslam.maps.new_output import new_output
     from vslam.trajectory import read_trajectory, write_euroc
 
     trajectory = read_trajectory(run / "trajectory.tum")
     target = out or run / "trajectory_euroc.csv"
-    with new_file(target) as file:
+    with new_output(target) as file:
         write_euroc(file, trajectory)
     if not quiet:
         typer.echo(f"{target}: {counted(len(trajectory), 'pose')}")
 
 
-@commands.command(epilog="[b]Example[/b]\n  vslam export ros runs/latest")
+@app.command(epilog="[b]Example[/b]\n  vslam export ros runs/latest")
 def ros(
     run: Run,
     out: Annotated[Path | None, _out("ros.mcap")] = None,
@@ -205,7 +192,7 @@ def ros(
     """Write odometry, transforms, path and landmarks as ROS 2 messages, in an MCAP file."""
     import numpy as np
 
-    from vslam.maps.new_output import new_file
+    from vslam.maps.new_output import new_output
     from vslam.maps.ros import frame_poses, save_bag
     from vslam.maps.storage import load_map
     from vslam.report.frame_table import read_covariances
@@ -223,7 +210,7 @@ def ros(
     if (run / "map.npz").is_file():  # a run that only localises has no map of its own
         map_ = load_map(run).map
         xyz = map_.arrays.xyz[map_.living_landmarks()]
-    with new_file(target) as file:
+    with new_output(target) as file:
         save_bag(file, poses, trajectory, xyz)
     if not quiet:
         typer.echo(f"{target}: {counted(len(poses), 'pose')}, {counted(len(xyz), 'landmark')}")
@@ -264,10 +251,10 @@ def _read(run: Path) -> tuple[FinishedRun, Reconstruction]:
 
 
 def _keyframes(finished: FinishedRun, data: str | None, *, quiet: bool) -> Iterator[TimedFrame]:
-    from vslam.cli.console import console
+    from vslam.cli.console import Console
     from vslam.report.finished_run import keyframe_frames, open_images
 
-    told = console(shown=not quiet)
+    told = Console(shown=not quiet)
     with told.render_bar() as on_render:
         source = open_images(finished, data, on_render)
     with told.count_bar("images", len(finished.map.frames)) as advance:
@@ -276,36 +263,41 @@ def _keyframes(finished: FinishedRun, data: str | None, *, quiet: bool) -> Itera
             advance()
 
 
-def _write_images(
-    folder: Path,
-    finished: FinishedRun,
+def _export_images(
+    run: Path,
     data: str | None,
-    reconstruction: Reconstruction,
+    target: Path,
+    save: Callable[[Path, Reconstruction, list[str], Colours], None],
     *,
     link: bool,
     quiet: bool,
-) -> tuple[list[str], NDArray[np.uint8]]:
-    """Write the keyframe images; returns their names and the colours of the landmarks."""
-    from vslam.maps.keyframe_images import landmark_colours, save_image
+) -> None:
+    """Write the keyframe images of a run into a new folder, and ``save`` a model beside them, given
+    the names of the images and the colours of the landmarks."""
+    from vslam.maps.formats import landmark_colours, save_image
+    from vslam.maps.new_output import new_output
 
-    folder.mkdir()
+    finished, reconstruction = _read(run)
     names: list[str] = []
 
-    def saved() -> Iterator[NDArray[np.uint8]]:
+    def saved(images: Path) -> Iterator[NDArray[np.uint8]]:
         frames = _keyframes(finished, data, quiet=quiet)
         for index, frame in zip(reconstruction.frames.tolist(), frames, strict=True):
             image = _image_of(frame)
             if link:
                 file = _own_file(frame, finished)
                 names.append(f"{index:06d}{file.suffix}")
-                (folder / names[-1]).symlink_to(file.resolve())
+                (images / names[-1]).symlink_to(file.resolve())
             else:
                 names.append(f"{index:06d}.png")
-                save_image(image, folder / names[-1])
+                save_image(image, images / names[-1])
             yield image
 
-    colours = landmark_colours(reconstruction, saved())
-    return names, colours
+    with new_output(target, folder=True) as folder:
+        (folder / "images").mkdir()
+        colours = landmark_colours(reconstruction, saved(folder / "images"))
+        save(folder, reconstruction, names, colours)
+    _say(target, reconstruction, quiet=quiet)
 
 
 def _image_of(frame: TimedFrame) -> NDArray[np.uint8]:

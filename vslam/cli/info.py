@@ -12,12 +12,10 @@ from vslam.cli.options import kitti_root
 from vslam.cli.tables import print_rows
 from vslam.errors import InputError
 
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command()(info)
+app = typer.Typer()
 
 
+@app.command()
 def info(
     data: Annotated[
         Path | None,

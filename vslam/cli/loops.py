@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -16,6 +14,7 @@ from vslam.cli.options import (
     METHOD,
     OUTPUT,
     AllThreads,
+    Detectors,
     Quiet,
     Seed,
     Weights,
@@ -25,11 +24,7 @@ from vslam.cli.options import (
 from vslam.errors import InputError, counted
 
 if TYPE_CHECKING:
-    from vslam.lab.loopbench.conditions import Condition
-    from vslam.lab.loopbench.online import Window
     from vslam.lab.loopbench.schema import Gain, OnlineScore, Score
-    from vslam.lab.loopbench.sets import ProgressBar
-    from vslam.loopclosure.vocabulary import Vocabulary
 
 _EXAMPLES = """
 [b]Examples[/b]
@@ -42,20 +37,10 @@ DATA = ("town:demo[seed=101]", "town:05[seed=102]", "town:demo[seed=103,aliased=
 DRIVES = ("drive:05[seed=102]", "drive:demo[seed=103,aliased=1,every=5]")
 PERTURB, STRENGTHS = "none,light,clipping,viewpoint,occlusion,noise,blur,change,all", "0.5,1"
 WINDOW = "20s"
-commands = typer.Typer(help="Compare loop detectors.", no_args_is_help=True)
+app = typer.Typer(name="loops", help="Compare loop detectors.", no_args_is_help=True)
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the application."""
-    app.add_typer(commands, name="loops")
-
-
-@commands.callback()
-def _group() -> None:
-    """Keep the name of the only command, which typer would otherwise drop."""
-
-
-@commands.command("bench", epilog=_EXAMPLES)
+@app.command("bench", epilog=_EXAMPLES)
 def bench(
     protocol: Annotated[
         Literal["retrieval", "online"],
@@ -78,10 +63,7 @@ def bench(
             unset="three towns, or two drives",
         ),
     ] = None,
-    detectors: Annotated[
-        str,
-        option(METHOD, "NAMES", "Loop detectors, separated by commas; the first is the baseline."),
-    ] = "bow,capsule,capsule-pruned",
+    detectors: Detectors = "bow,capsule,capsule-pruned",
     weights: Weights = None,
     perturb: Annotated[
         str,
@@ -130,98 +112,55 @@ def bench(
         raise InputError("--window: only for --protocol online; add that or leave it out.")
 
     _require_writable(out)
-    from vslam.cli.console import console
-    from vslam.loopclosure.vocabulary import load
-    from vslam.machine import available_cores
-
-    asked = _Asked(
-        names,
-        files,
-        load(),
-        seed,
-        threads or available_cores(),
-        console(shown=not quiet).count_bar,
-    )
-    write = partial(_write, out, seed)
-    # The report is written after every set, so that a command that is stopped keeps its results.
-    if protocol == "online":
-        done = _on_drives(asked, data or DRIVES, youngest, write)
-    else:
-        done = _on_sets(asked, data or DATA, conditions, write, quiet=quiet)
-    if not quiet:
-        typer.echo(f"{out / 'loops.html'}: {counted(len(names), 'detector')} on {done}")
-
-
-class _Asked(NamedTuple):
-    """What both protocols need."""
-
-    names: list[str]
-    files: dict[str, Path]
-    vocabulary: Vocabulary
-    seed: int
-    threads: int
-    progress_bar: ProgressBar
-
-
-def _on_drives(
-    asked: _Asked, data: Sequence[str], window: Window, write: Callable[..., None]
-) -> str:
-    """Measure in the online protocol of the literature; returns what was measured on."""
-    from vslam.datasets.synthetic import store
-    from vslam.lab.loopbench.detectors import open_scorer
-    from vslam.lab.loopbench.drives import open_drives
-    from vslam.lab.loopbench.measure_online import measure_drive
-
-    scorers = [open_scorer(one, asked.files.get(one), asked.vocabulary) for one in asked.names]
-    threads, bar = asked.threads, asked.progress_bar
-    drives = [
-        drive
-        for spec in data
-        for drive in open_drives(spec, store.cache_folder(), threads=threads, progress_bar=bar)
-    ]
-    scores: list[OnlineScore] = []
-    for drive in drives:
-        scores += measure_drive(drive, scorers, window, asked.vocabulary, threads=threads)
-        write(online=scores)
-    return counted(len(drives), "drive")
-
-
-def _on_sets(
-    asked: _Asked,
-    data: Sequence[str],
-    conditions: list[Condition],
-    write: Callable[..., None],
-    *,
-    quiet: bool,
-) -> str:
-    """Measure queries against galleries; returns what was measured on."""
-    from vslam.cli.console import console
+    from vslam.cli.console import Console
     from vslam.datasets.synthetic import store
     from vslam.lab.loopbench.cost import cost
     from vslam.lab.loopbench.detectors import DetectorSet, open_scorer
+    from vslam.lab.loopbench.drives import open_drives
     from vslam.lab.loopbench.measure import measure
+    from vslam.lab.loopbench.measure_online import measure_drive
     from vslam.lab.loopbench.sets import open_set
+    from vslam.loopclosure.vocabulary import SHIPPED
+    from vslam.loopclosure.vocabulary_text import read_vocabulary
+    from vslam.machine import available_cores
 
-    scorers = [open_scorer(one, asked.files.get(one), asked.vocabulary) for one in asked.names]
-    threads, bar = asked.threads, asked.progress_bar
-    sets = [
-        found
-        for spec in data
-        for found in open_set(spec, store.cache_folder(), threads=threads, progress_bar=bar)
-    ]
-    console(shown=not quiet).announce("time and memory of each detector ...")
-    costs = [cost(name, asked.files.get(name)) for name in asked.names]
-    scores: list[Score] = []
-    gains: list[Gain] = []
-    for test_set in sets:
-        compared = DetectorSet(scorers, asked.vocabulary, threads)
-        with bar(test_set.title, len(conditions)) as advance:
-            for condition in conditions:
-                more = measure(test_set, condition, compared, asked.seed)
-                scores, gains = scores + more[0], gains + more[1]
-                advance()
-        write(cells=scores, gains=gains, costs=costs)
-    return f"{counted(len(sets), 'set')} of images"
+    vocabulary = read_vocabulary(files.get("bow", SHIPPED))
+    scorers = [open_scorer(name, files.get(name), vocabulary) for name in names]
+    threads, told = threads or available_cores(), Console(shown=not quiet)
+    cache, bar = store.cache_folder(), told.count_bar
+    # The report is written after every set, so that a command that is stopped keeps its results.
+    if protocol == "online":
+        drives = [
+            drive
+            for spec in data or DRIVES
+            for drive in open_drives(spec, cache, threads=threads, progress_bar=bar)
+        ]
+        online: list[OnlineScore] = []
+        for drive in drives:
+            online += measure_drive(drive, scorers, youngest, vocabulary, threads=threads)
+            _write(out, seed, online=online)
+        done = counted(len(drives), "drive")
+    else:
+        sets = [
+            found
+            for spec in data or DATA
+            for found in open_set(spec, cache, threads=threads, progress_bar=bar)
+        ]
+        told.announce("time and memory of each detector ...")
+        costs = [cost(name, files.get(name)) for name in names]
+        scores: list[Score] = []
+        gains: list[Gain] = []
+        for test_set in sets:
+            compared = DetectorSet(scorers, vocabulary, threads)
+            with bar(test_set.title, len(conditions)) as advance:
+                for condition in conditions:
+                    more = measure(test_set, condition, compared, seed)
+                    scores, gains = scores + more[0], gains + more[1]
+                    advance()
+            _write(out, seed, cells=scores, gains=gains, costs=costs)
+        done = f"{counted(len(sets), 'set')} of images"
+    if not quiet:
+        typer.echo(f"{out / 'loops.html'}: {counted(len(names), 'detector')} on {done}")
 
 
 def _require_writable(out: Path) -> None:
@@ -245,9 +184,6 @@ def _write(out: Path, seed: int, **found: object) -> None:
 
     here = this_machine()
     report = {
-        "cells": [],
-        "gains": [],
-        "costs": [],
         **found,
         "seed": seed,
         "machine": f"{here.cpu}, {counted(here.cores, 'core')}",

@@ -49,13 +49,11 @@ class _Command(TyperCommand):
     """A command with our own help, which suggests a name for a misspelt choice."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """See ``TyperCommand.format_help``."""
         from vslam.cli.help import show_help
 
         show_help(self, ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """See ``TyperCommand.parse_args``."""
         try:
             return super().parse_args(ctx, args)
         except typer.BadParameter as error:
@@ -67,7 +65,6 @@ class _Group(TyperGroup):
     """Several commands under one name, with our own help."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """See ``TyperGroup.format_help``."""
         from vslam.cli.help import show_help
 
         show_help(self, ctx)
@@ -95,11 +92,8 @@ def application(groups: Collection[ModuleType]) -> typer.Typer:
         rich_markup_mode="rich",
     )
     for group in groups:
-        group.register(made)
-    for several in made.registered_groups:
-        several.cls = _Group
-    for commands in (made, *(several.typer_instance for several in made.registered_groups)):
-        for command in commands.registered_commands if commands else ():
+        made.add_typer(group.app, cls=_Group)
+        for command in group.app.registered_commands:
             command.cls = _Command
     made.callback(invoke_without_command=True)(version)
     return made

@@ -9,20 +9,20 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vslam.cli.options import METHOD, OUTPUT, Quiet, Thresholds, option, read_thresholds
-from vslam.errors import InputError, ResultsError, counted
+from vslam.errors import InputError, counted
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     import numpy as np
     from numpy.typing import NDArray
 
     from vslam.cli.tables import Rows
+    from vslam.config import Config
     from vslam.map import Map
     from vslam.maps.reconstruction import Reconstruction
     from vslam.maps.stored_map import StoredMap
 
-commands = typer.Typer(
+app = typer.Typer(
+    name="map",
     help="Show, merge and crop the maps of runs (docs/howto/maps.md).",
     no_args_is_help=True,
 )
@@ -31,12 +31,7 @@ Out = Annotated[Path, option(OUTPUT, "FILE", "Map to write; it must not exist ye
 MapFile = Annotated[Path, typer.Argument(metavar="MAP", help="Folder of a run, or a map.npz.")]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the application."""
-    app.add_typer(commands, name="map")
-
-
-@commands.command(epilog="[b]Example[/b]\n  vslam map info runs/latest")
+@app.command(epilog="[b]Example[/b]\n  vslam map info runs/latest")
 def info(
     map_file: MapFile,
 ) -> None:
@@ -105,9 +100,7 @@ def _extent(T_wc: NDArray[np.float64]) -> list[str]:
     return [f"{axis} {low[i]:.1f} to {high[i]:.1f}" for i, axis in ((0, "x"), (2, "z"))]
 
 
-@commands.command(
-    epilog="[b]Example[/b]\n  vslam map merge runs/monday runs/tuesday --out town.npz"
-)
+@app.command(epilog="[b]Example[/b]\n  vslam map merge runs/monday runs/tuesday --out town.npz")
 def merge(
     maps: Annotated[
         list[Path],
@@ -119,32 +112,33 @@ def merge(
     config: Thresholds = None,
     weights: Annotated[
         Path | None,
-        option(METHOD, "FILE", "ONNX file of the network of the detector that made the maps."),
+        option(METHOD, "FILE", "Weights or vocabulary of the detector that made the maps."),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Merge several maps into one by verified loops between them.
 
     A map without a loop to the others is left out and named. If no map has a loop to the first
-    one, nothing is written and the exit code is 1. The files of the maps are not changed.
+    one, nothing is written and the exit code is 1. The files of the maps are not changed. Without
+    --config, the thresholds are those that the first map was made with.
     """
-    from vslam.cli.console import console
+    from vslam.cli.console import Console
     from vslam.loopclosure.registry import detector_with_images
-    from vslam.maps.storage import load_map, map_file_of, save_map
+    from vslam.maps.storage import load_map, map_file_of
     from vslam.merging import Memory, merge_maps
 
     if len(maps) < 2:
         raise InputError(f"{maps[0]}: this is one map; name two or more to merge.")
-    _require_free(out)
-    thresholds = read_thresholds(config)
-    # No camera waits for the network, which may see all keyframes at once.
-    seen = thresholds.siamese.model_copy(update={"embedded_at_once": sys.maxsize})
-    thresholds = thresholds.model_copy(update={"siamese": seen})
+    _require_place(out)
     files = [map_file_of(path) for path in maps]
     for number, file in enumerate(files):
         if file.resolve() in [other.resolve() for other in files[:number]]:
             raise InputError(f"{file}: named twice; a map cannot be merged with itself.")
     stored = [load_map(file) for file in files]
+    thresholds = _thresholds_of(stored, files) if config is None else read_thresholds(config)
+    # No camera waits for the network, which may see all keyframes at once.
+    seen = thresholds.siamese.model_copy(update={"embedded_at_once": sys.maxsize})
+    thresholds = thresholds.model_copy(update={"siamese": seen})
     if not stored[0].map.n_keyframes:
         raise InputError(f"{files[0]}: the map is empty; name one that others can be merged into.")
     name = stored[0].detector.name
@@ -158,7 +152,7 @@ def merge(
 
     keyframes = sum(one.map.n_keyframes for one in stored[1:])
     try:
-        with console(shown=not quiet).count_bar("keyframes", keyframes) as advance:
+        with Console(shown=not quiet).count_bar("keyframes", keyframes) as advance:
             merged = merge_maps(stored, thresholds, create, advance)
     except ValueError as error:
         raise InputError(f"{files[0]} and the others cannot be merged: {error}.") from error
@@ -169,10 +163,26 @@ def merge(
     if not merged.joined:
         typer.echo("no map has a loop to the first one: nothing was written")
         raise typer.Exit(1)
-    _save(save_map, out, merged.stored)
+    _save(out, merged.stored)
 
 
-@commands.command(
+def _thresholds_of(stored: list[StoredMap], files: list[Path]) -> Config:
+    """The thresholds that the first map was made with; other maps with different ones are named."""
+    from vslam.config import as_config
+
+    thresholds = stored[0].thresholds
+    others = [
+        str(file) for one, file in zip(stored, files, strict=True) if one.thresholds != thresholds
+    ]
+    if others:
+        typer.echo(
+            f"{', '.join(others)}: made with other thresholds than {files[0]}, whose thresholds "
+            "are used; --config gives others."
+        )
+    return as_config(thresholds, str(files[0]))
+
+
+@app.command(
     epilog="[b]Examples[/b]\n  vslam map crop town.npz --box=-50,50,0,200 --out street.npz\n"
     "  vslam map crop town.npz --point 20,140 --within 60 --out crossing.npz\n"
     "  vslam map crop town.npz --frames 300:500 --within 10 --out way.npz"
@@ -214,12 +224,12 @@ def crop(
 
     x points to the right of the first camera and z ahead; the height does not matter.
     """
-    from vslam.maps.crop import in_box, near_frames, near_point
-    from vslam.maps.storage import load_map, map_file_of, save_map
+    from vslam.maps.storage import load_map, map_file_of
+    from vslam.maps.stored_map import in_box, near_frames, near_point
 
     if sum(map(bool, (box, point, frames))) != 1:
         raise InputError("--box, --point, --frames: give exactly one, which says what is kept.")
-    _require_free(out)
+    _require_place(out)
     file = map_file_of(map_file)
     stored = load_map(file)
     if box:
@@ -231,7 +241,7 @@ def crop(
         kept = near_frames(stored.map, drive, first, last, within)
     if not len(kept):
         raise InputError(f"{file}: no keyframe lies there; 'vslam map info' shows its extent.")
-    _save(save_map, out, stored.select(kept))
+    _save(out, stored.select(kept))
 
 
 def _numbers(option: str, text: str, n: int, separator: str = ",") -> list[float]:
@@ -244,22 +254,19 @@ def _numbers(option: str, text: str, n: int, separator: str = ",") -> list[float
     return numbers
 
 
-def _require_free(out: Path) -> None:
-    from vslam.maps.new_output import require_place
+def _require_place(out: Path) -> None:
+    from vslam.maps.new_output import require_free, require_place
 
-    if out.exists():
-        raise InputError(f"{out}: exists already; remove it, or name another file with --out.")
+    require_free(out)
     require_place(out, "--out")
 
 
-def _save(save_map: Callable[[Path, StoredMap], None], out: Path, stored: StoredMap) -> None:
-    try:
-        save_map(out, stored)
-    except OSError as error:
-        raise ResultsError(
-            f"{out}: cannot be written ({error.strerror or error}); free some space or name "
-            "another place with --out."
-        ) from error
+def _save(out: Path, stored: StoredMap) -> None:
+    from vslam.maps.new_output import new_output
+    from vslam.maps.storage import save_map
+
+    with new_output(out) as file:
+        save_map(file, stored)
     map_ = stored.map
     keyframes = counted(map_.n_keyframes, "keyframe")
     typer.echo(f"{out}: {keyframes}, {counted(map_.n_landmarks, 'landmark')}")

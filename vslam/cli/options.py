@@ -55,6 +55,11 @@ def flag(panel: str, text: str, *names: str) -> Any:
     return typer.Option(*names, help=text, rich_help_panel=panel)
 
 
+def threads(unset: str, text: str = "Threads; they do not change the result.") -> Any:
+    """The option ``--threads`` of a command whose default is ``unset``."""
+    return option(EXECUTION, "N", text, min=1, unset=unset)
+
+
 Perturb = Annotated[
     str,
     option(
@@ -81,6 +86,10 @@ Weights = Annotated[
         METHOD, "NAME=FILE", "Weights of a detector in place of the shipped ones; repeat for more."
     ),
 ]
+Detectors = Annotated[
+    str,
+    option(METHOD, "NAMES", "Loop detectors, separated by commas; the first is the baseline."),
+]
 Seeds = Annotated[int, option(METHOD, "N", "Seeds of each random perturbation.", min=1)]
 Jobs = Annotated[
     int,
@@ -88,31 +97,46 @@ Jobs = Annotated[
         EXECUTION, "N", "Runs at a time. Only with 1 are the frames per second comparable.", min=1
     ),
 ]
-Threads = Annotated[
-    int | None,
-    option(
-        EXECUTION,
-        "N",
-        "Threads; they do not change the result.",
-        min=1,
-        unset="all cores, at most 4",
-    ),
-]
-AllThreads = Annotated[
-    int | None,
-    option(EXECUTION, "N", "Threads; they do not change the result.", min=1, unset="all cores"),
-]
+Threads = Annotated[int | None, threads("all cores, at most 4")]
+AllThreads = Annotated[int | None, threads("all cores")]
 ThreadsOfRun = Annotated[
-    int | None,
-    option(
-        EXECUTION, "N", "Threads of each run.", min=1, unset="the cores shared by --jobs, at most 4"
-    ),
+    int | None, threads("the cores shared by --jobs, at most 4", "Threads of each run.")
 ]
 Scheduler = Annotated[
     str | None,
     option(
         EXECUTION, "ADDRESS", "Dask scheduler, such as tcp://HOST:8786, whose workers do the runs."
     ),
+]
+SystemNames = Annotated[
+    str,
+    option(
+        METHOD, "NAMES", "Systems to test: [b]vslam[/b], [b]orbslam3[/b] and those of --system."
+    ),
+]
+OtherSystems = Annotated[
+    list[str] | None,
+    option(
+        METHOD,
+        "NAME=COMMAND",
+        "Another system: a command that reads {folder}, in KITTI's format, and writes "
+        "{out} (docs/howto/stress.md).",
+        "--system",
+    ),
+]
+OrbSlam3Python = Annotated[
+    Path | None,
+    option(
+        METHOD,
+        "FILE",
+        "Python interpreter that has pyorbslam3.",
+        "--orbslam3-python",
+        unset="this one",
+    ),
+]
+OrbSlam3Vocabulary = Annotated[
+    Path | None,
+    option(METHOD, "FILE", "Vocabulary of ORB-SLAM3, in DBoW2's text format.", "--vocabulary"),
 ]
 Quiet = Annotated[bool, flag(OUTPUT, "Show no progress and no summary.", "--quiet")]
 SensorName = Literal["stereo", "mono", "rgbd"]

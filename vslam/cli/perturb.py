@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.cli.console import console
+from vslam.cli.console import Console
 from vslam.cli.options import OUTPUT, Perturb, Seed, flag, open_given, option, reads_source
-from vslam.errors import InputError
+from vslam.errors import write_file
 
 if TYPE_CHECKING:
     from vslam.datasets.sources import SourceOptions
@@ -22,11 +22,10 @@ _EXAMPLE = """
 """
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command("perturb", epilog=_EXAMPLE)(preview)
+app = typer.Typer()
 
 
+@app.command("perturb", epilog=_EXAMPLE)
 @reads_source(without=("mask",))
 def preview(
     given: SourceOptions,
@@ -61,9 +60,11 @@ def preview(
         parse_perturbation,
         sheet_of_laws,
     )
+    from vslam.maps.new_output import require_place
 
+    require_place(out, "--out")
     name = perturb if perturb == "all" else parse_perturbation(perturb, seed).name
-    opened = open_given(given, console(shown=True))
+    opened = open_given(given, Console(shown=True))
     sequence = first_frames(opened)
     if perturb == "all":
         fit, unfit = laws_for(opened)
@@ -77,13 +78,7 @@ def preview(
         image = contact_sheet(
             sequence, parse_perturbation(perturb, seed), shown, given.start, given.every
         )
-    sheet = cv2.imencode(".png", image)[1]
-    try:
-        out.write_bytes(sheet.tobytes())
-    except OSError as error:
-        raise InputError(
-            f"{out}: cannot be written ({error.strerror}); name another file with --out."
-        ) from error
+    write_file(out, cv2.imencode(".png", image)[1].tobytes(), "name another file with --out")
     frames_shown = ", ".join(str(given.start + given.every * frame) for frame in shown)
     typer.echo(f"{out}: {name}, seed {seed}, frames {frames_shown}")
 

@@ -19,11 +19,10 @@ _EXAMPLES = """
 """
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command(epilog=_EXAMPLES)(report)
+app = typer.Typer()
 
 
+@app.command(epilog=_EXAMPLES)
 def report(
     runs: Annotated[
         list[Path],
@@ -89,7 +88,7 @@ def write_overview_of(
 ) -> None:
     """Write the report of finished runs; unless ``quiet``, print its first tables and its path."""
     from vslam.cli.tables import show_sections
-    from vslam.lab.overview import write_overview
+    from vslam.lab.overview.render import write_overview
     from vslam.lab.overview.versus import versus
 
     written = write_overview(runs, trajectories, out, baseline)

@@ -11,6 +11,7 @@ from vslam.cli.drive import Output, drive
 from vslam.cli.options import (
     DETECTOR_NAMES,
     EXECUTION,
+    INPUT,
     MAP,
     METHOD,
     OUTPUT,
@@ -22,6 +23,7 @@ from vslam.cli.options import (
     Thresholds,
     ViewerName,
     flag,
+    names_in,
     option,
     read_thresholds,
     reads_source,
@@ -45,15 +47,23 @@ _EXAMPLES = """
 _OTHER_DETECTORS = ", ".join(name for name in DETECTOR_NAMES if name not in ("none", "both"))
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command(epilog=_EXAMPLES)(run)
+app = typer.Typer()
 
 
+@app.command(epilog=_EXAMPLES)
 @reads_source()
 def run(
     context: typer.Context,
     given: SourceOptions,
+    gps: Annotated[
+        Path | None,
+        option(
+            INPUT,
+            "FILE",
+            "GPS fixes, which put the trajectory on the Earth: CSV, a bag, or the folder oxts of "
+            "KITTI raw (docs/howto/gps.md).",
+        ),
+    ] = None,
     perturb: Perturb = "none",
     seed: Seed = 0,
     detector: Annotated[
@@ -69,7 +79,10 @@ def run(
     weights: Annotated[
         Path | None,
         option(
-            METHOD, "FILE", "ONNX file of the detector's network, written by [b]vslam train[/b]."
+            METHOD,
+            "FILE",
+            "ONNX file of the detector's network, written by [b]vslam train[/b], or the "
+            "vocabulary of [b]bow[/b], written by [b]vslam vocabulary[/b].",
         ),
     ] = None,
     local_weights: Annotated[
@@ -149,12 +162,18 @@ def run(
         _refuse_beside_resume(context)
         from vslam.run.options import resumed_options
 
-        drive(resumed_options(resume), output, resume=resume)
+        if resume.is_symlink():  # runs/latest names another run after the next one
+            resume = resume.parent / resume.readlink()
+        options = resumed_options(resume)
+        require_detector(options.detector, options.weights, f"--resume {resume}: detector")
+        drive(options, output, resume=resume)
         return
     if local_weights is not None and not local_weights.is_file():
         raise InputError(f"--local-weights {local_weights}: no such file; name an .onnx file.")
     if localize and map_file is None:
         raise InputError("--localize: name the map to localise in with --map.")
+    if localize and gps is not None:
+        raise InputError("--gps: localising does not change the map; leave --localize out.")
     of_map: dict[str, object] = {}
     if map_file is not None:
         if compare:
@@ -179,6 +198,7 @@ def run(
         **given.model_dump(),
         perturb=perturb,
         seed=seed,
+        gps=gps,
         threads=threads or min(available_cores(), 4),
         detector=detector,
         weights=weights,
@@ -211,7 +231,7 @@ def _compared(names: str, detector: str) -> tuple[str, ...]:
     """The detectors of ``--compare``, without repetitions."""
     from vslam.loopclosure.registry import require_detector
 
-    found = tuple(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
+    found = tuple(names_in(names))
     for name in found:
         require_detector(name, option="--compare")
     if detector in found:

@@ -24,11 +24,10 @@ _EXAMPLES = """
 _DRIVE, _TOWN, _PAIRS = "Drive", "Town", "Pairs of images"  # panels of --help
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command(epilog=_EXAMPLES)(synth)
+app = typer.Typer()
 
 
+@app.command(epilog=_EXAMPLES)
 def synth(
     route: Annotated[
         str, typer.Argument(help="Built-in route, or a name for that of --trajectory.")
@@ -129,7 +128,7 @@ def synth(
     quiet: Quiet = False,
 ) -> None:
     """Render a drive through a town in KITTI's format, with exact ground truth."""
-    from vslam.cli.console import console
+    from vslam.cli.console import Console
     from vslam.datasets.synthetic import (
         DRIVES,
         ROUTES,
@@ -180,34 +179,21 @@ def synth(
         seed or town.seed, aliased or town.aliased, change or town.change, dynamic or town.moving
     )
     threads = threads or min(available_cores(), 4)
-    with console(shown=not quiet).render_bar() as on_frame:
+    with Console(shown=not quiet).render_bar() as on_frame:
         if pairs:
             from vslam.datasets.synthetic.pairs import Moves, render_pairs
 
             root = out or Path("pairs")
             moves = Moves(_range("--lateral", lateral, -4.0), _range("--heading", heading, 0.0))
             render_pairs(drive, variation, root, pairs, moves, threads=threads, on_frame=on_frame)
-        elif fisheye:
+        elif fisheye or rgbd:
             from vslam.datasets.synthetic.fisheye import render_fisheye
+            from vslam.datasets.synthetic.layouts import render_rgbd
 
-            root = render_fisheye(
-                drive,
-                variation,
-                out or Path(f"{route}-fisheye"),
-                until=max_frames,
-                threads=threads,
-                on_frame=on_frame,
-            )
-        elif rgbd:
-            from vslam.datasets.synthetic.rgbd import render_rgbd
-
-            root = render_rgbd(
-                drive,
-                variation,
-                out or Path(f"{route}-rgbd"),
-                until=max_frames,
-                threads=threads,
-                on_frame=on_frame,
+            render, form = (render_fisheye, "fisheye") if fisheye else (render_rgbd, "rgbd")
+            target = out or Path(f"{route}-{form}")
+            root = render(
+                drive, variation, target, until=max_frames, threads=threads, on_frame=on_frame
             )
         else:
             root = store.render_sequence(
@@ -222,7 +208,7 @@ def synth(
             )
     if side_by_side is not None:
         from vslam.datasets.kitti import open_kitti
-        from vslam.datasets.synthetic.video import write_side_by_side
+        from vslam.datasets.synthetic.layouts import write_side_by_side
 
         frames = open_kitti(root, drive.name, max_frames=max_frames)
         calibration_file = write_side_by_side(frames, side_by_side)

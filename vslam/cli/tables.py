@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from vslam.report.schema import ReportJson
 
 Rows = list[tuple[str, str]]
-_LOOK_AT = (("report", "report.html"), ("recording", "recording.rrd"))
+_LOOK_AT = (("report", "report.html"), ("recording", "recording*.rrd"))
 
 
 def show_sections(sections: Iterable[Section]) -> None:
@@ -33,11 +33,14 @@ def print_rows(rows: Rows) -> None:
 def print_summary(report: ReportJson, folder: Path) -> None:
     """Print the first sections of the report of a finished run, whose results are in ``folder``."""
     from vslam.report.run_page import run_page
+    from vslam.run.autosave import MAP
 
     page = run_page(report)
     summary, detectors, *_ = page.sections
-    there = [(name, str(folder / file)) for name, file in _LOOK_AT if (folder / file).exists()]
+    there = [(name, str(file)) for name, files in _LOOK_AT for file in sorted(folder.glob(files))]
     rows = [("folder", str(folder)), *there, *_how_to_compare(report)]
+    if report.interrupted and (folder / MAP).exists():
+        rows.append(("continue", f"vslam run --resume {folder}"))
     about = Section("", [" · ".join(page.about)])
     show_sections([about, summary, detectors, Section("", [Pairs(rows)])])
 

@@ -9,18 +9,13 @@ from __future__ import annotations
 import time
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import typer
 
-from vslam.cli.export import commands as export
+from vslam.cli.export import app as export
 from vslam.cli.options import EXECUTION, INPUT, METHOD, OUTPUT, AllThreads, Quiet, flag, option
-from vslam.errors import counted
-
-if TYPE_CHECKING:
-    from vslam.loopclosure.training.data import Collection
-    from vslam.loopclosure.training.settings import TrainSettings
-    from vslam.loopclosure.training.training import TrainingOutcome
+from vslam.errors import InputError, counted, write_file
 
 _TRAIN_EXAMPLES = """
 [b]Examples[/b]
@@ -39,9 +34,7 @@ _PLACES_EXAMPLES = """
 """
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command(epilog=_TRAIN_EXAMPLES)(train)
+app = typer.Typer()
 
 
 NetworkName = Literal["capsule", "capsule-pruned", "capsule-paper"]
@@ -61,6 +54,7 @@ DataSources = Annotated[
 ]
 
 
+@app.command(epilog=_TRAIN_EXAMPLES)
 def train(
     network: Annotated[
         NetworkName,
@@ -141,15 +135,21 @@ def train(
     and a model card.
     """
     _require_libraries("train")
+    from vslam.cli.console import Console
     from vslam.loopclosure.siamese.images import parse_size
     from vslam.loopclosure.siamese.source_registry import open_source
+    from vslam.loopclosure.training.checkpoint import CHECKPOINT
     from vslam.loopclosure.training.data import load, refuse_test_data
-    from vslam.loopclosure.training.runtime import set_threads
+    from vslam.loopclosure.training.export import export_onnx
+    from vslam.loopclosure.training.initial_network import starting_network
+    from vslam.loopclosure.training.model_card import describe, write_card
     from vslam.loopclosure.training.settings import PRESETS, load_settings
     from vslam.loopclosure.training.siamese import load_network
+    from vslam.loopclosure.training.training import set_threads
+    from vslam.loopclosure.training.training import train as run
     from vslam.machine import available_cores
 
-    began = time.monotonic()
+    until = None if max_minutes is None else time.monotonic() + 60.0 * max_minutes
     sources = [source for spec in data for source in open_source(spec)]
     if not allow_test_data:
         refuse_test_data(sources)
@@ -167,11 +167,23 @@ def train(
     threads = threads or available_cores()
     set_threads(threads)
     collection = load(sources, chosen.shape.input, chosen.fit, threads)
-    outcome = _train(
-        collection, chosen, folder, settings.name if settings else preset, data, device, threads,
-        resume, weights,
-        None if max_minutes is None else began + 60.0 * max_minutes, quiet,
-    )  # fmt: skip
+    start, chosen, report = starting_network(
+        chosen, collection, weights, device, resuming=resume and (folder / CHECKPOINT).exists()
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "settings.json").write_text(chosen.model_dump_json(indent=1) + "\n")
+    with Console(shown=not quiet).training_bar() as on_step:
+        outcome = run(
+            collection, chosen, folder, device=device, threads=threads, resume=resume,
+            start=start, on_step=on_step,
+            should_stop=None if until is None else lambda: time.monotonic() > until,
+        )  # fmt: skip
+    if outcome.weights.exists():
+        trained, about = load_network(outcome.weights)
+        export_onnx(trained, outcome.weights.with_suffix(".onnx"), about)
+        name = settings.name if settings else preset
+        card = describe(trained, collection, chosen, outcome, preset=name, data=data, device=device)
+        write_card({**card, **report}, outcome.weights)
     if quiet:
         return
     if not outcome.finished:
@@ -190,55 +202,11 @@ def _require_libraries(command: str) -> None:
     Raises:
         InputError: one of the packages of the extra ``train`` is not installed.
     """
-    from vslam.errors import InputError
-
     for name in ("torch", "safetensors", "onnx", "onnxscript"):
         if find_spec(name) is None:
             raise InputError(
                 f"vslam {command}: {name} is not installed; pip install 'vslam[train]'."
             )
-
-
-def _train(
-    collection: Collection,
-    settings: TrainSettings,
-    folder: Path,
-    preset: str,
-    data: list[str],
-    device: str,
-    threads: int,
-    resume: bool,
-    weights: Path | None,
-    until: float | None,
-    quiet: bool,
-) -> TrainingOutcome:
-    from vslam.cli.console import console
-    from vslam.loopclosure.training.checkpoint import CHECKPOINT
-    from vslam.loopclosure.training.export import export_onnx
-    from vslam.loopclosure.training.initial_network import starting_network
-    from vslam.loopclosure.training.model_card import describe, write_card
-    from vslam.loopclosure.training.siamese import load_network
-    from vslam.loopclosure.training.training import train as run
-
-    start, settings, report = starting_network(
-        settings, collection, weights, device, resuming=resume and (folder / CHECKPOINT).exists()
-    )
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "settings.json").write_text(settings.model_dump_json(indent=1) + "\n")
-    with console(shown=not quiet).training_bar() as on_step:
-        outcome = run(
-            collection, settings, folder, device=device, threads=threads, resume=resume,
-            start=start, on_step=on_step,
-            should_stop=None if until is None else lambda: time.monotonic() > until,
-        )  # fmt: skip
-    if outcome.weights.exists():
-        network, about = load_network(outcome.weights)
-        export_onnx(network, outcome.weights.with_suffix(".onnx"), about)
-        card = describe(
-            network, collection, settings, outcome, preset=preset, data=data, device=device
-        )
-        write_card({**card, **report}, outcome.weights)
-    return outcome
 
 
 @export.command("onnx", epilog=_EXPORT_EXAMPLES)
@@ -270,9 +238,6 @@ def weights_(
 ) -> None:
     """Write weights as vslam ships them: in half precision, with model card and ONNX file."""
     _require_libraries("export weights")
-    import shutil
-
-    from vslam.errors import ResultsError
     from vslam.loopclosure.training.export import export_onnx
     from vslam.loopclosure.training.siamese import load_network, save_network
 
@@ -280,13 +245,8 @@ def weights_(
     save_network(network, out, about, half=True)
     export_onnx(load_network(out)[0], out.with_suffix(".onnx"), about)
     cards = [weights.with_suffix(end) for end in (".md", ".json")]
-    try:
-        for card in filter(Path.exists, cards):
-            shutil.copyfile(card, out.with_suffix(card.suffix))
-    except OSError as error:
-        raise ResultsError(
-            f"{out.parent}: the model card cannot be written ({error.strerror})."
-        ) from error
+    for card in filter(Path.exists, cards):
+        write_file(out.with_suffix(card.suffix), card.read_bytes())
     typer.echo(f"{out}: {network.name}, {out.stat().st_size / 1e6:.2f} MB")
 
 

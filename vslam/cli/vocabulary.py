@@ -18,19 +18,14 @@ if TYPE_CHECKING:
 
     from vslam.config import OrbConfig
 
-_IMAGES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
-
-commands = typer.Typer(
-    help="Train, convert and show vocabularies of visual words.", no_args_is_help=True
+app = typer.Typer(
+    name="vocabulary",
+    help="Train, convert and show vocabularies of visual words.",
+    no_args_is_help=True,
 )
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the application."""
-    app.add_typer(commands, name="vocabulary")
-
-
-@commands.command(
+@app.command(
     epilog="[b]Examples[/b]\n  vslam vocabulary train photos kitti/sequences/01/image_0"
     "\n  vslam vocabulary train 'photos/*/*.jpg' --levels 6 --out mine.npz"
 )
@@ -52,7 +47,7 @@ def train(
     quiet: Quiet = False,
 ) -> None:
     """Train a vocabulary on images, preferably of many different places."""
-    from vslam.cli.console import console
+    from vslam.cli.console import Console
     from vslam.config import OrbConfig
     from vslam.loopclosure import vocabulary_training
     from vslam.loopclosure.vocabulary_text import is_text, write_vocabulary
@@ -62,7 +57,7 @@ def train(
         raise InputError(f"{out}: there is no folder {out.parent}; create it or choose another.")
     paths = _find(images)
     descriptors, unreadable = [], 0
-    shown = console(shown=not quiet)
+    shown = Console(shown=not quiet)
     with shown.count_bar("images", len(paths)) as advance:
         for path, found in zip(paths, _extract_all(paths, OrbConfig()), strict=True):
             if found is None:
@@ -90,7 +85,7 @@ def train(
     )
 
 
-@commands.command(epilog="[b]Example[/b]\n  vslam vocabulary convert ORBvoc.txt orbvoc.npz")
+@app.command(epilog="[b]Example[/b]\n  vslam vocabulary convert ORBvoc.txt orbvoc.npz")
 def convert(
     source: Annotated[Path, typer.Argument(help="Vocabulary, .npz or .txt (DBoW2).")],
     target: Annotated[Path, typer.Argument(help="File to write, .npz or .txt (DBoW2).")],
@@ -104,7 +99,7 @@ def convert(
     typer.echo(f"{target}: {read.n_words} words, {target.stat().st_size / 1e6:.1f} MB")
 
 
-@commands.command()
+@app.command()
 def info(
     file: Annotated[
         Path | None,
@@ -140,11 +135,13 @@ def _find(images: list[str]) -> list[Path]:
     """The image files of all folders and globs, sorted by name and without repetitions."""
     import glob
 
+    from vslam.datasets.image_files import is_image
+
     found: dict[Path, None] = {}
     for name in images:
         path = Path(name)
         if path.is_dir():
-            files = sorted(p for p in path.rglob("*") if p.suffix.lower() in _IMAGES)
+            files = sorted(filter(is_image, path.rglob("*")))
         elif path.is_file():
             files = [path]
         else:

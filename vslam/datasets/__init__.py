@@ -12,7 +12,7 @@ from vslam.datasets.frames import Source
 from vslam.errors import InputError, did_you_mean
 
 _FIRST = "00"  # KITTI's, and the town rendered after it
-DATASETS = ("kitti", "euroc", "tum", "synthetic")  # those that `open_sequence` knows
+DATASETS = ("kitti", "euroc", "tum", "synthetic")  # vslam's own
 
 
 def open_sequence(
@@ -48,16 +48,9 @@ def open_sequence(
         "start": start, "every": every, "max_frames": max_frames, "monocular": monocular
     }  # fmt: skip
     if dataset == "kitti":
-        from vslam.datasets.kitti import open_kitti, open_kitti_images
+        from vslam.datasets.kitti import open_kitti
 
-        name = _FIRST if name is None else name
-        if not calib:
-            return open_kitti(root, name, **chosen)
-        from vslam.calibration.files import read_calibration
-        from vslam.datasets.rectified import rectified
-
-        images = open_kitti_images(root, name, **chosen)
-        return rectified(images, read_calibration(calib, images.sizes[0]))
+        return open_kitti(root, _FIRST if name is None else name, calib=calib, **chosen)
     if dataset == "euroc":
         from vslam.datasets.euroc import open_euroc
 
@@ -71,33 +64,7 @@ def open_sequence(
     if dataset == "synthetic":
         from vslam.datasets.synthetic import open_synthetic
 
-        name = _FIRST if name is None else name
-        return open_synthetic(name, on_frame=on_render, **chosen)
-    source = open_plugin_source(dataset, root, name, calib=calib, **chosen)
-    if not source.seekable:
-        raise InputError(
-            f"--dataset {dataset}: this is a stream, which cannot seek; open it with "
-            "vslam.datasets.sources.open_source."
-        )
-    return source
-
-
-def open_plugin_source(
-    dataset: str,
-    root: Path | str,
-    name: str | None,
-    *,
-    start: int,
-    every: int,
-    max_frames: int | None,
-    monocular: bool,
-    calib: Several[Path | str],
-) -> Source:
-    """Open the source that a reader of another package offers.
-
-    Raises:
-        InputError: unknown data set, a broken package, or bad input as the reader says.
-    """
+        return open_synthetic(_FIRST if name is None else name, on_frame=on_render, **chosen)
     others = plugins.find_plugins(plugins.READERS)
     if dataset not in others:
         known = (*DATASETS, *others)
@@ -109,10 +76,7 @@ def open_plugin_source(
         raise InputError(f"--calib: {others[dataset]} brings its own; leave it out.")
     from vslam.datasets.plugin_reader import open_plugin
 
-    return open_plugin(
-        others[dataset], Path(root), name,
-        start=start, every=every, max_frames=max_frames, monocular=monocular,
-    )  # fmt: skip
+    return open_plugin(others[dataset], Path(root), name, **chosen)
 
 
 def known_datasets() -> tuple[str, ...]:

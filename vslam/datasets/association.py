@@ -1,9 +1,20 @@
-"""Association of images by their times."""
+"""Association by time: pairs of images, and ground truth at the times of frames."""
 
 from __future__ import annotations
 
+import logging
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
+
+from vslam.trajectory import Trajectory
+
+_log = logging.getLogger(__name__)
+
+# Ground truth comes at 100 Hz (TUM), 200 Hz (EuRoC) or 10 Hz (vehicles). At an acceleration of
+# 2 m/s^2, linear interpolation is off by 6 mm in the middle of this gap.
+_MAX_GAP_S = 0.15
 
 
 def associate(
@@ -29,3 +40,37 @@ def associate(
             taken.add(j)
     pairs = np.array(sorted(partner.items()), np.int64).reshape(-1, 2)
     return pairs[:, 0], pairs[:, 1]
+
+
+def poses_at(
+    source: Path, measured: Trajectory, times: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """Interpolated poses: positions linearly, rotations along the shortest arc.
+
+    Args:
+        source: file to name in the log.
+        times: ``(N,)`` seconds of frames.
+
+    Returns:
+        ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames outside the measured time or in a gap of more
+        than 0.15 s. None, with a warning, if no frame has a pose.
+    """
+    from scipy.spatial.transform import Rotation, Slerp
+
+    known = measured.timestamps
+    after = np.clip(np.searchsorted(known, times), 1, max(len(known) - 1, 1))
+    if len(known) < 2:
+        covered = np.zeros(len(times), np.bool_)
+    else:
+        near = known[after] - known[after - 1] <= _MAX_GAP_S
+        covered = near & (times >= known[0]) & (times <= known[-1])
+    if not covered.any():
+        _log.warning("%s: the ground truth covers none of the frames.", source)
+        return None
+    T_wc = np.full((len(times), 4, 4), np.nan)
+    T_wc[covered] = np.eye(4)
+    turns = Rotation.from_matrix(measured.T_wc[:, :3, :3])
+    T_wc[covered, :3, :3] = Slerp(known, turns)(times[covered]).as_matrix()
+    for k in range(3):
+        T_wc[covered, k, 3] = np.interp(times[covered], known, measured.T_wc[:, k, 3])
+    return T_wc

@@ -32,14 +32,16 @@ from vslam.datasets.bag_messages import (
     depth_of,
     grey_of,
     is_depth,
+    nav_sat_fix,
     stamp_of,
 )
-from vslam.datasets.frames import Images, RawSource, Size, TimedFrame
+from vslam.datasets.frames import Images, RawSource, Size, TimedFrame, decoded
 from vslam.datasets.image_files import size_text
 from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
 
 Bag = Any  # rosbags.highlevel.AnyReader
 
+_FIX_TYPE = "sensor_msgs/msg/NavSatFix"
 _MOST_METADATA = 1_000_000  # bytes; a hundred topics make 100,000
 _TOLERANCE_NS = 5_000_000
 _DEPTH_TOLERANCE_NS = 20_000_000  # as in TUM's associate.py; a Kinect alternates image and depth
@@ -130,11 +132,9 @@ def _play(
 ) -> Iterator[TimedFrame]:
     def read(messages: tuple[Message, ...], image_map: ImageMap) -> Images:
         sides = zip(messages, topics, sizes, (False, depth), strict=False)
-        left, *second = image_map(of_size, list(sides))
-        return np.asarray(left, np.uint8), second[0] if second else None
+        return decoded([partial(of_size, *side) for side in sides], image_map)
 
-    def of_size(side: tuple[Message, str, Size, bool]) -> Image | DepthImage:
-        message, topic, size, is_depth = side
+    def of_size(message: Message, topic: str, size: Size, is_depth: bool) -> Image | DepthImage:
         image = _decoded(path, topic, message, is_depth, scale)
         if image.shape[::-1] != size:
             raise UnreadableImageError(
@@ -186,6 +186,35 @@ def find_calibration(source: BagSource) -> Calibration | None:
                 return None
             documents.append(found)
     return read_ros(documents, None)
+
+
+def read_fixes_of_bag(path: Path) -> NDArray[np.float64]:
+    """``(M, 7)`` float64 GPS fixes, ``sensor_msgs/NavSatFix``: seconds, latitude, longitude,
+    altitude, and the standard deviations to the east, to the north and up, NaN if unknown.
+
+    Raises:
+        InputError: rosbags is not installed, the bag is damaged, it has no topic of fixes or
+            several, or no message has a position and a time.
+    """
+    with _opened(path) as bag:
+        topics = sorted({c.topic for c in bag.connections if c.msgtype == _FIX_TYPE})
+        if len(topics) != 1:
+            there = f"several ({', '.join(topics)})" if topics else "none"
+            raise InputError(
+                f"{path}: --gps needs one topic of NavSatFix messages, but the bag has {there}; "
+                "write the fixes to a CSV file."
+            )
+        fixes = [nav_sat_fix(message) for _, message in _messages(bag, path, (topics[0],))]
+    rows = np.array(fixes, np.float64).reshape(-1, 7)
+    rows = rows[np.isfinite(rows[:, 1:4]).all(axis=1)]
+    if not len(rows):
+        raise InputError(f"{path}: no message of {topics[0]} is a fix; name another file.")
+    if not rows[:, 0].all():
+        raise InputError(
+            f"{path}: the fixes of {topics[0]} have no time stamps (header.stamp is 0); record "
+            "them again with a driver that sets it."
+        )
+    return rows
 
 
 @contextmanager

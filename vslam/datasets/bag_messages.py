@@ -1,6 +1,6 @@
-"""Images and calibrations from ROS messages.
+"""Images, calibrations and GPS fixes from ROS messages.
 
-Fields and encodings: ``sensor_msgs/Image``, ``CompressedImage``, ``CameraInfo`` and
+Fields and encodings: ``sensor_msgs/Image``, ``CompressedImage``, ``CameraInfo``, ``NavSatFix`` and
 ``sensor_msgs/image_encodings.hpp`` of ROS.
 """
 
@@ -41,6 +41,19 @@ def stamp_of(message: Message) -> int:
     """Nanoseconds of the header's stamp, 0 if it was not set."""
     stamp = message.header.stamp
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def nav_sat_fix(message: Message) -> tuple[float, ...]:
+    """Seconds, latitude, longitude, altitude, and three standard deviations (east, north, up) of a
+    ``NavSatFix``; NaN where there is no fix, or where the covariance is unknown."""
+    status, covariance = message.status.status, np.asarray(message.position_covariance)
+    position = (message.latitude, message.longitude, message.altitude)
+    if status < 0:  # STATUS_NO_FIX
+        position = (np.nan, np.nan, np.nan)
+    variances = covariance.reshape(3, 3).diagonal()
+    known = message.position_covariance_type > 0 and (variances > 0.0).all()
+    sigma = np.sqrt(variances) if known else np.full(3, np.nan)
+    return (stamp_of(message) / 10**9, *map(float, position), *sigma.tolist())
 
 
 def grey_of(message: Message) -> Image:

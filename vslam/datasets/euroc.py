@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from vslam.calibration.documents import read_document
 from vslam.calibration.files import read_calibration
+from vslam.datasets.association import poses_at
 from vslam.datasets.frames import RawSource, Source
-from vslam.datasets.ground_truth import poses_at
 from vslam.datasets.image_files import checked_files, find_sequence, select_frames
 from vslam.datasets.rectified import rectified
 from vslam.errors import InputError
@@ -40,14 +40,12 @@ def open_euroc(
     """Open a sequence; its images are rectified as they are read.
 
     A frame is a left image with the nearest right image within 5 ms; left images without a partner
-    are left out. The ground truth is interpolated, see `vslam.datasets.ground_truth.poses_at`.
+    are left out. The ground truth is interpolated, see `vslam.datasets.association.poses_at`.
 
     Args:
         root: folder of the sequence, or of several sequences.
         name: name of the sequence in ``root``; None for ``root`` itself, or its only sequence.
-        start: first frame, counted over the pairs.
-        every: take every N-th frame.
-        max_frames: largest number of frames, None for all.
+        start, every, max_frames: selects every N-th pair, from a first one on, up to a number.
         monocular: read the left camera alone.
         calib: calibration files, which replace the cameras' ``sensor.yaml``.
 

@@ -196,6 +196,16 @@ def stored_frames(
     )
 
 
+def decoded(sides: Several[Callable[[], Image | DepthImage]], image_map: ImageMap = map) -> Images:
+    """The images of a frame, each from a function that decodes one side."""
+    left, *second = image_map(_call, sides)
+    return np.asarray(left, np.uint8), second[0] if second else None
+
+
+def _call(decode: Callable[[], Image | DepthImage]) -> Image | DepthImage:
+    return decode()
+
+
 def selected(
     source: _AnySource, *, start: int = 0, every: int = 1, max_frames: int | None = None
 ) -> _AnySource:

@@ -1,4 +1,4 @@
-"""Shared code of readers of image files: finding folders and files, and decoding images."""
+"""Shared code of readers of image files: finding files, and decoding images and depth."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Image, ImageMap
-from vslam.datasets.frames import Images, RawSource, Size, stored_frames
+from vslam.calibration.models import Calibration
+from vslam.camera import Camera, DepthImage, Image, ImageMap
+from vslam.datasets.frames import Images, RawSource, Size, decoded, stored_frames
 from vslam.errors import InputError, UnreadableImageError
 from vslam.untrusted import MOST_PIXELS, require_utf8
 
+# Distance in metres from a Kinect's projector to its camera (ORB-SLAM2, section III-A).
+_VIRTUAL_BASELINE = 0.08
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
 
 
@@ -24,61 +27,51 @@ def checked_files(
     name: str,
     timestamps: NDArray[np.float64],
     ground_truth: NDArray[np.float64] | None,
-    sides: Several[tuple[Path, ...]],
+    sides: Several[Several[Path]],
+    depth_scale: float | None = None,
 ) -> RawSource:
     """Check all files, decode the first images and make a source of image files.
 
     Args:
         timestamps: ``(N,)`` float64 seconds.
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of the left camera, or None.
-        sides: N files of the left camera and N of the right one, or those of the left one alone.
+        sides: N files of the left camera alone, and N of the right one, or N depth images.
+        depth_scale: units of the depth images per metre; None if there are none.
 
     Raises:
-        UnreadableImageError: a file is empty, or the first frame cannot be decoded.
+        UnreadableImageError: a file is empty, the first frame cannot be decoded, or depth has
+            another size than the image or not 16 bits.
     """
     for path in (path for side in sides for path in side):
         check_not_empty(path)
-    sizes = tuple(image_size(side[0]) for side in sides)
+    depth = depth_scale is not None
+    sizes = tuple(image_size(side[0]) for side in (sides[:1] if depth else sides))
+    grey = [partial(_read_grey_of, size) for size in sizes]
+    readers: list[Callable[[Path], Image | DepthImage]] = [*grey]
+    if depth_scale is not None:
+        readers.append(partial(_read_depth, sizes[0], depth_scale))
 
     def read(index: int, image_map: ImageMap) -> Images:
-        return read_files([side[index] for side in sides], sizes, image_map)
+        each = [partial(reader, side[index]) for reader, side in zip(readers, sides, strict=True)]
+        return decoded(each, image_map)
 
     stored = stored_frames(timestamps, read, sides[0], read_colour)
-    if len(sides) == 2:
-        pairs = zip(stored, *sides, strict=True)
-        stored = tuple(replace(frame, sides=_alone(files, sizes)) for frame, *files in pairs)
-    return RawSource(
+    if len(sizes) == 2:
+        stored = tuple(
+            replace(frame, sides=(partial(grey[0], left), partial(grey[1], right)))
+            for frame, left, right in zip(stored, *sides, strict=True)
+        )
+    source = RawSource(
         dataset=dataset,
         name=name,
         sizes=sizes,
+        depth=depth,
         stored=stored,
         ground_truth=ground_truth,
     )
-
-
-def read_files(
-    files: Several[Path], sizes: Several[Size], image_map: ImageMap
-) -> tuple[Image, Image | None]:
-    """Left and right image; the right one is None if there is only one file.
-
-    Raises:
-        UnreadableImageError: a file is missing, damaged or of another size.
-    """
-    left, *right = image_map(_read_file, list(zip(files, sizes, strict=True)))
-    return left, right[0] if right else None
-
-
-def _alone(
-    files: Several[Path], sizes: Several[Size]
-) -> tuple[Callable[[], Image], Callable[[], Image]]:
-    """Functions that decode each image of a pair."""
-    left, right = (partial(_read_file, side) for side in zip(files, sizes, strict=True))
-    return left, right
-
-
-def _read_file(file: tuple[Path, Size]) -> Image:
-    path, (width, height) = file
-    return read_grey_of_size(path, width, height)
+    if depth:
+        source.read(0)
+    return source
 
 
 def image_size(path: Path) -> Size:
@@ -213,17 +206,13 @@ def read_colour(path: Path) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def read_grey_of_size(path: Path, width: int, height: int) -> Image:
-    """As `read_grey`, and check that the image has the size of the first one.
-
-    Raises:
-        UnreadableImageError: missing, damaged or of another size.
-    """
+def _read_grey_of(size: Size, path: Path) -> Image:
+    """As `read_grey`, and check that the image has the size of the first one."""
     image = read_grey(path)
-    if image.shape != (height, width):
+    if image.shape != size[::-1]:
         raise UnreadableImageError(
             path,
-            f"{size_text(image.shape)} pixels where the first image has {width}x{height}; "
+            f"{size_text(image.shape)} pixels where the first image has {size[0]}x{size[1]}; "
             "replace it by the original.",
         )
     return image
@@ -232,3 +221,36 @@ def read_grey_of_size(path: Path, width: int, height: int) -> Image:
 def size_text(shape: tuple[int, ...]) -> str:
     """A shape ``(H, W)`` as the text ``WxH``."""
     return f"{shape[1]}x{shape[0]}"
+
+
+def with_depth(camera: Camera, calibration: Calibration) -> Camera:
+    """Give an RGB-D camera the calibration's virtual baseline, or that of a Kinect."""
+    baseline = calibration.virtual_baseline or _VIRTUAL_BASELINE
+    return replace(camera, baseline=baseline, depth=True)
+
+
+def _read_depth(size: Size, scale: float, path: Path) -> DepthImage:
+    import cv2
+
+    from vslam.datasets.png import decode_with_opencv
+
+    try:
+        image = decode_with_opencv(path.read_bytes(), cv2.IMREAD_UNCHANGED)
+    except (OSError, ValueError, cv2.error):
+        image = None
+    if image is None:
+        raise UnreadableImageError(path, "cannot be decoded; download the file again.")
+    if image.dtype != np.uint16 or image.ndim != 2:
+        channels = 1 if image.ndim == 2 else image.shape[2]
+        raise UnreadableImageError(
+            path,
+            f"depth of {8 * image.dtype.itemsize} bits and {channels} channels, but it must be one "
+            "channel of 16 bits; take the original.",
+        )
+    if image.shape != size[::-1]:
+        raise UnreadableImageError(
+            path,
+            f"depth has {size_text(image.shape)} pixels but the colour image has "
+            f"{size[0]}x{size[1]}; take depth that is registered to the colour images.",
+        )
+    return np.asarray(image, np.uint16) * np.float32(1.0 / scale)

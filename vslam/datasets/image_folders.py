@@ -25,9 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.datasets.association import associate
-from vslam.datasets.depth_images import depth_files
 from vslam.datasets.frames import RawSource
-from vslam.datasets.image_files import checked_files, image_size, list_images, select_frames
+from vslam.datasets.image_files import (
+    checked_files,
+    image_size,
+    list_images,
+    select_frames,
+)
 from vslam.errors import InputError
 from vslam.trajectory import read_table
 
@@ -85,13 +89,12 @@ class ImageFolders:
         """
         if not self.depth:
             return checked_files("images", self.name, self.timestamps, None, self.sides)
-        colour, depth = self.sides
         if depth_scale is None:
             raise InputError(
-                f"{depth[0].parent}: the unit of the depth images is unknown; give --depth-scale, "
-                "1000 for millimetres, or depth_scale in the calibration."
+                f"{self.sides[1][0].parent}: the unit of the depth images is unknown; give "
+                "--depth-scale, 1000 for millimetres, or depth_scale in the calibration."
             )
-        return depth_files("images", self.name, self.timestamps, None, colour, depth, depth_scale)
+        return checked_files("images", self.name, self.timestamps, None, self.sides, depth_scale)
 
 
 def open_images(

@@ -7,14 +7,17 @@ root/poses/NN.txt                                ground truth, for 00 to 10
 
 from __future__ import annotations
 
+from collections.abc import Sequence as Several
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.calibration import files as calibration_files
 from vslam.camera import Camera
-from vslam.datasets.frames import RawSource, Source
+from vslam.datasets.frames import Source
 from vslam.datasets.image_files import checked_files, list_images, select_frames
+from vslam.datasets.rectified import rectified
 from vslam.errors import InputError, UnreadableImageError
 from vslam.trajectory import read_kitti_poses, read_table
 
@@ -29,39 +32,9 @@ def open_kitti(
     every: int = 1,
     max_frames: int | None = None,
     monocular: bool = False,
+    calib: Several[Path | str] = (),
 ) -> Source:
-    """Open a sequence with its own calibration; see `open_kitti_images`.
-
-    Raises:
-        InputError: as `open_kitti_images`, or the calibration is unusable.
-        UnreadableImageError: the first pair cannot be decoded.
-    """
-    images = open_kitti_images(
-        root, name, start=start, every=every, max_frames=max_frames, monocular=monocular
-    )
-    folder = _find_sequence(_find_root(root), name)
-    width, height = images.sizes[0]
-    camera = read_calibration(folder / "calib.txt", width=width, height=height, monocular=monocular)
-    return Source(
-        dataset=images.dataset,
-        name=name,
-        camera=camera,
-        stored=images.stored,
-        ground_truth=images.ground_truth,
-    )
-
-
-def open_kitti_images(
-    root: Path | str,
-    name: str,
-    *,
-    start: int = 0,
-    every: int = 1,
-    max_frames: int | None = None,
-    monocular: bool = False,
-) -> RawSource:
-    """Open the images of a sequence without its calibration; only the selected frames must be
-    complete.
+    """Open a sequence; only the selected frames must be complete.
 
     Frame k has row k of ``times.txt`` and of the poses. If those files have more rows than there
     are images, k is the number in the file name, so that an excerpt of a sequence works with the
@@ -71,14 +44,15 @@ def open_kitti_images(
         root: folder that holds ``sequences`` (or ``dataset/sequences``, as KITTI's archives unpack)
             and, optionally, ``poses``.
         name: name of the sequence, for example ``00``.
-        start: first frame, counted over the images present.
-        every: take every N-th frame.
-        max_frames: largest number of frames, None for all.
+        start, every, max_frames: selects every N-th of the images present, from a first one on, up
+            to a number.
         monocular: read the left camera alone; the right camera's images need not exist.
+        calib: calibration files, which replace ``calib.txt``; the images are then rectified as they
+            are read.
 
     Raises:
-        InputError: data is missing, the sides have different images, or times or poses are
-            unusable.
+        InputError: data is missing, the sides have different images, or calibration, times or poses
+            are unusable.
         UnreadableImageError: the first pair cannot be decoded.
     """
     base = _find_root(root)
@@ -103,7 +77,17 @@ def open_kitti_images(
             f"{right[0]} pixels but the left image has {left}; use the rectified images of both "
             "cameras.",
         )
-    return images
+    if calib:
+        return rectified(images, calibration_files.read_calibration(calib, images.sizes[0]))
+    width, height = images.sizes[0]
+    camera = read_calibration(folder / "calib.txt", width=width, height=height, monocular=monocular)
+    return Source(
+        dataset=images.dataset,
+        name=name,
+        camera=camera,
+        stored=images.stored,
+        ground_truth=images.ground_truth,
+    )
 
 
 def list_kitti(root: Path | str) -> list[tuple[str, int, int]]:

@@ -28,10 +28,10 @@ _WIDEST = 1 << 15  # pixels per line; the buffers need 65 bytes per pixel of a l
 
 
 def decode_png(data: bytes) -> NDArray[np.uint8] | None:
-    """Decode a file: ``(H, W)`` uint8, exactly as libpng does.
+    """Decode a PNG file of 8-bit grey levels to ``(H, W)`` uint8, exactly as libpng does.
 
-    None unless the data is an undamaged (by all check sums), not interlaced PNG of 8-bit grey
-    levels; another decoder may be able to read it.
+    Returns None if the file is of another kind, interlaced, or damaged, which all its check sums
+    are tested for. Another decoder may be able to read it.
     """
     import deflate
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from vslam.calibration.models import Calibration
 from vslam.calibration.rectification import Rectification, rectify
 from vslam.camera import DepthImage, Image, ImageMap
-from vslam.datasets.depth_images import with_depth
-from vslam.datasets.frames import Images, RawSource, Size, Source, TimedFrame
+from vslam.datasets.frames import Images, RawSource, Size, Source, TimedFrame, decoded
+from vslam.datasets.image_files import with_depth
 from vslam.errors import InputError
 
 _CUT = {(1, 0): "column", (0, 1): "row", (1, 1): "column and row"}  # by missing (columns, rows)
@@ -96,23 +96,15 @@ def _rectified_frame(rectification: Rectification, frame: TimedFrame) -> TimedFr
 def _read(rectification: Rectification, frame: TimedFrame, image_map: ImageMap) -> Images:
     """Rectify the images of a frame; depth takes the nearest pixel."""
     left, second = frame.read(image_map)
-    left_side: Callable[[], Image | DepthImage] = partial(rectification.left, left)
-    if second is None:
-        return np.asarray(left_side(), np.uint8), None
-    second_side: Callable[[], Image | DepthImage]
-    if rectification.camera.depth:
-        second_side = partial(rectification.left_depth, second)
-    else:
-        second_side = partial(rectification.right, np.asarray(second, np.uint8))
-    first, other = image_map(_call, [left_side, second_side])
-    return np.asarray(first, np.uint8), other
+    sides: list[Callable[[], Image | DepthImage]] = [partial(rectification.left, left)]
+    if second is not None and rectification.camera.depth:
+        sides.append(partial(rectification.left_depth, second))
+    elif second is not None:
+        sides.append(partial(rectification.right, np.asarray(second, np.uint8)))
+    return decoded(sides, image_map)
 
 
 def _read_colour(
     rectification: Rectification, colour: Callable[[], NDArray[np.uint8]]
 ) -> NDArray[np.uint8]:
     return np.asarray(rectification.left(colour()), np.uint8)
-
-
-def _call(function: Callable[[], Image | DepthImage]) -> Image | DepthImage:
-    return function()

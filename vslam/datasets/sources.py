@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict
 
 from vslam.calibration.files import read_calibration
 from vslam.calibration.models import Calibration
-from vslam.datasets import DATASETS, open_plugin_source, open_sequence
+from vslam.datasets import open_sequence
 from vslam.datasets.detection import detect_dataset
 from vslam.datasets.frames import RawSource, Source, selected
 from vslam.datasets.image_files import list_images
@@ -94,11 +94,6 @@ def open_source(
     source: Source
     if dataset in SOURCES:
         source = _open_images(dataset, o)
-    elif dataset not in DATASETS:
-        source = open_plugin_source(
-            dataset, Path(o.data), o.seq, start=o.start, every=o.every, max_frames=o.max_frames,
-            monocular=o.sensor == "mono", calib=o.calib,
-        )  # fmt: skip
     else:
         source = open_sequence(
             dataset, Path(o.data), o.seq, start=o.start, every=o.every, max_frames=o.max_frames,
@@ -199,7 +194,7 @@ def _open_stream(
         device = opened(o.data, "mono" if monocular else o.sensor)
         raw, own = frames_of(device), device.calibration
     else:
-        from vslam.datasets.live_camera import open_camera
+        from vslam.datasets.video import open_camera
 
         raw = open_camera(o.data, side_by_side=o.side_by_side, monocular=monocular)
     return selected(raw, start=o.start, every=o.every, max_frames=o.max_frames), own

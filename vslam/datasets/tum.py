@@ -16,11 +16,14 @@ from numpy.typing import NDArray
 
 from vslam.calibration.files import read_calibration
 from vslam.calibration.models import Calibration, CameraModel
-from vslam.datasets.association import associate
-from vslam.datasets.depth_images import depth_files
+from vslam.datasets.association import associate, poses_at
 from vslam.datasets.frames import Source
-from vslam.datasets.ground_truth import poses_at
-from vslam.datasets.image_files import checked_files, find_sequence, image_size, select_frames
+from vslam.datasets.image_files import (
+    checked_files,
+    find_sequence,
+    image_size,
+    select_frames,
+)
 from vslam.datasets.rectified import rectified
 from vslam.errors import InputError
 from vslam.trajectory import read_trajectory
@@ -56,14 +59,12 @@ def open_tum(
 
     A frame is a colour image with the depth image nearest in time, within 20 ms; each is used
     once, the nearest first, as by TUM's ``associate.py``. The ground truth is interpolated
-    (`vslam.datasets.ground_truth.poses_at`).
+    (`vslam.datasets.association.poses_at`).
 
     Args:
         root: folder of the sequence, or of several sequences.
         name: name of the sequence in ``root``; None for ``root`` itself, or its only sequence.
-        start: first frame, counted over the pairs.
-        every: take every N-th frame.
-        max_frames: largest number of frames, None for all.
+        start, every, max_frames: selects every N-th pair, from a first one on, up to a number.
         monocular: read the colour images alone; depth images need not exist.
         calib: calibration file, which replaces the folder's own and those of TUM's cameras.
         depth_scale: units of the depth images per metre; None takes the calibration's value, or
@@ -106,7 +107,7 @@ def open_tum(
     else:
         depth = tuple(files_of_depth[k] for k in partners[chosen])
         scale = depth_scale or calibration.depth_scale or _DEPTH_SCALE
-        raw = depth_files("tum", found, times, truth, colour, depth, scale)
+        raw = checked_files("tum", found, times, truth, [colour, depth], scale)
     return rectified(raw, calibration)
 
 

@@ -1,24 +1,102 @@
-"""Video files of one camera or of a stereo pair side by side, decoded by FFmpeg."""
+"""Video files and live cameras, of one camera or of a stereo pair side by side, through OpenCV.
+
+The time stamp of a frame of a live camera is the machine's monotonic clock when the image arrives.
+"""
 
 from __future__ import annotations
 
 import logging
+import os
+import time
 from collections.abc import Iterator
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
 
-from vslam.camera import Image
-from vslam.datasets.capture import Capture, left_in_colour, open_capture, read_sides, sizes_of
-from vslam.datasets.frames import RawSource, TimedFrame
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.camera import Image, ImageMap
+from vslam.datasets.frames import RawSource, Size, TimedFrame
 from vslam.errors import BrokenSourceError, InputError
 from vslam.untrusted import MOST_PIXELS
 
 _log = logging.getLogger(__name__)
 
+Capture = Any  # cv2.VideoCapture, which has no types
+_TIMEOUT_MS = 10_000  # of a camera at a URL
+_DEVICES = Path("/dev")
 _CONVERT = "convert the video, for example with ffmpeg -i VIDEO -c:v libx264 -crf 12 NEW.mp4"
 _SAME_RATE = 0.02  # 30 and 29.97 frames per second are the same
 _MISSING_SHARE = 0.05  # tolerated at the end, because the file's number of frames is an estimate
+
+
+def open_capture(source: str | int, *parameters: int) -> Capture | None:
+    """A capture of a file, URL or device; None if OpenCV cannot open it.
+
+    Args:
+        parameters: properties, each followed by its value.
+    """
+    import cv2
+
+    # FFmpeg and OpenCV would write to the terminal in the middle of the progress bar.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        backend = cv2.CAP_ANY if isinstance(source, int) else cv2.CAP_FFMPEG
+        capture = cv2.VideoCapture(source, backend, list(parameters))
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    return capture if capture.isOpened() else None
+
+
+def sizes_of(image: NDArray[np.uint8], side_by_side: bool, monocular: bool) -> tuple[Size, ...]:
+    """Width and height of each image that `read_sides` returns."""
+    height, width = image.shape[:2]
+    if not side_by_side:
+        return ((width, height),)
+    return ((width // 2, height),) * (1 if monocular else 2)
+
+
+def read_sides(
+    image: NDArray[np.uint8], side_by_side: bool, monocular: bool, image_map: ImageMap
+) -> tuple[Image, Image | None]:
+    """Grey images of a frame: the frame itself, or with ``side_by_side`` its left and right half.
+
+    Args:
+        image: ``(H, W, 3)`` uint8 blue, green, red, or ``(H, W)`` grey.
+        monocular: return only the left half.
+    """
+    width = image.shape[1] // 2
+    halves = [image[:, :width], image[:, width : 2 * width]] if side_by_side else [image]
+    left, *rest = image_map(_grey, halves[:1] if monocular else halves)
+    return left, rest[0] if rest else None
+
+
+def left_in_colour(image: NDArray[np.uint8], side_by_side: bool) -> NDArray[np.uint8]:
+    """The left image of a frame: ``(H, W, 3)`` uint8 red, green, blue, or ``(H, W)`` grey.
+
+    Args:
+        image: as for `read_sides`.
+    """
+    import cv2
+
+    left = image[:, : image.shape[1] // 2] if side_by_side else image
+    # Decoders return grey videos in three equal channels.
+    if left.ndim == 2 or (left == left[..., :1]).all():
+        return np.ascontiguousarray(left if left.ndim == 2 else left[..., 0])
+    return np.asarray(cv2.cvtColor(left, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def _grey(image: NDArray[np.uint8]) -> Image:
+    import cv2
+
+    if image.ndim == 2:
+        return np.ascontiguousarray(image)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
 def open_video(
@@ -145,3 +223,89 @@ def _images(capture: Capture) -> Iterator[tuple[float, Image]]:
             yield timestamp, image
     finally:
         capture.release()
+
+
+def open_camera(device: str, *, side_by_side: bool = False, monocular: bool = False) -> RawSource:
+    """Open a camera and take a first image; its frames can be read only once.
+
+    The source is named by the device's number or by the URL without user name and password.
+
+    Args:
+        device: a number, or a URL.
+        side_by_side: each frame holds the left image and, right of it, the right one.
+        monocular: read the left images alone.
+
+    Raises:
+        InputError: there is no such device, it is busy or gives no image, or it has one image per
+            frame but two are needed.
+    """
+    name = _name(device)
+    if not side_by_side and not monocular:
+        raise InputError(
+            f"camera {name}: a camera has one image per frame; use --side-by-side if it holds both "
+            "images of a stereo pair, or run with --sensor mono."
+        )
+    capture = _open_device(int(device)) if device.isdecimal() else _open_url(device, name)
+    decoded, image = capture.read()
+    if not decoded:
+        capture.release()
+        raise InputError(
+            f"camera {name}: gives no image; end other programs that use it, or name another one."
+        )
+    return RawSource(
+        dataset="camera",
+        name=name,
+        sizes=sizes_of(image, side_by_side, monocular),
+        play=partial(_film, capture, name, side_by_side, monocular),
+        live=True,
+    )
+
+
+def _film(capture: Capture, name: str, side_by_side: bool, monocular: bool) -> Iterator[TimedFrame]:
+    n = 0
+    try:
+        while True:
+            decoded, image = capture.read()
+            if not decoded:
+                break
+            sides = partial(read_sides, image, side_by_side, monocular)
+            yield TimedFrame(time.monotonic(), sides)
+            n += 1
+    finally:
+        capture.release()
+    raise BrokenSourceError(f"camera {name}: no image came after {n}; check its cable or network.")
+
+
+def _name(device: str) -> str:
+    if device.isdecimal():
+        return device
+    parts = urlsplit(device)
+    return f"{parts.hostname or ''}{parts.path}"
+
+
+def _open_device(number: int) -> Capture:
+    import cv2
+
+    capture = open_capture(number, cv2.CAP_PROP_BUFFERSIZE, 1)
+    if capture is not None:
+        return capture
+    if (_DEVICES / f"video{number}").exists():
+        raise InputError(
+            f"camera {number}: the device is busy or not a camera; end other programs that use it, "
+            "or name another number with --data."
+        )
+    there = sorted(path.name.removeprefix("video") for path in _DEVICES.glob("video*"))
+    choice = f"there are {', '.join(there)}" if there else "no camera is connected"
+    raise InputError(f"camera {number}: no such device; {choice}.")
+
+
+def _open_url(url: str, name: str) -> Capture:
+    import cv2
+
+    timeouts = (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC)
+    capture = open_capture(url, *(number for key in timeouts for number in (key, _TIMEOUT_MS)))
+    if capture is None:
+        raise InputError(
+            f"camera {name}: cannot be opened; check whether the URL plays in another program."
+        )
+    return capture

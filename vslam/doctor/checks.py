@@ -91,8 +91,10 @@ def check_sides(matches: Matches) -> Finding:
 
 
 def check_scale(camera: Camera, matches: Matches | None) -> Finding:
-    """Report the field of view, the baseline and the median depth, for the user to compare with the
-    scene, since images do not reveal a wrong baseline; only one in a wrong unit is a fault.
+    """Report the field of view, the baseline and the median depth.
+
+    The user must compare them with the scene, because images do not reveal a wrong baseline. The
+    check fails only if the baseline seems to be in a wrong unit.
 
     Args:
         matches: matches of the stereo pair; None for a monocular or RGB-D camera.

@@ -8,7 +8,7 @@ optimised for each focal length.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -23,7 +23,7 @@ _PIXEL, _DISPARITY = 0.35, 0.3  # px, standard deviations of matches refined by 
 _CAUCHY = 5.0  # variances at which a squared error has half its weight; 95 % of inliers are below 6
 _ITERATIONS = 12
 _FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.6, 1.8, 2.0)  # coarse search
-_SECTIONS = 12  # golden sections of the bracket, which leave 1e-3
+_PRECISION = 1e-3  # of the logarithm of the factor
 _STEP = 0.02  # of the logarithm, for the curvature at the minimum
 
 
@@ -65,6 +65,8 @@ def fit_focal_length(several: Sequence[Moved], camera: Camera) -> FocalFit:
         camera: the stereo or RGB-D camera; the disparities of the latter are those of its virtual
             baseline.
     """
+    from scipy.optimize import minimize_scalar
+
     poses = [np.zeros(6) for _ in several]
 
     def cost(log: float) -> float:
@@ -76,7 +78,8 @@ def fit_focal_length(several: Sequence[Moved], camera: Camera) -> FocalFit:
 
     logs = np.log(_FACTORS)
     best = int(np.argmin([cost(log) for log in logs]))
-    log = _least(cost, logs[max(best - 1, 0)], logs[min(best + 1, len(logs) - 1)])
+    bracket = logs[max(best - 1, 0)], logs[min(best + 1, len(logs) - 1)]
+    log = float(minimize_scalar(cost, bounds=bracket, options={"xatol": _PRECISION}).x)
     around = cost(log + _STEP), cost(log - _STEP)
     least = cost(log)
     curvature = (sum(around) - 2.0 * least) / _STEP**2
@@ -91,23 +94,6 @@ def fit_focal_length(several: Sequence[Moved], camera: Camera) -> FocalFit:
         float(np.sqrt(2.0 * variance / max(curvature, 1e-12))),
         float(np.degrees(max(turned, default=0.0))),
     )
-
-
-def _least(cost: Callable[[float], float], low: float, high: float) -> float:
-    """Minimise a function with one minimum between ``low`` and ``high`` by golden sections."""
-    golden = (np.sqrt(5.0) - 1.0) / 2.0
-    x = [high - golden * (high - low), low + golden * (high - low)]
-    y = [cost(x[0]), cost(x[1])]
-    for _ in range(_SECTIONS):
-        if y[0] < y[1]:
-            high, x[1], y[1] = x[1], x[0], y[0]
-            x[0] = high - golden * (high - low)
-            y[0] = cost(x[0])
-        else:
-            low, x[0], y[0] = x[0], x[1], y[1]
-            x[1] = low + golden * (high - low)
-            y[1] = cost(x[1])
-    return 0.5 * (low + high)
 
 
 def _best_pose(

@@ -16,10 +16,10 @@ from vslam.run.outcome import RunOutcome
 _FRAMES = 3  # examined frames; each shows the sign of hundreds of disparities
 
 
-def why_nothing_was_tracked(outcome: RunOutcome, options: RunOptions) -> str | None:
+def why_nothing_was_tracked(outcome: RunOutcome) -> str | None:
     """One sentence that explains why no frame of a run was tracked and what to do; None if a frame
     was tracked."""
-    n = len(outcome.tracks)
+    n, options = len(outcome.tracks), outcome.settings
     if n == 0 or outcome.n_tracked:
         return None
     said = f"nothing was tracked in {counted(n, 'frame')}"
@@ -30,13 +30,13 @@ def why_nothing_was_tracked(outcome: RunOutcome, options: RunOptions) -> str | N
     if outcome.sequence.camera.sensor == "stereo" and not outcome.sequence.live:
         middle = _median_disparity_behind_infinity(outcome.sequence)
         if middle is not None:
-            how = how_to_swap(outcome.settings.dataset, options)
+            how = how_to_swap(outcome.sequence.dataset, options)
             return (
                 f"{said}: disparities are negative (median {middle:.1f} px), as if left and right "
                 f"were swapped; {how}"
             )
-    if outcome.settings.perturb != "none":
-        return f"{said} under --perturb {outcome.settings.perturb}; a weaker one may work"
+    if options.perturb != "none":
+        return f"{said} under --perturb {options.perturb}; a weaker one may work"
     if outcome.sequence.camera.monocular:
         return f"{said}: one camera must move sideways to begin a map; vslam doctor checks the rest"
     return f"{said}: vslam doctor says what is wrong with images, calibration or times"

@@ -17,38 +17,22 @@ from vslam.geometry import inverses
 from vslam.loops import LoopEdge
 from vslam.run.outcome import RunOutcome, ground_truth_of
 
+# A revisit.
+MIN_LENGTH_M = 20.0  # shorter ones do not count
+MAX_LATERAL_M = 5.0  # from the earlier path; the next lane is 3 to 4 m away
+MAX_HEADING_DEG = 30.0  # between the optical axes; from behind, a place looks different
+MIN_SECONDS, MIN_PATH_M = 10.0, 50.0  # since the earlier passage
+# Stretches with a shorter gap count as one, because tracking continues in the old map over it.
+MAX_INTERRUPTION_M = 10.0
+# The largest error of a right loop's relative pose: well above the error of KITTI's ground truth
+# between two passages, and well below the distance of similar houses in a row.
+MAX_TRANSLATION_M, MAX_ROTATION_DEG = 2.0, 5.0
 _SAMPLE_M = 1.0  # the path is sampled once a metre, so that a standing camera adds no samples
 _UNIT_FRAMES = 20  # before and after a frame, to estimate the unit of a monocular map
 _MAX_STEP_M = 20.0  # between two frames farther apart the path is unknown
 
 Indices = NDArray[np.int64]
 Poses = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class LoopLimits:
-    """The definitions of a revisit and of a right loop.
-
-    Attributes:
-        min_length_m: shorter revisits do not count.
-        max_lateral_m: distance from the earlier path; the next lane is 3 to 4 m away.
-        max_heading_deg: angle between the optical axes; from behind, a place looks different.
-        min_seconds, min_path_m: time and path length since the earlier passage.
-        max_interruption_m: revisits with a shorter gap between them count as one stretch, because
-            tracking continues in the old map over such a gap.
-        max_translation_m, max_rotation_deg: largest error of a right loop's relative pose. They are
-            well above the error of KITTI's ground truth between two passages and well below the
-            distance of similar houses in a row.
-    """
-
-    min_length_m: float = 20.0
-    max_lateral_m: float = 5.0
-    max_heading_deg: float = 30.0
-    min_seconds: float = 10.0
-    min_path_m: float = 50.0
-    max_interruption_m: float = 10.0
-    max_translation_m: float = 2.0
-    max_rotation_deg: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -101,9 +85,6 @@ class LoopEvaluation:
         return len(self.revisits) - self.n_found
 
 
-_DEFAULT_LIMITS = LoopLimits()
-
-
 def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
     """Judge the loops of a run by the ground truth of the frames done. None if a frame has no
     ground truth, because revisits cannot be found on a path with gaps."""
@@ -115,7 +96,7 @@ def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
     T_wc, times = truth.T_wc, truth.timestamps
     done = int(np.searchsorted(times, outcome.trajectory.timestamps[-1], side="right"))
     loops = outcome.loops
-    if outcome.settings.alignment == "sim3":
+    if outcome.alignment == "sim3":
         metres = metres_per_unit(np.array([track.T_wc for track in outcome.tracks]), T_wc[:done])
         frames = outcome.keyframe_frames
         loops = [_in_metres(edge, float(metres[frames[edge.match]])) for edge in loops]
@@ -153,13 +134,11 @@ def _in_metres(edge: LoopEdge, metres: float) -> LoopEdge:
     return replace(edge, T_query_match=T)
 
 
-def revisits(
-    T_wc: Poses, timestamps: NDArray[np.float64], limits: LoopLimits = _DEFAULT_LIMITS
-) -> Revisits:
+def revisits(T_wc: Poses, timestamps: NDArray[np.float64]) -> Revisits:
     """Find the stretches on which the camera drives where it drove before, in the same direction.
 
-    A frame is a revisit if the path driven at least ``min_seconds`` and ``min_path_m`` earlier
-    passes within ``max_lateral_m`` of it and has, there, a heading within ``max_heading_deg`` of
+    A frame is a revisit if the path driven at least ``MIN_SECONDS`` and ``MIN_PATH_M`` earlier
+    passes within ``MAX_LATERAL_M`` of it and has, there, a heading within ``MAX_HEADING_DEG`` of
     its own. The path between two frames is assumed to be straight.
 
     Args:
@@ -172,17 +151,17 @@ def revisits(
     path = path_length(T_wc)
     sampled = np.searchsorted(path, np.arange(0.0, path[-1], _SAMPLE_M))
     sampled = np.unique(np.append(sampled, len(T_wc) - 1))
-    match = _earlier_passage(T_wc[sampled], timestamps[sampled], path[sampled], limits)
+    match = _earlier_passage(T_wc[sampled], timestamps[sampled], path[sampled])
 
     back = np.flatnonzero(match >= 0)
     if not len(back):
         return Revisits(none, none, none, none, np.zeros(0))
     at = path[sampled]
     gap = np.diff(at[back])
-    interrupted = (np.diff(back) > 1) & (gap >= limits.max_interruption_m)
+    interrupted = (np.diff(back) > 1) & (gap >= MAX_INTERRUPTION_M)
     apart = np.flatnonzero(interrupted | (gap > _MAX_STEP_M))
     first, last = back[np.append(0, apart + 1)], back[np.append(apart, len(back) - 1)]
-    long_enough = at[last] - at[first] >= limits.min_length_m
+    long_enough = at[last] - at[first] >= MIN_LENGTH_M
     first, last = first[long_enough], last[long_enough]
     return Revisits(
         first=sampled[first],
@@ -198,14 +177,14 @@ def judge_loops(
     frames: Indices,
     T_wc: Poses,
     timestamps: NDArray[np.float64],
-    limits: LoopLimits = _DEFAULT_LIMITS,
 ) -> LoopEvaluation:
     """Determine whether each edge is right, and whether each revisit was found by a loop.
 
-    An edge is right if ``T_query_match`` agrees with the ground truth within the limits. It finds a
-    stretch if it is right and accepted, its match belongs to an earlier passage (not to the frames
-    just before), and its query lies on the stretch or within ``max_interruption_m`` of it, since
-    the camera sees a place for a little longer than it is there.
+    An edge is right if ``T_query_match`` agrees with the ground truth within ``MAX_TRANSLATION_M``
+    and ``MAX_ROTATION_DEG``. It finds a stretch if it is right and accepted, its match belongs to
+    an earlier passage (not to the frames just before), and its query lies on the stretch or within
+    ``MAX_INTERRUPTION_M`` of it, since the camera sees a place for a little longer than it is
+    there.
 
     Args:
         edges: E loops, accepted or not.
@@ -213,16 +192,16 @@ def judge_loops(
         T_wc: ``(N, 4, 4)`` ground truth of the frames.
         timestamps: ``(N,)`` seconds.
     """
-    found = revisits(T_wc, timestamps, limits)
-    right = tuple(is_right_loop(edge, frames, T_wc, limits) for edge in edges)
+    found = revisits(T_wc, timestamps)
+    right = tuple(is_right_loop(edge, frames, T_wc) for edge in edges)
     loop_frame = np.full(len(found), -1, np.int64)
     path = path_length(T_wc)
-    slack = limits.max_interruption_m
+    slack = MAX_INTERRUPTION_M
     for edge, is_right in zip(edges, right, strict=True):
         if not (edge.accepted and is_right):
             continue
         query, match = sorted((int(frames[edge.query]), int(frames[edge.match])), reverse=True)
-        if not _long_ago(path, timestamps, query, match, limits):
+        if not _long_ago(path, timestamps, query, match):
             continue
         near = (path[found.first] - slack <= path[query]) & (
             path[query] <= path[found.last] + slack
@@ -235,9 +214,7 @@ def judge_loops(
     return LoopEvaluation(found, loop_frame, right, n_wrong)
 
 
-def is_right_loop(
-    edge: LoopEdge, frames: Indices, T_wc: Poses, limits: LoopLimits = _DEFAULT_LIMITS
-) -> bool | None:
+def is_right_loop(edge: LoopEdge, frames: Indices, T_wc: Poses) -> bool | None:
     """Whether the relative pose of one loop is the true one, as :func:`judge_loops` says; None
     where that cannot be told."""
     if edge.T_query_match is None or edge.query < 0:
@@ -250,13 +227,13 @@ def is_right_loop(
     error = edge.T_query_match @ T_match_query  # the identity if the edge is right
     cosine = np.clip((np.trace(error[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)
     return bool(
-        np.linalg.norm(error[:3, 3]) <= limits.max_translation_m
-        and np.degrees(np.arccos(cosine)) <= limits.max_rotation_deg
+        np.linalg.norm(error[:3, 3]) <= MAX_TRANSLATION_M
+        and np.degrees(np.arccos(cosine)) <= MAX_ROTATION_DEG
     )
 
 
 def _earlier_passage(
-    T_wc: Poses, timestamps: NDArray[np.float64], path: NDArray[np.float64], limits: LoopLimits
+    T_wc: Poses, timestamps: NDArray[np.float64], path: NDArray[np.float64]
 ) -> Indices:
     """``(S,)`` for each sample, the nearest sample of an earlier passage, or -1."""
     from scipy.spatial import cKDTree
@@ -268,10 +245,10 @@ def _earlier_passage(
     length[length > _MAX_STEP_M] = 0.0
 
     # A step that passes a sample within max_lateral_m starts at most this far from the sample.
-    radius = float(np.hypot(limits.max_lateral_m, length.max()))
+    radius = float(np.hypot(MAX_LATERAL_M, length.max()))
     pairs = cKDTree(position).query_pairs(radius, output_type="ndarray")
     start, query = pairs[:, 0], pairs[:, 1]
-    kept = _long_ago(path, timestamps, query, start, limits)
+    kept = _long_ago(path, timestamps, query, start)
     start, query = start[kept], query[kept]
 
     offset = position[query] - position[start]
@@ -280,9 +257,7 @@ def _earlier_passage(
     distance = np.linalg.norm(offset - along[:, None] * forward[start], axis=1)
     nearest = start + (along > 0.5)
     cosine = np.einsum("ni,ni->n", axis[query], axis[nearest])
-    same = (distance <= limits.max_lateral_m) & (
-        cosine >= np.cos(np.radians(limits.max_heading_deg))
-    )
+    same = (distance <= MAX_LATERAL_M) & (cosine >= np.cos(np.radians(MAX_HEADING_DEG)))
     query, nearest, distance = query[same], nearest[same], distance[same]
 
     match = np.full(len(T_wc), -1, np.int64)
@@ -296,7 +271,6 @@ def _long_ago(
     timestamps: NDArray[np.float64],
     query: Indices | int,
     match: Indices | int,
-    limits: LoopLimits,
 ) -> NDArray[np.bool_]:
-    apart = path[query] - path[match] >= limits.min_path_m
-    return apart & (timestamps[query] - timestamps[match] >= limits.min_seconds)
+    apart = path[query] - path[match] >= MIN_PATH_M
+    return apart & (timestamps[query] - timestamps[match] >= MIN_SECONDS)

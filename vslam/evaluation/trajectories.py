@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError
+from vslam.errors import InputError, counted
 from vslam.trajectory import Trajectory, read_table, read_trajectory, trajectory_format
 
 MAX_TIME_DIFFERENCE_S = 0.01  # evo's default
@@ -101,8 +101,8 @@ def evaluate_trajectory(
             rpe.process_data((reference, aligned))
     except EvoException as error:
         raise InputError(
-            f"{len(estimate)} frames with too little motion to compare; the camera must move "
-            "between two frames."
+            f"{counted(len(estimate), 'frame')} with too little motion to compare; the camera must "
+            "move between two frames."
         ) from error
 
     T_wc_aligned = np.array(aligned.poses_se3)

@@ -17,7 +17,7 @@ from vslam.run.outcome import RunOutcome, matched_ground_truth
 def name_of_world(outcome: RunOutcome) -> str:
     """Name of the world of a run's ground truth; rendered drives of one route share it, whatever
     their light and traffic."""
-    return f"{outcome.settings.dataset} {outcome.sequence.name.partition('+')[0]}"
+    return f"{outcome.sequence.dataset} {outcome.sequence.name.partition('+')[0]}"
 
 
 def world_of(outcome: RunOutcome, evaluation: Evaluation) -> World:

@@ -13,43 +13,31 @@ from vslam.errors import InputError, ResultsError
 
 
 @contextmanager
-def new_folder(path: Path) -> Iterator[Path]:
-    """Yield an empty folder that is renamed to ``path`` at the end, or removed after an error.
+def new_output(path: Path, *, folder: bool = False) -> Iterator[Path]:
+    """Yield the path of a file to write, or an empty folder, which is renamed to ``path`` at the
+    end, or removed after an error.
 
     Raises:
-        InputError: ``path`` exists already and is not an empty folder.
+        InputError: ``path`` exists already, and is not an empty folder where one is wanted.
         ResultsError: it cannot be written, for example because the disk is full.
     """
-    free = path.is_dir() and not path.is_symlink() and not any(path.iterdir())
-    if not free:
-        _refuse_existing(path)
+    empty = path.is_dir() and not path.is_symlink() and not any(path.iterdir())
+    if not (folder and empty):
+        require_free(path)
     part = _beside(path)
-    with _as_results_error(path):
-        try:
-            part.mkdir(parents=True)
-            yield part
-            part.rename(path)
-        finally:
+    try:
+        (part if folder else part.parent).mkdir(parents=True, exist_ok=not folder)
+        yield part
+        part.rename(path)
+    except OSError as error:
+        raise ResultsError(
+            f"{path}: cannot be written ({error.strerror or error}); free some space or name "
+            "another place with --out."
+        ) from error
+    finally:
+        if folder:
             shutil.rmtree(part, ignore_errors=True)
-
-
-@contextmanager
-def new_file(path: Path) -> Iterator[Path]:
-    """Yield the path of a file to write, which is renamed to ``path`` at the end, or removed after
-    an error.
-
-    Raises:
-        InputError: ``path`` exists already.
-        ResultsError: it cannot be written, for example because the disk is full.
-    """
-    _refuse_existing(path)
-    part = _beside(path)
-    with _as_results_error(path):
-        try:
-            part.parent.mkdir(parents=True, exist_ok=True)
-            yield part
-            part.rename(path)
-        finally:
+        else:
             part.unlink(missing_ok=True)
 
 
@@ -96,7 +84,12 @@ def require_place(path: Path, option: str) -> None:
         raise InputError(f"{option} {path}: there is no folder {path.parent}; create it first.")
 
 
-def _refuse_existing(path: Path) -> None:
+def require_free(path: Path) -> None:
+    """Check that nothing is at ``path``, the value of ``--out``.
+
+    Raises:
+        InputError: a file or folder is there.
+    """
     if os.path.lexists(path):
         raise InputError(f"{path}: exists already; remove it, or name another place with --out.")
 
@@ -105,14 +98,3 @@ def _beside(path: Path) -> Path:
     """A hidden path on the same file system, so that renaming is atomic."""
     path = path.absolute()
     return path.with_name(f".{path.name}.{os.getpid()}.part")
-
-
-@contextmanager
-def _as_results_error(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise ResultsError(
-            f"{path}: cannot be written ({error.strerror or error}); free some space or name "
-            "another place with --out."
-        ) from error

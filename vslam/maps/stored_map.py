@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera
 from vslam.frame_poses import FrameTable
-from vslam.geometry import orthonormalised
+from vslam.geometry import inverses, orthonormalised
 from vslam.loops import DetectorMemory, LoopEdge, PerKeyframe, ranges
 from vslam.map import (
     KEYFRAME_FIELDS,
@@ -287,3 +288,38 @@ def _moved(frames: FrameTable, map_: Map, new_id: NDArray[np.int64]) -> FrameTab
         unit[i] = table.unit_scale[reference[i]]
     reference = new_id[reference] if map_.n_keyframes else reference
     return frames._replace(reference=reference, T_c_reference=T_c_reference, unit_scale=unit)
+
+
+def in_box(map_: Map, box: Sequence[float]) -> NDArray[np.int64]:
+    """Ids of the living keyframes in ``box`` (two x and two z, metres), ascending."""
+    keyframes, xz = _places(map_)
+    low, high = np.array(box).reshape(2, 2).T
+    return keyframes[((xz >= low) & (xz <= high)).all(axis=1)]
+
+
+def near_point(map_: Map, point: Sequence[float], within: float) -> NDArray[np.int64]:
+    """Ids of the living keyframes within a distance (metres) of a point (x and z), ascending."""
+    keyframes, xz = _places(map_)
+    return keyframes[np.linalg.norm(xz - point, axis=1) <= within]
+
+
+def near_frames(
+    map_: Map, drive: int, first: float, last: float, within: float
+) -> NDArray[np.int64]:
+    """Ids of the living keyframes within a distance (metres) of the keyframes that were made from
+    the frames ``first`` to ``last`` of a drive, ascending."""
+    from scipy.spatial import cKDTree
+
+    keyframes, xz = _places(map_)
+    frame, session = map_.frames[keyframes], map_.sessions[keyframes]
+    named = (session == drive) & (frame >= first) & (frame <= last)
+    if not named.any():
+        return keyframes[:0]
+    distance, _ = cKDTree(xz[named]).query(xz)
+    return keyframes[distance <= within]
+
+
+def _places(map_: Map) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Living keyframes, and their x and z ``(N, 2)``."""
+    keyframes = map_.living_keyframes()
+    return keyframes, inverses(map_.arrays.T_cw[keyframes])[:, [0, 2], 3]

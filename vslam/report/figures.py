@@ -32,7 +32,7 @@ from vslam.report.drawing import (
     new_figure,
 )
 from vslam.report.summary import stage_names
-from vslam.report.trajectory_figures import loop_closing, top_view
+from vslam.report.trajectory_figures import gps_map, loop_closing, top_view
 from vslam.run.outcome import RunOutcome
 from vslam.trajectory import Trajectory
 
@@ -74,6 +74,12 @@ def _drawings(
         if outcome.compared:
             caption += " Dashed: the detectors compared, each after its own alignment."
         yield "top_view", caption, top_view(outcome, evaluation, ground_truth, verdict)
+    if (track := outcome.gps_track) is not None:
+        caption = (
+            "From above, in metres from the first fix: the drive by vision alone, aligned as a "
+            "whole, and with GPS."
+        )
+        yield "gps_map", caption, gps_map(track)
     if outcome.corrections:
         caption = (
             "Keyframes just before the first loop was closed, and at the end. Dashed: each loop, "
@@ -88,14 +94,15 @@ def _drawings(
             _error_along_path(outcome, evaluation),
         )
         yield "error_histogram", "Number of frames by error.", _error_histogram(evaluation)
-    if ground_truth is not None and outcome.settings.sensor != "mono":
+    if ground_truth is not None and not outcome.sequence.camera.monocular:
         errors = motion_errors(outcome.tracks, ground_truth, _MOTION_S)
         if len(errors.first) > 1:
             yield (
                 "odometry_error",
                 "Error of the motion over one second, by odometry alone (trajectory_odom.tum), and "
                 "twice the standard deviation that its covariance predicts: about one error in "
-                "twenty should lie above.",
+                "twenty should lie above, if the ground truth is accurate to that over a second "
+                "(KITTI's is not).",
                 _odometry_error(errors),
             )
     if outcome.tracks:
@@ -197,7 +204,7 @@ def _tracked_points(outcome: RunOutcome) -> Figure:
 
 def _usable_features(outcome: RunOutcome) -> tuple[str, list[int]]:
     """The features that can give landmarks with this sensor, and their number in each frame."""
-    sensor = outcome.settings.sensor
+    sensor = outcome.sequence.camera.sensor
     if sensor == "mono":
         return "features", [track.n_features for track in outcome.tracks]
     name = "features with depth" if sensor == "rgbd" else "stereo features"

@@ -16,11 +16,11 @@ from vslam.errors import InputError, ResultsError
 from vslam.evaluation.loops import LoopEvaluation, evaluate_loops
 from vslam.evaluation.trajectories import Evaluation, evo_command
 from vslam.evaluation.worlds import world_of
-from vslam.maps.ply import save_ply
+from vslam.maps.formats import save_ply
 from vslam.maps.storage import save_map
 from vslam.report.frame_table import write_covariances, write_frames
 from vslam.report.schema import ReportJson
-from vslam.report.summary import evaluate_run, summarize
+from vslam.report.summary import evaluate_run, gps_figures, summarize
 from vslam.run.outcome import (
     RunOutcome,
     causal_trajectory,
@@ -98,6 +98,7 @@ def write_results(
     (``trajectory_kitti.txt``, ``trajectory.tum``, ``ground_truth_kitti.txt``, ``keyframes.tum``,
     ``trajectory_causal.tum`` with the poses as they were given at the time, ``covariance.csv`` with
     their covariances, ``trajectory_odom.tum`` with those that never jump,
+    with GPS ``trajectory_enu.tum``, ``trajectory_gps.csv`` and ``gps.json``,
     ``trajectory_<detector>.tum`` of each detector compared), maps (``map.npz``, ``map.ply``),
     numbers (``frames.csv``, ``config.json``, read by ``--config``, and ``report.json``), and pages
     for people (``figures/*.png``, ``report.md`` and ``report.html``, one file that makes no
@@ -199,6 +200,7 @@ def _write_data(
         write_tum(file, odometry_trajectory(outcome.tracks))
     with written.file("covariance.csv") as file:
         write_covariances(file, outcome.tracks)
+    _write_gps(written, outcome)
     for other in outcome.compared:
         with written.file(f"trajectory_{_safe(other.settings.detector)}.tum") as file:
             write_tum(file, other.trajectory)
@@ -206,7 +208,7 @@ def _write_data(
     with written.part("the evaluation"):
         evaluation, remark = evaluate_run(outcome)
     if (stored := outcome.stored) is not None:
-        if outcome.settings.map is None and evaluation is not None:
+        if outcome.settings.map_file is None and evaluation is not None:
             with written.part("the map's place in the ground truth"):
                 stored = replace(stored, world=world_of(outcome, evaluation))
         with written.file("map.npz") as file:
@@ -224,8 +226,29 @@ def _write_data(
     return evaluation, remark
 
 
+def _write_gps(written: Results, outcome: RunOutcome) -> None:
+    """The drive on the Earth, in files of its own."""
+    if (track := outcome.gps_track) is None:
+        return
+    with written.file("trajectory_enu.tum") as file:
+        write_tum(file, track.trajectory)
+    with written.file("trajectory_gps.csv") as file:
+        times = track.trajectory.timestamps.tolist()
+        lines = [
+            f"{time:.6f},{latitude:.9f},{longitude:.9f},{altitude:.3f}\n"
+            for time, (latitude, longitude, altitude) in zip(
+                times, track.geodetic.tolist(), strict=True
+            )
+        ]
+        file.write_text("time,latitude,longitude,altitude\n" + "".join(lines))
+    with written.file("gps.json") as file:
+        figures = gps_figures(outcome)
+        assert figures is not None
+        file.write_text(figures.model_dump_json(indent=2) + "\n")
+
+
 def _config_text(outcome: RunOutcome) -> str:
-    return outcome.settings.config.model_dump_json(indent=2) + "\n"
+    return outcome.settings.thresholds.model_dump_json(indent=2) + "\n"
 
 
 def write_trajectories(written: Results, outcome: RunOutcome) -> None:
@@ -271,9 +294,9 @@ def _write_pages(
     """Write the figures, and the pages with those that could be drawn."""
     from vslam.report.explorer import explorer
     from vslam.report.figures import draw_figures
+    from vslam.report.loop_tables import seen_loops
     from vslam.report.render import html, markdown
     from vslam.report.run_page import run_page
-    from vslam.report.seen_loops import seen_loops
 
     truth = matched_ground_truth(outcome)
     figures: list[Figure] = []

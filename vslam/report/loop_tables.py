@@ -1,16 +1,25 @@
-"""The tables of loops, which stay short even where hundreds of candidates were rejected."""
+"""The tables and pictures of loops, which stay few even where hundreds of candidates were
+rejected."""
 
 from __future__ import annotations
 
 import re
 from collections import defaultdict
+from collections.abc import Collection
+from typing import TYPE_CHECKING
 
 from vslam.errors import counted
-from vslam.report.page import Row, Section, Table, number
+from vslam.report.page import Figure, Row, Section, Table, number
 from vslam.report.schema import LoopEntry, ReportJson
+
+if TYPE_CHECKING:
+    from vslam.run.loop_pictures import LoopPicture
 
 _MAX_CLOSED = 60
 _MAX_REJECTED = 12
+_MAX_SEEN = 6  # loops in pictures: about 0.5 MB of the page
+_DESCRIPTORS = {"orb": "ORB descriptors", "learned": "learned descriptors"}
+_NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
 def loop_sections(report: ReportJson) -> list[Section]:
@@ -66,11 +75,16 @@ def _reasons(report: ReportJson) -> Table:
     groups: dict[str, list[LoopEntry]] = defaultdict(list)
     for loop in report.loops:
         if not loop.accepted:
-            groups[_without_numbers(loop.reason)].append(loop)
+            groups[_NUMBER.sub("0", loop.reason)].append(loop)
     ordered = sorted(groups.items(), key=lambda group: -len(group[1]))
     rows: list[Row] = [
-        (reason, str(len(loops)), str(max(loop.inliers for loop in loops)), _share_right(loops))
-        for reason, loops in ordered
+        (
+            _common(loops),
+            str(len(loops)),
+            str(max(one.inliers for one in loops)),
+            _right_of(loops),
+        )
+        for _, loops in ordered
     ]
     head = ("reason", "candidates", "most inliers", "pose right")
     note = f"{counted(report.loops_rejected, 'candidate')} in all; report.json lists each."
@@ -99,15 +113,59 @@ def _evidence(loop: LoopEntry) -> Row:
     )  # fmt: skip
 
 
-def _without_numbers(reason: str) -> str:
-    """Reasons that differ only in their numbers count as one."""
-    return re.sub(r"\d+(\.\d+)?", "N", reason)
+def _common(loops: list[LoopEntry]) -> str:
+    """The reason of loops whose reasons differ only in their numbers, with the ranges of these."""
+    columns = zip(*(_NUMBER.findall(loop.reason) for loop in loops), strict=True)
+    ends = [(min(column, key=float), max(column, key=float)) for column in columns]
+    ranges = iter([least if least == most else f"{least}-{most}" for least, most in ends])
+    return _NUMBER.sub(lambda _: next(ranges), loops[0].reason)
 
 
 def _right(loop: LoopEntry) -> str:
     return {True: "right", False: "wrong", None: "n/a"}[loop.right]
 
 
-def _share_right(loops: list[LoopEntry]) -> str:
+def _right_of(loops: list[LoopEntry]) -> str:
     judged = [loop.right for loop in loops if loop.right is not None]
     return f"{sum(judged)} of {len(judged)}" if judged else "n/a"
+
+
+def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[Figure]:
+    """Draw the closed loops that a reader should see: wrong ones first, then those that learned
+    descriptors verified, otherwise in their order.
+
+    Args:
+        report: of the run.
+        pictures: of those of its closed loops of which both images are kept.
+    """
+    closed = {(loop.query_frame, loop.match_frame): loop for loop in report.loops if loop.accepted}
+    of_loop = [(closed.get((one.query_frame, one.match_frame)), one) for one in pictures]
+    shown = [(loop, picture) for loop, picture in of_loop if loop is not None]
+    if not shown:
+        return []
+    from vslam.run.loop_pictures import draw_picture
+
+    shown.sort(key=lambda one: (one[0].right is not False, one[0].matched_by != "learned"))
+    return [
+        Figure(name, _caption(loop), draw_picture(picture), file=f"figures/{name}")
+        for loop, picture in shown[:_MAX_SEEN]
+        if (name := f"loop-{picture.query_frame}-{picture.match_frame}.jpg")
+    ]
+
+
+def seen_note(report: ReportJson, seen: Collection[Figure]) -> str:
+    """What the pictures show, and how many of the closed loops have one."""
+    note = "Lines join what both images show; at most 60 matches are drawn."
+    if len(seen) < report.loops_closed:
+        note += f" {len(seen)} of the {report.loops_closed} closed loops are shown."
+    return note
+
+
+def _caption(loop: LoopEntry) -> str:
+    wrong = loop.right is False
+    shows = "was wrongly taken for" if wrong else "shows"
+    return (
+        f"Frame {loop.query_frame} (right) {shows} the place of frame {loop.match_frame} (left): "
+        f"{loop.inliers} matches agree; proposed by {loop.proposed_by.replace('+', ' and ')}, "
+        f"verified by {_DESCRIPTORS[loop.matched_by]}."
+    )

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from vslam.errors import ResultsError
+from vslam.errors import write_file
 from vslam.report.page import (
     Alert,
     Bullets,
@@ -43,15 +43,8 @@ def write_files(
     Raises:
         ResultsError: a file cannot be written.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, content in files.items():
-            data = content.encode() if isinstance(content, str) else content
-            (folder / name).write_bytes(data)
-    except OSError as error:
-        raise ResultsError(
-            f"{folder}: the report cannot be written ({error.strerror}); {fix}."
-        ) from error
+    for name, content in files.items():
+        write_file(folder / name, content, fix)
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:

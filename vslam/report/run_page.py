@@ -7,10 +7,9 @@ from html import escape
 
 from vslam.config import thresholds_in_words
 from vslam.errors import counted
-from vslam.evaluation.loops import LoopLimits
+from vslam.evaluation.loops import MIN_LENGTH_M
 from vslam.loopclosure.registry import about
-from vslam.report.detector_table import detector_section
-from vslam.report.loop_tables import loop_sections
+from vslam.report.loop_tables import loop_sections, seen_note
 from vslam.report.page import (
     Alert,
     Bullets,
@@ -25,9 +24,9 @@ from vslam.report.page import (
     Table,
     Tile,
     Tiles,
+    number,
 )
 from vslam.report.schema import ReportJson
-from vslam.report.seen_loops import seen_note
 
 _ALIGNMENTS = {
     "se3": "SE3 alignment, no scale",
@@ -35,6 +34,23 @@ _ALIGNMENTS = {
     "none": "not aligned",
 }
 _MANY_LOST = 0.1  # share of the frames
+_COMPARED = (
+    ("lost", "lost_frames", "{}"),
+    ("ATE", "ate_rmse_m", "{:.3f} m"),
+    ("causal ATE", "causal_ate_rmse_m", "{:.3f} m"),
+    ("RPE", "rpe_m", "{:.4f} m"),
+    ("t_rel", "t_rel_percent", "{:.3f} %"),
+    ("loops closed", "loops_closed", "{}"),
+    ("loops found", "loops_found", "{}"),
+    ("missed", "loops_missed", "{}"),
+    ("wrong", "loops_wrong", "{}"),
+    ("time", "seconds", "{:.1f} s"),
+)
+_ABOUT_COMPARED = (
+    "All detectors saw the same frames. The time is that of tracking and mapping: images are read "
+    "and features are extracted once for all detectors. It is wall time on cores that the "
+    "detectors share; to compare costs, time separate runs."
+)
 
 
 def headlines(report: ReportJson) -> list[Tile]:
@@ -58,6 +74,7 @@ def headlines(report: ReportJson) -> list[Tile]:
             "bad" if lost else "good",
         ),
         *_in_map(report),
+        *_on_earth(report),
         *([Tile("Scale", "arbitrary", "as of any single camera")] if mono else []),
         Tile("ATE RMSE", _number(report.ate_rmse_m, "m"), evaluated),
         Tile(
@@ -116,6 +133,14 @@ def _in_map(report: ReportJson) -> list[Tile]:
     ]
 
 
+def _on_earth(report: ReportJson) -> list[Tile]:
+    if (found := report.gps_track) is None:
+        return []
+    apart = f"{_number(found.residual_m, 'm')} from the trajectory (RMS)"
+    used = f"{found.fixes - found.refused} fixes"
+    return [Tile("GPS", used, f"{found.refused} refused; {apart}")]
+
+
 def _latency(report: ReportJson) -> list[Tile]:
     """In a real-time run, dropped frames are a fault of the machine: they colour the tile."""
     if report.latency_ms is None:
@@ -147,9 +172,50 @@ def _revisits(report: ReportJson) -> str:
     mentioned."""
     if report.revisit_stretches:
         return f"{report.loops_found} of {counted(report.revisit_stretches, 'revisit')} found"
-    none = f"no revisit of {LoopLimits().min_length_m:.0f} m or more to be found"
+    none = f"the ground truth revisits no stretch of {MIN_LENGTH_M:.0f} m or more"
     right = sum(loop.accepted and loop.right is True for loop in report.loops)
     return f"{none} ({right} right on shorter ones)" if right else none
+
+
+def detector_section(report: ReportJson) -> Section:
+    """A row for each detector, the run's own first; empty where there was no comparison.
+
+    Figures that no detector has are left out. The loops closed are counted only where there is no
+    ground truth that tells which revisits were found.
+    """
+    detectors = report.detectors
+    if not detectors:
+        return Section("Detectors", [_left_out(report)])
+    known = {
+        name for _, name, _ in _COMPARED if any(getattr(one, name) is not None for one in detectors)
+    }
+    if "loops_found" in known:
+        known.remove("loops_closed")
+    figures = [figure for figure in _COMPARED if figure[1] in known]
+    ended = ("ended early",) if any(one.interrupted for one in detectors) else ()
+    head = ("detector", *(title for title, _, _ in figures), *ended)
+    rows: list[Row] = [
+        (
+            one.detector,
+            *(number(getattr(one, name), form) for _, name, form in figures),
+            *(one.interrupted or "no" for _ in ended),
+        )
+        for one in detectors
+    ]
+    names = "; ".join(f"{one.detector}: {about(one.detector)}" for one in detectors)
+    return Section(
+        "Detectors", [Table(head, rows, ("detector", *ended), f"{names}. {_ABOUT_COMPARED}")]
+    )
+
+
+def _left_out(report: ReportJson) -> str:
+    """Why there is no comparison although one was requested; empty otherwise."""
+    if report.detectors or not report.compare:
+        return ""
+    return (
+        f"The comparison with {', '.join(report.compare)} was left out: the run was resumed, and "
+        "only the map of its own detector had been saved."
+    )
 
 
 def run_page(
@@ -165,14 +231,14 @@ def run_page(
     Args:
         report: the numbers.
         figures: drawn by :func:`vslam.report.figures.draw_figures`.
-        seen: pictures of closed loops, of :func:`vslam.report.seen_loops.seen_loops`.
+        seen: pictures of closed loops, of :func:`vslam.report.loop_tables.seen_loops`.
         recordings: names of those beside the page.
         explorer: of :func:`vslam.report.explorer.explorer`.
         config: text of ``config.json``, which the HTML page shows as it is.
     """
     interrupted = f"Interrupted: {report.interrupted}."
     done = counted(report.frames, "frame")
-    alerts = [Alert(interrupted, f"The numbers are of the {done} before it.")]
+    alerts = [Alert(interrupted, f"The results cover the {done} before it.")]
     if not report.interrupted:
         alerts = []
     alerts += [Alert(f"Warning: {warning}") for warning in report.warnings]
@@ -202,6 +268,7 @@ def run_page(
                 [Bullets(report.skipped_messages)],
                 folded=True,
             ),
+            _gps(report),
             *explorer,
             Section("", [*figures], wide=False),
             Section("Time per stage (ms)", [stages], wide=False),
@@ -221,6 +288,27 @@ def run_page(
             Section("Configuration", [Markup(f"<pre>{escape(config)}</pre>")], folded=True),
         ),
     )
+
+
+def _gps(report: ReportJson) -> Section:
+    """The drive on the Earth; empty without GPS."""
+    if (found := report.gps_track) is None:
+        return Section("GPS", ())
+    latitude, longitude, altitude = found.datum
+    rows = [
+        ("origin", f"{latitude:.7f}°, {longitude:.7f}°, {altitude:.1f} m"),
+        ("fixes of tracked frames", f"{found.fixes}, {found.refused} of them refused"),
+        ("distance of the fixes used (RMS)", _number(found.residual_m, "m")),
+        ("scale of the map", f"{found.metres_per_unit:.4g} m per unit"),
+    ]
+    if found.ate_rmse_m is not None:
+        without = f"{_number(report.ate_rmse_m, 'm')} without ({report.alignment})"
+        rows.append(("ATE RMSE", f"{_number(found.ate_rmse_m, 'm')} with GPS (se3), {without}"))
+    note = (
+        "The drive is too straight for GPS to tell the rotation about it: the camera is taken to "
+    )
+    parts: list[Part] = [Pairs(rows)]
+    return Section("GPS", parts if found.level else [*parts, note + "stand upright."])
 
 
 def stage_rows(report: ReportJson) -> list[Row]:
@@ -244,6 +332,8 @@ def option_rows(report: ReportJson) -> list[tuple[str, str]]:
     realtime = [("realtime", "yes")] if report.realtime else []
     compare = [("compare", ", ".join(report.compare))] if report.compare else []
     files = [("calib", str(path)) for path in report.calib]
+    if report.gps:
+        files.append(("gps", str(report.gps)))
     if report.mask:
         files.append(("mask", str(report.mask)))
     return [*options, ("max-frames", limit), *thresholds, *weights, *realtime, *files, *compare]

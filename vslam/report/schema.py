@@ -1,14 +1,53 @@
-"""The schema of ``report.json``: what scripts may rely on."""
+"""The schema of ``report.json``: what scripts may rely on.
+
+``Record`` and ``Document`` are the base of all files of results.
+"""
 
 from __future__ import annotations
 
+import json
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-from vslam.report.document import Document, Record
+from vslam.errors import InputError
+
+
+class Record(BaseModel):
+    """A part of a document; a field that is not known is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Document(Record):
+    """A JSON file of results. A subclass sets ``schema_version`` to the version that it reads."""
+
+    schema_version: int
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read a file that ``to_json`` wrote.
+
+        Raises:
+            InputError: the file is missing, damaged or of another version.
+        """
+        known = cls.model_fields["schema_version"].default
+        try:
+            content = json.loads(path.read_bytes())
+            found = content["schema_version"]
+            if found == known:
+                return cls.model_validate(content)
+        except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+            raise InputError(f"{path}: missing or damaged; name the folder of a run.") from error
+        raise InputError(
+            f"{path}: report schema {found}, this version reads {known}; repeat the run with it."
+        )
+
+    def to_json(self) -> str:
+        """The text of the file."""
+        return self.model_dump_json(indent=2) + "\n"
 
 
 class StageTime(Record):
@@ -116,6 +155,27 @@ class MapFigures(Record):
     error_m: float | None
 
 
+class GpsFigures(Record):
+    """The drive on the Earth, also written as ``gps.json``.
+
+    ``datum`` is the origin of the local east-north-up frame: latitude and longitude in degrees and
+    altitude in metres, those of the first fix. ``fixes`` counts those of tracked frames,
+    ``refused`` those of them that failed the chi-square test. ``residual_m`` is the root mean
+    square distance of the others from the trajectory, ``metres_per_unit`` the mean scale of the
+    map. ``ate_rmse_m`` is the error of ``trajectory_enu.tum`` after its SE3 alignment, None without
+    ground truth. ``level`` is False where the drive is straight, so that the rotation about it is
+    unknown.
+    """
+
+    datum: tuple[float, float, float]
+    fixes: int
+    refused: int
+    residual_m: float
+    metres_per_unit: float
+    ate_rmse_m: float | None
+    level: bool
+
+
 class Machine(Record):
     """Where the times were measured; ``cores`` counts those that the process may use."""
 
@@ -175,6 +235,7 @@ class ReportJson(Measures, Document):
     loops: list[LoopEntry]
     detectors: tuple[DetectorFigures, ...] = ()
     in_map: MapFigures | None = None
+    gps_track: GpsFigures | None = None
 
     dataset: str
     sequence: str
@@ -191,6 +252,7 @@ class ReportJson(Measures, Document):
     realtime: bool = False
     calib: tuple[Path, ...] = ()
     mask: Path | None = None
+    gps: Path | None = None
     map: Path | None = None
     localize: bool = False
     compare: tuple[str, ...] = ()

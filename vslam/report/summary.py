@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections import Counter
-from dataclasses import asdict
+from contextlib import suppress
 from datetime import UTC, datetime
 from itertools import takewhile
 from typing import Any
@@ -23,6 +23,7 @@ from vslam.loops import LoopCorrection
 from vslam.machine import available_cores, cpu_name, versions
 from vslam.report.schema import (
     DetectorFigures,
+    GpsFigures,
     LoopEntry,
     Machine,
     MapFigures,
@@ -31,6 +32,11 @@ from vslam.report.schema import (
     StageTime,
 )
 from vslam.run.outcome import RunOutcome, causal_trajectory, matched_ground_truth
+
+_OPTIONS = (
+    "perturb", "detector", "seed", "threads", "start", "every", "max_frames", "weights",
+    "local_weights", "realtime", "calib", "mask", "gps", "localize", "compare",
+)  # fmt: skip
 
 
 def summarize(
@@ -50,8 +56,7 @@ def summarize(
     frames = len(outcome.tracks)
     states = Counter(track.state for track in outcome.tracks)
     done = frames - states[TrackingState.DROPPED]
-    options = asdict(outcome.settings)
-    options["thresholds"] = changed_thresholds(options.pop("config").model_dump())
+    settings, source = outcome.settings.model_dump(), outcome.sequence
     loops = _loops(outcome, verdict)
     return ReportJson(
         lost_before_map=_lost_before_map(outcome),
@@ -81,16 +86,22 @@ def summarize(
         loops=loops,
         detectors=_detectors(outcome, evaluation, verdict),
         in_map=_figures_in_map(outcome),
+        gps_track=gps_figures(outcome),
         machine=this_machine(),
         versions=versions(),
         created=datetime.now(UTC).replace(microsecond=0),
         **_measures(outcome, evaluation, verdict),
-        **options,
+        dataset=source.dataset,
+        sequence=source.name,
+        sensor=source.camera.sensor,
+        map=settings["map_file"],
+        thresholds=changed_thresholds(settings["thresholds"]),
+        **{name: settings[name] for name in _OPTIONS},
     )
 
 
 def _lost_before_map(outcome: RunOutcome) -> int:
-    if outcome.settings.map is not None or not outcome.n_tracked:
+    if outcome.settings.map_file is not None or not outcome.n_tracked:
         return 0
     untracked = (TrackingState.LOST, TrackingState.DROPPED)
     before = takewhile(lambda track: track.state in untracked, outcome.tracks)
@@ -105,8 +116,7 @@ def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
     if not outcome.tracks:
         return None, "no frames"
     try:
-        alignment = outcome.settings.alignment
-        found = evaluate_trajectory(outcome.trajectory, ground_truth, alignment)
+        found = evaluate_trajectory(outcome.trajectory, ground_truth, outcome.alignment)
     except InputError as error:  # a clip too short to align is no reason to lose the run
         return None, str(error)
     if found.frames == len(outcome.trajectory):
@@ -121,7 +131,7 @@ def causal_ate(outcome: RunOutcome) -> float | None:
         return None
     try:
         given = causal_trajectory(outcome.tracks)
-        return evaluate_trajectory(given, ground_truth, outcome.settings.alignment).ate_rmse_m
+        return evaluate_trajectory(given, ground_truth, outcome.alignment).ate_rmse_m
     except InputError:
         return None
 
@@ -174,6 +184,26 @@ def _figures_in_map(outcome: RunOutcome) -> MapFigures | None:
         sought=sought,
         found=len(found),
         error_m=error_in_map(outcome),
+    )
+
+
+def gps_figures(outcome: RunOutcome) -> GpsFigures | None:
+    """The drive on the Earth in numbers, None without GPS."""
+    if (track := outcome.gps_track) is None:
+        return None
+    ate, ground_truth = None, matched_ground_truth(outcome)
+    if ground_truth is not None:
+        with suppress(InputError):
+            ate = evaluate_trajectory(track.trajectory, ground_truth, "se3").ate_rmse_m
+    latitude, longitude, altitude = track.datum.tolist()
+    return GpsFigures(
+        datum=(latitude, longitude, altitude),
+        fixes=len(track.fixes),
+        refused=int(np.count_nonzero(~track.anchored.used)),
+        residual_m=track.anchored.residual_m,
+        metres_per_unit=float(track.anchored.scale.mean()),
+        ate_rmse_m=ate,
+        level=track.anchored.level,
     )
 
 

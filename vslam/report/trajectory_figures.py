@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from vslam.evaluation.loops import LoopEvaluation
 from vslam.evaluation.trajectories import Evaluation
+from vslam.evaluation.worlds import world_of
 from vslam.geometry import inverses
 from vslam.report.drawing import (
     AMBER,
@@ -33,6 +34,8 @@ from vslam.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from vslam.run.gps import GpsTrack
 
 Points = NDArray[np.float64]
 
@@ -142,8 +145,22 @@ def loop_closing(
     return figure
 
 
+def gps_map(track: GpsTrack) -> Figure:
+    """The drive on the Earth, with and without GPS, and the fixes."""
+    figure, axes = new_figure("With GPS", "east (m)", "north (m)", SQUARE)
+    used = track.anchored.used
+    fixes, refused = track.fixes[used], track.fixes[~used]
+    axes.plot(*fixes.T[:2], ".", color=GREY, markersize=4, label=f"fixes ({len(fixes)})")
+    if len(refused):
+        axes.plot(*refused.T[:2], "x", color=RED, markersize=4, label=f"refused ({len(refused)})")
+    axes.plot(*track.visual.T[:2], color=AMBER, linewidth=1.2, label="vision alone")
+    axes.plot(*track.trajectory.T_wc[:, :2, 3].T, color=BLUE, linewidth=1.2, label="with GPS")
+    finish_map(figure, axes)
+    return figure
+
+
 def _new_map(title: str, outcome: RunOutcome, evaluation: Evaluation | None) -> tuple[Figure, Axes]:
-    monocular = outcome.settings.sensor == "mono"
+    monocular = outcome.sequence.camera.monocular
     unit = "map units" if monocular and evaluation is None else "m"
     return new_figure(title, f"x ({unit})", f"z ({unit})", SQUARE)
 
@@ -170,11 +187,5 @@ def _aligned(outcome: RunOutcome, evaluation: Evaluation | None, points: Points)
     """Take ``(N, 3)`` points of the estimate's world to where the evaluation has put it."""
     if evaluation is None:
         return points
-    compared = np.isin(outcome.trajectory.timestamps, evaluation.timestamps)
-    estimate, aligned = outcome.trajectory.T_wc[compared], evaluation.T_wc_aligned
-    R = aligned[0, :3, :3] @ estimate[0, :3, :3].T
-    p, q = estimate[:, :3, 3], aligned[:, :3, 3]
-    scale = 1.0
-    if evaluation.alignment == "sim3":
-        scale = float(np.linalg.norm(q - q.mean(axis=0)) / np.linalg.norm(p - p.mean(axis=0)))
-    return scale * (points - p.mean(axis=0)) @ R.T + q.mean(axis=0)
+    S = world_of(outcome, evaluation).S_truth_world
+    return np.asarray(points @ S[:3, :3].T + S[:3, 3])

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
-from vslam.features import Features, TrackResult
+from vslam.camera import Camera, Image
+from vslam.features import TrackResult
 from vslam.loops import LoopEdge
 from vslam.map import Map
 from vslam.run.loop_pictures import LoopPicture, loop_matches, spread
@@ -56,25 +56,19 @@ class MomentRecorder(Recorder):
         self._every = 1
         self._n_keyframes = 0
 
-    def keyframe(
-        self,
-        result: TrackResult,
-        image: NDArray[np.uint8],
-        features: Features,
-        tracked: NDArray[np.bool_],
-    ) -> None:
+    def keyframe(self, result: TrackResult, image: Image, xy: NDArray, tracked: NDArray) -> None:
         """See `vslam.run.recorder.Recorder.keyframe`."""
         if self._n_keyframes % self._every == 0:
             if len(self.moments) == _MOST:
                 self.moments = self.moments[::2]
                 self._every *= 2
             if self._n_keyframes % self._every == 0:
-                self.moments.append(_moment(result.index, image, features, tracked))
+                self.moments.append(_moment(result.index, image, xy, tracked))
         self._n_keyframes += 1
 
 
 def _moment(
-    frame: int, image: NDArray[np.uint8], features: Features, tracked: NDArray[np.bool_]
+    frame: int, image: Image, xy: NDArray[np.float32], tracked: NDArray[np.bool_]
 ) -> Moment:
     height, width = image.shape
     size = min(width, _WIDTH), max(1, round(height * min(width, _WIDTH) / width))
@@ -83,7 +77,7 @@ def _moment(
     # Tracked ones first, evenly thinned out.
     order = np.argsort(~tracked, kind="stable")
     order = order[:: max(1, -(-len(order) // _MOST_POINTS))]
-    share = features.xy[order] / np.array([width, height], np.float32)
+    share = xy[order] / np.array([width, height], np.float32)
     points = np.clip(np.rint(255 * share), 0, 255).astype(np.uint8)
     return Moment(frame, jpeg, points, tracked[order])
 
@@ -107,13 +101,7 @@ class LoopPictureRecorder(Recorder):
         """See `vslam.run.recorder.Recorder.begin`."""
         self._camera = camera
 
-    def keyframe(
-        self,
-        result: TrackResult,
-        image: NDArray[np.uint8],
-        features: Features,
-        tracked: NDArray[np.bool_],
-    ) -> None:
+    def keyframe(self, result: TrackResult, image: Image, xy: NDArray, tracked: NDArray) -> None:
         """See `vslam.run.recorder.Recorder.keyframe`."""
         if len(self._jpegs) == _MOST_LOOP_IMAGES:
             self._jpegs = dict(list(self._jpegs.items())[::2])

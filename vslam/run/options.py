@@ -7,11 +7,9 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from vslam.config import Config
-from vslam.datasets.frames import Source
 from vslam.datasets.sources import SourceOptions
 from vslam.errors import InputError
 from vslam.loopclosure.registry import DEFAULT_DETECTOR
-from vslam.run.outcome import RunSettings
 
 OPTIONS = "run.json"
 
@@ -21,6 +19,7 @@ class RunOptions(SourceOptions):
 
     perturb: str = "none"
     seed: int = 0
+    gps: Path | None = None
     threads: int = 1
     detector: str = DEFAULT_DETECTOR
     weights: Path | None = None
@@ -33,35 +32,6 @@ class RunOptions(SourceOptions):
     autosave: float = 60.0
 
 
-def settings_of(options: RunOptions, source: Source, perturb: str) -> RunSettings:
-    """The settings that the report shows for a run of a source with these options.
-
-    Args:
-        perturb: name of the perturbation: its laws with their strengths.
-    """
-    return RunSettings(
-        dataset=source.dataset,
-        sequence=source.name,
-        perturb=perturb,
-        detector=options.detector,
-        sensor=source.camera.sensor,
-        seed=options.seed,
-        threads=options.threads,
-        start=options.start,
-        every=options.every,
-        max_frames=options.max_frames,
-        config=options.thresholds,
-        weights=options.weights,
-        local_weights=options.local_weights,
-        realtime=options.realtime or source.live,
-        calib=options.calib,
-        mask=options.mask,
-        map=options.map_file,
-        localize=options.localize,
-        compare=options.compare,
-    )
-
-
 def write_options(folder: Path, options: RunOptions) -> None:
     """Write ``run.json``.
 
@@ -71,7 +41,7 @@ def write_options(folder: Path, options: RunOptions) -> None:
     data = Path(options.data)
     absolute: dict[str, object] = {
         name: path.resolve()
-        for name in ("right", "depth", "mask", "weights", "local_weights", "map_file")
+        for name in ("right", "depth", "mask", "gps", "weights", "local_weights", "map_file")
         if (path := getattr(options, name)) is not None
     }
     if options.data and data.exists():

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.config import Config
 from vslam.datasets.frames import Source
 from vslam.features import TrackingState, TrackResult
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.map import Map
 from vslam.maps.stored_map import StoredMap, World
+from vslam.run.options import RunOptions
 from vslam.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from vslam.run.gps import GpsTrack
 
 
 def alignment_of(sensor: str) -> str:
@@ -23,40 +26,11 @@ def alignment_of(sensor: str) -> str:
 
 
 @dataclass(frozen=True)
-class RunSettings:
-    """The options of a run as the user gave them."""
-
-    dataset: str
-    sequence: str
-    perturb: str
-    detector: str
-    sensor: str
-    seed: int
-    threads: int
-    start: int
-    every: int
-    max_frames: int | None
-    config: Config
-    weights: Path | None = None
-    local_weights: Path | None = None
-    realtime: bool = False
-    calib: tuple[Path, ...] = ()
-    mask: Path | None = None
-    map: Path | None = None
-    localize: bool = False
-    compare: tuple[str, ...] = ()
-
-    @property
-    def alignment(self) -> str:
-        """How a trajectory is aligned with the ground truth before they are compared."""
-        return alignment_of(self.sensor)
-
-
-@dataclass(frozen=True)
 class RunOutcome:
     """All data that the report needs.
 
     Attributes:
+        settings: the options of the run, with the canonical name of its perturbation.
         trajectory: final pose of every processed frame, including lost ones; poses as they were
             tracked if there is no map.
         keyframes: final poses of the keyframes.
@@ -81,12 +55,13 @@ class RunOutcome:
         keyframe_frames: ``(K,)`` int64, the frame of this run behind each keyframe, including
             culled ones; -1 for keyframes of earlier drives.
         n_submaps: how often a map or sub-map was started; 0 before the first keyframe.
+        gps_track: the drive on the Earth; None without GPS.
         interrupted: why the run ended early ("Ctrl-C", a truncated file), or None.
         compared: the runs of the detectors of ``settings.compare`` on the same frames, without
             their maps; empty for a resumed run.
     """
 
-    settings: RunSettings
+    settings: RunOptions
     sequence: Source
     trajectory: Trajectory
     keyframes: Trajectory
@@ -108,9 +83,15 @@ class RunOutcome:
     corrections: list[LoopCorrection] = field(default_factory=list)
     keyframe_frames: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     n_submaps: int = 1
+    gps_track: GpsTrack | None = None
     interrupted: str | None = None
     step_s: float = 0.0
     compared: tuple[RunOutcome, ...] = ()
+
+    @property
+    def alignment(self) -> str:
+        """How the trajectory is aligned with the ground truth before they are compared."""
+        return alignment_of(self.sequence.camera.sensor)
 
     @property
     def n_tracked(self) -> int:

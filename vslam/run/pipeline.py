@@ -28,10 +28,10 @@ from vslam.map import Map
 from vslam.maps.storage import made_with
 from vslam.plugins import reason
 from vslam.run.autosave import NO_AUTOSAVE, Autosave, Unfinished
-from vslam.run.outcome import RunOutcome, RunSettings, causal_trajectory, ground_truth_of
-from vslam.run.preparation import PreparedFrame, in_their_time
+from vslam.run.options import RunOptions
+from vslam.run.outcome import RunOutcome, causal_trajectory, ground_truth_of
+from vslam.run.preparation import Played, PreparedFrame, in_their_time
 from vslam.run.progress import Progress, TrackLog, in_frames
-from vslam.run.realtime import Played
 from vslam.run.recorder import Recorder
 from vslam.run.rig import (
     calibration_warnings,
@@ -49,7 +49,7 @@ _log = logging.getLogger(__name__)
 def run_sequence(
     sequence: Source,
     perturbation: Perturbation,
-    settings: RunSettings,
+    settings: RunOptions,
     recorder: Recorder,
     *,
     on_frame: Callable[[TrackResult], None] = lambda result: None,
@@ -145,10 +145,11 @@ def run_sequence(
     return replace(_outcome(sequence, main, seconds, ended), compared=compared)
 
 
-def _compared(camera: Camera, settings: RunSettings) -> list[_Run]:
+def _compared(camera: Camera, settings: RunOptions) -> list[_Run]:
     """The runs of ``settings.compare`` before their first frame. ``settings.weights`` are those of
     the main detector only."""
-    each = [replace(settings, detector=name, weights=None, compare=()) for name in settings.compare]
+    alone: dict[str, object] = {"weights": None, "compare": ()}
+    each = [settings.model_copy(update={**alone, "detector": name}) for name in settings.compare]
     return [_Run(begin(camera, one), one, Progress()) for one in each]
 
 
@@ -159,7 +160,7 @@ class _Run:
         step_s: wall time of its own steps (``RunOutcome.step_s``).
     """
 
-    def __init__(self, slam: Slam, settings: RunSettings, before: Progress) -> None:
+    def __init__(self, slam: Slam, settings: RunOptions, before: Progress) -> None:
         self.slam, self.settings, self.before = slam, settings, before
         self.tracks = before.tracks.results()
         if self.tracks:
@@ -267,10 +268,10 @@ def _show(
     n_told: int,
 ) -> int:
     """Record a frame, and the map if nobody changes it; returns the number of recorded loops."""
-    recorder.frame(result, result.T_wc)
+    recorder.frame(result)
     images = None if played.made is None else played.made.images
     if result.is_keyframe and slam.frame is not None and images is not None:
-        recorder.keyframe(result, images.left, slam.frame.features, slam.frame.landmark >= 0)
+        recorder.keyframe(result, images.left, slam.frame.features.xy, slam.frame.landmark >= 0)
     if slam.is_mapping:
         return n_told
     recorder.map(slam.map)
@@ -329,25 +330,23 @@ def _outcome(
 
 def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
     """Add the results that need a complete map."""
-    slam, settings, camera = run.slam, run.settings, outcome.sequence.camera
+    slam, settings, source = run.slam, run.settings, outcome.sequence
     loops, corrections, keyframe_frames = _with_earlier(run.before, slam)
     return replace(
         outcome,
         trajectory=run.trajectory(),
         keyframes=slam.keyframe_trajectory(),
         warnings=[
-            *calibration_warnings(camera, settings.calib, outcome.sequence.name),
+            *calibration_warnings(source.camera, settings.calib, source.name),
             *slam.problems,
             *rig_warnings(slam.rig.sides),
-            *_map_warnings(slam, camera),
+            *_map_warnings(slam, source.camera),
         ],
         n_keyframes=len(slam.map.living_keyframes()),
         n_landmarks=len(slam.map.living_landmarks()),
         map=slam.map,
-        stored=None
-        if settings.localize
-        else slam.stored_map(f"{settings.dataset} {outcome.sequence.name}"),
-        in_map=None if settings.map is None else slam.in_map()[: len(run.tracks)],
+        stored=None if settings.localize else slam.stored_map(f"{source.dataset} {source.name}"),
+        in_map=None if settings.map_file is None else slam.in_map()[: len(run.tracks)],
         loops=loops,
         corrections=corrections,
         keyframe_frames=keyframe_frames,
@@ -389,8 +388,8 @@ def _with_earlier(
     return loops + slam.loops, corrections + slam.corrections, np.concatenate([frames, extra])
 
 
-def begin(camera: Camera, settings: RunSettings, saved: Path | None = None) -> Slam:
-    """Create the ``Slam`` of a run: with a new map, or with the map that ``settings.map`` names.
+def begin(camera: Camera, settings: RunOptions, saved: Path | None = None) -> Slam:
+    """Create the ``Slam`` of a run: with a new map, or with ``settings.map_file``.
 
     Args:
         saved: the map that an unfinished run left; the ``Slam`` continues after its last frame.
@@ -399,7 +398,7 @@ def begin(camera: Camera, settings: RunSettings, saved: Path | None = None) -> S
         InputError: the map does not exist or is of another camera, detector or pyramid, or the
             weights cannot be read.
     """
-    config, threads = settings.config, settings.threads
+    config, threads = settings.thresholds, settings.threads
     late = not settings.realtime  # then nothing is loaded while the camera drives
     detector, images = detector_with_images(
         settings.detector, config, settings.weights,
@@ -407,11 +406,10 @@ def begin(camera: Camera, settings: RunSettings, saved: Path | None = None) -> S
     )  # fmt: skip
     if saved is not None:
         return Slam.load(saved, config, detector, threads=threads, images=images, resume=True)
-    if settings.map is None:
+    map_file, localize = settings.map_file, settings.localize
+    if map_file is None:
         return Slam(camera, config, detector, threads=threads, images=images)
-    return Slam.load(
-        settings.map, config, detector, threads=threads, images=images, localize=settings.localize
-    )
+    return Slam.load(map_file, config, detector, threads=threads, images=images, localize=localize)
 
 
 def require_camera(map_file: Path, camera: Camera) -> None:

@@ -26,9 +26,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
+from vslam.camera import Camera, Image
 from vslam.errors import InputError
-from vslam.features import Features, TrackingState, TrackResult
+from vslam.features import TrackingState, TrackResult
 from vslam.geometry import inverses
 from vslam.loops import LoopEdge
 from vslam.map import Map
@@ -90,23 +90,17 @@ class Recorder:
             ground_truth: of the frames of this run, in any world frame, or None.
         """
 
-    def frame(self, result: TrackResult, T_wc: NDArray[np.float64]) -> None:
-        """Log one frame; ``T_wc`` is its ``(4, 4)`` pose (camera to world). Costs 0.1 ms."""
+    def frame(self, result: TrackResult) -> None:
+        """Log one frame. Costs 0.1 ms."""
 
-    def keyframe(
-        self,
-        result: TrackResult,
-        image: NDArray[np.uint8],
-        features: Features,
-        tracked: NDArray[np.bool_],
-    ) -> None:
+    def keyframe(self, result: TrackResult, image: Image, xy: NDArray, tracked: NDArray) -> None:
         """Log image and keypoints of a keyframe, after :meth:`frame`.
 
         Args:
             result: of this frame.
             image: ``(H, W)`` uint8 left image.
-            features: N features of the left image.
-            tracked: ``(N,)`` whether the feature is an inlier of the map.
+            xy: ``(N, 2)`` float32 pixels of its features.
+            tracked: ``(N,)`` bool, whether each feature is an inlier of the map.
         """
 
     def map(self, map_: Map) -> None:
@@ -136,17 +130,11 @@ class SeveralRecorders(Recorder):
     def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None:
         self._tell(lambda one: one.begin(camera, ground_truth))
 
-    def frame(self, result: TrackResult, T_wc: NDArray[np.float64]) -> None:
-        self._tell(lambda one: one.frame(result, T_wc))
+    def frame(self, result: TrackResult) -> None:
+        self._tell(lambda one: one.frame(result))
 
-    def keyframe(
-        self,
-        result: TrackResult,
-        image: NDArray[np.uint8],
-        features: Features,
-        tracked: NDArray[np.bool_],
-    ) -> None:
-        self._tell(lambda one: one.keyframe(result, image, features, tracked))
+    def keyframe(self, result: TrackResult, image: Image, xy: NDArray, tracked: NDArray) -> None:
+        self._tell(lambda one: one.keyframe(result, image, xy, tracked))
 
     def map(self, map_: Map) -> None:
         self._tell(lambda one: one.map(map_))
@@ -309,7 +297,7 @@ class RerunRecorder(Recorder):
         self._state: TrackingState | None = None
         self._points: dict[str, tuple[int, int, int]] = {}  # counts of a frame, with their colours
         self._index = 0  # of the last frame
-        self._frames: list[tuple[TrackResult, NDArray[np.float64]]] = []
+        self._frames: list[TrackResult] = []
         self._stages: list[str] = []  # each has a colour of its own
         self._keyframes = 0
         self._mapped_keyframes = -self._pace.keyframes
@@ -358,11 +346,11 @@ class RerunRecorder(Recorder):
             log("world/ground_truth", _path(T_wc, _GREY))
 
     @_guarded
-    def frame(self, result: TrackResult, T_wc: NDArray[np.float64]) -> None:
+    def frame(self, result: TrackResult) -> None:
         import rerun as rr
 
         # Sent in columns: four times faster than one log call for each value.
-        self._frames.append((result, T_wc.copy()))
+        self._frames.append(result)
         self._index = result.index
         if len(self._frames) >= self._pace.frames:
             self._send_frames()
@@ -376,13 +364,7 @@ class RerunRecorder(Recorder):
             self._hide_rejected_at = None
 
     @_guarded
-    def keyframe(
-        self,
-        result: TrackResult,
-        image: NDArray[np.uint8],
-        features: Features,
-        tracked: NDArray[np.bool_],
-    ) -> None:
+    def keyframe(self, result: TrackResult, image: Image, xy: NDArray, tracked: NDArray) -> None:
         import rerun as rr
 
         if self._path and shutil.disk_usage(self._path.parent).free < _RESERVED_BYTES:
@@ -398,7 +380,7 @@ class RerunRecorder(Recorder):
         path = "world/camera/image"
         self._recording.log(path, rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
         for name, chosen in (("tracked", tracked), ("untracked", ~tracked)):
-            positions = _half(features.xy[chosen])
+            positions = _half(xy[chosen])
             self._recording.log(f"{path}/{name}", rr.Points2D.from_fields(positions=positions))
 
     @_guarded
@@ -496,9 +478,8 @@ class RerunRecorder(Recorder):
 
         if not self._frames:
             return
-        frames, self._frames = self._frames, []
-        results = [result for result, _ in frames]
-        T_wc = np.array([pose for _, pose in frames])
+        results, self._frames = self._frames, []
+        T_wc = np.array([result.T_wc for result in results])
         poses = rr.Transform3D.columns(translation=T_wc[:, :3, 3], mat3x3=T_wc[:, :3, :3])
         self._recording.send_columns("world/camera", _times(results), poses)
         extracted = [result for result in results if result.n_features]

@@ -53,7 +53,7 @@ from vslam.features import Extracted, Features
 from vslam.frontend import pnp
 from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.frame import Frame
-from vslam.frontend.relocalization import relocalise
+from vslam.frontend.relocaliser import relocalise
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracking import TrackingContext
 from vslam.loopclosure import bow, local_matching, sim3_ransac
@@ -340,7 +340,7 @@ COLD_PROBES: tuple[tuple[ModuleType, str], ...] = (
     (pnp, "ransac_pose"),
     (bow, "choose_candidates"),
     (local_matching, "_locate_near"),
-    (global_bundle_adjustment, "_step_cameras"),
+    (global_bundle_adjustment, "reduce_points_sparsely"),
     (block_cholesky, "factor_solve"),
     (global_mapping, "remove_unchanged"),
 )

@@ -64,8 +64,8 @@ from vslam.datasets.perturbation.laws import (
     perturbed,
     sheet_of_laws,
 )
+from vslam.datasets.perturbation.light import ou_walk
 from vslam.datasets.perturbation.registry import LAWS, all_laws, law_kind
-from vslam.datasets.perturbation.streams import ou_walk
 
 __all__ = [
     "LAWS",

@@ -112,17 +112,17 @@ KINDS = {
         _blur, "x", 1.0, 0.1, 10.0, "Gaussian blur of 1.5 pixels", logarithmic=True, drawn=False
     ),
     "occlusion": LawKind(
-        _occlusion, "x", 1.0, 0.1, 6.0, "a rectangle over 15 % of the image", logarithmic=True
+        _occlusion, "x", 1.0, 0.1, 6.0, "a grey rectangle over 15 % of the image", logarithmic=True
     ),
     "vignetting": LawKind(
         _vignetting, "stops", 2.0, 0.0, 16.0, "darker towards the corners", most=20.0,
         of_scene=True, drawn=False,
     ),
     "dirt": LawKind(
-        _dirt, "%", 10.0, 0.0, 95.0, "glass covered by blobs", most=99.0, of_scene=True
+        _dirt, "%", 10.0, 0.0, 95.0, "share of the glass that blobs cover", most=99.0, of_scene=True
     ),
     "flare": LawKind(
-        _flare, "grey levels", 20.0, 0.1, 255.0, "veil 10 degrees from the sun", most=1000.0,
-        logarithmic=True, of_scene=True,
+        _flare, "grey levels", 20.0, 0.1, 255.0, "veiling glare at 10 degrees from the sun",
+        most=1000.0, logarithmic=True, of_scene=True,
     ),
 }  # fmt: skip

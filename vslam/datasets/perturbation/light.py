@@ -1,23 +1,85 @@
-"""Laws of the light and of the camera's response to it."""
+"""Laws of the light and of the camera's response to it.
+
+Their random numbers are endless walks in time, which do not depend on the order of reads.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from math import exp
+import threading
+from array import array
+from collections.abc import Callable, Iterable, Iterator
+from itertools import count, islice
+from math import exp, floor, inf
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Image
 from vslam.datasets.perturbation.kinds import Law, LawKind, RandomStream, to_8_bits
-from vslam.datasets.perturbation.streams import STEP_S, Drawn, jump_times, on_grid, ou_walk
 
+STEP_S = 0.01
+_TIME_CONSTANT_S = 2.0
+_JUMPS_PER_S = 3.0 / 60.0
+_JUMP_WIDENING = 1.5
 _GREYS = np.arange(256, dtype=np.float64)
 
 FULL_WELL = 10_000.0  # electrons at grey value 255, of a pixel of 3.75 um (Sony ICX267: 10,000)
 READ_NOISE = 10.0  # electrons, of the same kind of sensor
 _TUNNEL_STOPS = 3.0
 _TUNNELS_PER_S = 1.0 / 5.0
+
+
+def ou_walk(
+    deviation: float, rng: np.random.Generator, jumps: Iterable[float] = ()
+) -> Iterator[float]:
+    """An endless Ornstein-Uhlenbeck walk with a time constant of 2 s, exact on a grid of 10 ms.
+
+    Args:
+        deviation: stationary standard deviation; the walk begins in the stationary state.
+        rng: generates its normal numbers, one for each step.
+        jumps: increasing times in seconds at which the walk is redrawn with 1.5 times the
+            deviation.
+    """
+    decay = exp(-STEP_S / _TIME_CONSTANT_S)
+    spread = (1.0 - decay**2) ** 0.5
+    steps = (round(time / STEP_S) for time in jumps)
+    jump = next(steps, inf)
+    x = rng.standard_normal()
+    yield deviation * x
+    for k in count(1):
+        noise = rng.standard_normal()
+        x = _JUMP_WIDENING * noise if k == jump else decay * x + spread * noise
+        while jump <= k:
+            jump = next(steps, inf)
+        yield deviation * x
+
+
+class Drawn:
+    """Random numbers by their position in a stream, drawn on first use; thread-safe."""
+
+    def __init__(self, numbers: Iterator[float]) -> None:
+        self._numbers = numbers
+        self._drawn = array("d")
+        self._lock = threading.Lock()
+
+    def __getitem__(self, k: int) -> float:
+        with self._lock:
+            self._drawn.extend(islice(self._numbers, max(0, k + 1 - len(self._drawn))))
+            return self._drawn[k]
+
+
+def on_grid(t: float) -> int:
+    """The step of a walk at time t."""
+    # The small offset prevents a time on the grid from rounding into the previous step.
+    return floor(t / STEP_S + 1e-6)
+
+
+def jump_times(rng: np.random.Generator, per_second: float = _JUMPS_PER_S) -> Iterator[float]:
+    """Endless times of a Poisson process, in seconds."""
+    time = 0.0
+    while True:
+        time += rng.exponential(1.0 / per_second)
+        yield time
 
 
 def _pointwise(curve: Callable[[int, float], NDArray[np.float64]]) -> Law:
@@ -112,23 +174,26 @@ def _contrast(percent: float, stream: RandomStream) -> Law:
 
 KINDS = {
     "brightness": LawKind(
-        _brightness, "x", 1.0, 0.1, 10.0, "gain and bias walk and jump", logarithmic=True
+        _brightness, "x", 1.0, 0.1, 10.0, "gain and offset drift and jump at random",
+        logarithmic=True,
     ),
-    "gamma": LawKind(_gamma, "x", 1.0, 0.1, 10.0, "gamma walks", logarithmic=True),
-    "flicker": LawKind(_flicker, "x", 1.0, 0.1, 10.0, "gain of each frame", logarithmic=True),
+    "gamma": LawKind(_gamma, "x", 1.0, 0.1, 10.0, "gamma drifts at random", logarithmic=True),
+    "flicker": LawKind(
+        _flicker, "x", 1.0, 0.1, 10.0, "a random gain for each frame", logarithmic=True
+    ),
     "exposure": LawKind(
-        _exposure, "s", 0.5, 0.02, 10.0, "lag of auto-exposure behind tunnels of 3 stops",
+        _exposure, "s", 0.5, 0.02, 10.0, "auto-exposure lags behind light changes of 3 stops",
         logarithmic=True,
     ),
     "night": LawKind(
         _night, "stops", 4.0, 0.0, 10.0, "less light, shot and read noise", most=16.0
     ),
     "bias": LawKind(
-        _bias, "grey levels", 50.0, 0.0, 255.0, "brighter by so much", least=-255.0, most=255.0,
-        drawn=False,
+        _bias, "grey levels", 50.0, 0.0, 255.0, "grey levels added to every pixel",
+        least=-255.0, most=255.0, drawn=False,
     ),
     "contrast": LawKind(
-        _contrast, "%", 30.0, 100.0, 1.0, "contrast left, about the mean", most=100.0,
+        _contrast, "%", 30.0, 100.0, 1.0, "share of the contrast that remains", most=100.0,
         logarithmic=True, drawn=False,
     ),
 }  # fmt: skip

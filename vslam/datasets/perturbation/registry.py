@@ -1,10 +1,65 @@
-"""All laws by name."""
+"""All laws by name; those of other packages (docs/howto/plugins.md) are checked at every image."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from vslam.camera import Image
 from vslam.datasets.perturbation import glass, light, motion, sensor, stereo, weather
 from vslam.datasets.perturbation.kinds import LawKind
-from vslam.datasets.plugin_laws import plugin_laws
+from vslam.errors import InputError, UnreadableImageError
+from vslam.plugins import PERTURBATIONS, PlugIn, find_plugins
+
+PlugInLaw = Callable[[int, float, int, Image], Image]
+_PROBE = (48, 64)  # rows and columns of the image that a law is tried on
+
+
+def plugin_laws() -> dict[str, Callable[[float, tuple[int, int]], PlugInLaw]]:
+    """By name, functions that make a law from a strength and the seed of its random stream."""
+    return {name: partial(_make, plugin) for name, plugin in find_plugins(PERTURBATIONS).items()}
+
+
+def _make(plugin: PlugIn, strength: float, stream: tuple[int, int]) -> PlugInLaw:
+    """Make a law and try it on a grey image.
+
+    Raises:
+        InputError: the package is broken, or the object that it makes is not a law.
+    """
+    law = plugin.call(strength, stream)
+    if not callable(law):
+        raise InputError(
+            f"{plugin}: made a {type(law).__name__}, which is not a function; repair or uninstall "
+            "the package."
+        )
+    checked = partial(_apply, plugin, law)
+    checked(0, 0.0, 0, np.full(_PROBE, 128, np.uint8))
+    return checked
+
+
+def _apply(plugin: PlugIn, law: PlugInLaw, frame: int, t: float, side: int, image: Image) -> Image:
+    """Apply a law to an image.
+
+    Raises:
+        UnreadableImageError: the law fails or returns no image of this size; the frame is skipped.
+    """
+    view = image.view()
+    view.flags.writeable = False
+    where = Path(f"frame {frame}")
+    try:
+        made = plugin.guarded(law, frame, t, side, view)
+    except InputError as error:
+        raise UnreadableImageError(where, str(error)) from error
+    if getattr(made, "dtype", None) != np.uint8 or made.shape != image.shape:
+        kind = f"{getattr(made, 'dtype', type(made).__name__)} {getattr(made, 'shape', '')}"
+        raise UnreadableImageError(
+            where, f"{plugin} gave {kind.strip()}, not uint8 {image.shape}; repair the package."
+        )
+    return np.asarray(made, np.uint8)
+
 
 LAWS: dict[str, LawKind] = {
     **{name: light.KINDS[name] for name in ("brightness", "gamma", "flicker")},

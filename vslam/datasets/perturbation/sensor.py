@@ -100,24 +100,27 @@ def _outage(seconds: float, stream: RandomStream) -> Law:
 
 KINDS = {
     "noise": LawKind(
-        _noise, "x", 1.0, 0.1, 15.0, "normal noise of 8 grey levels", most=15.0, logarithmic=True
+        _noise, "x", 1.0, 0.1, 15.0, "Gaussian noise of 8 grey levels", most=15.0, logarithmic=True
     ),
     "shot": LawKind(
-        _shot, "photons", 25.0, 10_000.0, 0.5, "photons at white", least=0.1, most=1e5,
-        logarithmic=True,
+        _shot, "photons", 25.0, 10_000.0, 0.5, "photons that a white pixel receives",
+        least=0.1, most=1e5, logarithmic=True,
     ),
-    "impulse": LawKind(_impulse, "%", 5.0, 0.0, 50.0, "pixels black or white", most=100.0),
-    "bits": LawKind(_bits, "bits", 3.0, 8.0, 1.0, "grey values", least=1.0, most=8.0, drawn=False),
+    "impulse": LawKind(_impulse, "%", 5.0, 0.0, 50.0, "pixels turned black or white", most=100.0),
+    "bits": LawKind(
+        _bits, "bits", 3.0, 8.0, 1.0, "bits of a grey value", least=1.0, most=8.0, drawn=False
+    ),
     "jpeg": LawKind(
-        _jpeg, "quality", 10.0, 100.0, 1.0, "compression", least=1.0, most=100.0,
+        _jpeg, "quality", 10.0, 100.0, 1.0, "JPEG compression", least=1.0, most=100.0,
         logarithmic=True, drawn=False,
     ),
     "resolution": LawKind(
-        _resolution, "of 1", 0.3, 1.0, 0.02, "resolution, scaled up again", least=0.01, most=1.0,
-        logarithmic=True, drawn=False,
+        _resolution, "of 1", 0.3, 1.0, 0.02, "share of the width that remains",
+        least=0.01, most=1.0, logarithmic=True, drawn=False,
     ),
-    "drop": LawKind(_drop, "%", 30.0, 0.0, 95.0, "frames that do not come", most=99.0),
+    "drop": LawKind(_drop, "%", 30.0, 0.0, 95.0, "frames dropped at random", most=99.0),
     "outage": LawKind(
-        _outage, "s", 1.0, 0.1, 9.0, "no frames once in ten seconds", most=9.0, logarithmic=True
+        _outage, "s", 1.0, 0.1, 9.0, "length of a gap in every ten seconds", most=9.0,
+        logarithmic=True,
     ),
 }  # fmt: skip

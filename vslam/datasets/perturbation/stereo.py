@@ -135,23 +135,23 @@ def _fault(
 
 
 KINDS = {
-    "stereo_gain": _fault(_gain, "stops", 1.0, 8.0, "the right side is darker"),
+    "stereo_gain": _fault(_gain, "stops", 1.0, 8.0, "the right image is darker"),
     "desync": _fault(
-        _desync, "ms", 20.0, 200.0, "the right side comes later", neighbours=True, weakest=0.5
+        _desync, "ms", 20.0, 200.0, "the right image is late", neighbours=True, weakest=0.5
     ),
     "baseline": _fault(
-        _baseline, "%", 2.0, 50.0, "the rig is longer than calibrated", weakest=0.05
+        _baseline, "%", 2.0, 50.0, "the baseline is longer than calibrated", weakest=0.05
     ),
     "yaw": _fault(
-        _turned(1), "arc minutes", 5.0, 300.0, "the right side is turned right", weakest=0.1
+        _turned(1), "arc minutes", 5.0, 300.0, "the right camera is turned right", weakest=0.1
     ),
     "pitch": _fault(
-        _turned(0), "arc minutes", 5.0, 300.0, "the right side is turned up", weakest=0.1
+        _turned(0), "arc minutes", 5.0, 300.0, "the right camera is turned up", weakest=0.1
     ),
     "black_right": _fault(
-        _black("right"), "%", 30.0, 100.0, "seconds with a black right side", drawn=True
+        _black("right"), "%", 30.0, 100.0, "seconds in which the right image is black", drawn=True
     ),
     "black_left": _fault(
-        _black("left"), "%", 10.0, 100.0, "seconds with a black left side", drawn=True
+        _black("left"), "%", 10.0, 100.0, "seconds in which the left image is black", drawn=True
     ),
 }

@@ -14,10 +14,9 @@ from scipy.spatial import cKDTree
 
 from vslam.camera import Camera
 from vslam.datasets.synthetic import solids
-from vslam.datasets.synthetic.camera_effects import sensor_image
 from vslam.datasets.synthetic.files import check_disk, write_png, writing
 from vslam.datasets.synthetic.passes import Passes
-from vslam.datasets.synthetic.render import Renderer
+from vslam.datasets.synthetic.render import Renderer, sensor_image
 from vslam.datasets.synthetic.routes import Route
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.store import OnFrame
@@ -149,7 +148,7 @@ def _view(
 ) -> NDArray[np.uint8]:  # fmt: skip
     moment = passes.at(when)
     light = replace(moment.light, exposure=moment.light.exposure * ratio)
-    (view,) = renderer.views(moment.surfaces, moment.shadows, light, [T_wc], moment.pools)
+    (view,) = renderer.views(replace(moment, light=light), T_wc)
     return sensor_image(view.image, route.camera, yaw_rate=0.0, night=moment.night, key=key)
 
 
@@ -198,7 +197,7 @@ def _look_alikes(route: Route, town: Town, passes: Passes, threads: int) -> NDAr
     moment = passes.at(0)
     seen = []
     for k in chosen:
-        (view,) = renderer.views(moment.surfaces, moment.shadows, moment.light, [route.T_wc[k]])
+        (view,) = renderer.views(moment, route.T_wc[k])
         blurred = cv2.GaussianBlur(np.minimum(view.image, 255.0), (0, 0), 1.5).ravel()
         seen.append((blurred - blurred.mean()) / (blurred.std() + 1e-6))
     renderer.close()

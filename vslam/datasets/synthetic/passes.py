@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vslam.datasets.synthetic.plan import CLEARANCE
-from vslam.datasets.synthetic.render import Light
+from vslam.datasets.synthetic.render import Light, Moment
 from vslam.datasets.synthetic.routes import CAMERA_HEIGHT, Route
 from vslam.datasets.synthetic.scene import Surfaces, join
 from vslam.datasets.synthetic.shadows import (
     NO_LAMPS,
-    LampPools,
     ShadowMap,
     cast_shadows,
     lamp_pools,
 )
 from vslam.datasets.synthetic.site import AFTER, BEFORE, Variation
+from vslam.datasets.synthetic.terrain import CLEARANCE
 from vslam.datasets.synthetic.town import Town
 
 _NEAR, _LEFT = 60.0, 75.0  # m: a place is passed within the first, and left beyond the second
@@ -28,17 +26,6 @@ _AGAIN, _STRETCH = 60, 15  # frames: least time until a revisit; least length of
 _CASTS = 8  # number of shadow maps that are kept
 _CLOUD = 12.0  # frames for which a cloud hides the sun while it moves between two passes
 _CAR_REACH = np.array([1.1, 2.7])  # half width and length of the largest car, m
-
-
-@dataclass(frozen=True)
-class Moment:
-    """The scene of one frame; ``night``, 0 to 1, raises the gain of the sensor."""
-
-    surfaces: Surfaces
-    shadows: ShadowMap
-    light: Light
-    night: float
-    pools: LampPools = NO_LAMPS
 
 
 class Passes:

@@ -51,8 +51,8 @@ def find_visible(surfaces, atlas, camera, light):
     """Project the surfaces that a camera may see, nearest first.
 
     Args:
-        surfaces, atlas, camera, light: `SurfaceArrays`, `scene.Atlas`, `PosedCamera`,
-            `LightValues`.
+        surfaces, atlas, camera, light: `scene.Surfaces`, `scene.Atlas`,
+            `scene.PosedCamera`, `scene.LightValues`.
 
     Returns:
         ``(V, COLUMNS)`` float64; the columns are named above.

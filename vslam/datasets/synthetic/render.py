@@ -9,28 +9,35 @@ pixel is shaded once for each surface that its four samples see.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera
-from vslam.datasets.synthetic.kernel_arrays import (
+from vslam.datasets.synthetic.rasterise import find_visible, rasterise
+from vslam.datasets.synthetic.scene import (
+    Atlas,
     LightValues,
     PosedCamera,
     SampleBand,
-    SurfaceArrays,
+    Surfaces,
 )
-from vslam.datasets.synthetic.rasterise import find_visible, rasterise
-from vslam.datasets.synthetic.scene import Atlas, Surfaces
 from vslam.datasets.synthetic.shade import shade
 from vslam.datasets.synthetic.shadows import NO_LAMPS, LampPools, ShadowMap
 
 SAMPLES = 2  # visibility samples per pixel in each direction
 _BANDS = 2  # bands of rows per image, each of which is a job for a thread
+# Lens and sensor.
+SHUTTER = 0.004  # s, exposure time by day
+_BLUR = 0.55  # px, standard deviation of the lens blur
+_VIGNETTE = 0.22  # share of the light lost in the corners
+_READ_NOISE, _SHOT_NOISE = 0.9, 0.022  # standard deviation (grey levels); variance per grey level
+_KNEE, _ROLL = 170.0, 0.5  # grey level at which the response bends, and its slope above
 
 Float32 = NDArray[np.float32]
 
@@ -66,6 +73,17 @@ class Light:
         return LightValues(*(float(x) for x in (*self.sun, *sky, *air, self.headlight)))
 
 
+@dataclass(frozen=True)
+class Moment:
+    """The scene of one frame; ``night``, 0 to 1, raises the gain of the sensor."""
+
+    surfaces: Surfaces
+    shadows: ShadowMap
+    light: Light
+    night: float = 0.0
+    pools: LampPools = NO_LAMPS
+
+
 class RenderedView(NamedTuple):
     """A rendered view: ``image`` ``(H, W)`` float32 grey levels before the sensor (0 to above 255)
     and ``depth`` ``(H, W)`` float32 metres along z, 0 in the sky."""
@@ -88,31 +106,17 @@ class Renderer:
         self._pool.shutdown()
 
     def stereo(
-        self,
-        surfaces: Surfaces,
-        shadows: ShadowMap,
-        light: Light,
-        T_wc: NDArray[np.float64],
-        pools: LampPools = NO_LAMPS,
+        self, moment: Moment, T_wc: NDArray[np.float64]
     ) -> tuple[RenderedView, RenderedView]:
         """Left and right view of a rig whose left camera stands at ``T_wc`` ``(4, 4)``."""
         right = T_wc.copy()
         right[:3, 3] += T_wc[:3, 0] * self._camera.baseline
-        left_view, right_view = self.views(surfaces, shadows, light, (T_wc, right), pools)
+        left_view, right_view = self.views(moment, T_wc, right)
         return left_view, right_view
 
-    def views(
-        self,
-        surfaces: Surfaces,
-        shadows: ShadowMap,
-        light: Light,
-        T_wc: Iterable[NDArray[np.float64]],
-        pools: LampPools = NO_LAMPS,
-    ) -> list[RenderedView]:
+    def views(self, moment: Moment, *T_wc: NDArray[np.float64]) -> list[RenderedView]:
         """A view from each of the ``(4, 4)`` poses ``T_wc``."""
-        prepared = [
-            self._pool.submit(self._prepare, surfaces, shadows, light, T, pools) for T in T_wc
-        ]
+        prepared = [self._pool.submit(self._prepare, moment, T) for T in T_wc]
         views, jobs = [], []
         for preparation in prepared:
             view, bands = preparation.result()
@@ -123,20 +127,15 @@ class Renderer:
         return views
 
     def _prepare(
-        self,
-        surfaces: Surfaces,
-        shadows: ShadowMap,
-        light: Light,
-        T_wc: NDArray[np.float64],
-        pools: LampPools,
+        self, moment: Moment, T_wc: NDArray[np.float64]
     ) -> tuple[RenderedView, list[Callable[[], None]]]:
         fx, fy, cx, cy = (
             float(x) for x in (self._camera.fx, self._camera.fy, self._camera.cx, self._camera.cy)
         )
         height, width = self._camera.height, self._camera.width
         camera = PosedCamera(np.ascontiguousarray(T_wc), fx, fy, cx, cy, height, width)
-        values = light.values()
-        visible = find_visible(SurfaceArrays.of(surfaces), self._atlas, camera, values)
+        values = moment.light.values()
+        visible = find_visible(moment.surfaces, self._atlas, camera, values)
         view = RenderedView(
             np.empty((height, width), np.float32), np.empty((height, width), np.float32)
         )
@@ -147,7 +146,8 @@ class Renderer:
             inverse_depth, seen = np.zeros(shape, np.float32), np.full(shape, -1, np.int32)
             samples = SampleBand(first, SAMPLES, inverse_depth, seen)
             rasterise(visible, self._atlas, samples)
-            shade(visible, samples, self._atlas, self._sky, values, shadows, pools, camera, view)
+            shade(visible, samples, self._atlas, self._sky, values, moment.shadows, moment.pools,
+                  camera, view)  # fmt: skip
 
         # The defaults bind the present values of the loop variables.
         return (
@@ -157,3 +157,53 @@ class Renderer:
                 for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
             ],
         )
+
+
+def sensor_image(
+    radiance: NDArray[np.float32],
+    camera: Camera,
+    *,
+    yaw_rate: float,
+    night: float,
+    key: tuple[int, int, int],
+) -> NDArray[np.uint8]:
+    """Turn radiance into the ``(H, W)`` uint8 image of the camera, by blur, vignetting, response
+    and noise of its lens and sensor. The result depends only on the radiance and on the key.
+
+    Args:
+        radiance: ``(H, W)`` float32, from `render.RenderedView.image`.
+        camera: its focal length scales the motion blur.
+        yaw_rate: rad/s, causes motion blur.
+        night: 0 to 1, lengthens the exposure and raises the gain.
+        key: seed, frame and side, which determine the noise.
+    """
+    image = radiance
+    streak = abs(yaw_rate) * SHUTTER * (1 + 2 * night) * camera.fx
+    if streak > 0.2:
+        kernel = _streak(streak)[None, :]
+        blurred = cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REPLICATE)
+        image = np.asarray(blurred, np.float32)
+    image = np.asarray(cv2.GaussianBlur(image, (0, 0), _BLUR), np.float32)
+    image = image * _vignette(camera)
+    image = np.minimum(image, _KNEE + _ROLL * (image - _KNEE))
+    image = np.minimum(image, 255.0)
+    rng = np.random.default_rng(key)
+    gain = 1.0 + 5.0 * night
+    deviation = np.sqrt(_READ_NOISE**2 + _SHOT_NOISE * np.maximum(image, 0)) * np.float32(gain)
+    image = image + deviation * rng.standard_normal(image.shape, np.float32)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def _streak(length: float) -> NDArray[np.float32]:
+    """Box filter ``length`` pixels wide, whose outer pixels are weighted by their covered part."""
+    half = int(np.ceil(length / 2 + 0.5))
+    at = np.arange(-half, half + 1)
+    weight = np.clip(length / 2 + 0.5 - np.abs(at), 0, 1)
+    return np.asarray(weight / weight.sum(), np.float32)
+
+
+def _vignette(camera: Camera) -> NDArray[np.float32]:
+    u = (np.arange(camera.width) - camera.cx) / camera.fx
+    v = (np.arange(camera.height) - camera.cy) / camera.fx
+    square = (u[None, :] ** 2 + v[:, None] ** 2) / (u.max() ** 2 + v.max() ** 2)
+    return np.asarray(1.0 - _VIGNETTE * square**1.5, np.float32)

@@ -1,8 +1,8 @@
-"""The scene of the renderer: flat textured surfaces, and their textures with mipmaps."""
+"""The scene of the renderer, as its kernels take it: flat textured surfaces, their textures with
+mipmaps, light and camera."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import cv2
@@ -16,8 +16,7 @@ Float = NDArray[np.float64]
 OPAQUE, FOLIAGE, SCREEN = 0, 1, 2
 
 
-@dataclass(frozen=True)
-class Surfaces:
+class Surfaces(NamedTuple):
     """Q parallelograms (or triangles) ``origin + s edge_s + t edge_t``, s and t in [0, 1].
 
     Attributes:
@@ -47,28 +46,22 @@ class Surfaces:
     material: NDArray[np.uint8]
     thing: NDArray[np.int32]
 
-    def __len__(self) -> int:
-        return len(self.origin)
-
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Surfaces:
         """The surfaces ``rows``, a mask or indices."""
-        return Surfaces(*(np.ascontiguousarray(getattr(self, f.name)[rows]) for f in fields(self)))
+        return Surfaces._make(np.ascontiguousarray(column[rows]) for column in self)
 
     def moved(self, R: Float, t: Float) -> Surfaces:
         """The surfaces turned by ``R`` ``(3, 3)`` and then shifted by ``t`` ``(3,)``."""
-        values = dict(vars(self))
-        values["origin"] = self.origin @ R.T + t
-        values["edge_s"] = self.edge_s @ R.T
-        values["edge_t"] = self.edge_t @ R.T
-        return Surfaces(**values)
+        return self._replace(
+            origin=self.origin @ R.T + t, edge_s=self.edge_s @ R.T, edge_t=self.edge_t @ R.T
+        )
 
 
 def join(parts: list[Surfaces]) -> Surfaces:
     """All surfaces of ``parts`` (at least one) in their order."""
     if len(parts) == 1:
         return parts[0]
-    columns = zip(*(vars(part).values() for part in parts), strict=True)
-    return Surfaces(*(np.concatenate(column) for column in columns))
+    return Surfaces(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def patches(
@@ -187,3 +180,50 @@ def _flatten(
         if pyramid:
             row[len(pyramid) :] = row[len(pyramid) - 1]
     return offset, np.concatenate(flat) if flat else np.zeros(1, np.uint8)
+
+
+class LightValues(NamedTuple):
+    """Sun, sky and air in the form for kernels, all f8; `render.Light` documents the fields.
+
+    ``sun_x``, ``sun_y``, ``sun_z``: unit vector towards the sun, world.
+    """
+
+    sun_x: float
+    sun_y: float
+    sun_z: float
+    direct: float
+    ambient: float
+    glow: float
+    haze: float
+    visibility: float
+    exposure: float
+    headlight: float
+
+
+class PosedCamera(NamedTuple):
+    """A camera with its pose in the form for kernels.
+
+    ``T_wc`` (4, 4) f8; ``fx``, ``fy``, ``cx``, ``cy`` f8 pixels; ``height``, ``width`` i8 pixels.
+    """
+
+    T_wc: NDArray[np.float64]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    height: int
+    width: int
+
+
+class SampleBand(NamedTuple):
+    """The samples of a band of image rows, h rows of w samples.
+
+    ``first_row`` i8 first row of the band, in pixels; ``samples`` i8 samples per pixel in each
+    direction; ``inverse_depth`` (h, w) f4 1/z of the nearest surface, 0 if there is none; ``seen``
+    (h, w) i4 the surface's row in the result of `find_visible`, -1 if there is none.
+    """
+
+    first_row: int
+    samples: int
+    inverse_depth: NDArray[np.float32]
+    seen: NDArray[np.int32]

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.datasets.synthetic.kernel_arrays import PosedCamera
 from vslam.datasets.synthetic.rasterise import (
     AMBIENT,
     DETAIL,
@@ -19,7 +18,7 @@ from vslam.datasets.synthetic.rasterise import (
     SUN,
     TEXTURE,
 )
-from vslam.datasets.synthetic.scene import Atlas
+from vslam.datasets.synthetic.scene import Atlas, PosedCamera
 from vslam.datasets.synthetic.shadows import LampPools, ShadowMap
 from vslam.kernels import borrowed, inline, kernel
 
@@ -184,7 +183,7 @@ def shade(visible, band, atlas, sky, light, shadows, pools, camera, view):
 
     Args:
         visible: from `rasterise.find_visible`.
-        band: `kernel_arrays.SampleBand`, from `rasterise.rasterise`.
+        band: `scene.SampleBand`, from `rasterise.rasterise`.
         atlas, light, camera: `scene.Atlas`, `LightValues`, `PosedCamera`.
         sky: number of the sky's panorama in the atlas.
         shadows, pools: `shadows.ShadowMap`, `shadows.LampPools`.

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.datasets.synthetic.kernel_arrays import SurfaceArrays
 from vslam.datasets.synthetic.scene import Atlas, Surfaces
 from vslam.kernels import kernel
 
@@ -71,7 +70,7 @@ def cast_shadows(surfaces: Surfaces, atlas: Atlas, sun: NDArray[np.float64]) -> 
     ``sun`` is a ``(3,)`` unit vector towards the sun.
     """
     casts = surfaces.select(surfaces.thing >= 0)
-    if len(casts) == 0:
+    if not len(casts.origin):
         return ShadowMap(np.zeros((1, 1), np.uint16), np.array([0.0, 0.0, 1.0, 0.0]))
     corners = np.stack(
         [
@@ -87,7 +86,7 @@ def cast_shadows(surfaces: Surfaces, atlas: Atlas, sun: NDArray[np.float64]) -> 
     columns, rows = np.ceil((high - low) / cell).astype(int) + 1
     frame = np.array([low[0], low[1], cell, float(up.min()) - 1.0])
     shadows = ShadowMap(np.zeros((rows, columns), np.uint16), frame)
-    _cast(SurfaceArrays.of(casts), atlas, slope, shadows)
+    _cast(casts, atlas, slope, shadows)
     return shadows
 
 
@@ -96,7 +95,7 @@ def _cast(surfaces, atlas, slope, shadows):
     """Raise the heights of a shadow map to those of the occluders.
 
     Args:
-        surfaces, atlas: `SurfaceArrays` of the occluders, `scene.Atlas`.
+        surfaces, atlas: `scene.Surfaces` of the occluders, `scene.Atlas`.
         slope: ``(2,)`` float64 metres along x and z that a sun ray travels per metre of height.
         shadows: `ShadowMap`, updated.
     """

@@ -7,9 +7,8 @@ import json
 import logging
 import os
 import shutil
-from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from vslam.camera import Camera
-from vslam.datasets.synthetic.camera_effects import sensor_image
 from vslam.datasets.synthetic.files import (
     check_disk,
     checksum,
@@ -30,7 +28,7 @@ from vslam.datasets.synthetic.files import (
     writing,
 )
 from vslam.datasets.synthetic.passes import Passes
-from vslam.datasets.synthetic.render import Renderer
+from vslam.datasets.synthetic.render import Renderer, sensor_image
 from vslam.datasets.synthetic.routes import Route
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.town import build_town
@@ -172,7 +170,9 @@ def render_sequence(
             for path in frame_files(folder, k, depth):
                 path.unlink(missing_ok=True)
         if missing:
-            _render(route, variation, folder, missing, depth, threads, on_frame)
+            render_frames(
+                route, variation, folder, missing, depth, threads, on_frame, total=missing[-1] + 1
+            )
         if n < frames:
             return root
         files = [frame_files(folder, k, depth) for k in range(n)]
@@ -197,25 +197,34 @@ def _missing(folder: Path, n: int, depth: bool) -> list[int]:
     return [k for k in range(n) if not all(p.exists() for p in frame_files(folder, k, depth))]
 
 
-def _render(
+def render_frames(
     route: Route,
     variation: Variation,
     folder: Path,
-    missing: list[int],
+    frames: list[int],
     depth: bool,
     threads: int,
     on_frame: OnFrame | None,
+    *,
+    total: int,
+    monocular: bool = False,
 ) -> None:
+    """Render frames of a route into the folder of a sequence.
+
+    Args:
+        depth, threads: as for `render_sequence`.
+        on_frame: called with the number of finished frames and ``total``, of which all but
+            ``frames`` exist already.
+        monocular: render the left images alone.
+    """
     town = build_town(route, variation)
     passes = Passes(route, town, variation)
     renderer = Renderer(route.camera, town.atlas, town.sky, threads)
     yaw_rate = route.yaw_rate
 
-    def frame(k: int) -> None:
-        moment = passes.at(k)
-        views = renderer.stereo(
-            moment.surfaces, moment.shadows, moment.light, route.T_wc[k], moment.pools
-        )
+    def render(k: int) -> None:
+        moment, T_wc = passes.at(k), route.T_wc[k]
+        views = renderer.views(moment, T_wc) if monocular else renderer.stereo(moment, T_wc)
         paths = frame_files(folder, k, depth)
         for side, (view, path) in enumerate(zip(views, paths, strict=False)):
             image = sensor_image(
@@ -230,26 +239,13 @@ def _render(
             steps = np.clip(np.rint(views[0].depth * DEPTH_SCALE), 0, 65535).astype(np.uint16)
             write_png(paths[2], steps, 1)
 
-    total = missing[-1] + 1
-    done = total - len(missing)
     with ThreadPoolExecutor(threads) as pool:
-        running: deque[Future[None]] = deque()
         try:
-            for k in missing:
-                running.append(pool.submit(frame, k))
-                if len(running) > 2 * threads:
-                    running.popleft().result()
-                    done += 1
-                    if on_frame:
-                        on_frame(done, total)
-            while running:
-                running.popleft().result()
-                done += 1
+            for done, _ in enumerate(pool.map(render, frames), total - len(frames) + 1):
                 if on_frame:
                     on_frame(done, total)
         finally:
-            for job in running:
-                job.cancel()
+            pool.shutdown(cancel_futures=True)
     renderer.close()
 
 

@@ -7,9 +7,9 @@ from scipy.spatial import cKDTree
 
 from vslam.datasets.synthetic import solids
 from vslam.datasets.synthetic.ground import RoadStyle
-from vslam.datasets.synthetic.plan import CLEARANCE, rectangle
 from vslam.datasets.synthetic.scene import Surfaces, join, patches
 from vslam.datasets.synthetic.site import AFTER, ALIASES, ALWAYS, BEFORE, Float, Site
+from vslam.datasets.synthetic.terrain import CLEARANCE, rectangle
 from vslam.datasets.synthetic.vehicles import make_car
 
 _KERB = (0.15, 0.12)  # width and height of kerb stones, m

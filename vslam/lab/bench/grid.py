@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -110,6 +110,7 @@ def make_grid(
     sensor: str | None = None,
     calib: tuple[str, ...] = (),
     thresholds: str = "",
+    repeated: Collection[str] = (),
 ) -> list[Cell]:
     """All cells, ordered so that an interrupted benchmark is as useful as possible: all sequences
     with the first seed, then all with the next.
@@ -119,6 +120,7 @@ def make_grid(
 
     Args:
         weights: weight files by detector, for detectors that do not use the shipped ones.
+        repeated: systems that are not deterministic; they run with all seeds.
     """
     paths = {name: str(path) for name, path in (weights or {}).items()}
     digests = {name: _digest(path) for name, path in (weights or {}).items()}
@@ -139,7 +141,7 @@ def make_grid(
         for seed, sequence, perturb, detector in product(
             range(runs), sequences, perturbations, detectors
         )
-        if seed == 0 or draws(perturb)
+        if seed == 0 or draws(perturb) or detector in repeated
     ]
 
 

@@ -36,14 +36,15 @@ def _median_ms(call: Callable[[], object]) -> float:
     return 1e3 * float(np.median(taken[_REPEATS // 10 :]))
 
 
-def _bow() -> Cost:
+def _bow(file: Path | None) -> Cost:
     from vslam.machine import peak_memory_mb
 
     began = time.process_time()
     from vslam.loopclosure.bow_index import InvertedIndex
-    from vslam.loopclosure.vocabulary import bow_vector, load
+    from vslam.loopclosure.vocabulary import SHIPPED, bow_vector
+    from vslam.loopclosure.vocabulary_text import read_vocabulary
 
-    vocabulary = load()
+    vocabulary = read_vocabulary(file or SHIPPED)
     loading = time.process_time() - began
     rng = np.random.default_rng(0)
     nodes = np.flatnonzero(vocabulary.word >= 0)
@@ -68,10 +69,9 @@ def _network(name: str, weights: Path | None) -> Cost:
     from vslam.machine import peak_memory_mb
 
     began = time.process_time()
-    from vslam.config import SiameseConfig
-    from vslam.loopclosure.siamese.scoring import NetworkScorer
+    from vslam.lab.loopbench.detectors import NetworkScorer
 
-    network = NetworkScorer(name, weights, SiameseConfig().fit)
+    network = NetworkScorer(name, weights)
     loading = time.process_time() - began
     image = np.random.default_rng(0).integers(0, 256, (376, 1241), dtype=np.uint8)
     query = {}
@@ -88,5 +88,5 @@ def _network(name: str, weights: Path | None) -> Cost:
 
 if __name__ == "__main__":
     name, file = sys.argv[1:3]
-    found = _bow() if name == "bow" else _network(name, Path(file) if file else None)
+    found = (_bow if name == "bow" else partial(_network, name))(Path(file) if file else None)
     sys.stdout.write(found.model_dump_json())

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.config import OrbConfig
+from vslam.config import OrbConfig, SiameseConfig
 from vslam.errors import InputError, did_you_mean
 from vslam.frontend.orb import extract
 from vslam.lab.loopbench.conditions import Image
@@ -20,11 +20,12 @@ from vslam.lab.loopbench.node_matching import NodeIndex, index_nodes
 from vslam.loopclosure.bow_index import InvertedIndex
 from vslam.loopclosure.local_matching import DescriptorMaps
 from vslam.loopclosure.registry import DETECTORS, require_detector
+from vslam.loopclosure.siamese.images import to_size
+from vslam.loopclosure.siamese.inference import open_network
 from vslam.loopclosure.vocabulary import Vocabulary, bow_vector
 
 if TYPE_CHECKING:
     from vslam.loopclosure.siamese.local_descriptors import LocalDescriptors
-    from vslam.loopclosure.siamese.scoring import NetworkScorer
 
 
 _MATCHING_LEVEL = 2  # vocabulary level with about 100 nodes; features are matched within a node
@@ -89,14 +90,12 @@ class BowScorer:
         self._vocabulary = vocabulary
 
     def store(self, gallery: list[DescribedImage]) -> InvertedIndex:
-        """See :class:`Scorer`."""
         index = InvertedIndex(self._vocabulary.n_words)
         for number, one in enumerate(gallery):
             index.add(number, bow_vector(self._vocabulary, one.words))
         return index
 
     def scores(self, queries: list[DescribedImage], stored: InvertedIndex) -> NDArray[np.float64]:
-        """See :class:`Scorer`."""
         return np.stack(
             [stored.compare(bow_vector(self._vocabulary, one.words)).score for one in queries]
         ).astype(np.float64)
@@ -127,31 +126,37 @@ def open_scorer(name: str, weights: Path | None, vocabulary: Vocabulary) -> Scor
     Raises:
         InputError: no weights for it, or those of another network.
     """
-    if name == "bow":
-        return BowScorer(vocabulary)
-    from vslam.config import SiameseConfig
-    from vslam.loopclosure.siamese.scoring import NetworkScorer
-
-    return _ImageScorer(NetworkScorer(name, weights, SiameseConfig().fit))
+    return BowScorer(vocabulary) if name == "bow" else NetworkScorer(name, weights)
 
 
-class _ImageScorer:
-    """Passes the images to a network."""
+class NetworkScorer:
+    """One of ``NETWORKS``, on one thread.
+
+    Attributes:
+        parameters: number of learned parameters.
+    """
 
     probability = True
 
-    def __init__(self, network: NetworkScorer) -> None:
-        self.name = network.name
-        self._network = network
+    def __init__(self, name: str, weights: Path | None = None) -> None:
+        self._network = open_network(name, weights)
+        self.name, self.parameters = name, int(self._network.about["parameters"])
+        self.compare = self._network.compare
 
     def store(self, gallery: list[DescribedImage]) -> NDArray[np.float32]:
         """Descriptors ``(G, D)``."""
-        return self._network.embed([one.image for one in gallery])
+        return self.embed([one.image for one in gallery])
 
     def scores(
         self, queries: list[DescribedImage], stored: NDArray[np.float32]
     ) -> NDArray[np.float64]:
-        return self._network.scores(self.store(queries), stored)
+        embedded = self.store(queries)
+        return np.stack([self.compare(one, stored) for one in embedded]).astype(np.float64)
+
+    def embed(self, images: list[Image]) -> NDArray[np.float32]:
+        """``(N, D)`` descriptors of ``(H, W)`` uint8 images."""
+        size, fit = self._network.size, SiameseConfig().fit
+        return np.stack([self._network.embed(to_size(one, size, fit)) for one in images])
 
 
 class LocalDescriptorCache:
@@ -205,5 +210,4 @@ class DetectorSet:
         return self._kept[digest]
 
     def describe(self, images: list[Image]) -> list[DescribedImage]:
-        """See :func:`describe`."""
         return describe(images, self._vocabulary, self._threads)

@@ -63,7 +63,7 @@ def _rendered(
     progress_bar: ProgressBar,
 ) -> ImageSource:
     from vslam.datasets.synthetic import built_in_route, store
-    from vslam.datasets.synthetic.views import render_views
+    from vslam.lab.loopbench.views import render_views
 
     route = built_in_route(name)
     frames = range(0, len(route.T_wc), every)

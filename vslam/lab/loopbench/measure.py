@@ -16,7 +16,6 @@ from vslam.lab.loopbench.detectors import (
 )
 from vslam.lab.loopbench.node_matching import match_by_node
 from vslam.lab.loopbench.schema import Curve, Gain, Score, Verified
-from vslam.lab.loopbench.sequences import log_odds, sequence_scores
 from vslam.lab.loopbench.sets import QuerySet, TestSet
 from vslam.loopclosure.local_matching import homography_share, match_coarse
 from vslam.loopclosure.precision_recall import (
@@ -34,6 +33,10 @@ MIN_MATCHES = 20  # that fit one epipolar geometry (ORB-SLAM, VII-B, requires 20
 _EPIPOLAR_PIXELS = 2.0
 _CURVE_POINTS = 200
 _RESAMPLES = 200  # bootstrap resamples of the queries
+# Of sequences, as in OpenSeqSLAM (Sünderhauf et al., ICRA 2013 workshop).
+LENGTH = 10  # queries
+SPEEDS = (0.8, 0.9, 1.0, 1.1, 1.2)  # images of the gallery for each query
+_LEAST_P = 1e-6  # probabilities nearer to 0 or 1 are clipped
 
 
 def measure(
@@ -198,16 +201,13 @@ class Verification:
         return self._by_learned[key]
 
 
-def epipolar_inliers(
-    a: DescribedImage, b: DescribedImage, config: VerificationConfig | None = None
-) -> int:
+def epipolar_inliers(a: DescribedImage, b: DescribedImage) -> int:
     """Number of matches of two images that fit the best fundamental matrix found."""
     import cv2
 
-    config = config or VerificationConfig()
+    config = VerificationConfig()
     match = match_by_node(
-        *a.nodes, a.descriptors.view(np.uint64), np.ones(len(a.xy), np.bool_),
-        *b.nodes, b.descriptors.view(np.uint64), np.ones(len(b.xy), np.bool_),
+        *a.nodes, a.descriptors.view(np.uint64), *b.nodes, b.descriptors.view(np.uint64),
         config.match_distance, config.match_ratio,
     )  # fmt: skip
     rows = np.flatnonzero(match >= 0)
@@ -217,3 +217,36 @@ def epipolar_inliers(
         a.xy[rows], b.xy[match[rows]], cv2.USAC_DEFAULT, _EPIPOLAR_PIXELS, 0.999, 2000
     )
     return 0 if inlier is None else int(inlier.sum())
+
+
+def sequence_scores(scores: Matrix) -> Matrix:
+    """The mean score along the best line that ends at each query and image.
+
+    Sequences recognise a stretch of the way instead of one image. As in SeqSLAM (Milford and Wyeth,
+    ICRA 2012), the scores of a query and its predecessors are added along lines through the
+    gallery, one for each speed.
+
+    Args:
+        scores: ``(Q, G)`` of queries and images in driving order; higher is more similar.
+
+    Returns:
+        ``(Q, G)``. Outside the gallery, a line takes the mean score of the query; the first queries
+        have shorter lines.
+    """
+    n_queries, n_images = scores.shape
+    usual = scores.mean(1)
+    found = np.full(scores.shape, -np.inf)
+    for speed in SPEEDS:
+        along = np.zeros(scores.shape)
+        for back in range(min(LENGTH, n_queries)):
+            shift = min(round(speed * back), n_images)
+            along[back:, shift:] += scores[: n_queries - back, : n_images - shift]
+            along[back:, :shift] += usual[: n_queries - back, None]
+        np.maximum(found, along, out=found)
+    return np.asarray(found / np.minimum(np.arange(n_queries) + 1, LENGTH)[:, None])
+
+
+def log_odds(p: Matrix) -> Matrix:
+    """Log odds of probabilities, which can be added over independent observations."""
+    p = np.clip(p, _LEAST_P, 1.0 - _LEAST_P)
+    return np.asarray(np.log(p / (1.0 - p)))

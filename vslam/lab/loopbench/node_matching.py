@@ -32,23 +32,13 @@ def index_nodes(node: NDArray[np.int32]) -> NodeIndex:
 
 @kernel
 def match_by_node(
-    node_a,
-    feature_a,
-    descriptors_a,
-    use_a,
-    node_b,
-    feature_b,
-    descriptors_b,
-    use_b,
-    max_distance,
-    ratio,
+    node_a, feature_a, descriptors_a, node_b, feature_b, descriptors_b, max_distance, ratio
 ):
     """Match features of two images whose words lie under the same node of the vocabulary.
 
     Args:
         node_a, feature_a: direct index of image a (``NodeIndex``); likewise b.
         descriptors_a, descriptors_b: ``(M, 4)`` and ``(N, 4)`` uint64, of all features.
-        use_a, use_b: ``(M,)`` and ``(N,)`` bool, features that may be matched.
         max_distance: bits.
         ratio: largest ratio of the best to the second best distance under the node; 1 disables it.
 
@@ -63,15 +53,11 @@ def match_by_node(
         while first < n_b and node_b[first] < node_a[i]:
             first += 1
         feature = feature_a[i]
-        if not use_a[feature]:
-            continue
         best, least, second = -1, 257, 257
         j = first
         while j < n_b and node_b[j] == node_a[i]:
             other = feature_b[j]
             j += 1
-            if not use_b[other]:
-                continue
             distance = hamming(descriptors_a[feature], descriptors_b[other])
             if distance < least:
                 second = least

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError
-from vslam.loopclosure.precision_recall import PrecisionRecall
+from vslam.loopclosure.precision_recall import PrecisionRecall, curve_of
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME
 
 
@@ -159,12 +159,4 @@ def decision_curve(judged: Judged, *, near_is_wrong: bool = True) -> PrecisionRe
     """
     wrong = judged.far | (judged.near & near_is_wrong)
     counted = judged.right | wrong
-    score, right = judged.score[counted], judged.right[counted]
-    order = np.argsort(-score, kind="stable")
-    ranked = score[order]
-    last = np.flatnonzero(np.append(np.diff(ranked) != 0, len(ranked) > 0))
-    n_right = np.cumsum(right[order])[last]
-    precision, recall = n_right / (last + 1), n_right / judged.answerable.sum()
-    return PrecisionRecall(
-        np.append(precision[::-1], 1.0), np.append(recall[::-1], 0.0), ranked[last][::-1]
-    )
+    return curve_of(judged.right[counted], judged.score[counted], int(judged.answerable.sum()))

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from vslam.lab.loopbench.curves import draw_curves
-from vslam.lab.loopbench.measure import MIN_MATCHES, MIN_SHARE
-from vslam.lab.loopbench.report_online import online_tables, online_words
-from vslam.lab.loopbench.schema import LoopsJson, Score
-from vslam.lab.loopbench.sequences import LENGTH
+from vslam.lab.loopbench.measure import LENGTH, MIN_MATCHES, MIN_SHARE
+from vslam.lab.loopbench.schema import LoopsJson, OnlineScore, Score
 from vslam.report.page import Bullets, Page, Pairs, Section, Table
 from vslam.report.render import html, markdown, write_files
+
+_Scored = TypeVar("_Scored", bound=Score | OnlineScore)
 
 MEAN = "mean of all"
 _ABOUT_AP = (
@@ -43,6 +44,15 @@ _ABOUT_ACCEPTED = "Over the pairs with p of at least 0.9; if there are none, pre
 _ABOUT_COST = (
     "Medians, each detector in its own process with one thread. Image: time in addition to the ORB "
     "features, which tracking extracts anyway. Parameters of bow: weights of its words."
+)
+
+_ABOUT_ONLINE = (
+    "Each image is compared with the images before the window. Recall: among the images with a "
+    "true match there, the share with a right decision. In brackets: recall if unmarked matches "
+    "near the place do not count as wrong."
+)
+_ABOUT_DECISIONS = (
+    "Numbers of decisions at the lowest threshold whose match is marked, near the place, or far."
 )
 
 
@@ -79,7 +89,7 @@ def title(report: LoopsJson) -> str:
 def words(report: LoopsJson) -> list[str]:
     """Sentences about the result of each detector but the first under each condition, and about the
     best detector on each drive."""
-    sentences = online_words(report.online)
+    sentences = _online_words(report.online)
     for first, second in dict.fromkeys((g.first, g.second) for g in report.gains):
         for condition in _conditions(report):
             gains = [g for g in report.gains
@@ -100,12 +110,12 @@ def words(report: LoopsJson) -> list[str]:
 def tables(report: LoopsJson) -> list[Section]:
     """Every table of the report."""
     if not report.cells:
-        return online_tables(report.online)
+        return _online_tables(report.online)
     names = _detectors(report)
     head = ("images", "condition", *names, *_gain_heads(report))
     found = [
         Section("Average precision", [Table(head, _ap_rows(report), head[:2], _ABOUT_AP)]),
-        *(_table(report, title, shown, note) for title, shown, note in _TABLES),
+        *(_retrieval_table(report, *one) for one in _TABLES),
     ]
     if report.costs:
         heads = [f"query of {n} (ms)" for n in report.costs[0].query_ms]
@@ -186,17 +196,67 @@ def _ap_rows(report: LoopsJson) -> list[tuple[str, ...]]:
     return rows
 
 
-def _table(report: LoopsJson, name: str, shown: Callable[[Score], str], note: str) -> Section:
-    names = _detectors(report)
-    cells = {(c.data, c.condition, c.detector): shown(c) for c in report.cells}
-    rows = [
-        (data, condition, *(cells[data, condition, name] for name in names))
-        for condition in _conditions(report)
-        for data in _data(report)
-        if (data, condition, names[0]) in cells
+def _retrieval_table(
+    report: LoopsJson, title: str, shown: Callable[[Score], str], note: str
+) -> Section:
+    scores = [c for one in _conditions(report) for c in report.cells if c.condition == one]
+    head = ("images", "condition")
+    table = _by_detector(scores, head, lambda c: (c.data, c.condition), shown)
+    return Section(title, [Table(*table, head, note)])
+
+
+def _online_tables(scores: Iterable[OnlineScore]) -> list[Section]:
+    """Recall at 100 % precision, largest F1 and counts."""
+    head = ("drive", "images", "with a match", "window", "verified by")
+    texts = ("drive", "window", "verified by")
+
+    def about(s: OnlineScore) -> tuple[str, ...]:
+        return s.data, str(s.images), str(s.answerable), s.window, s.verified_by
+
+    shown: list[tuple[str, Callable[[OnlineScore], str], str]] = [
+        ("Recall at 100 % precision",
+         lambda s: f"{s.recall_at_100_precision:.3f} ({s.recall_at_100_precision_far:.3f})",
+         _ABOUT_ONLINE),
+        ("Largest F1", lambda s: f"{s.max_f1:.3f} ({s.max_f1_far:.3f})", ""),
+        ("Decisions right / near / far", lambda s: f"{s.right} / {s.near} / {s.far}",
+         _ABOUT_DECISIONS),
+    ]  # fmt: skip
+    return [
+        Section(title, [Table(*_by_detector(scores, head, about, cell), texts, note)])
+        for title, cell, note in shown
     ]
-    table = Table(("images", "condition", *names), rows, ("images", "condition"), note)
-    return Section(name, [table])
+
+
+def _by_detector(
+    scores: Iterable[_Scored],
+    head: tuple[str, ...],
+    about: Callable[[_Scored], tuple[str, ...]],
+    shown: Callable[[_Scored], str],
+) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Head and rows of a table with a column for each detector: what scores are ``about``, then
+    what is ``shown`` of each."""
+    rows: dict[tuple[str, ...], dict[str, str]] = {}
+    for score in scores:
+        rows.setdefault(about(score), {})[score.detector] = shown(score)
+    names = list(dict.fromkeys(name for cells in rows.values() for name in cells))
+    return (*head, *names), [(*key, *(cells[n] for n in names)) for key, cells in rows.items()]
+
+
+def _online_words(scores: Iterable[OnlineScore]) -> list[str]:
+    """Sentences that name, for each drive and verification, the detector with the highest recall
+    without a wrong match."""
+    sentences = []
+    for data in dict.fromkeys(s.data for s in scores):
+        for by in ("nothing", "both"):
+            of = [s for s in scores if (s.data, s.verified_by) == (data, by)]
+            best = max(s.recall_at_100_precision for s in of)
+            names = [s.detector for s in of if s.recall_at_100_precision == best]
+            how = "unverified" if by == "nothing" else "verified by ORB or learned descriptors"
+            sentences.append(
+                f"{data}, {of[0].answerable} of {of[0].images} images with a true match, {how}: "
+                f"highest recall at 100 % precision {best:.3f} ({', '.join(names)})."
+            )
+    return sentences
 
 
 def _detectors(report: LoopsJson) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Literal
 
-from vslam.report.document import Document, Record
+from vslam.report.schema import Document, Record
 
 
 class Curve(Record):
@@ -120,10 +120,10 @@ class LoopsJson(Document):
     schema_version: int = 3
 
     seed: int
-    cells: list[Score]
+    cells: tuple[Score, ...] = ()
     online: tuple[OnlineScore, ...] = ()
-    gains: list[Gain]
-    costs: list[Cost]
+    gains: tuple[Gain, ...] = ()
+    costs: tuple[Cost, ...] = ()
 
     machine: str
     versions: dict[str, str]

@@ -13,7 +13,7 @@ from vslam.config import changed_thresholds
 from vslam.errors import InputError, counted
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.lab.overview.schema import MEASURES, Drive, OverviewJson, RunEntry
-from vslam.report.schema import ReportJson
+from vslam.report.schema import DetectorFigures, ReportJson
 from vslam.run.outcome import alignment_of
 from vslam.trajectory import Trajectory, read_trajectory
 from vslam.untrusted import require_utf8
@@ -60,6 +60,13 @@ def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
             continue
         found.runs.append(entry)
         found.estimate[entry.source] = folder / "trajectory.tum"
+        for other in report.detectors[1:]:
+            if other.interrupted:
+                found.notes.append(f"left out: {other.detector} in {folder} ({other.interrupted})")
+                continue
+            beside = _beside(entry, report, other, folder)
+            found.runs.append(beside)
+            found.estimate[beside.source] = Path(beside.source)
         if (folder / "ground_truth_kitti.txt").is_file():
             found.truth.setdefault((entry.drive.dataset, entry.drive.place), folder)
     if not found.runs:
@@ -131,6 +138,18 @@ def _is_overview(path: Path) -> bool:
     return True
 
 
+def _beside(entry: RunEntry, report: ReportJson, other: DetectorFigures, folder: Path) -> RunEntry:
+    """A detector that ran beside the one of the run (``--compare``)."""
+    return entry.model_copy(
+        update={
+            "system": other.detector + entry.system.removeprefix(report.detector),
+            "settings": {k: v for k, v in entry.settings.items() if k != "weights"},
+            "measures": {name: getattr(other, name, None) for name, *_ in MEASURES},
+            "source": str(folder / f"trajectory_{other.detector}.tum"),
+        }
+    )
+
+
 def _entry(report: ReportJson, folder: Path) -> RunEntry:
     parts = [f"frames from {report.start}"] if report.start else []
     parts += [f"every {report.every}"] if report.every > 1 else []
@@ -160,7 +179,11 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
         town=town,
         alignment=alignment_of(report.sensor),
         frames=report.frames,
-        measures={name: getattr(report, name) for name, *_ in MEASURES},
+        # The frames per second of a run with several detectors are of all together.
+        measures={
+            name: None if name == "fps" and report.detectors else getattr(report, name)
+            for name, *_ in MEASURES
+        },
         source=str(folder),
         machine=f"{report.machine.cpu}, {counted(report.machine.cores, 'core')}, "
         f"{counted(report.threads, 'thread')}",

@@ -1,15 +1,18 @@
-"""The page of many runs, and its rows as CSV."""
+"""The report of many runs: its page, its rows as CSV, and the files of both."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
+from pathlib import Path
 
 from vslam.errors import counted
+from vslam.lab.overview.collect import collect
+from vslam.lab.overview.figures import draw_overview
 from vslam.lab.overview.schema import DECIMALS, MEASURES, Measure, OverviewJson, RunEntry, Spread
-from vslam.lab.overview.summary import ALPHA
+from vslam.lab.overview.summary import ALPHA, summarize
 from vslam.lab.overview.versus import median_text, versus
 from vslam.report.page import Bullets, Figure, Page, Pairs, Section, Table, number
-from vslam.report.render import csv_text
+from vslam.report.render import csv_text, html, markdown, write_files
 
 _MOTION = ("rpe_m", "rpe_deg", "t_rel_percent", "r_rel_deg_per_100m")
 _OTHER = ("loops_found", "loops_missed", "loops_wrong", "fps")
@@ -35,6 +38,36 @@ _TESTED = (
     f"once, with the mean of its medians. Two-sided, level {ALPHA:g}, not corrected for the "
     "number of tests. Comparisons in which all sequences tie are left out."
 )
+
+
+def write_overview(
+    runs: Collection[Path],
+    trajectories: Collection[str],
+    out: Path,
+    baseline: str | None = None,
+) -> OverviewJson:
+    """Gather finished runs and write ``report.{html,md,json}`` and ``table.csv`` into ``out``.
+
+    Args:
+        runs: folders of runs, or folders that hold such at any depth.
+        trajectories: ``NAME[@SEQUENCE[@PERTURB]]=FILE``, of other systems.
+        out: made if it is not there.
+        baseline: the system that the others are compared with; None for the simplest.
+
+    Raises:
+        InputError: no finished run, a trajectory that cannot be read or placed, or no run of the
+            baseline.
+        ResultsError: a file cannot be written.
+    """
+    found = collect(runs, trajectories)
+    report = summarize(found, baseline)
+    figures = draw_overview(report, found)
+    notes = list(dict.fromkeys((*report.notes, *found.notes)))  # drawing adds some
+    report = report.model_copy(update={"notes": notes})
+    page = overview_page(report, figures)
+    files = {"report.json": report.to_json(), "table.csv": render_csv(report)}
+    write_files(out, {**files, "report.md": markdown(page), "report.html": html(page)})
+    return report
 
 
 def overview_page(report: OverviewJson, figures: Collection[Figure]) -> Page:

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from vslam.report.document import Document, Record
+from vslam.report.schema import Document, Record
 
 Measure = tuple[str, str, str, int]
 # Name in the JSON, title, unit, decimals.
@@ -50,7 +50,8 @@ class RunEntry(Record):
 
     ``settings`` are the thresholds and options that differ from the defaults. ``system`` is the
     loop detector, followed in brackets by the settings that not all runs share, or the name of
-    another system; ``source`` the folder of the run or the file of the trajectory; ``seed`` is None
+    another system; ``source`` the folder of the run, or the file of the trajectory of another
+    system or of a detector that ran beside another (``--compare``); ``seed`` is None
     for other systems. ``town`` is the seed of a rendered town: the same route in another town
     counts as the same drive with another seed. ``alignment`` is what was fitted before errors were
     computed: ``se3``, or ``sim3`` for a monocular run, whose scale is arbitrary.

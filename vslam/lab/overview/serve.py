@@ -22,7 +22,6 @@ from urllib.parse import parse_qs, urlsplit
 from vslam.config import thresholds_in_words
 from vslam.errors import InputError
 from vslam.lab.overview.collect import run_folders
-from vslam.report.finished_run import read_report
 from vslam.report.page import number
 from vslam.report.render import fill_template
 from vslam.report.schema import ReportJson
@@ -51,7 +50,7 @@ def list_runs(folders: Collection[Path]) -> list[tuple[Path, ReportJson]]:
         with suppress(InputError):
             require_utf8(folder)
             if _is_own(folder / "report.json"):
-                found.append((folder, read_report(folder)))
+                found.append((folder, ReportJson.read(folder / "report.json")))
     if not found:
         raise InputError(f"{', '.join(map(str, folders))}: no run here; name folders of runs.")
     return sorted(found, key=lambda run: (run[1].created, run[0].name), reverse=True)

@@ -210,7 +210,7 @@ def is_tie(difference: float, measure: str) -> bool:
 
 
 def strengths(drives: Iterable[Drive], law: str) -> dict[Drive, float]:
-    """Drives with this law alone, or with none, and how strong it is there."""
+    """The strength of a law in each drive that has this law alone; 0 in drives without any law."""
     found = {}
     for drive in drives:
         if drive.perturb == "none":

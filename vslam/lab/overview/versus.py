@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 
 from vslam.errors import counted
-from vslam.evaluation.loops import LoopLimits
+from vslam.evaluation.loops import MIN_LENGTH_M
 from vslam.lab.overview.collect import without_settings
 from vslam.lab.overview.schema import Comparison, Drive, OverviewJson, Row, Spread
 from vslam.lab.overview.summary import ALPHA, COMPARED, ROTATION, least_pairs
@@ -21,7 +21,7 @@ _NOTES = {
     "lost_frames": "Lost: number of lost frames.",
     "rpe_m": "RPE: error of the motion from one frame to the next.",
     "loops_found": (
-        "Loops: revisits that were found, of those in the ground truth; - where there are none."
+        "Loops: revisits found, of those in the ground truth; a dash where there are none."
     ),
 }
 
@@ -59,19 +59,19 @@ def median_text(spread: Spread | None, decimals: int) -> str:
 
 
 def _without_revisits(report: OverviewJson) -> str:
-    """Why loop detectors do not differ, or hardly; empty where a drive has a revisit or nobody
-    could judge it."""
+    """Why loop detectors do not differ, or hardly; empty if a drive has a revisit or no run has a
+    ground truth."""
     judged = [row for row in report.rows if row.measures["loops_found"] is not None]
     names = {row.system for row in judged if row.system == without_settings(row.system)}
     counts = [row.measures[name] for row in judged for name in ("loops_found", "loops_missed")]
     if len(names) < 2 or any(count.greatest for count in counts if count is not None):
         return ""
-    none = f"No drive has a revisit of {LoopLimits().min_length_m:.0f} m or more"
+    none = f"No drive revisits a stretch of {MIN_LENGTH_M:.0f} m or more"
     compared = [c for c in report.comparisons if {c.first, c.second} <= names]
     if all(_is_tie(one) for one in compared):
         return f"{none}, so there is no loop to find and the loop detectors cannot differ."
     return (
-        f"{none}. Loop detectors can differ only by wrong loops and by loops on shorter revisits."
+        f"{none}. Loop detectors can differ only by wrong loops and by loops on shorter stretches."
     )
 
 

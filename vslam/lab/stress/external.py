@@ -28,7 +28,8 @@ from vslam.errors import DroppedFrameError, InputError, ResultsError
 from vslam.features import TrackingState, TrackResult
 from vslam.report.folder import write_results
 from vslam.report.schema import ReportJson
-from vslam.run.outcome import RunOutcome, RunSettings
+from vslam.run.options import RunOptions
+from vslam.run.outcome import RunOutcome
 from vslam.trajectory import Trajectory, bridge_gaps, read_trajectory
 
 _SAME_TIME_S = 1e-3
@@ -40,6 +41,10 @@ class Poses:
 
     T_wc: NDArray[np.float64]
     known: NDArray[np.bool_]
+
+    def bridged(self, times: NDArray[np.float64]) -> Trajectory:
+        """All poses at the ``(N,)`` times of the frames; unknown ones are interpolated."""
+        return bridge_gaps(Trajectory(times, self.T_wc), self.known)
 
 
 def check_template(name: str, template: str) -> None:
@@ -72,7 +77,7 @@ def check_template(name: str, template: str) -> None:
 def run_external(
     sequence: Source,
     perturbation: Perturbation,
-    settings: RunSettings,
+    settings: RunOptions,
     template: str,
     folder: Path,
 ) -> ReportJson:
@@ -150,13 +155,15 @@ def _call(template: str, sequence: Path, out: Path) -> None:
 
 
 def _outcome(
-    sequence: Source, settings: RunSettings, kept: NDArray[np.int64], out: Path, wall: float
+    sequence: Source, settings: RunOptions, kept: NDArray[np.int64], out: Path, wall: float
 ) -> RunOutcome:
     if not (out / "trajectory.txt").is_file():
         raise InputError(f"{settings.detector}: no trajectory.txt in {{out}}.")
     times = np.asarray(sequence.timestamps, np.float64)
-    final = _poses(out / "trajectory.txt", times, kept)
-    causal = _poses(out / "causal.txt", times, kept) if (out / "causal.txt").is_file() else final
+    final = read_poses(out / "trajectory.txt", times, kept)
+    causal = final
+    if (out / "causal.txt").is_file():
+        causal = read_poses(out / "causal.txt", times, kept)
     lost = ~final.known
     if (out / "states.txt").is_file():
         states = (out / "states.txt").read_text().split()
@@ -165,7 +172,7 @@ def _outcome(
         lost[kept] = np.array(states) != "OK"
     dropped = np.ones(len(times), bool)
     dropped[kept] = False
-    trajectory = bridge_gaps(Trajectory(times, final.T_wc), final.known)
+    trajectory = final.bridged(times)
     given = np.where(causal.known[:, None, None], causal.T_wc, _last_known(causal))
     tracks = [
         TrackResult(
@@ -193,8 +200,18 @@ def _outcome(
     )
 
 
-def _poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) -> Poses:
-    """Poses by frame; an unknown pose is the last known one before it, or the first one."""
+def read_poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) -> Poses:
+    """Read the poses that a system wrote. An unknown pose is the last known one before it, or the
+    first one.
+
+    Args:
+        path: file in KITTI's or TUM's format.
+        times: ``(N,)`` seconds of the frames.
+        kept: indices of the frames that the system got.
+
+    Raises:
+        InputError: the file is malformed.
+    """
     T_wc, known = np.tile(np.eye(4), (len(times), 1, 1)), np.zeros(len(times), bool)
     try:
         found = read_trajectory(path, times[kept] - times[0])

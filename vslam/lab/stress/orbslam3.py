@@ -1,16 +1,20 @@
 """Runs ORB-SLAM3 (``pip install pyorbslam3``) on a folder in KITTI's format.
 
-usage: PYTHON orbslam3.py VOCABULARY FOLDER OUT [--mono]
+usage: PYTHON orbslam3.py VOCABULARY FOLDER OUT [--frames N]
 
-The interpreter that has pyorbslam3 starts this file and need not have vslam, so nothing of vslam is
-imported here. The process ends when its standard input does.
+It prints the costs of its frame loop as a JSON object. The interpreter that has pyorbslam3 starts
+this file and need not have vslam, so nothing of vslam is imported here. The process ends when its
+standard input does.
 """
 
 from __future__ import annotations
 
+import argparse
+import json
 import os
 import sys
 import threading
+import time
 from pathlib import Path
 
 import cv2
@@ -50,13 +54,14 @@ Viewer.ViewpointF: 2000.0
 """
 
 
-def main(vocabulary: str, folder: Path, out: Path, *, mono: bool) -> None:
-    """Track every frame; write ``trajectory.txt``, ``causal.txt`` and ``states.txt``."""
+def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
+    """Track the first ``frames`` stereo frames, None for all; write ``trajectory.txt``,
+    ``causal.txt`` and ``states.txt``."""
     import pyorbslam3
 
-    left = sorted((folder / "image_0").iterdir())
-    right = left if mono else sorted((folder / "image_1").iterdir())
-    times = np.loadtxt(folder / "times.txt", ndmin=1)
+    out.mkdir(exist_ok=True)
+    left, right = (sorted((folder / f"image_{side}").iterdir())[:frames] for side in (0, 1))
+    times = np.loadtxt(folder / "times.txt", ndmin=1)[:frames].tolist()
     rows = (folder / "calib.txt").read_text().splitlines()
     P0, P1 = (np.array(row.split()[1:], float).reshape(3, 4) for row in rows[:2])
     height, width = np.asarray(cv2.imread(str(left[0]), 0)).shape
@@ -67,22 +72,33 @@ def main(vocabulary: str, folder: Path, out: Path, *, mono: bool) -> None:
             bf=-P1[0, 3],
         )
     )  # fmt: skip
-    sensor = pyorbslam3.Sensor.MONOCULAR if mono else pyorbslam3.Sensor.STEREO
-    slam = pyorbslam3.Slam(vocabulary, str(settings), sensor, use_viewer=False)
-    causal, states = [], []
-    for ours, theirs, t in zip(left, right, times.tolist(), strict=True):
-        images = [cv2.imread(str(path), 0) for path in ((ours,) if mono else (ours, theirs))]
-        found = slam.track_monocular(*images, t) if mono else slam.track_stereo(*images, t)
+    slam = pyorbslam3.Slam(vocabulary, str(settings), pyorbslam3.Sensor.STEREO, use_viewer=False)
+    causal, states, track_ms = [], [], []
+    wall, cpu = time.perf_counter(), time.process_time()
+    for ours, theirs, t in zip(left, right, times, strict=True):
+        images = [cv2.imread(str(path), 0) for path in (ours, theirs)]
+        began = time.perf_counter()
+        found = slam.track_stereo(*images, t)
+        track_ms.append(1e3 * (time.perf_counter() - began))
         states.append("OK" if found.state == pyorbslam3.TrackingState.OK else "LOST")
         pose = found.pose_wc if found.pose_valid else None
         if pose is not None:
             causal.append((t, np.asarray(pose, float)))
+    costs = {
+        "frames": len(left),
+        "fps": len(left) / (time.perf_counter() - wall),
+        "cpu_ms_per_frame": 1e3 * (time.process_time() - cpu) / len(left),
+        "track_ms_median": float(np.median(track_ms)),
+        "track_ms_p95": float(np.percentile(track_ms, 95)),
+        "lost": states.count("LOST"),
+    }
     slam.shutdown()
     tum = out / "trajectory.txt"
-    (slam.save_keyframe_trajectory_tum if mono else slam.save_trajectory_tum)(str(tum))
+    slam.save_trajectory_tum(str(tum))
     _keep_first_of_each_time(tum)
     (out / "causal.txt").write_text("".join(_tum(t, T) for t, T in causal))
     (out / "states.txt").write_text("\n".join(states))
+    sys.stdout.write(f"{json.dumps(costs)}\n")
 
 
 def _keep_first_of_each_time(path: Path) -> None:
@@ -109,4 +125,9 @@ def _end_with_input() -> None:
 
 if __name__ == "__main__":
     threading.Thread(target=_end_with_input, daemon=True).start()
-    main(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]), mono="--mono" in sys.argv)
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("vocabulary")
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--frames", type=int)
+    main(**vars(parser.parse_args()))

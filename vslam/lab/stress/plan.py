@@ -42,28 +42,26 @@ class Search:
         name = parse_perturbation(f"{self.law}:{strength:g}", self.seed).name
         return replace(self.clean, perturb=name, seed=self.seed)
 
+    def position(self) -> float | None:
+        """The next position to test; None if the search has ended."""
+        return next_position({p: bool(v) for p, v in self.verdicts.items()}, self.steps)
+
     def wants(self) -> Cell | None:
         """The next cell to run; None if the search has ended."""
-        position = next_position({p: bool(v) for p, v in self.verdicts.items()}, self.steps)
-        return None if position is None else self.cell(position)
+        return None if (position := self.position()) is None else self.cell(position)
 
-    def advance(self, reports: Reports, criterion: Criterion) -> bool:
-        """Judge the runs that have finished; returns whether there was any."""
-        moved = False
+    def advance(self, reports: Reports, criterion: Criterion) -> None:
+        """Judge the runs that have finished."""
         clean = reports(self.clean)
-        while isinstance(clean, ReportJson):
-            states = {p: bool(v) for p, v in self.verdicts.items()}
-            position = next_position(states, self.steps)
-            if position is None:
-                break
+        if not isinstance(clean, ReportJson):
+            return
+        while (position := self.position()) is not None:
             cell = self.cell(position)
             found = reports(cell)
             if found is None:
                 break
             verdict = found if isinstance(found, str) else criterion.verdict(found, clean)
             self.verdicts[position], self.tested[position] = verdict, cell
-            moved = True
-        return moved
 
     @property
     def boundary(self) -> Boundary:
@@ -76,48 +74,23 @@ class Plan:
     """The searches and runs of a stress test.
 
     Attributes:
+        clean: the runs of each system on the clean images of each sequence.
         laws: names of the laws whose boundaries are searched.
-        systems: loop detectors of vslam, and names of other systems.
+        seeds: number of seeds of each law.
+        steps: bisections of each search.
+        baseline: the system to which the errors of a preset are compared.
         repeated: systems that are not deterministic; they run with all seeds under every law.
         preset: ``kitti-c`` for fixed severities, or None.
-        sensor: ``mono`` for the left camera alone, None for all images that the data has.
-        calib: calibration files.
-        thresholds: as in `Cell`.
-        baseline: the system to which the errors of a preset are compared.
     """
 
-    dataset: str
-    sequences: tuple[str, ...]
+    clean: list[Cell]
     laws: tuple[str, ...]
-    systems: tuple[str, ...]
     seeds: int
     steps: int
-    max_frames: int | None
     baseline: str
     criterion: Criterion
     repeated: tuple[str, ...] = ()
     preset: str | None = None
-    sensor: str | None = None
-    calib: tuple[str, ...] = ()
-    thresholds: str = ""
-
-    def clean_cells(self) -> list[Cell]:
-        """The runs of each system on clean images."""
-        return [
-            Cell(
-                self.dataset,
-                sequence,
-                "none",
-                system,
-                0,
-                self.max_frames,
-                sensor=self.sensor,
-                calib=self.calib,
-                thresholds=self.thresholds,
-            )
-            for sequence in self.sequences
-            for system in self.systems
-        ]
 
     def searches(self) -> list[Search]:
         """All searches, one for each seed. A law without random numbers is searched with one seed
@@ -126,7 +99,7 @@ class Plan:
             Search(clean, law, seed, self.steps)
             for seed in range(self.seeds)
             for law in self.laws
-            for clean in self.clean_cells()
+            for clean in self.clean
             if seed == 0 or law_kind(law).drawn or clean.detector in self.repeated
         ]
 
@@ -139,7 +112,7 @@ class Plan:
             replace(clean, perturb=spec, seed=seed)
             for seed in range(self.seeds)
             for spec in specs
-            for clean in self.clean_cells()
+            for clean in self.clean
             if seed == 0 or draws(spec) or clean.detector in self.repeated
         ]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vslam.report.document import Document, Record
+from vslam.report.schema import Document, Record
 
 
 class Tested(Record):

@@ -39,46 +39,44 @@ def strength_at(kind: LawKind, position: float) -> float:
     return float(f"{value:.3g}")
 
 
-def next_position(failed: Mapping[float, bool], steps: int) -> float | None:
-    """The next position to test; None at the end of the search.
-
-    The greatest strength is tested first. If it fails, the interval is bisected ``steps`` times.
-    The last test is at half of the position that holds, to check the assumption of bisection that
-    a system also withstands all weaker strengths.
+def bracket(failed: Mapping[float, bool], steps: int) -> tuple[float, float, float | None]:
+    """Positions that hold and that fail, by the bisection so far, and the next one to test; None if
+    both are final.
 
     Args:
         failed: whether the run failed, by tested position.
         steps: number of bisections.
     """
-    if 1.0 not in failed:
-        return 1.0
-    if not failed[1.0]:
-        return None if 0.5 in failed else 0.5
+    if not failed.get(1.0, True):
+        return 1.0, 1.0, None
     holds, fails = 0.0, 1.0
     for _ in range(steps):
         middle = 0.5 * (holds + fails)
         if middle not in failed:
-            return middle
+            return holds, fails, middle
         holds, fails = (holds, middle) if failed[middle] else (middle, fails)
+    return holds, fails, None
+
+
+def next_position(failed: Mapping[float, bool], steps: int) -> float | None:
+    """The next position to test; None at the end of the search.
+
+    The greatest strength is tested first. If it fails, the interval is bisected ``steps`` times.
+    The last test is at half of the position that holds, to check the assumption of bisection that
+    a system also withstands all weaker strengths. For the arguments see :func:`bracket`.
+    """
+    if 1.0 not in failed:
+        return 1.0
+    holds, _, middle = bracket(failed, steps)
+    if middle is not None:
+        return middle
     probe = 0.5 * holds
     return probe if holds > 0.0 and probe not in failed else None
 
 
 def boundary(verdicts: Mapping[float, Verdict], kind: LawKind, steps: int) -> Boundary:
-    """The boundary according to the finished tests.
-
-    Args:
-        verdicts: verdicts by position.
-        kind: the law.
-        steps: as in :func:`next_position`.
-    """
-    holds, fails = 0.0, 1.0
-    if not verdicts[1.0]:
-        holds = 1.0
-    else:
-        for _ in range(steps):
-            middle = 0.5 * (holds + fails)
-            holds, fails = (holds, middle) if verdicts[middle] else (middle, fails)
+    """The boundary according to the finished tests, whose verdicts are given by position."""
+    holds, fails, _ = bracket({p: bool(v) for p, v in verdicts.items()}, steps)
     weaker = tuple(
         strength_at(kind, position)
         for position, verdict in sorted(verdicts.items())

@@ -19,17 +19,16 @@ def summarise(
     plan: Plan, searches: Collection[Search], reports: Reports, notes: list[str]
 ) -> StressJson:
     """Make the report from the searches that have ended; its notes also name failed clean runs."""
-    clean = plan.clean_cells()
-    failed = [(cell, found) for cell in clean if isinstance(found := reports(cell), str)]
+    failed = [(cell, found) for cell in plan.clean if isinstance(found := reports(cell), str)]
     notes = [*notes, *(f"{cell.name} is left out, it fails on clean images: {why}"
                        for cell, why in failed)]  # fmt: skip
     ended = [s for s in searches if isinstance(reports(s.clean), ReportJson) and s.wants() is None]
     return StressJson(
         criterion=plan.criterion.words,
         steps=plan.steps,
-        max_frames=plan.max_frames,
+        max_frames=plan.clean[0].max_frames,
         notes=notes,
-        clean=clean_entries(clean, reports, plan.criterion),
+        clean=clean_entries(plan.clean, reports, plan.criterion),
         boundaries=[boundary_entry(search, reports) for search in ended],
         preset=plan.preset,
         baseline=plan.baseline if plan.preset else None,

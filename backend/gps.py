@@ -1,0 +1,341 @@
+"""Puts a finished map on the Earth: GPS fixes join its pose graph.
+
+The map frame is first aligned with the local east-north-up frame (ENU) by RANSAC over Umeyama's
+closed form (TPAMI 1991), each part of the map by itself that tracking did not connect with the
+others. Then the keyframes are optimised with the edges of the essential graph and a GPS factor for
+each fix. No keyframe is held.
+
+Fixes have the Cauchy loss at first, which begins wide and narrows, so that a map that has drifted
+far is drawn towards its fixes and not away from them. Afterwards, fixes that fail a chi-square test
+are refused, and the others get a Gaussian loss.
+
+The error of GPS is mostly a bias that changes slowly (atmosphere, reflections): a hundred fixes in
+ten seconds say little more than one. So all fixes within ``CORRELATION_S`` together have the weight
+of a single one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.backend.pose_graph import GAP, WEAK, PoseGraph, edge_sigmas, minimised
+from vslam.config import PoseGraphConfig
+from vslam.errors import InputError
+from vslam.geometry import inverses
+
+# Constants of the method; docs/research/gps.md shows what other values of the first do.
+CORRELATION_S = 10.0
+GATE = 11.34  # chi-square of three degrees of freedom that 1 % of the good fixes exceed
+_MEDIAN = 2.366  # that half of them exceed
+_CAUCHY = 2.0  # scale of the narrowest loss, in standard deviations
+_NARROWING = 3.0  # from one optimisation to the next
+_DRIFT = 0.02  # of the map, as a share of its radius, that the alignment allows
+_DRAWS, _MOST_DRAWN = 1000, 500  # of RANSAC: triples, and fixes that are drawn from
+_UP_WEIGHT = 1e-3  # see _umeyama
+_METRIC = 0.02  # standard deviation of the scale of a metric map, by errors of its calibration
+_MOST_UNSURE = 0.1  # rad, of the alignment
+_LOOSE = np.array([0.3, 0.3, 0.3, 100.0, 100.0, 100.0])  # rad and m, of the prior
+_STRETCH = 0.1  # of the edges of a monocular map while its local scale is sought
+_WINDOW = 25  # keyframes before and after, for the local scale of a monocular map
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Positions:
+    """M positions of the camera that GPS has measured.
+
+    Attributes:
+        seconds: ``(M,)`` times.
+        keyframe: ``(M,)`` int64, index of the keyframe that each is relative to.
+        arm: ``(M, 3)`` the position in the frame of that keyframe, in units of the map.
+        enu: ``(M, 3)`` the measured position, east, north and up of a datum, in metres.
+        sigma: ``(M, 3)`` its standard deviations in metres.
+    """
+
+    seconds: Array
+    keyframe: NDArray[np.int64]
+    arm: Array
+    enu: Array
+    sigma: Array
+
+    def select(self, chosen: NDArray[np.bool_]) -> Positions:
+        """Some of the positions."""
+        return Positions(*(values[chosen] for values in vars(self).values()))
+
+    @property
+    def crowding(self) -> Array:
+        """``(M,)`` number of positions within ``CORRELATION_S`` of each, itself included."""
+        times = np.sort(self.seconds)
+        first = np.searchsorted(times, self.seconds - 0.5 * CORRELATION_S, "left")
+        last = np.searchsorted(times, self.seconds + 0.5 * CORRELATION_S, "right")
+        return (last - first).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Anchored:
+    """The keyframes in the ENU frame.
+
+    Attributes:
+        T_enu_k: ``(N, 4, 4)`` poses of the keyframes, in metres.
+        scale: ``(N,)`` metres per unit of the map at each keyframe.
+        used: ``(M,)`` bool, the fixes that passed the test.
+        residual_m: root mean square of the distances between these and the trajectory.
+        S_enu_w: ``(4, 4)`` the alignment of the whole map before the optimisation.
+        level: False if the fixes lie on a straight line, so that the rotation about it was taken
+            from the assumption that the camera stands upright.
+    """
+
+    T_enu_k: Array
+    scale: Array
+    used: NDArray[np.bool_]
+    residual_m: float
+    S_enu_w: Array
+    level: bool
+
+
+def anchor(
+    graph: PoseGraph, seconds: Array, positions: Positions, config: PoseGraphConfig, *, metric: bool
+) -> Anchored:
+    """Move the keyframes of a finished map to where its drive and the GPS fixes say.
+
+    Args:
+        graph: the essential graph of the map.
+        seconds: ``(N,)`` times of its keyframes.
+        metric: whether the unit of the map is the metre, except for errors of the calibration. The
+            scale of a monocular map is estimated freely, and its drift with it.
+
+    Raises:
+        InputError: the drive is too short for its direction to be known.
+    """
+    T_wk = inverses(graph.T_cw)
+    part = _parts(graph)
+    main = align(T_wk, positions, metric=metric)
+    if main.unsure > _MOST_UNSURE:
+        raise InputError(
+            "the drive is too short for GPS: the fixes do not tell which way it went; drive "
+            "farther, or use a receiver with a smaller error."
+        )
+    T_enu_k, scale = _moved(T_wk, main.S_enu_w)
+    for label in np.unique(part) if part.any() else ():
+        at = part[positions.keyframe] == label
+        own = align(T_wk, positions.select(at), metric=metric) if at.sum() >= 3 else main
+        if own.unsure <= _MOST_UNSURE:
+            inside = part == label
+            T_enu_k[inside], scale[inside] = _moved(T_wk[inside], own.S_enu_w)
+
+    width = 2.0 * float(np.sqrt(np.median(_chi2(positions, T_enu_k, scale))))
+    width = max(width, _CAUCHY * _NARROWING ** (1 if metric else 4))
+    stretch = 0.0 if metric else _STRETCH
+    while width > _CAUCHY:
+        width = max(width / _NARROWING, _CAUCHY)
+        T_enu_k = _optimised(
+            graph, seconds, T_enu_k, scale, positions, config, cauchy=width, stretch=stretch
+        )
+        if not metric:
+            scale = _local_scale(T_wk, T_enu_k, scale, part)
+    used = np.ones(len(positions.seconds), np.bool_)
+    for _ in range(2):
+        chi2 = _chi2(positions, T_enu_k, scale)
+        # Receivers promise too much: where the residuals are larger, these count.
+        used = chi2 <= GATE * max(1.0, float(np.median(chi2)) / _MEDIAN)
+        chosen = positions.select(used)
+        T_enu_k = _optimised(graph, seconds, T_enu_k, scale, chosen, config)
+    apart = np.linalg.norm(_residuals(positions, T_enu_k, scale)[used], axis=1)
+    residual = float(np.sqrt(np.mean(apart**2)))
+    return Anchored(T_enu_k, scale, used, residual, main.S_enu_w, main.unsure_about <= _MOST_UNSURE)
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """A similarity from the map to ENU, and how sure it is.
+
+    Attributes:
+        S_enu_w: ``(4, 4)``.
+        unsure: standard deviation of the direction of the drive, rad.
+        unsure_about: standard deviation of the rotation about this direction, rad.
+    """
+
+    S_enu_w: Array
+    unsure: float
+    unsure_about: float
+
+
+def align(T_wk: Array, positions: Positions, *, metric: bool, seed: int = 0) -> Alignment:
+    """Align a map with its fixes by RANSAC.
+
+    The scale of a metric map is estimated, too, as far as the fixes are surer of it than the
+    calibration (``_METRIC``): a baseline that is 1 % too long makes the map 1 % too large.
+
+    Args:
+        T_wk: ``(N, 4, 4)`` poses of the keyframes in the map.
+        positions: at least three.
+    """
+    at, enu = _at(positions, T_wk, np.ones(len(T_wk))), positions.enu
+    up = -T_wk[positions.keyframe, :3, 1]
+    sigma = float(np.sqrt(np.mean(positions.sigma**2)))
+    radius = float(np.sqrt(np.sum(np.median((enu - np.median(enu, axis=0)) ** 2, axis=0))))
+    near = max(np.sqrt(GATE) * sigma, _DRIFT * radius)
+
+    rng = np.random.default_rng(seed)
+    drawn = np.unique(np.linspace(0, len(enu) - 1, min(len(enu), _MOST_DRAWN)).astype(int))
+    triples = drawn[np.argsort(rng.random((_DRAWS, len(drawn))), axis=1)[:, :3]]
+    fixed = 1.0 if metric else None
+    S = _umeyama(at[triples], enu[triples], up[triples], fixed)
+    apart = np.linalg.norm(_mapped(S, at[drawn]) - enu[drawn], axis=-1)
+    best = S[np.argmin(np.minimum(apart / near, 1.0).sum(axis=1))]
+    for _ in range(3):
+        inliers = np.linalg.norm(_mapped(best, at) - enu, axis=-1) <= near
+        if inliers.sum() < 3:
+            inliers[:] = True
+        best = _umeyama(at[inliers], enu[inliers], up[inliers], fixed)
+    path = _mapped(best, at[inliers])
+    spread = np.linalg.eigvalsh(np.cov(path.T, bias=True))[::-1]
+    independent = float(np.sum(1.0 / positions.select(inliers).crowding))
+    error = sigma / np.sqrt(independent)
+    if metric:
+        free = _umeyama(at[inliers], enu[inliers], up[inliers], None)
+        apart = np.sqrt(np.mean((_mapped(free, at[inliers]) - enu[inliers]) ** 2))
+        variance = max(sigma, apart) ** 2 / (independent * max(spread.sum(), 1e-12))
+        share = _METRIC**2 / (_METRIC**2 + variance)
+        scale = 1.0 + share * (_scale_of(free) - 1.0)
+        best = _umeyama(at[inliers], enu[inliers], up[inliers], scale)
+    unsure, unsure_about = error / np.sqrt(np.maximum([spread[0], spread[1:].sum()], 1e-12))
+    return Alignment(best, float(unsure), float(unsure_about))
+
+
+def _umeyama(p: Array, q: Array, up: Array, fixed: float | None) -> Array:
+    """``(..., 4, 4)`` similarities that map ``(..., M, 3)`` points p to q; their scale is ``fixed``
+    unless that is None.
+
+    Points on a line leave the rotation about it open. There, the camera's upward axes ``up``
+    decide, with a weight that is too small to matter anywhere else.
+    """
+    p_mean, q_mean = p.mean(axis=-2), q.mean(axis=-2)
+    p0, q0 = p - p_mean[..., None, :], q - q_mean[..., None, :]
+    cross = np.einsum("...mi,...mj->...ij", q0, p0)
+    size = np.sqrt((p0**2).sum((-2, -1)) * (q0**2).sum((-2, -1)))
+    upward = np.zeros_like(cross)
+    upward[..., 2, :] = up.mean(axis=-2)
+    U, _, Vt = np.linalg.svd(cross + _UP_WEIGHT * size[..., None, None] * upward)
+    U[..., 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    R = U @ Vt
+    scale: Array | float
+    if fixed is not None:
+        scale = fixed
+    else:
+        scale = np.einsum("...ij,...ij->...", R, cross) / np.maximum((p0**2).sum((-2, -1)), 1e-12)
+    S = np.zeros((*size.shape, 4, 4))
+    S[..., :3, :3] = np.asarray(scale)[..., None, None] * R
+    S[..., :3, 3] = q_mean - np.einsum("...ij,...j->...i", S[..., :3, :3], p_mean)
+    S[..., 3, 3] = 1.0
+    return S
+
+
+def _scale_of(S: Array) -> float:
+    return float(np.cbrt(np.linalg.det(S[:3, :3])))
+
+
+def _mapped(S: Array, points: Array) -> Array:
+    """``(..., M, 3)`` images of ``(M, 3)`` points under ``(..., 4, 4)`` similarities."""
+    return points @ np.swapaxes(S[..., :3, :3], -2, -1) + S[..., None, :3, 3]
+
+
+def _moved(T_wk: Array, S_enu_w: Array) -> tuple[Array, Array]:
+    """Poses ``T_enu_k`` and scales of keyframes after an alignment."""
+    scale = _scale_of(S_enu_w)
+    T_enu_k = S_enu_w @ T_wk
+    T_enu_k[:, :3, :3] /= scale
+    return T_enu_k, np.full(len(T_wk), scale)
+
+
+def _parts(graph: PoseGraph) -> NDArray[np.int64]:
+    """``(N,)`` the part of the map of each keyframe: parts are joined by measured edges."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    n = len(graph.keyframes)
+    i, j = graph.edges[(graph.kind != WEAK) & (graph.kind != GAP)].T
+    links = coo_array((np.ones(len(i)), (i, j)), shape=(n, n))
+    return np.asarray(connected_components(links, directed=False)[1], np.int64)
+
+
+def _at(positions: Positions, T_k: Array, scale: Array) -> Array:
+    """``(M, 3)`` where keyframes at these poses put the positions."""
+    of = positions.keyframe
+    arm = positions.arm * scale[of, None]
+    return np.einsum("mij,mj->mi", T_k[of, :3, :3], arm) + T_k[of, :3, 3]
+
+
+def _residuals(positions: Positions, T_enu_k: Array, scale: Array) -> Array:
+    return _at(positions, T_enu_k, scale) - positions.enu
+
+
+def _chi2(positions: Positions, T_enu_k: Array, scale: Array) -> Array:
+    return np.sum((_residuals(positions, T_enu_k, scale) / positions.sigma) ** 2, axis=1)
+
+
+def _local_scale(T_wk: Array, T_enu_k: Array, scale: Array, part: NDArray[np.int64]) -> Array:
+    """``(N,)`` metres per unit of the map: the ratio of the lengths of the path around each
+    keyframe, within its part of the map; the previous ``scale`` where there is no path."""
+    scale = scale.copy()
+    for label in np.unique(part):
+        inside = np.flatnonzero(part == label)
+        k = np.arange(len(inside))
+        first, last = np.maximum(k - _WINDOW, 0), np.minimum(k + _WINDOW, len(k) - 1)
+        steps = (np.diff(T[inside, :3, 3], axis=0) for T in (T_enu_k, T_wk))
+        paths = (np.append(0.0, np.cumsum(np.linalg.norm(step, axis=1))) for step in steps)
+        metres, units = (path[last] - path[first] for path in paths)
+        scale[inside[units > 0]] = metres[units > 0] / units[units > 0]
+    return scale
+
+
+def _optimised(
+    graph: PoseGraph,
+    seconds: Array,
+    T_enu_k: Array,
+    scale: Array,
+    positions: Positions,
+    config: PoseGraphConfig,
+    *,
+    cauchy: float | None = None,
+    stretch: float = 0.0,
+) -> Array:
+    """``(N, 4, 4)`` poses that best agree with edges and fixes, starting from ``T_enu_k``.
+
+    Args:
+        cauchy: scale of the loss on fixes, in their standard deviations; None for a Gaussian loss.
+        stretch: standard deviation of the lengths of edges, as a share of them, beside that of
+            ``edge_sigmas``.
+    """
+    import gtsam
+
+    noise = gtsam.noiseModel
+    factors, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    loose = noise.Diagonal.Sigmas(_LOOSE)
+    for i, T in enumerate(T_enu_k):
+        pose = gtsam.Pose3(T)
+        start.insert(i, pose)
+        if graph.fixed[i]:  # keeps parts without fixes, and rotations about a straight drive
+            factors.add(gtsam.PriorFactorPose3(i, pose, loose))
+    edges, T_i_j = graph.edges, graph.T_i_j.copy()
+    T_i_j[:, :3, 3] *= scale[edges].mean(axis=1)[:, None]
+    sigmas = edge_sigmas(edges, T_i_j, graph.kind, seconds[edges], len(T_enu_k), config)
+    sigmas[:, 0] = np.hypot(sigmas[:, 0], stretch * np.linalg.norm(T_i_j[:, :3, 3], axis=1))
+    for (i, j), T, sigma in zip(
+        edges.tolist(), T_i_j, np.repeat(sigmas[:, ::-1], 3, axis=1), strict=True
+    ):
+        drift = noise.Diagonal.Sigmas(sigma)
+        factors.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(T), drift))
+    crowding = np.sqrt(positions.crowding)
+    arms = positions.arm * scale[positions.keyframe, None]
+    for k, (i, n) in enumerate(zip(positions.keyframe.tolist(), crowding.tolist(), strict=True)):
+        plain = noise.Diagonal.Sigmas(n * positions.sigma[k])
+        loss = None if cauchy is None else noise.mEstimator.Cauchy.Create(cauchy / n)
+        model = plain if loss is None else noise.Robust.Create(loss, plain)
+        factors.add(gtsam.GPSFactorArm(i, positions.enu[k], arms[k], model))
+    result = minimised(factors, start, config)
+    return np.array([result.atPose3(i).matrix() for i in range(len(T_enu_k))])

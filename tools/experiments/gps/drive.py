@@ -1,0 +1,125 @@
+"""Measure what GPS does to the error of a drive.
+
+    python tools/experiments/gps/drive.py RUN [RUN ...] --seeds 5
+
+Simulates a receiver along the ground truth of finished runs: one fix a second, with white noise, a
+bias that walks at random, gaps, and jumps by 20 m that last ten seconds. Prints the root mean
+square error of the positions of the run without GPS (after the alignment of its sensor), of the
+fixes, of the fixes interpolated at the times of the frames, and of the run with GPS: after SE3
+alignment, and without any. All are means over the seeds.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.backend import gps
+from vslam.config import load_config
+from vslam.datasets.fixes import Fixes, to_enu, to_geodetic
+from vslam.evaluation.trajectories import evaluate_trajectory
+from vslam.maps.storage import load_map
+from vslam.run.gps import locate
+from vslam.run.outcome import alignment_of
+from vslam.trajectory import Trajectory, read_trajectory
+
+DATUM = np.array([49.0, 8.4, 115.0])
+# The ground truth's x, y and z point right, down and ahead of the first camera, which looks
+# north-east.
+R_ENU_TRUTH = np.array([[1, 0, 1], [0, 2**0.5, 0], [-1, 0, 1]])[[0, 2, 1]] / 2**0.5
+R_ENU_TRUTH[2] *= -1.0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("runs", type=Path, nargs="+", help="folders of runs with ground truth")
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--noise", type=float, default=1.0, help="m, of each axis")
+    parser.add_argument("--walk", type=float, default=0.05, help="of the bias, m per root second")
+    parser.add_argument("--gaps", type=int, default=3, help="of 30 s each")
+    parser.add_argument("--jumps", type=int, default=3)
+    parser.add_argument("--hertz", type=float, default=1.0)
+    parser.add_argument("--sigma", type=float, default=1.5, help="that the receiver states, m")
+    parser.add_argument("--correlation", type=float, default=gps.CORRELATION_S, help="s")
+    options = parser.parse_args()
+    gps.CORRELATION_S = options.correlation
+    print("| run | positions of | error after alignment, m | error, m | refused, wrongly refused |")
+    print("|---|---|---|---|---|")
+    for run in options.runs:
+        measure(run, options)
+
+
+def measure(run: Path, options: argparse.Namespace) -> None:
+    """Print the rows of a run: means over the seeds."""
+    visual = read_trajectory(run / "trajectory.tum")
+    truth = read_trajectory(run / "ground_truth_kitti.txt", visual.timestamps)
+    truth = Trajectory(truth.timestamps, truth.T_wc.copy())
+    truth.T_wc[:, :3] = R_ENU_TRUTH @ truth.T_wc[:, :3]
+    stored, config = load_map(run / "map.npz"), load_config(run / "config.json")
+    names = "fixes", "GPS alone", "with GPS"
+    rows: dict[str, list[tuple[float, ...]]] = {name: [] for name in names}
+    for seed in range(options.seeds):
+        fixes, is_jump = simulated(truth, options, seed)
+        track = locate(stored, fixes, config.pose_graph)
+        assert len(track.anchored.used) == len(fixes)
+        wrongly = float(np.mean(~track.anchored.used[~is_jump]))
+        missed = int(np.sum(track.anchored.used & is_jump))
+        # The datum of a run is its first fix.
+        placed = to_enu(to_geodetic(track.trajectory.T_wc[:, :3, 3], track.datum), DATUM)
+        alone = np.column_stack(
+            [np.interp(truth.timestamps, fixes.times, x) for x in to_enu(fixes.geodetic, DATUM).T]
+        )
+        at_fixes = np.column_stack(
+            [np.interp(fixes.times, truth.timestamps, x) for x in truth.T_wc[:, :3, 3].T]
+        )
+        apart = np.linalg.norm(to_enu(fixes.geodetic, DATUM) - at_fixes, axis=1)
+        rows["fixes"].append((np.nan, float(np.sqrt(np.mean(apart**2))), wrongly, missed))
+        for name, positions in (("GPS alone", alone), ("with GPS", placed)):
+            rows[name].append((*errors(positions, truth), wrongly, missed))
+    alignment = alignment_of(stored.camera.sensor)
+    without = evaluate_trajectory(visual, truth, alignment).ate_rmse_m
+    print(f"| {run.resolve().name} | vision alone | {without:.2f} ({alignment}) | | |")
+    for label, values in rows.items():
+        aligned, absolute, wrongly, missed = np.mean(values, axis=0)
+        jumps = f"{100 * wrongly:.1f} % of the good, {missed:.1f} jumped fixes kept"
+        jumps = jumps if label == "with GPS" else ""
+        shown = "" if np.isnan(aligned) else f"{aligned:.2f}"
+        print(f"| | {label} | {shown} | {absolute:.2f} | {jumps} |", flush=True)
+
+
+def errors(positions: NDArray[np.float64], truth: Trajectory) -> tuple[float, float]:
+    """RMSE of ``(N, 3)`` positions in metres, after SE3 alignment and without."""
+    T_wc = truth.T_wc.copy()
+    T_wc[:, :3, 3] = positions
+    aligned = evaluate_trajectory(Trajectory(truth.timestamps, T_wc), truth, "se3").ate_rmse_m
+    apart = np.linalg.norm(positions - truth.T_wc[:, :3, 3], axis=1)
+    return aligned, float(np.sqrt(np.mean(apart**2)))
+
+
+def simulated(
+    truth: Trajectory, options: argparse.Namespace, seed: int
+) -> tuple[Fixes, NDArray[np.bool_]]:
+    """Fixes along the ground truth, and which of them have jumped."""
+    rng = np.random.default_rng(seed)
+    first, last = truth.timestamps[[0, -1]]
+    times = np.arange(first, last, 1.0 / options.hertz)
+    enu = np.column_stack([np.interp(times, truth.timestamps, x) for x in truth.T_wc[:, :3, 3].T])
+    steps = rng.normal(0.0, options.walk / options.hertz**0.5, enu.shape)
+    enu += rng.normal(0.0, options.noise, enu.shape) + np.cumsum(steps, axis=0)
+    is_jump, is_gap = np.zeros((2, len(times)), np.bool_)
+    for begin in rng.uniform(first, max(first, last - 10.0), options.jumps):
+        at = (times >= begin) & (times < begin + 10.0)
+        angle = rng.uniform(0.0, 2.0 * np.pi)
+        enu[at & ~is_jump] += 20.0 * np.array([np.cos(angle), np.sin(angle), 0.0])
+        is_jump |= at
+    for begin in rng.uniform(first, max(first, last - 30.0), options.gaps):
+        is_gap |= (times >= begin) & (times < begin + 30.0)
+    fixes = Fixes(times, to_geodetic(enu, DATUM), np.full(enu.shape, options.sigma))
+    return Fixes(*(values[~is_gap] for values in vars(fixes).values())), is_jump[~is_gap]
+
+
+if __name__ == "__main__":
+    main()

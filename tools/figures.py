@@ -1,0 +1,368 @@
+"""Make the tables and figures of README and the documentation from runs, and check them.
+
+    python tools/figures.py [--quick] [--only TEXT]    # make figures, make figures FIGURES=quick
+    python tools/figures.py --check                    # make figures-check
+    python tools/figures.py --adopt [VERSION]          # stamp files that were made by other means
+
+``figures.toml`` lists every table and figure with the commands that make it. A command is run by
+bash in the root of the repository and writes into the folder ``$OUT`` under the names of the files;
+``$TOWNS`` is the folder of rendered towns. ``$OUT`` is kept in ``runs/figures``, one folder for
+each version of the method, so that an interrupted command continues. The files are copied to their
+places, or below ``build/figures`` with ``--quick``, and ``docs/stamps.json`` there gets a stamp for
+each: commit, version of the method, machine, seed, command and digest. What has a valid stamp of
+this version is not made again.
+
+sources.py explains how a page names the file that its numbers come from.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+import tomllib
+from dataclasses import asdict, dataclass
+from graphlib import TopologicalSorter
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple
+
+import sources
+
+from vslam import METHOD_VERSION
+
+ROOT = Path(__file__).resolve().parents[1]
+STAMPS = "docs/stamps.json"
+KINDS = {".csv", ".json", ".svg", ".png", ".jpg"}  # of files below docs/ that need a stamp
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Files that are made together.
+
+    ``run`` and ``quick`` are commands for bash, ``needs`` environment variables that must name a
+    path, ``reads`` files of other entries. ``trajectories`` is False if no version of the method
+    changes the files. ``tested`` names the test that compares the files with the code, so that they
+    need no stamp. ``history`` says what made the files of a finished experiment; no command makes
+    them again, and patterns may name them.
+    """
+
+    files: tuple[str, ...]
+    run: str = ""
+    quick: str = ""
+    needs: tuple[str, ...] = ()
+    reads: tuple[str, ...] = ()
+    seed: int | None = None
+    trajectories: bool = True
+    tested: str = ""
+    history: str = ""
+
+    def paths(self, root: Path) -> list[str]:
+        """The files, with patterns resolved."""
+        found = [sorted(root.glob(one)) if "*" in one else [root / one] for one in self.files]
+        return [path.relative_to(root).as_posix() for path in chain(*found)]
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """How a file was made. What git's history does not tell of an older file is None."""
+
+    digest: str
+    commit: str
+    date: str
+    method: int | None = None
+    machine: str | None = None
+    seed: int | None = None
+    command: str | None = None
+
+
+class Report(NamedTuple):
+    """What a check found: ``faults`` must be repaired, ``older`` and ``typed`` are listed."""
+
+    faults: list[str]
+    older: list[str]
+    typed: list[str]
+
+
+def read_entries(root: Path = ROOT) -> list[Entry]:
+    """The entries of figures.toml, inputs before what is made of them."""
+    tables = tomllib.loads((root / "tools" / "figures.toml").read_text())["figure"]
+    entries = [
+        Entry(**{k: tuple(v) if isinstance(v, list) else v for k, v in one.items()})
+        for one in tables
+    ]
+    made_by = {file: k for k, one in enumerate(entries) for file in one.files}
+    graph = {k: {made_by[file] for file in one.reads} for k, one in enumerate(entries)}
+    return [entries[k] for k in TopologicalSorter(graph).static_order()]
+
+
+def read_stamps(folder: Path) -> dict[str, Stamp]:
+    """Stamps by the path of the file; empty without stamps.json."""
+    path = folder / STAMPS
+    known = json.loads(path.read_text()) if path.exists() else {}
+    return {file: Stamp(**one) for file, one in known.items()}
+
+
+def write_stamps(folder: Path, stamps: dict[str, Stamp]) -> None:
+    """Write stamps.json, sorted by file."""
+    (folder / STAMPS).parent.mkdir(parents=True, exist_ok=True)
+    content = {file: asdict(stamps[file]) for file in sorted(stamps)}
+    (folder / STAMPS).write_text(json.dumps(content, indent=1) + "\n")
+
+
+def digest_of(path: Path) -> str:
+    """The first 16 hexadecimal digits of SHA-256."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+def is_older(stamp: Stamp, entry: Entry) -> bool:
+    """Whether another version of the method made a file that depends on it."""
+    return entry.trajectories and stamp.method != METHOD_VERSION
+
+
+def make(root: Path, *, quick: bool, only: str = "") -> int:
+    """Make what is missing or older, and print a sentence for each entry.
+
+    Args:
+        root: repository.
+        quick: run the short commands, and write below build/figures.
+        only: leave out entries that have no file with this text in its path.
+
+    Returns:
+        Number of entries that failed.
+    """
+    target = root / "build" / "figures" if quick else root
+    failed = 0
+    for entry in read_entries(root):
+        if not any(only in file for file in entry.files):
+            continue
+        command = entry.quick if quick else entry.run
+        more = f" and {len(entry.files) - 1} more" if len(entry.files) > 1 else ""
+        name = f"{entry.files[0]}{more}"
+        absent = [x for x in entry.needs if not os.path.exists(os.environ.get(x, ""))]
+        if entry.history:
+            print(f"{name}: kept, {entry.history}.")
+        elif not command:
+            print(f"{name}: skipped, it has no quick variant.")
+        elif absent and not quick:
+            print(f"{name}: skipped, {' and '.join(absent)} must name files (datasets.md).")
+        elif _is_done(entry, target, command):
+            print(f"{name}: up to date.")
+        else:
+            start = time.monotonic()
+            made = _made(entry, command, root, target)
+            failed += not made
+            what = "made in" if made else "FAILED after"
+            print(f"{name}: {what} {time.monotonic() - start:.0f} s.", flush=True)
+    return failed
+
+
+def _is_done(entry: Entry, target: Path, command: str) -> bool:
+    stamps = read_stamps(target)
+    mine = [stamps.get(file) for file in entry.files]
+    inputs = [stamps[file].date for file in entry.reads if file in stamps]
+    return all(
+        stamp is not None
+        and (target / file).exists()
+        and stamp.digest == digest_of(target / file)
+        and stamp.command == command
+        and not is_older(stamp, entry)
+        and stamp.date >= max(inputs, default="")
+        for file, stamp in zip(entry.files, mine, strict=True)
+    )
+
+
+def _made(entry: Entry, command: str, root: Path, target: Path) -> bool:
+    from vslam.datasets.synthetic.site import Variation
+    from vslam.datasets.synthetic.store import cache_folder, folder_name
+
+    kind = "full" if target == root else "quick"
+    out = root / "runs" / "figures" / f"{kind}-{METHOD_VERSION}" / entry.files[0].replace("/", "-")
+    out.mkdir(parents=True, exist_ok=True)
+    environment = os.environ | {
+        "OUT": str(out),
+        "TOWNS": str(cache_folder() / folder_name(Variation())),
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+    }
+    print(command.strip(), flush=True)
+    shell = ["bash", "-euo", "pipefail", "-c", command]
+    if subprocess.run(shell, cwd=root, env=environment, check=False).returncode:
+        return False
+    stamps = read_stamps(target)
+    for file in entry.files:
+        (target / file).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(out / Path(file).name, target / file)
+        stamps[file] = _stamp(target / file, entry, command, root, METHOD_VERSION)
+    write_stamps(target, stamps)
+    return True
+
+
+def _stamp(path: Path, entry: Entry, command: str, root: Path, method: int) -> Stamp:
+    """The stamp of a file that was made just now."""
+    from vslam.report.summary import this_machine
+
+    machine = this_machine()
+    return Stamp(
+        digest_of(path),
+        _commit(root),
+        time.strftime("%Y-%m-%d %H:%M:%S"),
+        method,
+        f"{machine.cpu}, {machine.cores} cores, {machine.platform}",
+        entry.seed,
+        command,
+    )
+
+
+def _commit(root: Path) -> str:
+    """The commit that is checked out, with a mark if code was changed since."""
+    head = _git(root, "rev-parse", "--short", "HEAD")
+    changed = _git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs")
+    return f"{head} with changes" if changed else head
+
+
+def _git(root: Path, *words: str) -> str:
+    done = subprocess.run(["git", *words], cwd=root, check=True, capture_output=True, text=True)
+    return done.stdout.strip()
+
+
+def adopt(root: Path, method: int | None = None) -> list[str]:
+    """Stamp every file that has no valid stamp, and return these files.
+
+    Args:
+        root: repository.
+        method: version of the method that made the files with the commands of figures.toml on this
+            machine; None if unknown: then the stamp has only the commit that wrote the file.
+    """
+    stamps, adopted = read_stamps(root), []
+    entries = {file: entry for entry in read_entries(root) for file in entry.paths(root)}
+    for file in entries:
+        known = stamps[file].digest if file in stamps else ""
+        if entries[file].tested or known == digest_of(root / file):
+            continue
+        # A commit that only moved the file did not write it.
+        words = ("log", "-1", "--follow", "--diff-filter=AM", "--format=%h %as", "--", file)
+        commit, _, date = _git(root, *words).partition(" ")
+        stamps[file] = (
+            Stamp(digest_of(root / file), commit, date)
+            if method is None
+            else _stamp(root / file, entries[file], entries[file].run, root, method)
+        )
+        adopted.append(file)
+    write_stamps(root, stamps)
+    return adopted
+
+
+def check(root: Path) -> Report:
+    """Check that all tables and figures have valid stamps and tables in Markdown their values."""
+    entries = {file: entry for entry in read_entries(root) for file in entry.paths(root)}
+    stamps, report = read_stamps(root), Report([], [], [])
+    below = (path for path in (root / "docs").rglob("*") if path.suffix in KINDS)
+    there = {path.relative_to(root).as_posix() for path in below} - {STAMPS}
+    texts = {page: page.read_text() for page in pages(root)}
+    for file in sorted(there | entries.keys()):
+        if file not in entries:
+            report.faults.append(f"{file}: name the command that makes it in tools/figures.toml")
+        elif not (root / file).exists():
+            report.older.append(f"{file}: not made yet")
+        elif entries[file].tested:
+            continue
+        elif file not in stamps:
+            report.faults.append(f"{file}: has no stamp; make it with make figures")
+        elif stamps[file].digest != digest_of(root / file):
+            report.faults.append(f"{file}: was changed after the run of its stamp")
+        elif is_older(stamps[file], entries[file]):
+            names = [
+                p.relative_to(root) for p, text in texts.items() if file in used(p, text, root)
+            ]
+            on = f", on {', '.join(map(str, names))}" if names else ""
+            report.older.append(f"{file}: {origin(stamps[file])}{on}")
+    for page, text in texts.items():
+        name = page.relative_to(root)
+        report.faults.extend(f"{name}: {one}" for one in sources.compare(text, root))
+        typed, tables = sources.untraced(text)
+        if typed and str(name) not in entries:
+            report.typed.append(f"{name}: {typed} of {tables} tables")
+    return report
+
+
+def pages(root: Path) -> list[Path]:
+    """README and the pages of the documentation, but for those that are made from the code."""
+    below = sorted((root / "docs").rglob("*.md"))
+    made = root / "docs" / "reference"
+    return [root / "README.md", *(page for page in below if made not in page.parents)]
+
+
+def used(page: Path, text: str, root: Path) -> set[str]:
+    """The files that a page links, shows or names as a source."""
+    links = re.findall(r"\]\(([^)#\s:]+)\)", text)
+    named = {os.path.relpath(os.path.normpath(page.parent / link), root) for link in links}
+    return named.union(*map(sources.files_of, sources.COMMENT.findall(text)))
+
+
+def origin(stamp: Stamp) -> str:
+    """``version 1, commit 0123abc, 2026-11-25``."""
+    version = "before version 1" if stamp.method is None else f"version {stamp.method}"
+    return f"{version}, commit {stamp.commit}, {stamp.date[:10]}"
+
+
+def mark_older(page: Path, text: str, root: Path) -> str:
+    """The text of a page, in which a line before each traced table and a note at the end name the
+    files that another version of the method made."""
+    stamps = read_stamps(root)
+    older = {
+        file: origin(stamps[file])
+        for entry in read_entries(root)
+        for file in entry.paths(root)
+        if file in stamps and is_older(stamps[file], entry)
+    }
+
+    def marked(found: re.Match[str]) -> str:
+        names = sorted(sources.files_of(found[1]) & older.keys())
+        origins = "; ".join(f"`{file}`: {older[file]}" for file in names)
+        return (
+            f"*Older than version {METHOD_VERSION} of the method: {origins}.*\n\n" if names else ""
+        )
+
+    names = sorted(used(page, text, root) & older.keys())
+    text = sources.COMMENT.sub(marked, text)
+    if names:
+        items = "".join(f"- `{file}`: {older[file]}\n" for file in names)
+        title = f"Files that are older than version {METHOD_VERSION} of the method:"
+        text += f"\n```{{note}}\n{title}\n\n{items}```\n"
+    return text
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="minutes; writes to build/figures")
+    parser.add_argument("--only", default="", help="files whose path contains this text")
+    parser.add_argument("--check", action="store_true", help="make nothing; check what is there")
+    parser.add_argument(
+        "--adopt", type=int, nargs="?", const=0, metavar="VERSION",
+        help="stamp files that were made by other means, by this version of the method if known",
+    )  # fmt: skip
+    options = parser.parse_args()
+    if options.adopt is not None:
+        print("\n".join(adopt(ROOT, options.adopt or None)))
+    elif options.check:
+        report = check(ROOT)
+        print(
+            f"Made by another version of the method than {METHOD_VERSION}:",
+            *report.older,
+            sep="\n  ",
+        )
+        print("Tables that name no source:", *report.typed, sep="\n  ")
+        print("Faults:", *(report.faults or ["none"]), sep="\n  ")
+        sys.exit(bool(report.faults))
+    else:
+        sys.exit(make(ROOT, quick=options.quick, only=options.only) > 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,139 @@
+"""Compare the numbers of pages with the CSV files that they come from.
+
+A table in Markdown names its source in a comment before it. A line of the comment describes one row
+of the table, and the last line all further rows::
+
+    <!-- from: docs/x.csv | drive=$1, light=clean | | ate_m (system=ours) | found; missed -->
+
+It holds the CSV file, the filter that selects its row (``$1``: the text of the first cell of the
+table's row, or what its backticks enclose), then the columns that the numbers of each cell must
+equal, as they are rounded there; the last place is for all further columns. ``$0`` is the head of
+the column. A filter in parentheses belongs to the columns before it in the
+cell. An empty place is not compared; ``mean x`` and ``sum x`` are over all selected rows; a line
+``-`` skips a row. Before a paragraph, the comment names columns whose values it must mention.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator
+from itertools import zip_longest
+from pathlib import Path
+
+COMMENT = re.compile(r"<!-- from:(.*?)-->[ ]*\n", re.DOTALL)
+TABLE = re.compile(r"(--> *\n)?(?:^ *\|.*\n)+?^ *\|[-| :]+\|\n((?:^ *\|.*\n?)+)", re.MULTILINE)
+DECIMAL = re.compile(r"\d\.\d")
+NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d,]*(?:\.\d+)?")
+OVER_ROWS = {"mean": lambda x: sum(x) / len(x), "sum": sum}
+
+
+def lines_of(comment: str) -> list[str]:
+    """The lines of a source comment."""
+    return [line.strip() for line in comment.strip().splitlines()]
+
+
+def files_of(comment: str) -> set[str]:
+    """The CSV files that a source comment names."""
+    return {line.partition("|")[0].strip() for line in lines_of(comment)} - {"-"}
+
+
+def untraced(text: str) -> tuple[int, int]:
+    """The number of tables with decimal numbers but no source, and of all tables."""
+    tables = TABLE.findall(text)
+    return sum(not comment and bool(DECIMAL.search(body)) for comment, body in tables), len(tables)
+
+
+def compare(text: str, root: Path) -> Iterator[str]:
+    """A sentence for each value on a page that differs from its source."""
+    for found in COMMENT.finditer(text):
+        lines, after = lines_of(found[1]), text[found.end() :].partition("\n\n")[0]
+        try:
+            if not after.lstrip().startswith("|"):
+                for line in lines:
+                    yield from _paragraph_faults(line, after, root)
+                continue
+            head, _, *rows = [_cells(row) for row in after.splitlines()]
+            if len(lines) > len(rows):
+                yield f"{len(lines)} source lines for the {len(rows)} rows after {rows[0]}"
+            for line, row in zip_longest(lines[: len(rows)], rows, fillvalue=lines[-1]):
+                yield from _row_faults(line, head, row, root)
+        except (LookupError, ValueError, OSError) as error:
+            yield f"source {lines[0]!r} cannot be read: {error}"
+
+
+def _cells(row: str) -> list[str]:
+    return [cell.strip() for cell in row.strip().strip("|").split("|")]
+
+
+def _row_faults(line: str, head: list[str], row: list[str], root: Path) -> Iterator[str]:
+    if line == "-":
+        return
+    file, filters, *columns = [part.strip() for part in line.split("|")]
+    columns += columns[-1:] * (len(row) - len(columns))
+    for name, cell, column in zip(head, row, columns, strict=True):
+        values = _values(root / file, filters, column, [name, *row]) if column else []
+        left, numbers = cell, []
+        for value in values:
+            if isinstance(value, str):
+                if value not in left:
+                    yield f"{row[0]}: {cell!r} lacks {value!r} of {file} ({column})"
+                left = left.replace(value, "", 1)
+            else:
+                numbers.append(value)
+        shown = NUMBER.findall(left)
+        agree = len(shown) == len(numbers) and all(map(_is_rounded, shown, numbers))
+        if column and not agree:
+            yield f"{row[0]}: {cell!r} differs from {values} of {file} ({column})"
+
+
+def _paragraph_faults(line: str, paragraph: str, root: Path) -> Iterator[str]:
+    file, filters, column = [part.strip() for part in line.split("|")]
+    shown = NUMBER.findall(paragraph)
+    for value in _values(root / file, filters, column, []):
+        if isinstance(value, str):
+            found = value in paragraph
+        else:
+            found = any(_is_rounded(number, value) for number in shown)
+        if not found:
+            yield f"{paragraph[:40]!r}... does not mention {value} of {file} ({column})"
+
+
+def _is_rounded(shown: str, value: float) -> bool:
+    number = shown.replace(",", "")
+    decimals = len(number.partition(".")[2])
+    return abs(float(number) - value) <= 0.5 * 10.0**-decimals * (1 + 1e-6)
+
+
+def _values(path: Path, filters: str, column: str, row: list[str]) -> list[float | str]:
+    """The values that a cell must show: numbers, or texts where the CSV file has texts. ``row``
+    holds the head of its column, then all cells of its row."""
+    with path.open(newline="", encoding="utf-8") as file:
+        table = list(csv.DictReader(file))
+    found: list[float | str] = []
+    own = ""
+    for field in reversed(column.split(";")):
+        name, _, more = field.strip().removesuffix(")").partition(" (")
+        own = more or own
+        wanted = _wanted(f"{filters}, {own}", row)
+        rows = [one for one in table if wanted.items() <= one.items()]
+        over, _, summed = name.partition(" ")
+        if over in OVER_ROWS and rows:
+            found.append(OVER_ROWS[over]([float(one[summed]) for one in rows]))
+        elif len(rows) != 1:
+            raise LookupError(f"{len(rows)} rows of {path.name} have {wanted}")
+        elif value := rows[0][name]:
+            found.append(float(value) if NUMBER.fullmatch(value) else value)
+    return found[::-1]
+
+
+def _wanted(filters: str, row: list[str]) -> dict[str, str]:
+    """Values by column, in which ``$1`` is replaced by the text of ``row[1]``."""
+
+    def text(found: re.Match[str]) -> str:
+        cell = row[int(found[1])]
+        code = re.search("`(.*?)`", cell)
+        return code[1] if code else cell.strip("*")
+
+    pairs = [one.split("=", 1) for one in re.split(r", (?=\w+=)", filters.strip(", "))]
+    return {key: re.sub(r"\$(\d)", text, value) for key, value in pairs}

@@ -1,0 +1,262 @@
+"""What ``vslam bench`` and ``vslam stress`` share: the systems and data of their cells."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Collection, Generator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vslam.cli.console import Console
+from vslam.cli.options import kind_of_source, names_in, open_given, read_thresholds
+from vslam.errors import InputError, did_you_mean
+
+if TYPE_CHECKING:
+    from vslam.datasets.frames import Source
+    from vslam.datasets.sources import SourceOptions
+    from vslam.lab.bench.execute import CellOutcome, RunOptions
+    from vslam.lab.bench.grid import Cell
+
+_ORBSLAM3 = "orbslam3"
+
+
+@dataclass(frozen=True)
+class Systems:
+    """The systems to test.
+
+    Attributes:
+        detectors: loop detectors of vslam.
+        weights: weight files of some of them.
+        others: command templates of other systems by name (:mod:`vslam.lab.stress.external`).
+    """
+
+    detectors: list[str]
+    weights: dict[str, Path]
+    others: dict[str, str]
+
+    @property
+    def names(self) -> list[str]:
+        """The detectors, then the other systems."""
+        return [*self.detectors, *self.others]
+
+
+def choose_systems(
+    detectors: str,
+    weights: Collection[str],
+    systems: str,
+    given: Collection[str],
+    python: Path | None,
+    vocabulary: Path | None,
+) -> Systems:
+    """The systems that the options name.
+
+    Raises:
+        InputError: there is none, one is unknown, or something that it needs is missing.
+    """
+    from vslam.loopclosure.registry import parse_weights, require_detector
+
+    wanted = names_in(systems)
+    others = _others(wanted, given, python, vocabulary)
+    chosen = names_in(detectors) if "vslam" in wanted else []
+    files = parse_weights(weights, chosen)
+    for name in chosen or [""] * ("vslam" in wanted):
+        require_detector(name, files.get(name), option="--detectors")
+    if clash := [name for name in chosen if name in others]:
+        raise InputError(f"--system {clash[0]}: a detector of this test has that name; rename it.")
+    if not chosen and not others:
+        raise InputError("--systems: names no system; name vslam, orbslam3 or one of --system.")
+    return Systems(chosen, files, others)
+
+
+def _others(
+    wanted: list[str], given: Collection[str], python: Path | None, vocabulary: Path | None
+) -> dict[str, str]:
+    """Command templates of the other systems."""
+    from vslam.lab.stress import orbslam3
+    from vslam.lab.stress.external import check_template
+
+    templates: dict[str, str] = {}
+    for text in given:
+        name, separator, command = text.partition("=")
+        if not (name and separator):
+            raise InputError(f"--system {text}: write NAME=COMMAND.")
+        check_template(name, command)
+        templates[name] = command
+    if _ORBSLAM3 in wanted and _ORBSLAM3 not in templates:
+        if vocabulary is None or not vocabulary.is_file():
+            raise InputError(
+                "--systems orbslam3: name its vocabulary, DBoW2's text format, with --vocabulary."
+            )
+        interpreter = python or Path(sys.executable)
+        if not interpreter.exists():
+            raise InputError(f"--orbslam3-python {interpreter}: no such file; name an interpreter.")
+        words = [interpreter.absolute(), Path(orbslam3.__file__), vocabulary.absolute()]
+        templates[_ORBSLAM3] = f"{shlex.join(map(str, words))} {{folder}} {{out}}"
+    for name in wanted:
+        if name != "vslam" and name not in templates:
+            raise InputError(
+                f"--systems {name}: unknown{did_you_mean(name, ('vslam', _ORBSLAM3, *templates))}; "
+                f"name vslam, orbslam3, or give --system {name}=COMMAND."
+            )
+    return {name: templates[name] for name in [*wanted, *templates] if name in templates}
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The sequences and settings of the cells of one command, which are run in the folder ``out``.
+
+    Attributes:
+        kind: kind of data.
+        given: options of the data, with absolute paths, because each run has its own folder.
+        sequences: the opened sequences by name.
+        options: settings that all cells share.
+        jobs: runs at a time on this machine.
+        scheduler: address of the Dask scheduler whose workers do the runs instead.
+    """
+
+    kind: str
+    given: SourceOptions
+    systems: Systems
+    sequences: dict[str, Source]
+    options: RunOptions
+    jobs: int
+    scheduler: str | None
+    out: Path
+    told: Console
+
+    def grid(self, perturbations: Collection[str], seeds: int) -> list[Cell]:
+        """The cells of all sequences and systems; see :func:`vslam.lab.bench.grid.make_grid`."""
+        from vslam.lab.bench.grid import make_grid, thresholds_digest
+
+        return make_grid(
+            self.kind, self.sequences, perturbations, self.systems.names, seeds,
+            self.given.max_frames, self.systems.weights, sensor=self.given.sensor,
+            calib=tuple(map(str, self.given.calib)),
+            thresholds=thresholds_digest(self.options.config), repeated=self.systems.others,
+        )  # fmt: skip
+
+    def prepare(self) -> None:
+        """Create the folder; see :func:`vslam.lab.bench.execute.prepare`."""
+        from vslam.lab.bench.execute import prepare
+
+        prepare(self.out, _identity(self.kind, self.given))
+
+    def run(self, cells: Collection[Cell]) -> Generator[CellOutcome, None, None]:
+        """Run some of the cells on this machine or on a cluster, and yield their outcomes."""
+        if self.scheduler is not None:
+            from vslam.lab.bench.cluster import run_on_cluster
+
+            return run_on_cluster(cells, self.options, self.scheduler, self.out)
+        from vslam.lab.bench.execute import run_here
+        from vslam.machine import available_cores
+        from vslam.run.warmup import compile_kernels, is_cold
+
+        if cells and is_cold():  # once, not in each run
+            self.told.announce("first run: compiling the kernels, about a minute ...")
+            compile_kernels(processes=min(available_cores(), 2))
+        return run_here(cells, self.options, self.jobs, self.out)
+
+
+def open_cells(
+    given: SourceOptions,
+    seqs: str | None,
+    systems: Systems,
+    config: str | None,
+    threads: int | None,
+    jobs: int,
+    scheduler: str | None,
+    out: Path,
+    *,
+    shown: bool,
+) -> Cells:
+    """Open all sequences.
+
+    Args:
+        seqs: list of sequences; None for the only one that the data has.
+
+    Raises:
+        InputError: data is missing or cannot be used.
+    """
+    from vslam.lab.bench.execute import RunOptions, scratch_folder
+    from vslam.machine import available_cores
+
+    if given.sensor == "mono" and systems.others:
+        raise InputError("--sensor mono: only vslam supports it; other systems need both cameras.")
+    out, told = out.absolute(), Console(shown=shown)
+    kind = kind_of_source(given)
+    given = _absolute(given)
+    opened = _open_all(kind, given, seqs, told)
+    if systems.others and not all(source.seekable for source in opened.values()):
+        raise InputError(
+            f"--systems {next(iter(systems.others))}: other systems read KITTI's format, which "
+            "vslam can write only from data sets and folders of images; extract the images, or "
+            "test vslam alone."
+        )
+    program = (sys.executable, "-m", "vslam.cli.child", "foreign")
+    options = RunOptions(
+        data=Path(given.data) if kind != "synthetic" else None,
+        config=read_thresholds(config).model_dump_json(indent=2) + "\n",  # as a run writes it
+        threads=threads or max(1, min(available_cores() // jobs, 4)),
+        scratch=None if scheduler else scratch_folder(out),
+        others={name: (*program, name, command) for name, command in systems.others.items()},
+        source=tuple(_words_of(given)),
+    )
+    return Cells(kind, given, systems, opened, options, jobs, scheduler, out, told)
+
+
+def _absolute(given: SourceOptions) -> SourceOptions:
+    paths = {
+        name: path.absolute()
+        for name in ("right", "depth")
+        if (path := getattr(given, name)) is not None
+    }
+    data = given.data
+    if data and Path(data).exists():
+        data = str(Path(data).absolute())
+    calib = tuple(path.absolute() for path in given.calib)
+    return given.model_copy(update={**paths, "data": data, "calib": calib})
+
+
+def _words_of(given: SourceOptions) -> list[str]:
+    """Options of ``vslam run`` that all cells share; the others are in the cells."""
+    words = ["--side-by-side"] if given.side_by_side else []
+    values = {
+        "--right": given.right,
+        "--depth": given.depth,
+        "--fps": given.fps,
+        "--topics": given.topics or None,
+        "--depth-scale": given.depth_scale,
+    }
+    return words + [str(x) for pair in values.items() if pair[1] is not None for x in pair]
+
+
+def _identity(kind: str, given: SourceOptions) -> str:
+    """A text that identifies the data of a benchmark."""
+    if kind != "synthetic":
+        return " ".join([given.data, *_words_of(given), *map(str, given.calib)])
+    from vslam.datasets.synthetic import Variation, store
+
+    return f"rendered towns {store.folder_name(Variation())}"
+
+
+def _open_all(
+    kind: str, given: SourceOptions, seqs: str | None, told: Console
+) -> dict[str, Source]:
+    """Open every sequence by name, so that missing data is reported before the first run.
+
+    Synthetic sequences are rendered here, because two runs cannot render one at the same time.
+    """
+    from vslam.lab.bench.grid import parse_sequences
+
+    once = f"--data {given.data}: a live camera gives each image once; record a video or a bag."
+    if kind == "camera":
+        raise InputError(once)
+    opened = {}
+    for name in [None] if seqs is None else parse_sequences(seqs):
+        source = open_given(given.model_copy(update={"dataset": kind, "seq": name}), told)
+        if source.live:
+            raise InputError(once)
+        opened[name or source.name] = source
+    return opened

@@ -1,0 +1,136 @@
+"""Rendered sequences in other layouts: RGB-D images in TUM's (`vslam.datasets.tum`), or a video."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from vslam.camera import Camera
+from vslam.datasets.frames import Source
+from vslam.datasets.synthetic.files import frame_files, write, writing
+from vslam.datasets.synthetic.routes import Route
+from vslam.datasets.synthetic.site import Variation
+from vslam.datasets.synthetic.store import DEPTH_SCALE, OnFrame, render_sequence
+from vslam.datasets.tum import CALIBRATION
+from vslam.errors import InputError
+from vslam.trajectory import Trajectory, write_tum
+
+
+def render_rgbd(
+    route: Route,
+    variation: Variation,
+    out: Path,
+    *,
+    until: int | None = None,
+    threads: int = 2,
+    on_frame: OnFrame | None = None,
+) -> Path:
+    """Render a route as an RGB-D camera sees it, or its missing frames, into a folder in TUM's
+    layout, and return the folder.
+
+    ``out/stereo`` has the same drive as a KITTI tree. The left image serves as colour image. Depth
+    has no maximum range; it is in centimetres, 0 in the sky. The virtual baseline in
+    ``calibration.yaml`` is the baseline of the rendered pair, so that far points are as uncertain
+    as with stereo.
+
+    Args:
+        route, variation, threads, on_frame: as for `render_sequence`.
+        out: output folder.
+        until: write only the frames before this one.
+
+    Raises:
+        InputError: as `render_sequence`, or the folder cannot be written.
+    """
+    root = render_sequence(
+        route,
+        variation,
+        out / "stereo",
+        depth=True,
+        until=until,
+        threads=threads,
+        on_frame=on_frame,
+    )
+    n = min(until or len(route.T_wc), len(route.T_wc))
+    source = root / "sequences" / route.name
+    with writing(out):
+        names: dict[str, list[str]] = {"rgb": [], "depth": []}
+        for kind in names:
+            (out / kind).mkdir(parents=True, exist_ok=True)
+        for k, time in enumerate(route.timestamps[:n].tolist()):
+            left, _, depth = frame_files(source, k, True)
+            for kind, path in (("rgb", left), ("depth", depth)):
+                name = f"{kind}/{time:.6f}.png"
+                shutil.copyfile(path, out / name)
+                names[kind].append(f"{time:.6f} {name}\n")
+        for kind, lines in names.items():
+            write(out / f"{kind}.txt", "".join(["# timestamp filename\n", *lines]).encode())
+        truth = Trajectory(route.timestamps[:n], route.ground_truth[:n])
+        write_tum(out / "groundtruth.txt", truth)
+        write(out / CALIBRATION, _depth_calibration(route.camera).encode())
+    return out
+
+
+def _depth_calibration(camera: Camera) -> str:
+    left = {
+        "lens": "pinhole",
+        "size": [camera.width, camera.height],
+        "focal": [camera.fx, camera.fy],
+        "centre": [camera.cx, camera.cy],
+    }
+    return yaml.safe_dump(
+        {"left": left, "depth_scale": DEPTH_SCALE, "virtual_baseline": camera.baseline}
+    )
+
+
+def write_side_by_side(sequence: Source, path: Path) -> Path:
+    """Write a stereo sequence as one video, left and right images side by side, losslessly (codec
+    FFV1), and vslam's calibration file beside it.
+
+    Args:
+        sequence: a stereo sequence; the video gets its mean frame rate.
+        path: path of the video, for example with the suffix ``.mkv``.
+
+    Returns:
+        The calibration file, which has the same name with ``.yaml``.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    import cv2
+
+    camera, times = sequence.camera, sequence.timestamps
+    seconds = float(times[-1] - times[0])
+    fps = (len(times) - 1) / seconds if seconds > 0 else 10.0
+    calibration = path.with_suffix(".yaml")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        calibration.write_text(_pair_calibration(camera))
+    except OSError as error:
+        raise InputError(
+            f"{calibration}: cannot be written ({error.strerror}); name another file."
+        ) from error
+    size = (2 * camera.width, camera.height)
+    fourcc = cv2.VideoWriter.fourcc(*"FFV1")
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, fps, size, isColor=False)
+    if not writer.isOpened():
+        raise InputError(f"{path}: cannot be written as a video; name a file like town.mkv.")
+    try:
+        for index in range(len(sequence)):
+            left, right = sequence.read(index)
+            if right is None:
+                raise InputError(f"{path}: a side-by-side video needs a stereo sequence.")
+            writer.write(np.hstack([left, right]))
+    finally:
+        writer.release()
+    return calibration
+
+
+def _pair_calibration(camera: Camera) -> str:
+    side = (
+        f"{{size: [{camera.width}, {camera.height}], focal: [{camera.fx!r}, {camera.fy!r}], "
+        f"centre: [{camera.cx!r}, {camera.cy!r}]}}"
+    )
+    return f"left: {side}\nright: {side}\nbaseline: {camera.baseline!r}\n"

@@ -1,0 +1,125 @@
+"""The trajectory of a finished run on the Earth, from its map and GPS fixes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.backend.gps import Anchored, Positions, anchor
+from vslam.backend.pose_graph import essential_graph
+from vslam.config import PoseGraphConfig
+from vslam.datasets.fixes import Fixes, to_enu, to_geodetic
+from vslam.errors import InputError
+from vslam.frame_poses import FrameTable
+from vslam.geometry import inverses
+from vslam.maps.stored_map import StoredMap
+from vslam.trajectory import Trajectory, bridge_gaps
+
+_LONGEST_S = 0.5  # between two frames, between which a position is interpolated
+
+
+@dataclass(frozen=True)
+class GpsTrack:
+    """A drive in the local east-north-up frame (ENU) of a datum.
+
+    Attributes:
+        trajectory: poses of the frames, camera to ENU, in metres.
+        geodetic: ``(N, 3)`` their latitude and longitude (degrees) and altitude (m).
+        datum: ``(3,)`` latitude, longitude and altitude of the origin: those of the first fix.
+        visual: ``(N, 3)`` positions in ENU without GPS, after the alignment alone.
+        fixes: ``(M, 3)`` the fixes of tracked frames, in ENU.
+        anchored: the keyframes in ENU, and which of the fixes were used.
+    """
+
+    trajectory: Trajectory
+    geodetic: NDArray[np.float64]
+    datum: NDArray[np.float64]
+    visual: NDArray[np.float64]
+    fixes: NDArray[np.float64]
+    anchored: Anchored
+
+
+def locate(stored: StoredMap, fixes: Fixes, config: PoseGraphConfig) -> GpsTrack:
+    """Put a finished drive on the Earth. The map is not changed.
+
+    Args:
+        stored: the map with the poses of its last drive's frames.
+
+    Raises:
+        InputError: fewer than three fixes belong to tracked frames, or the drive is too short.
+    """
+    stored = stored.compact(copy=False)
+    map_, table = stored.map, stored.frames
+    if table is None or not map_.n_keyframes:
+        raise InputError("the run has no map.")
+    growth = map_.keyframes.unit_scale[table.reference] / table.unit_scale
+    T_c_reference = table.T_c_reference.copy()
+    T_c_reference[:, :3, 3] *= growth[:, None]
+    table = table._replace(T_c_reference=T_c_reference)
+    graph = essential_graph(
+        map_, stored.loops, config, weak=map_.restarts, unpredicted=map_.unpredicted_restarts,
+        driven=True,
+    )  # fmt: skip
+    positions, datum = _positions(table, map_.arrays.T_cw[: map_.n_keyframes], fixes)
+    metric = not stored.camera.monocular
+    found = anchor(graph, map_.timestamps[: map_.n_keyframes], positions, config, metric=metric)
+    trajectory = _in_map(table, inverses(found.T_enu_k), found.scale)
+    S, visual = found.S_enu_w, _in_map(table, graph.T_cw).T_wc[:, :3, 3]
+    return GpsTrack(
+        trajectory=trajectory,
+        geodetic=to_geodetic(trajectory.T_wc[:, :3, 3], datum),
+        datum=datum,
+        visual=visual @ S[:3, :3].T + S[:3, 3],
+        fixes=positions.enu,
+        anchored=found,
+    )
+
+
+def _in_map(
+    table: FrameTable, T_kw: NDArray[np.float64], scale: NDArray[np.float64] | None = None
+) -> Trajectory:
+    """The poses of all frames, from those of their keyframes; interpolated where the camera was
+    lost.
+
+    Args:
+        scale: ``(K,)`` by which lengths around each keyframe are multiplied.
+    """
+    T_ck = table.T_c_reference.copy()
+    if scale is not None:
+        T_ck[:, :3, 3] *= scale[table.reference, None]
+    T_wc = inverses(T_ck @ T_kw[table.reference])
+    if table.tracked.any():
+        first = int(np.argmax(table.tracked))
+        T_wc[:first] = T_wc[first]
+    return bridge_gaps(Trajectory(table.timestamp, T_wc), table.tracked)
+
+
+def _positions(
+    table: FrameTable, T_kw: NDArray[np.float64], fixes: Fixes
+) -> tuple[Positions, NDArray[np.float64]]:
+    """The fixes between tracked frames, each relative to the keyframe of the frame before it, and
+    the datum."""
+    at = np.searchsorted(table.timestamp, fixes.times, "right") - 1
+    at[fixes.times == table.timestamp[-1]] -= 1
+    inside = (at >= 0) & (at + 1 < len(table.timestamp))
+    before = at.clip(0, max(len(table.timestamp) - 2, 0))
+    after = np.minimum(before + 1, len(table.timestamp) - 1)
+    elapsed = table.timestamp[after] - table.timestamp[before]
+    inside &= table.tracked[before] & table.tracked[after] & (elapsed <= _LONGEST_S)
+    if inside.sum() < 3:
+        raise InputError(
+            f"only {inside.sum()} of the {len(fixes)} GPS fixes are of the time of tracked frames; "
+            "at least three are needed."
+        )
+    before, after, elapsed = before[inside], after[inside], elapsed[inside]
+    share = ((fixes.times[inside] - table.timestamp[before]) / elapsed)[:, None]
+    centres = _in_map(table, T_kw).T_wc[:, :3, 3]
+    world = (1.0 - share) * centres[before] + share * centres[after]
+    keyframe = table.reference[before]
+    T = T_kw[keyframe]
+    arm = np.einsum("mij,mj->mi", T[:, :3, :3], world) + T[:, :3, 3]
+    geodetic = fixes.geodetic[inside]
+    enu = to_enu(geodetic, geodetic[0])
+    return Positions(fixes.times[inside], keyframe, arm, enu, fixes.sigma[inside]), geodetic[0]

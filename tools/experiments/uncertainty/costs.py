@@ -21,13 +21,13 @@ import cv2
 import numpy as np
 
 from vslam.cli.export import ros
-from vslam.config import Config
 from vslam.datasets.perturbation import parse_perturbation
-from vslam.datasets.sources import SourceOptions, open_source
-from vslam.frontend import patch_tracking, tracking
+from vslam.datasets.sources import open_source
+from vslam.frontend import tracking
 from vslam.odometry import Odometry
 from vslam.report.folder import write_results
-from vslam.run.outcome import RunOutcome, RunSettings
+from vslam.run.options import RunOptions
+from vslam.run.outcome import RunOutcome
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
 
@@ -41,8 +41,7 @@ def main() -> None:
     options = parser.parse_args()
     n, camera = options.repeats, run(options, None).sequence.camera  # compiles the kernels
     spent: dict[str, list[float]] = defaultdict(list)
-    for owner, name in ((patch_tracking, "pose_covariance"), (tracking, "pose_covariance"),
-                        (Odometry, "move")):  # fmt: skip
+    for owner, name in ((tracking, "pose_covariance"), (Odometry, "move")):
         setattr(owner, name, timed(getattr(owner, name), spent[name]))
     outcomes: dict[str, list[RunOutcome]] = defaultdict(list)
     with TemporaryDirectory() as folder:
@@ -69,13 +68,11 @@ def main() -> None:
 
 def run(options: argparse.Namespace, mask: Path | None) -> RunOutcome:
     """A run of the drive by one thread without loop detection."""
-    given = SourceOptions(
-        data=options.data, dataset="kitti", seq=options.seq, max_frames=options.frames, mask=mask
-    )
-    settings = RunSettings(
-        "kitti", options.seq, "none", "none", "stereo", 0, 1, 0, 1, options.frames, Config()
-    )
-    return run_sequence(open_source(given), parse_perturbation("none", 0), settings, Recorder())
+    given = RunOptions(
+        data=options.data, dataset="kitti", seq=options.seq, max_frames=options.frames, mask=mask,
+        detector="none",
+    )  # fmt: skip
+    return run_sequence(open_source(given), parse_perturbation("none", 0), given, Recorder())
 
 
 def timed(function: Callable[..., Any], times: list[float]) -> Callable[..., Any]:

@@ -131,6 +131,38 @@ def test_exposure_without_lag_is_the_identity():
         np.testing.assert_array_equal(law.apply(k, 0.01 * k, ramp, None)[0], ramp)
 
 
+def test_dark_lowers_gain_and_gamma_in_turn():
+    ramp = np.arange(256, dtype=np.uint8)[None]
+    levels = np.array([seen(f"dark:{level}", (ramp, None))[0][0] for level in range(13)], float)
+    np.testing.assert_array_equal(levels[0], ramp[0])
+    np.testing.assert_array_equal(levels[3], np.rint(255 * 0.7 * (ramp[0] / 255) ** (1 / 0.9)))
+    white = levels[:, 255]  # gamma leaves it as it is
+    assert (np.diff(white)[::2] < -30).all()
+    assert (np.diff(white)[1::2] == 0).all()
+    assert (np.diff(levels[:, 128]) < 0).all()
+    between = seen("dark:2.5", (ramp, None))[0][0]
+    assert levels[3, 255] < between[255] < levels[2, 255]
+
+
+@pytest.mark.parametrize("ms", [10, 3])
+def test_a_blackout_lasts_its_time_whatever_the_frame_rate(ms):
+    law = parse_perturbation("blackout:5", 1)
+    white = np.full((2, 2), 255, np.uint8)
+    times = np.arange(0.0, 41.0, 1e-3 * ms)
+    grey = np.array([law.apply(k, t, white, None)[0][0, 0] for k, t in enumerate(times)], int)
+    assert (grey[times < 1.0] == 255).all()
+    for k in range(8):
+        within = (times >= 1.0 + 5.0 * k) & (times < 6.0 + 5.0 * k)
+        begin = np.flatnonzero(within & (grey == 0))[0]
+        black, dim = ((0.16, 0.64), (0.32, 0.40))[k % 2]
+        assert 1e-3 * ms * (within & (grey == 0)).sum() == pytest.approx(black, abs=2e-3 * ms)
+        assert 1e-3 * ms * (within & (grey < 255)).sum() == pytest.approx(
+            black + dim, abs=2e-3 * ms
+        )
+        middle = np.searchsorted(times, times[begin] + black + dim / 2)
+        assert grey[middle] == pytest.approx(128, abs=8)
+
+
 def test_motion_blur_is_as_long_as_the_turn_while_the_shutter_is_open():
     """0.4 rad/s, 400 pixels, 50 ms: 8 pixels."""
     point = np.zeros((160, 320), np.uint8)

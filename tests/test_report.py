@@ -598,6 +598,7 @@ def test_frames_lost_before_the_map_began_are_explained(tmp_path: Path) -> None:
     outcome = replace(outcome, tracks=tracks)
     report = report_of(outcome, tmp_path)
     assert (report.lost_frames, report.lost_before_map) == (3, 2)
+    assert report.longest_loss_s == tracks[3].timestamp - tracks[0].timestamp
     assert headlines(report)[0].note.startswith(
         "7.5 % of 40, 2 of them before the map began: a monocular map needs the camera to move "
         "sideways first; "

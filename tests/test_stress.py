@@ -18,7 +18,7 @@ from vslam.datasets.perturbation import LAWS, parse_perturbation, sheet_of_laws
 from vslam.errors import InputError
 from vslam.lab.bench.execute import Failed, Finished
 from vslam.lab.bench.grid import Cell, make_grid
-from vslam.lab.stress.criterion import Criterion
+from vslam.lab.stress.criterion import Criterion, absolute_verdict
 from vslam.lab.stress.external import check_template, export_kitti, run_external
 from vslam.lab.stress.figures import draw_curves
 from vslam.lab.stress.kitti_c import CORRUPTIONS
@@ -122,6 +122,21 @@ def test_criterion(figures, verdict):
     clean = report_of(Cell("kitti", "00", "none", "bow", 0))
     found = report_of(Cell("kitti", "00", "fog:20", "bow", 0), **figures)
     assert Criterion().verdict(found, clean) == verdict
+
+
+@pytest.mark.parametrize(
+    ("figures", "verdict"),
+    [
+        ({"longest_loss_s": 10.0, "ate_rmse_m": 1.0}, ""),
+        ({"longest_loss_s": 10.6, "ate_rmse_m": 20.0}, "lost for 11 s"),
+        ({"longest_loss_s": None, "ate_rmse_m": None}, ""),
+        ({"ate_rmse_m": 1.1}, "ATE above 1 m"),
+        ({"ate_rmse_m": 10.1}, "ATE above 10 m"),
+    ],
+)
+def test_absolute_verdict(figures, verdict):
+    found = report_of(Cell("kitti", "00", "fog:20", "bow", 0), **figures)
+    assert absolute_verdict(found) == verdict
 
 
 def test_three_times_nothing_is_nothing():
@@ -231,6 +246,7 @@ def test_the_report_says_it_in_every_form(tmp_path):
         assert "night" in text
         assert "50 % lost" in text
         assert Criterion().words in text
+        assert "above 10 m" in text
     assert html.count("<svg") == 2
     assert 'src="http' not in html
     assert [figure.name for figure in draw_curves(report)] == ["00-blur", "00-night"]

@@ -196,6 +196,7 @@ class ReportJson(Measures, Document):
     that was resumed, since the maps of the others are not saved.
     ``lost_before_map`` counts those of the lost frames that came before the first tracked one, in a
     run that began a new map.
+    ``longest_loss_s`` is the longest time from a lost frame to the next tracked one, or to the end.
     ``frames`` counts the frames that were processed; of them ``skipped_frames`` had an unreadable
     image and ``dropped_frames`` were overtaken by a newer one in a real-time run, whose
     ``latency_ms`` is from the time of an image to its pose (None in any other run).
@@ -206,6 +207,7 @@ class ReportJson(Measures, Document):
     schema_version: int = 5
 
     lost_before_map: int = 0
+    longest_loss_s: float | None = None
     weak_frames: int
     skipped_frames: int
     skipped_messages: list[str]

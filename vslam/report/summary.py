@@ -60,6 +60,7 @@ def summarize(
     loops = _loops(outcome, verdict)
     return ReportJson(
         lost_before_map=_lost_before_map(outcome),
+        longest_loss_s=_longest_loss_s(outcome.tracks),
         weak_frames=states[TrackingState.WEAK],
         skipped_frames=len(outcome.skipped),
         skipped_messages=outcome.skipped,
@@ -106,6 +107,18 @@ def _lost_before_map(outcome: RunOutcome) -> int:
     untracked = (TrackingState.LOST, TrackingState.DROPPED)
     before = takewhile(lambda track: track.state in untracked, outcome.tracks)
     return sum(track.state == TrackingState.LOST for track in before)
+
+
+def _longest_loss_s(tracks: list[TrackResult]) -> float:
+    longest, since = 0.0, None
+    for track in tracks:
+        if track.state == TrackingState.LOST and since is None:
+            since = track.timestamp
+        if since is not None:
+            longest = max(longest, track.timestamp - since)
+        if track.state not in (TrackingState.LOST, TrackingState.DROPPED):
+            since = None
+    return longest
 
 
 def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:

@@ -21,6 +21,12 @@ fog           meteorological visibility, m, the distance at which contrast falls
 rain          mm/h: streaks of drops that fall during the exposure, and drops on the glass.
 night         stops of lost light; photon and read noise are computed in electrons.
 exposure      s: time constant with which auto-exposure follows a light that changes by 3 stops.
+dark          255 A (v / 255)^(1 / gamma), as in Dark EuRoC (Xu et al., AirSLAM, T-RO 2025, eq. 22):
+              each level lowers either A, by 0.15, or gamma, by 0.1, in turn. The rule is the
+              paper's; the values are our own, and are interpolated between levels.
+blackout      s: in every period of this length, the light goes out once. It is out for 0.16 s and
+              then rises steadily for 0.64 s; next time, it is out for 0.32 s and rises for 0.4 s.
+              The paper names these times for two recordings of UMA-VI; the rest is our own.
 motion        ms: exposure time while the camera turns, at its true rate if poses are known, else at
               the rate of the optical flow.
 flare         grey levels of veiling glare at 10 degrees from a sun, by 1 / angle^2

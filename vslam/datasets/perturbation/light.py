@@ -27,6 +27,11 @@ FULL_WELL = 10_000.0  # electrons at grey value 255, of a pixel of 3.75 um (Sony
 READ_NOISE = 10.0  # electrons, of the same kind of sensor
 _TUNNEL_STOPS = 3.0
 _TUNNELS_PER_S = 1.0 / 5.0
+# Gain and gamma at the levels of ``dark``, lowered in turn.
+DARK_GAIN = tuple(1.0 - 0.15 * ((level + 1) // 2) for level in range(13))
+DARK_GAMMA = tuple(1.0 - 0.1 * (level // 2) for level in range(13))
+_BLACKOUTS = ((0.16, 0.64), (0.32, 0.40))  # seconds without light, then until it is back
+_LIT_S = 1.0  # no blackout begins earlier
 
 
 def ou_walk(
@@ -157,6 +162,26 @@ def _night(stops: float, stream: RandomStream) -> Law:
     return law
 
 
+def _dark(level: float, stream: RandomStream) -> Law:
+    gain, gamma = (np.interp(level, range(13), ladder) for ladder in (DARK_GAIN, DARK_GAMMA))
+    darkened = 255.0 * gain * (_GREYS / 255.0) ** (1.0 / gamma)
+    return _pointwise(lambda frame, t: darkened)
+
+
+def _blackout(period: float, stream: RandomStream) -> Law:
+    """One blackout somewhere in every period; the two kinds take turns."""
+
+    def curve(frame: int, t: float) -> NDArray[np.float64]:
+        if t < _LIT_S:
+            return _GREYS
+        k, since = divmod(t - _LIT_S, period)
+        black, dim = _BLACKOUTS[int(k) % len(_BLACKOUTS)]
+        since -= np.random.default_rng([*stream, int(k)]).uniform(0.0, period - black - dim)
+        return _GREYS if since < 0.0 else _GREYS * min(max(0.0, since - black) / dim, 1.0)
+
+    return _pointwise(curve)
+
+
 def _bias(greys: float, stream: RandomStream) -> Law:
     return _pointwise(lambda frame, t: _GREYS + greys)
 
@@ -187,6 +212,14 @@ KINDS = {
     ),
     "night": LawKind(
         _night, "stops", 4.0, 0.0, 10.0, "less light, shot and read noise", most=16.0
+    ),
+    "dark": LawKind(
+        _dark, "level", 6.0, 0.0, 12.0, "maximum brightness and gamma lowered in turn", most=12.0,
+        drawn=False,
+    ),
+    "blackout": LawKind(
+        _blackout, "s", 5.0, 60.0, 1.0, "period in which the light goes out once",
+        least=1.0, most=3600.0, logarithmic=True,
     ),
     "bias": LawKind(
         _bias, "grey levels", 50.0, 0.0, 255.0, "grey levels added to every pixel",

@@ -66,7 +66,7 @@ LAWS: dict[str, LawKind] = {
     **{name: sensor.KINDS[name] for name in ("noise",)},
     **{name: glass.KINDS[name] for name in ("blur", "occlusion")},
     **weather.KINDS,
-    **{name: light.KINDS[name] for name in ("night", "exposure")},
+    **{name: light.KINDS[name] for name in ("night", "exposure", "dark", "blackout")},
     **motion.KINDS,
     **{name: glass.KINDS[name] for name in ("flare", "vignetting", "dirt")},
     **{name: sensor.KINDS[name] for name in ("jpeg", "resolution", "drop", "outage")},

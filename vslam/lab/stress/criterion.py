@@ -6,6 +6,23 @@ from dataclasses import dataclass
 
 from vslam.report.schema import ReportJson
 
+_LOSS_S = 10.0
+_ERRORS_M = (10.0, 1.0)
+ABSOLUTE = (
+    "Absolute: whether the run also fails by the rules of AirSLAM (Xu et al., T-RO 2025): lost "
+    f"for more than {_LOSS_S:g} s, or an ATE above {_ERRORS_M[0]:g} m (on OIVIO and UMA-VI) or "
+    f"{_ERRORS_M[1]:g} m (on Dark EuRoC)."
+)
+
+
+def absolute_verdict(report: ReportJson) -> str:
+    """Why a run failed by limits that do not depend on its clean run (``ABSOLUTE``); empty if it
+    did not fail."""
+    if report.longest_loss_s is not None and report.longest_loss_s > _LOSS_S:
+        return f"lost for {report.longest_loss_s:.0f} s"
+    above = [limit for limit in _ERRORS_M if (report.ate_rmse_m or 0.0) > limit]
+    return f"ATE above {above[0]:g} m" if above else ""
+
 
 @dataclass(frozen=True)
 class Criterion:

@@ -12,6 +12,7 @@ import numpy as np
 from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import law_kind, sheet_of_laws
 from vslam.errors import InputError, counted
+from vslam.lab.stress.criterion import ABSOLUTE
 from vslam.lab.stress.figures import draw_curves
 from vslam.lab.stress.schema import BoundaryEntry, StressJson
 from vslam.lab.stress.summary import mean_error
@@ -206,15 +207,16 @@ def _runs(report: StressJson) -> Table:
             number(test.ate_rmse_m, "{:.3f}"),
             number(test.causal_ate_rmse_m, "{:.3f}"),
             test.verdict or "held",
+            test.absolute,
         )
         for entry in report.boundaries
         for test in entry.tested
     ]
     head = (
         "sequence", "law", "system", "seed", "strength", "lost (%)", "ATE (m)", "causal (m)",
-        "verdict",
+        "verdict", "absolute",
     )  # fmt: skip
-    return Table(head, rows, (*head[:3], "verdict"))
+    return Table(head, rows, (*head[:3], *head[-2:]), ABSOLUTE)
 
 
 def _sheet(report: StressJson, sequences: Mapping[str, Source]) -> list[Figure]:

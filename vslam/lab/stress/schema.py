@@ -6,10 +6,12 @@ from vslam.report.schema import Document, Record
 
 
 class Tested(Record):
-    """One run at one strength; ``verdict`` is why it failed, empty if it did not."""
+    """One run at one strength; ``verdict`` is why it failed, and ``absolute`` why it failed by
+    limits that do not depend on the clean run; they are empty if it did not."""
 
     strength: float
     verdict: str
+    absolute: str = ""
     lost_percent: float | None = None
     ate_rmse_m: float | None = None
     causal_ate_rmse_m: float | None = None

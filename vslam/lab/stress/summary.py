@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 
 from vslam.datasets.perturbation import law_kind
 from vslam.lab.bench.grid import Cell
-from vslam.lab.stress.criterion import Criterion
+from vslam.lab.stress.criterion import Criterion, absolute_verdict
 from vslam.lab.stress.kitti_c import CORRUPTIONS, Corruption
 from vslam.lab.stress.plan import Plan, Reports, Search
 from vslam.lab.stress.schema import BoundaryEntry, CleanEntry, CorruptionEntry, StressJson, Tested
@@ -86,6 +86,7 @@ def _tested(strength: float, verdict: str, report: ReportJson | str | None) -> T
     return Tested(
         strength=strength,
         verdict=verdict,
+        absolute=absolute_verdict(report),
         lost_percent=lost_percent(report),
         ate_rmse_m=report.ate_rmse_m,
         causal_ate_rmse_m=report.causal_ate_rmse_m,

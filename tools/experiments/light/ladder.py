@@ -1,0 +1,50 @@
+"""Write where runs of ``vslam bench`` fail by AirSLAM's rules: a row for each system and law.
+
+vslam bench ... --perturb none,dark:1,dark:2 --out FOLDER
+python tools/experiments/light/ladder.py FOLDER TABLE.csv
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from pathlib import Path
+
+from vslam.errors import InputError
+from vslam.lab.stress.criterion import absolute_verdict
+from vslam.report.schema import ReportJson
+
+
+def rows_of(folder: Path) -> list[list[object]]:
+    """A row for each run, by sequence, system, law and strength."""
+    rows: list[list[object]] = []
+    for path in folder.glob("*/report.json"):
+        try:
+            report = ReportJson.read(path)
+        except InputError as error:
+            raise SystemExit(str(error)) from error
+        law, _, strength = report.perturb.partition(":")
+        rows.append(
+            [report.sequence, report.detector, law, float(strength or 0), report.frames,
+             report.lost_frames, report.longest_loss_s, report.ate_rmse_m,
+             absolute_verdict(report)]
+        )  # fmt: skip
+    return sorted(rows, key=lambda row: (row[2] != "none", row[:4]))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("table", type=Path)
+    options = parser.parse_args()
+    head = "sequence,system,law,strength,frames,lost,longest_loss_s,ate_m,fails"
+    with options.table.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(head.split(","))
+        for *named, loss, ate, fails in rows_of(options.folder):
+            rounded = ("" if x is None else round(x, 3) for x in (loss, ate))
+            writer.writerow([*named, *rounded, fails])
+
+
+if __name__ == "__main__":
+    main()

@@ -223,6 +223,13 @@ RULES = {
             ("vslam stress --seqs 00 --systems vslam,orbslam3", ORBSLAM),
         ),
     ),
+    "docs/research/light.md": Rules(
+        (
+            ("vslam,orbslam3 .* --perturb ", "vslam --perturb "),
+            (r"none,dark:2\S+", "none"),
+        ),
+        (("python tools/experiments/light/day_night.py synthetic", AGAIN),),
+    ),
     "docs/research/stress.md": Rules(
         (
             ("--laws all", "--laws night --seeds 1 --steps 1"),

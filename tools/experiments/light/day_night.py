@@ -157,10 +157,9 @@ def main() -> None:
     parser.add_argument("--candidates", nargs="+", type=int, default=(3, 5, 10))
     parser.add_argument("--every", type=int, default=8, help="localise every n-th image")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, required=True, help="table to which rows are added")
+    parser.add_argument("--out", type=Path, required=True, help="table to write")
     options = parser.parse_args()
-    if not options.out.exists():
-        options.out.write_text("sequence,law,detector,candidates,images,right,wrong,recall\n")
+    options.out.write_text("sequence,law,detector,candidates,images,right,wrong,recall\n")
     for drive in options.drives:
         name, _, n_map = drive.partition("=")
         source = open_sequence(options.dataset, options.data, name, max_frames=options.max_frames)

@@ -16,20 +16,23 @@ from vslam.report.schema import ReportJson
 
 
 def rows_of(folder: Path) -> list[list[object]]:
-    """A row for each run, by sequence, system, law and strength."""
+    """A row for each run, by sequence, system, strength of the law and seed."""
     rows: list[list[object]] = []
     for path in folder.glob("*/report.json"):
         try:
             report = ReportJson.read(path)
         except InputError as error:
             raise SystemExit(str(error)) from error
-        law, _, strength = report.perturb.partition(":")
-        rows.append(
-            [report.sequence, report.detector, law, float(strength or 0), report.frames,
-             report.lost_frames, report.longest_loss_s, report.ate_rmse_m,
-             absolute_verdict(report)]
-        )  # fmt: skip
-    return sorted(rows, key=lambda row: (row[2] != "none", row[:4]))
+        named = [report.sequence, report.detector, report.perturb, report.seed]
+        lost = [report.frames, report.lost_frames, report.longest_loss_s]
+        rows.append([*named, *lost, report.ate_rmse_m, absolute_verdict(report)])
+    return sorted(rows, key=_order)
+
+
+def _order(row: list[object]) -> tuple[object, ...]:
+    sequence, system, perturb, seed = row[:4]
+    law, _, strength = str(perturb).partition(":")
+    return sequence, system, law, float(strength or 0), seed
 
 
 def main() -> None:
@@ -37,7 +40,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("table", type=Path)
     options = parser.parse_args()
-    head = "sequence,system,law,strength,frames,lost,longest_loss_s,ate_m,fails"
+    head = "sequence,system,law,seed,frames,lost,longest_loss_s,ate_m,fails"
     with options.table.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(head.split(","))

@@ -257,6 +257,7 @@ def test_a_value_out_of_range_is_told_in_our_words(call, words, part):
     ("text", "part"),
     [
         ('{"orb": {"n_feature": 500}}', "orb.n_feature: unknown key (did you mean n_features?)"),
+        ('{"n_features": 500}', "n_features: unknown key (did you mean orb.n_features?)"),
         ('{"orb": {"n_features": -1}}', "orb.n_features: must be at least 100."),
         ('{"orb.n_features": -1}', "orb.n_features: must be at least 100."),
         ('{"orb": 5}', "orb must map names to values"),

@@ -242,8 +242,9 @@ def adopt(root: Path, method: int | None = None) -> list[str]:
     stamps, adopted = read_stamps(root), []
     entries = {file: entry for entry in read_entries(root) for file in entry.paths(root)}
     for file in entries:
-        known = stamps[file].digest if file in stamps else ""
-        if entries[file].tested or known == digest_of(root / file):
+        if entries[file].tested or not (root / file).exists():
+            continue
+        if file in stamps and stamps[file].digest == digest_of(root / file):
             continue
         # A commit that only moved the file did not write it.
         words = ("log", "-1", "--follow", "--diff-filter=AM", "--format=%h %as", "--", file)

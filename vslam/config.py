@@ -802,9 +802,17 @@ def _fault(model: type[BaseModel], error: ValidationError, what: str) -> str:
         return f'{name} must map names to values, as in {{"name": 1}}'
     why = plain_reason(first["msg"])
     if first["type"] in ("extra_forbidden", "invalid_key"):
-        meant = did_you_mean(place[-1], _keys(model, place[:-1]))
+        meant = _without_section(model, place) or did_you_mean(place[-1], _keys(model, place[:-1]))
         why = f"unknown key{meant}; correct or remove it"
     return f"{'.'.join(place)}: {why}"
+
+
+def _without_section(model: type[BaseModel], place: list[str]) -> str:
+    """A suggestion for a key that belongs into a section, and was given without one."""
+    of = [section for section in model.model_fields if place[-1] in _keys(model, [section])]
+    if len(place) > 1 or not of:
+        return ""
+    return f" (did you mean {' or '.join(f'{section}.{place[-1]}' for section in of)}?)"
 
 
 def _keys(model: type[BaseModel], place: list[str]) -> list[str]:

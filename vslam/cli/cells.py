@@ -248,10 +248,12 @@ def _open_all(
 
     Synthetic sequences are rendered here, because two runs cannot render one at the same time.
     """
+    from vslam.datasets.sources import LIVE
     from vslam.lab.bench.grid import parse_sequences
 
-    once = f"--data {given.data}: a live camera gives each image once; record a video or a bag."
-    if kind == "camera":
+    named = f"--data {given.data}" if given.data else f"--dataset {kind}"
+    once = f"{named}: a live camera gives each image once; record a video or a bag."
+    if kind in LIVE:
         raise InputError(once)
     opened = {}
     for name in [None] if seqs is None else parse_sequences(seqs):

@@ -26,7 +26,8 @@ def _with_plugins(names: tuple[str, ...], group: str) -> tuple[str, ...]:
 
 
 _DATASETS = _with_plugins(("kitti", "euroc", "tum", "synthetic"), plugins.READERS)
-_SOURCES = ("images", "video", "bag", "camera")
+_DEPTH_CAMERAS = ("realsense", "oakd")
+_SOURCES = ("images", "video", "bag", "camera", *_DEPTH_CAMERAS)
 DETECTOR_NAMES = _with_plugins(
     ("none", "bow", "both", "capsule", "capsule-pruned", "capsule-paper"), plugins.DETECTORS
 )
@@ -272,7 +273,7 @@ def _source_options(
     if data is None and dataset in (None, "kitti"):
         data = kitti_root()
         dataset = "kitti" if data != KITTI_ROOT else dataset
-    elif data is None and dataset != "synthetic":
+    elif data is None and dataset not in ("synthetic", *_DEPTH_CAMERAS):
         raise InputError(f"--dataset {dataset}: name the data with --data.")
     return SourceOptions(
         data=data or "", dataset=dataset, seq=seq, calib=tuple(calib or ()), right=right,

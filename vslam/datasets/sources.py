@@ -17,14 +17,17 @@ from vslam.datasets.masks import with_masks
 from vslam.datasets.rectified import rectified
 from vslam.errors import InputError
 
-SOURCES = ("images", "video", "bag", "camera")
+DEPTH_CAMERAS = ("realsense", "oakd")
+LIVE = ("camera", *DEPTH_CAMERAS)
+SOURCES = ("images", "video", "bag", *LIVE)
 
 
 class SourceOptions(BaseModel):
     """The options that select and describe a source of frames.
 
     Attributes:
-        data: folder, file, number of a device, or URL; not needed for rendered towns.
+        data: folder, file, number of a device, or URL; not needed for rendered towns, and for a
+            depth camera its serial number, or empty for the first one.
         dataset: one of `vslam.datasets.known_datasets` or of `SOURCES`; None detects it from
             ``data``.
         seq: name of the sequence of a data set; None as for `vslam.datasets.open_sequence`.
@@ -166,7 +169,7 @@ def open_raw(options: SourceOptions) -> RawSource:
 def _open_stream(
     dataset: str, options: SourceOptions, monocular: bool
 ) -> tuple[RawSource, Calibration | None]:
-    """A video, bag or camera, and the calibration in a bag."""
+    """A video, bag or camera, and the calibration in a bag or depth camera."""
     o = options
     raw: RawSource
     own: Calibration | None = None
@@ -182,6 +185,14 @@ def _open_stream(
             Path(o.data), topics=topics, sensor=o.sensor, depth_scale=o.depth_scale
         )
         own = None if o.calib else find_calibration(bag)
+    elif dataset in DEPTH_CAMERAS:
+        from vslam.datasets.depth_cameras import frames_of
+        from vslam.datasets.oakd import open_oakd
+        from vslam.datasets.realsense import open_realsense
+
+        opened = open_oakd if dataset == "oakd" else open_realsense
+        device = opened(o.data, "mono" if monocular else o.sensor)
+        raw, own = frames_of(device), device.calibration
     else:
         from vslam.datasets.video import open_camera
 

@@ -10,7 +10,7 @@ from vslam.backend.pose_graph import PoseGraph, essential_graph
 from vslam.camera import Camera, same_camera
 from vslam.config import Config, load_config
 from vslam.datasets.frames import Source, TimedFrame, frames_at
-from vslam.datasets.sources import open_source
+from vslam.datasets.sources import LIVE, open_source
 from vslam.errors import InputError
 from vslam.loops import LoopEdge
 from vslam.map import Map
@@ -80,7 +80,7 @@ def open_images(
             f"{_WITHOUT_IMAGES}."
         )
     options = read_options(run.folder)
-    if run.report.dataset == "camera":
+    if run.report.dataset in LIVE:
         raise InputError(
             f"{run.folder}: what a camera has shown cannot be seen again; {_WITHOUT_IMAGES}."
         )

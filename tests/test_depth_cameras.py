@@ -1,0 +1,427 @@
+"""Depth cameras, in place of which small fakes of their packages play recorded frames."""
+
+from __future__ import annotations
+
+import re
+import sys
+from dataclasses import dataclass, field
+from datetime import timedelta
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import corridor_depth
+from source_files import open_from, run_source, write_calibration
+
+from vslam.datasets import depth_cameras
+from vslam.datasets.sources import SourceOptions
+from vslam.errors import BrokenSourceError, InputError
+
+FRAMES = 8
+PACKAGES = {"realsense": "pyrealsense2", "oakd": "depthai"}
+
+
+@dataclass
+class Recorded:
+    """What a device has seen, and how it fails."""
+
+    camera: Any
+    left: list[np.ndarray]
+    right: list[np.ndarray]
+    depth: list[np.ndarray]  # uint16, units of `unit` metres
+    unit: float = 0.001
+    lens: tuple[float, ...] = (0.0,) * 5
+    shown: int = 0
+    log: list[Any] = field(default_factory=list)
+    gone: type[Exception] | None = None  # raised instead of a time-out after the last frame
+
+    def following(self) -> int | None:
+        if self.shown == len(self.left):
+            if self.gone is not None:
+                raise self.gone("the device was disconnected")
+            return None
+        self.shown += 1
+        return self.shown - 1
+
+
+def colours(grey: np.ndarray) -> np.ndarray:
+    """Red, green, blue that differ but have this grey value."""
+    rgb = np.repeat(grey[..., None], 3, axis=2).astype(int)
+    rgb[..., 2] = np.clip(rgb[..., 2] + 3, 0, 255)  # blue has a weight of 0.114
+    return rgb.astype(np.uint8)
+
+
+def realsense(recorded: Recorded, serials: tuple[str, ...] = ("817", "918")) -> SimpleNamespace:
+    """The part of pyrealsense2 that vslam uses; depth is registered to colour only by ``align``."""
+    r, c = recorded, recorded.camera
+    names = ("color", "depth", "infrared")
+    option = SimpleNamespace(emitter_enabled="emitter", stereo_baseline="baseline")
+
+    def frame(image: np.ndarray, k: int) -> SimpleNamespace:
+        return SimpleNamespace(
+            get_data=lambda: image, get_timestamp=lambda: 1000.0 * (50 + 0.1 * k)
+        )
+
+    class Sensor:
+        supports = staticmethod(lambda name: True)
+        get_option = staticmethod(lambda name: {"baseline": 1000.0 * c.baseline}[name])
+        get_depth_scale = staticmethod(lambda: r.unit)
+        set_option = staticmethod(lambda name, value: r.log.append((name, value)))
+
+    def device(serial: str) -> SimpleNamespace:
+        return SimpleNamespace(get_info=lambda what: serial, first_depth_sensor=Sensor)
+
+    class Config:
+        def enable_device(self, serial: str) -> None:
+            r.log.append(serial)
+
+        def enable_stream(self, *what: Any) -> None:
+            r.log.append(what)
+
+    class Stream:
+        def __init__(self, side: int) -> None:
+            self.side = side
+
+        def as_video_stream_profile(self) -> Stream:
+            return self
+
+        def get_intrinsics(self) -> SimpleNamespace:
+            return SimpleNamespace(
+                fx=c.fx, fy=c.fy, ppx=c.cx, ppy=c.cy, width=c.width, height=c.height,
+                model="inverse_brown_conrady", coeffs=list(r.lens),
+            )  # fmt: skip
+
+        def get_extrinsics_to(self, other: Stream) -> SimpleNamespace:
+            along = c.baseline * (self.side - other.side)
+            return SimpleNamespace(rotation=np.eye(3).ravel().tolist(), translation=[along, 0, 0])
+
+    class Frames:
+        def __init__(self, k: int, aligned: bool = False) -> None:
+            self.k, self.aligned = k, aligned
+
+        def get_infrared_frame(self, side: int) -> Any:
+            return frame((r.left, r.right)[side - 1][self.k], self.k)
+
+        def get_color_frame(self) -> Any:
+            return frame(colours(r.left[self.k]), self.k)
+
+        def get_depth_frame(self) -> Any:
+            depth = r.depth[self.k]
+            return frame(depth if self.aligned else np.roll(depth, 9, axis=1), self.k)
+
+    class Pipeline:
+        def start(self, config: Config) -> SimpleNamespace:
+            r.log.append("start")
+            return SimpleNamespace(get_stream=lambda name, side=0: Stream(side))
+
+        def try_wait_for_frames(self, timeout_ms: int) -> tuple[bool, Any]:
+            k = r.following()
+            return k is not None, None if k is None else Frames(k)
+
+        def stop(self) -> None:
+            r.log.append("stop")
+
+    return SimpleNamespace(
+        stream=SimpleNamespace(**{name: name for name in names}),
+        format=SimpleNamespace(y8="y8", rgb8="rgb8", z16="z16"), option=option,
+        camera_info=SimpleNamespace(serial_number="serial"),
+        distortion=SimpleNamespace(
+            brown_conrady="brown_conrady", inverse_brown_conrady="inverse_brown_conrady"
+        ),
+        context=lambda: SimpleNamespace(query_devices=lambda: [device(s) for s in serials]),
+        config=Config, pipeline=Pipeline,
+        align=lambda to: SimpleNamespace(process=lambda frames: Frames(frames.k, aligned=True)),
+    )  # fmt: skip
+
+
+def depthai(recorded: Recorded, platform: str = "RVC2") -> SimpleNamespace:
+    """The part of depthai that vslam uses: a graph of nodes, through which images are pulled."""
+    r, c = recorded, recorded.camera
+
+    class Frame:
+        def __init__(self, image: np.ndarray, k: int, lens: tuple[float, ...]) -> None:
+            self.image, self.k, self.lens = image, k, lens
+
+        def getFrame(self) -> np.ndarray:
+            return self.image.copy()
+
+        def getTimestamp(self) -> timedelta:
+            return timedelta(seconds=50 + 0.1 * self.k)
+
+        def getWidth(self) -> int:
+            return self.image.shape[1]
+
+        def getHeight(self) -> int:
+            return self.image.shape[0]
+
+        def getTransformation(self) -> SimpleNamespace:
+            K = [[c.fx, 0.0, c.cx], [0.0, c.fy, c.cy], [0.0, 0.0, 1.0]]
+            return SimpleNamespace(
+                getIntrinsicMatrix=lambda: K, getDistortionCoefficients=lambda: list(self.lens)
+            )
+
+    class Input:
+        source: Output
+
+    class Output:
+        def __init__(self, frame: Any) -> None:
+            self.frame = frame
+
+        def link(self, other: Input) -> None:
+            other.source = self
+
+        def createOutputQueue(self, maxSize: int, blocking: bool) -> SimpleNamespace:
+            def get(timeout: timedelta) -> Any:
+                k = r.following()
+                return None if k is None else self.frame(k)
+
+            return SimpleNamespace(get=get)
+
+    class Camera:
+        def build(self, socket: str) -> Camera:
+            self.socket = socket
+            return self
+
+        def requestOutput(self, size, type, *, fps, enableUndistortion) -> Output:
+            images = {"A": [colours(i) for i in r.left], "B": r.left, "C": r.right}[self.socket]
+            assert type in (None, "RGB888i" if self.socket == "A" else "GRAY8")
+            lens = r.lens if enableUndistortion else (0.3,)
+            return Output(lambda k: Frame(images[k], k, lens))
+
+    class StereoDepth:
+        def build(self, left: Output, right: Output) -> StereoDepth:
+            self.inputAlignTo = Input()
+            self.depth = Output(self._measured)
+            return self
+
+        def _measured(self, k: int) -> Frame:
+            aligned = hasattr(self.inputAlignTo, "source")
+            return Frame(r.depth[k] if aligned else np.roll(r.depth[k], 9, axis=1), k, ())
+
+    class ImageAlign:
+        def __init__(self) -> None:
+            self.input, self.inputAlignTo = Input(), Input()
+            self.outputAligned = Output(lambda k: Frame(r.depth[k], k, ()))
+
+    class Sync:
+        def __init__(self) -> None:
+            self.inputs = {"left": Input(), "second": Input()}
+            self.out = Output(
+                lambda k: {
+                    name: i.source.frame(k)
+                    for name, i in self.inputs.items()
+                    if hasattr(i, "source")
+                }
+            )
+
+        def setSyncThreshold(self, threshold: timedelta) -> None:
+            assert threshold < timedelta(seconds=0.02)
+
+    class Device:
+        def __init__(self, name: str = "1844") -> None:
+            if name != "1844":
+                raise RuntimeError("Cannot find any device with given deviceInfo")
+
+        def getDeviceId(self) -> str:
+            return "1844"
+
+        def getPlatform(self) -> str:
+            return platform
+
+        def readCalibration(self) -> SimpleNamespace:
+            def getCameraExtrinsics(source: str, to: str) -> list[list[float]]:
+                T = np.eye(4)
+                T[0, 3] = 100.0 * c.baseline * (1 if (source, to) == ("C", "B") else -1)
+                return T.tolist()
+
+            return SimpleNamespace(getCameraExtrinsics=getCameraExtrinsics)
+
+        def close(self) -> None:
+            r.log.append("close")
+
+    class Pipeline:
+        def __init__(self, device: Device) -> None:
+            self.getDefaultDevice = lambda: device
+
+        def create(self, node: type) -> Any:
+            r.log.append(node.__name__)
+            return node()
+
+        def start(self) -> None:
+            r.log.append("start")
+
+        def stop(self) -> None:
+            r.log.append("stop")
+
+    return SimpleNamespace(
+        Device=Device, Pipeline=Pipeline, Platform=SimpleNamespace(RVC4="RVC4"),
+        node=SimpleNamespace(
+            Camera=Camera, StereoDepth=StereoDepth, ImageAlign=ImageAlign, Sync=Sync
+        ),
+        CameraBoardSocket=SimpleNamespace(CAM_A="A", CAM_B="B", CAM_C="C"),
+        ImgFrame=SimpleNamespace(Type=SimpleNamespace(GRAY8="GRAY8", RGB888i="RGB888i")),
+        MessageQueue=SimpleNamespace(QueueException=QueueGoneError),
+    )  # fmt: skip
+
+
+class QueueGoneError(Exception):
+    """As depthai's, this is no RuntimeError."""
+
+
+FAKES = {"realsense": realsense, "oakd": depthai}
+
+
+@pytest.fixture
+def recorded(corridor) -> Recorded:
+    poses = corridor.T_wc[:FRAMES]
+    metres = [corridor_depth(corridor.camera, T_wc) for T_wc in poses]
+    depth = [np.rint(1000 * m).clip(0, 65535).astype(np.uint16) for m in metres]
+    return Recorded(corridor.camera, corridor.left[:FRAMES], corridor.right[:FRAMES], depth)
+
+
+def connect(monkeypatch, dataset: str, recorded: Recorded, *more: Any) -> None:
+    monkeypatch.setitem(sys.modules, PACKAGES[dataset], FAKES[dataset](recorded, *more))
+
+
+def taken(source) -> list[Any]:
+    """The frames of a source until the device stops."""
+    frames = []
+    with pytest.raises(BrokenSourceError, match="no image came after"):
+        frames.extend(source.frames())  # extend keeps what came before the error
+    return frames
+
+
+@pytest.mark.parametrize("dataset", ["realsense", "oakd"])
+@pytest.mark.parametrize("sensor", ["stereo", "rgbd", "mono", None])
+def test_the_frames_and_the_calibration_are_those_of_the_device(
+    dataset, sensor, recorded, monkeypatch
+):
+    connect(monkeypatch, dataset, recorded)
+    source = open_from(dataset, "", sensor=sensor)
+    sensor = sensor or {"realsense": "rgbd", "oakd": "stereo"}[dataset]
+    wanted = recorded.camera
+    assert (source.dataset, source.name) == (dataset, {"realsense": "817", "oakd": "1844"}[dataset])
+    assert source.live
+    assert source.camera.sensor == sensor
+    assert (source.camera.fx, source.camera.cx) == (wanted.fx, wanted.cx)
+    assert source.camera.baseline == pytest.approx(0.0 if sensor == "mono" else wanted.baseline)
+    first = recorded.shown  # the first image of an OAK camera has told the size
+    frames = taken(source)
+    assert len(frames) == FRAMES - first
+    assert [f.timestamp for f in frames] == pytest.approx(
+        [50 + 0.1 * k for k in range(first, FRAMES)]
+    )
+    for k, frame in enumerate(frames, first):
+        left, second = frame.read(map)
+        assert np.abs(left.astype(int) - recorded.left[k]).max() <= (frame.colour is not None)
+        if sensor == "stereo":
+            assert np.array_equal(second, recorded.right[k])
+        elif sensor == "rgbd":
+            assert second.dtype == np.float32
+            np.testing.assert_allclose(second, recorded.depth[k] / 1000, rtol=1e-6)
+        else:
+            assert second is None
+        if frame.colour is not None:
+            assert np.array_equal(frame.colour(), colours(recorded.left[k]))
+    assert "stop" in recorded.log
+
+
+def test_depth_of_the_newer_oak_cameras_is_registered_by_a_node(recorded, monkeypatch):
+    connect(monkeypatch, "oakd", recorded, "RVC4")
+    frame = taken(open_from("oakd", "", sensor="rgbd"))[0]
+    np.testing.assert_allclose(frame.read(map)[1], recorded.depth[1] / 1000, rtol=1e-6)
+    assert "ImageAlign" in recorded.log
+
+
+@pytest.mark.parametrize(("sensor", "on"), [("stereo", 0.0), ("mono", 0.0), ("rgbd", 1.0)])
+def test_the_projector_is_set_before_the_first_image(sensor, on, recorded, monkeypatch):
+    connect(monkeypatch, "realsense", recorded)
+    open_from("realsense", "918", sensor=sensor)
+    assert recorded.log.index(("emitter", on)) < recorded.log.index("start")
+    assert "918" in recorded.log
+
+
+def test_a_lens_and_another_depth_unit(recorded, monkeypatch):
+    recorded.lens, recorded.unit = (-0.055, 0.065, 0.0, 0.0, -0.02), 0.0001
+    connect(monkeypatch, "realsense", recorded)
+    source = open_from("realsense", "")
+    assert source.rectify_mask is not None
+    left, depth = taken(source)[0].read(map)
+    middle = tuple(n // 2 for n in left.shape)
+    assert depth[middle] == pytest.approx(recorded.depth[0][middle] / 1e4, rel=0.05)
+    assert not np.array_equal(left, recorded.left[0])
+
+
+def test_a_calibration_file_replaces_that_of_the_device(recorded, monkeypatch, tmp_path):
+    connect(monkeypatch, "oakd", recorded)
+    other = SimpleNamespace(**{**vars(recorded.camera), "fx": 250.0, "fy": 250.0})
+    calib = write_calibration(tmp_path / "stereo.yaml", other)
+    assert open_from("oakd", "", SourceOptions(calib=(calib,))).camera.fx == 250.0
+
+
+@pytest.mark.parametrize(
+    ("dataset", "gone"),
+    [("realsense", None), ("realsense", RuntimeError), ("oakd", None), ("oakd", QueueGoneError)],
+)
+def test_a_run_keeps_what_a_device_gave_before_it_stopped(dataset, gone, recorded, monkeypatch):
+    recorded.gone = gone
+    connect(monkeypatch, dataset, recorded)
+    outcome = run_source(open_from(dataset, "", sensor="stereo"))
+    n = FRAMES - (dataset == "oakd")
+    assert len(outcome.trajectory) == n
+    assert f"no image came after {n}; check its cable" in outcome.interrupted
+
+
+def test_what_is_missing_is_said_in_one_sentence(recorded, monkeypatch, call):
+    def refused(match: str, *words: str) -> None:
+        code, _, err = call("run", *words)
+        assert code == 2
+        assert re.search(match, " ".join(err.split()))
+
+    for dataset, package in PACKAGES.items():
+        monkeypatch.setitem(sys.modules, package, None)
+        refused(rf"pip install 'vslam\[{dataset}\]'", "--dataset", dataset)
+
+    def broken(name: str) -> None:
+        raise ImportError("libusb-1.0.so.0: cannot open shared object file")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(depth_cameras.importlib, "import_module", broken)
+        refused("libusb-1.0.so.0: cannot open .* install what it needs", "--dataset", "realsense")
+    connect(monkeypatch, "realsense", recorded, ())
+    refused("no RealSense camera is connected", "--dataset", "realsense")
+    connect(monkeypatch, "realsense", recorded)
+    refused("there are 817, 918", "--dataset", "realsense", "--data", "77")
+    connect(monkeypatch, "oakd", recorded)
+    refused("oakd 77: Cannot find any device", "--dataset", "oakd", "--data", "77")
+    refused("--seq 05: only for data sets", "--dataset", "oakd", "--seq", "05")
+
+
+def test_a_calibration_that_cannot_be_used_is_refused(recorded, monkeypatch):
+    recorded.lens = (0.1, 0.2)
+    connect(monkeypatch, "oakd", recorded)
+    with pytest.raises(InputError, match="too old for the device to remove the distortion"):
+        open_from("oakd", "")
+    fake = realsense(recorded)
+    fake.distortion = SimpleNamespace(brown_conrady="other", inverse_brown_conrady="another")
+    monkeypatch.setitem(sys.modules, "pyrealsense2", fake)
+    with pytest.raises(InputError, match=r"the lens model .* is not supported; .* --calib"):
+        open_from("realsense", "")
+
+
+@pytest.mark.parametrize("dataset", ["realsense", "oakd"])
+def test_the_package_has_the_names_that_its_fake_has(dataset, recorded):
+    package = pytest.importorskip(PACKAGES[dataset], exc_type=ImportError)
+
+    def compare(fake: Any, real: Any) -> None:
+        for name in vars(fake):
+            assert hasattr(real, name), name
+            inner = getattr(fake, name)
+            if isinstance(inner, SimpleNamespace):
+                compare(inner, getattr(real, name))
+            elif isinstance(inner, type):
+                public = [n for n, f in vars(inner).items() if callable(f) and n[0] != "_"]
+                assert all(hasattr(getattr(real, name), n) for n in public), public
+
+    compare(FAKES[dataset](recorded), package)

@@ -1,0 +1,115 @@
+"""Live depth cameras, whose makers' packages bring the images and the calibration of the device."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.calibration.models import Calibration
+from vslam.camera import DepthImage, Image, ImageMap
+from vslam.datasets.frames import Images, RawSource, TimedFrame
+from vslam.errors import BrokenSourceError, InputError
+
+FPS = 30
+TIMEOUT_S = 10
+
+
+@dataclass(frozen=True)
+class Grabbed:
+    """The images that a device took at one time, copied out of its buffers.
+
+    Attributes:
+        timestamp: seconds.
+        left: left or colour image, ``(H, W)`` uint8, or ``(H, W, 3)`` uint8 red, green, blue.
+        second: right image, ``(H, W)`` uint8; or depth, ``(H, W)`` uint16; or None.
+    """
+
+    timestamp: float
+    left: NDArray[np.uint8]
+    second: NDArray[Any] | None
+
+
+@dataclass(frozen=True)
+class DepthCamera:
+    """A device that is filming.
+
+    Attributes:
+        dataset: kind of source.
+        name: serial number.
+        calibration: that of the device, for the images that it delivers. With ``depth_scale``, the
+            second images are the depth of the first images' pixels.
+        grab: waits for the next images; None if none came in time or the device is gone.
+        stop: stops the device.
+    """
+
+    dataset: str
+    name: str
+    calibration: Calibration
+    grab: Callable[[], Grabbed | None]
+    stop: Callable[[], None]
+
+
+def frames_of(device: DepthCamera) -> RawSource:
+    """The frames of a device, which can be read only once."""
+    calibration = device.calibration
+    models = [model for model in (calibration.left, calibration.right) if model is not None]
+    return RawSource(
+        dataset=device.dataset,
+        name=device.name,
+        sizes=tuple((model.width, model.height) for model in models),
+        depth=calibration.depth_scale is not None,
+        play=partial(_play, device),
+        live=True,
+    )
+
+
+def maker_package(name: str, extra: str) -> Any:
+    """Import the package of a device's maker.
+
+    Raises:
+        InputError: it is not installed, or a library that it needs is not.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        missing = isinstance(error, ModuleNotFoundError)
+        fix = f"pip install 'vslam[{extra}]'" if missing else "install what it needs"
+        raise InputError(
+            f"--dataset {extra}: the package {name} cannot be imported ({error}); {fix} "
+            "(docs/howto/cameras.md)."
+        ) from error
+
+
+def _play(device: DepthCamera) -> Iterator[TimedFrame]:
+    scale = device.calibration.depth_scale
+    n = 0
+    try:
+        while (grabbed := device.grab()) is not None:
+            colour = partial(np.asarray, grabbed.left) if grabbed.left.ndim == 3 else None
+            yield TimedFrame(grabbed.timestamp, partial(_read, grabbed, scale), colour=colour)
+            n += 1
+    finally:
+        with suppress(RuntimeError):  # the device may be gone
+            device.stop()
+    raise BrokenSourceError(
+        f"{device.dataset} {device.name}: no image came after {n}; check its cable and its power."
+    )
+
+
+def _read(grabbed: Grabbed, depth_scale: float | None, image_map: ImageMap) -> Images:
+    import cv2
+
+    left: NDArray[Any] = grabbed.left
+    if left.ndim == 3:
+        left = cv2.cvtColor(left, cv2.COLOR_RGB2GRAY)
+    second: Image | DepthImage | None = grabbed.second
+    if second is not None and depth_scale is not None:
+        second = second * np.float32(1.0 / depth_scale)
+    return np.asarray(left, np.uint8), second

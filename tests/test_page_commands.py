@@ -227,6 +227,7 @@ RULES = {
         (
             ("vslam,orbslam3 .* --perturb ", "vslam --perturb "),
             (r"none,dark:2\S+", "none"),
+            ("--every 4", "--every 2 --laws none dark:4 --detectors bow --candidates 3"),
         ),
         (("python tools/experiments/light/day_night.py synthetic", AGAIN),),
     ),

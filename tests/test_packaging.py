@@ -93,7 +93,7 @@ def test_its_metadata_are_complete(wheels):
     classifiers = metadata.get_all("Classifier") or []
     for version in ("3.11", "3.12", "3.13"):
         assert f"Programming Language :: Python :: {version}" in classifiers
-    assert {"bag", "cluster", "docs", "dev", "gps", "train"} == set(
+    assert {"bag", "cluster", "docs", "dev", "gps", "oakd", "realsense", "train"} == set(
         metadata.get_all("Provides-Extra") or []
     )
     assert "vslam = vslam.cli.main:main" in points

@@ -41,6 +41,7 @@ N = 6  # frames of each sequence
 HOURS = "it takes hours"
 AGAIN = "each town takes seconds, and this form runs on another page or above"
 REAL = "it needs real KITTI"
+DEPTH_CAMERA = "there is none here; test_depth_cameras.py has fakes of both"
 ORBSLAM = "it needs pyorbslam3, which vslam does not depend on"
 BOARDS = "test_calibrate.py renders boards for it"
 INSTALL = "`make test` builds and installs the wheel"
@@ -109,7 +110,14 @@ RULES = {
         ),
     ),
     "docs/howto/calibrate.md": Rules(not_run=(("vslam calibrate", BOARDS),)),
-    "docs/howto/cameras.md": Rules(not_run=(("vslam synth block --fisheye", AGAIN),)),
+    "docs/howto/cameras.md": Rules(
+        not_run=(
+            ("vslam synth block --fisheye", AGAIN),
+            ("pip install", INSTALL),
+            ("vslam run --dataset realsense", DEPTH_CAMERA),
+            ("vslam run --dataset oakd", DEPTH_CAMERA),
+        )
+    ),
     "docs/explanation/design.md": Rules(),
     "docs/howto/exports.md": Rules(
         (
@@ -208,6 +216,7 @@ RULES = {
         not_run=(
             ("vslam run --dataset synthetic --seq demo", "test_site.py runs it"),
             ("vslam run --data 0", "there is no camera here; test_sources.py makes one"),
+            ("vslam run --dataset realsense", DEPTH_CAMERA),
         )
     ),
     "docs/howto/stress.md": Rules(

@@ -322,8 +322,8 @@ def world_ray(T_cw, xy, intrinsics, ray):
 def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_cosine, point):
     """Triangulate a landmark and write its position in the world into ``point`` ``(3,)``.
 
-    The position is the intersection of two rays, unless the stereo pair of one of the keyframes has
-    more parallax than the rays: then it is the stereo point of that keyframe.
+    Usually the two rays are intersected. Where the stereo pair of one keyframe sees the landmark
+    with more parallax than the rays have, the stereo point of that keyframe is taken instead.
 
     Args:
         depth_1, depth_2: stereo depths of the features, NaN without one.

@@ -145,8 +145,9 @@ def contact_sheet(
     start: int = 0,
     every: int = 1,
 ) -> Image:
-    """A grey image with a row for each frame. Each row shows the left image before the
-    perturbation, both images after it, and the amplified change of one of them.
+    """A grey image that shows a perturbation, with a row for each frame. A row begins with the left
+    image as it was; then come both perturbed images, and finally how one of them has changed, which
+    is amplified to be visible.
 
     Args:
         indices: frames of the sequence.
@@ -166,9 +167,8 @@ def contact_sheet(
 
 
 def sheet_of_laws(sequence: Source, specs: Collection[str], index: int, seed: int) -> Image:
-    """A grey image with a row for each perturbation of one frame. Each row shows the left image
-    before the perturbation, both images after it, and the amplified change of one of them. Several
-    rows are arranged in two columns.
+    """A grey image that shows several perturbations of one frame, with a row for each. The rows are
+    those of ``contact_sheet``; if there are several, they are arranged in two columns.
 
     Raises:
         InputError: the sequence lacks what a law needs.

@@ -107,18 +107,13 @@ class FrameImages:
         return matched(self.find_corners(), self._context, keypoints)
 
     @cached_property
-    def left_for_places(self) -> Image:
-        """``(H, W)`` uint8: the left image by which places are recognised. It shows nothing where
-        the image is masked."""
-        return self.left if self.mask is None else self.mask.filled(self.left)
-
-    @property
     def image(self) -> Image:
-        """``(H, W)`` uint8 that the features are extracted from, as ``left_for_places``."""
-        if self.find_corners().side == Side.LEFT:
-            return self.left_for_places
-        right = np.array(self._second, np.uint8)  # a copy: the right image is the caller's
-        return right if self.mask is None else self.mask.filled(right)
+        """``(H, W)`` uint8 that the features are extracted from, by which places are recognised. It
+        shows nothing where it is masked."""
+        seen = self.left
+        if self.find_corners().side == Side.RIGHT:
+            seen = np.array(self._second, np.uint8)  # a copy: the right image is the caller's
+        return seen if self.mask is None else self.mask.filled(seen)
 
     def _found(self) -> Corners:
         try:

@@ -50,7 +50,8 @@ class Frame:
     Attributes:
         index: number of the frame in the run, from 0.
         timestamp: seconds.
-        image: ``(H, W)`` uint8 image of the camera, for loop detectors that need it, or None.
+        image: ``(H, W)`` uint8 image of the camera, for loop detectors that need it; None without
+            one, and until ``extract``.
         features, grid: the N features of that image, and a grid to search them by position.
         pyramid, row_offset, side: see ``Extracted``.
         T_camera_left: ``(4, 4)`` transform from the left camera to the camera: the identity, or
@@ -130,13 +131,11 @@ class Frame:
         was found, there is a feature, even if it is no corner for the detector."""
         if self.source is None:
             return
-        source, features = self.source, self.features
-        if len(features):
-            extracted = source.extracted_with((features.xy, features.octave))
-            image = self.image
-        else:
-            extracted, image = source.extracted, source.image
-        new = Frame.of(extracted, camera, image=image)
+        source, found = self.source, self.features
+        extracted = (
+            source.extracted_with((found.xy, found.octave)) if len(found) else source.extracted
+        )
+        new = Frame.of(extracted, camera, image=source.image)
         for name in _OF_FEATURES:
             setattr(self, name, getattr(new, name))
         self.source = None

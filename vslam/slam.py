@@ -226,7 +226,7 @@ class Slam:
             images: they are not copied: do not write to them afterwards.
             timestamp, stage_ms: as for ``step_features``.
         """
-        frame = self._next_frame(Extracted.nothing(), timestamp, images.left_for_places)
+        frame = self._next_frame(Extracted.nothing(), timestamp, None)
         frame.source, frame.pyramid, frame.coarse = images, images.pyramid, images.coarse
         frame.mask = images.mask
         return self._step(frame, StageClock(dict(stage_ms or {})))

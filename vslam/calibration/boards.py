@@ -8,15 +8,16 @@ towards the viewer.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import product
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, cast
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,7 +39,6 @@ _REACH_PX = (2, 6)  # least and greatest half width of the window in which a cor
 # To recognise a board. A few false tags and a small false checkerboard appear in any image of
 # houses, so it takes more tags than that, or the same checkerboard in two images.
 _RECOGNISED_TAGS = 6
-_SMALLEST = (4, 3)  # inner corners of a checkerboard
 _SIZES = (50, 100, 250, 1000)  # of the dictionaries of a family; each begins with the smaller ones
 _FAMILIES = (
     *((f"{bits}X{bits}_50", 1) for bits in (4, 5, 6, 7)),
@@ -47,7 +47,6 @@ _FAMILIES = (
 )  # a dictionary of each family, and the black bits around its tags
 _MOST_COLUMNS = 40
 _OFF_PLACE = 0.2  # largest distance of a tag from its place in the layout, in squares
-_TRIALS = 200  # of RANSAC; few tags are wrong
 _SAME_RATIO = 0.12  # relative error of the measured marker / square, which blur decreases
 
 _Found = tuple[NDArray[np.int64], Array] | None  # ids and xy of a `View`
@@ -77,25 +76,24 @@ class Board:
     dictionary: str = "5X5_1000"
 
     def __post_init__(self) -> None:
-        size = f"{self.columns}x{self.rows}"
         if not 0 <= self.marker < self.square <= _LARGEST_M:
             raise InputError(
                 f"a board cannot have squares of {self.square:g} m and markers of {self.marker:g} "
-                "m; give both in metres, such as 0.025 for 25 mm, and a marker smaller than a "
-                "square."
+                "m; give both in metres, such as 0.025 for 25 mm."
             )
         least = 1 if self.kind == "aprilgrid" else 3
         if not all(least <= n <= 100 for n in (self.columns, self.rows)):
             raise InputError(
-                f"a {self.kind} cannot have the size {size}; give {least} to 100 columns and rows."
+                f"a {self.kind} cannot have the size {self.columns}x{self.rows}; give {least} to "
+                "100 columns and rows."
             )
-        if self.kind == "charuco" and self.columns * self.rows // 2 > len(
-            _dictionary(self.dictionary).bytesList
-        ):
-            raise InputError(
-                f"--dictionary {self.dictionary}: has too few markers for {size} squares; give the "
-                "size and the dictionary of the printed board."
-            )
+        if self.kind == "charuco":
+            n = len(_dictionary(self.dictionary).bytesList)
+            if n < self.columns * self.rows // 2:
+                raise InputError(
+                    f"--dictionary {self.dictionary}: {n} markers are too few for this board; give "
+                    "the --size and the --dictionary that were printed."
+                )
 
     def __str__(self) -> str:
         size = f"{self.columns}x{self.rows}"
@@ -129,13 +127,11 @@ def read_board(path: Path) -> Board:
     """
     document = read_document(path)
     kind = document.text("target_type")
-    marker = 0.0
     if kind == "aprilgrid":
-        names = "tagCols", "tagRows"
-        marker = document.number("tagSize")
+        names, marker = ("tagCols", "tagRows"), document.number("tagSize")
         square = marker * (1 + document.number("tagSpacing"))
     elif kind == "checkerboard":
-        names = "targetCols", "targetRows"
+        names, marker = ("targetCols", "targetRows"), 0.0
         square = document.number("colSpacingMeters")
         if square != document.number("rowSpacingMeters"):
             raise InputError(f"{path}: the fields of the board are not square; use another board.")
@@ -164,12 +160,12 @@ def board_points(board: Board) -> Array:
 
 def find_corners(board: Board, image: Image, name: str = "") -> View | None:
     """Find a board in an ``(H, W)`` uint8 image; None if too few corners are visible."""
-    finders = {
+    find = {
         "checkerboard": _find_checkerboard,
         "charuco": _find_charuco,
         "aprilgrid": _find_aprilgrid,
-    }
-    found = finders[board.kind](board, image)
+    }[board.kind]
+    found = find(board, image)
     return None if found is None else _refined(board, image, View(name, *found))
 
 
@@ -183,10 +179,8 @@ def same_order(board: Board, left: View, right: View) -> View:
         return right
     grid = right.xy.reshape(board.rows, board.columns, 2)
     turned = [np.rot90(grid, k) for k in range(4)]
-    numbered = [g.reshape(-1, 2) for g in turned if g.shape == grid.shape]
-    centred = left.xy - left.xy.mean(axis=0)
-    off = [float(np.linalg.norm(xy - xy.mean(axis=0) - centred)) for xy in numbered]
-    return replace(right, xy=numbered[int(np.argmin(off))])
+    xy = [each.reshape(-1, 2) for each in turned if each.shape == grid.shape]
+    return replace(right, xy=min(xy, key=lambda each: np.std(each - left.xy, axis=0).sum()))
 
 
 def other_board(board: Board, images: Sequence[Image]) -> str:
@@ -198,7 +192,7 @@ def other_board(board: Board, images: Sequence[Image]) -> str:
         return ""
     if found.kind == board.kind and found.columns == board.columns:  # some rows may be out of view
         found = replace(found, rows=max(found.rows, board.rows))
-    family, given = (each.dictionary.rpartition("_")[0] for each in (found, board))
+    family, given = (re.sub(r"_\d+$", "", each.dictionary) for each in (found, board))
     if found.kind != "charuco" or family == given:
         found = replace(found, dictionary=board.dictionary)
     ratio = found.marker / found.square
@@ -214,8 +208,6 @@ def other_board(board: Board, images: Sequence[Image]) -> str:
 
 
 def _find_checkerboard(board: Board, image: Image) -> _Found:
-    import cv2
-
     small, times = _reduced(image)
     size, flags = (board.columns, board.rows), cv2.CALIB_CB_NORMALIZE_IMAGE
     found, xy = cv2.findChessboardCornersSB(small, size, flags=flags)
@@ -226,35 +218,22 @@ def _find_checkerboard(board: Board, image: Image) -> _Found:
 
 def _reduced(image: Image) -> tuple[Image, float]:
     """An image small enough to find a checkerboard quickly, and by what factor it is smaller."""
-    import cv2
-
     times = max(1.0, max(image.shape) / _SEARCHED_PX)
     small = cv2.resize(image, None, None, 1 / times, 1 / times, cv2.INTER_AREA)
     return cast("Image", small), times
 
 
 def _find_charuco(board: Board, image: Image) -> _Found:
-    for detector in _charuco_detectors(board):
-        xy, ids, _, _ = detector.detectBoard(image)
+    size, markers = (board.columns, board.rows), _dictionary(board.dictionary)
+    layout = cv2.aruco.CharucoBoard(size, board.square, board.marker, markers)
+    for legacy in (False, True):  # OpenCV before 4.6 began boards of even height with a marker
+        layout.setLegacyPattern(legacy)
+        xy, ids, _, _ = cv2.aruco.CharucoDetector(layout).detectBoard(image)
         if ids is not None and len(ids) >= _FEWEST_CORNERS:
             rows = np.asarray(ids, np.int64).ravel()
             if np.ptp(board_points(board)[rows, :2], axis=0).all():  # a line of corners has no pose
                 return rows, xy.reshape(-1, 2).astype(np.float64)
     return None
-
-
-@cache
-def _charuco_detectors(board: Board) -> list[Any]:
-    import cv2
-
-    detectors = []
-    # Before version 4.6, OpenCV printed a marker in the first square of boards of even height.
-    for legacy in (False, True)[: 1 + (board.rows % 2 == 0)]:
-        size, markers = (board.columns, board.rows), _dictionary(board.dictionary)
-        layout = cv2.aruco.CharucoBoard(size, board.square, board.marker, markers)
-        layout.setLegacyPattern(legacy)
-        detectors.append(cv2.aruco.CharucoDetector(layout))
-    return detectors
 
 
 def _find_aprilgrid(board: Board, image: Image) -> _Found:
@@ -273,8 +252,6 @@ def _find_aprilgrid(board: Board, image: Image) -> _Found:
 
 def _find_tags(image: Image, dictionary: str, border: int) -> tuple[NDArray[np.int64], Array]:
     """The numbers, ``(N,)``, and corners, ``(N, 4, 2)`` pixels, of the tags in an image."""
-    import cv2
-
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border
     detector = cv2.aruco.ArucoDetector(_dictionary(dictionary), parameters)
@@ -284,8 +261,6 @@ def _find_tags(image: Image, dictionary: str, border: int) -> tuple[NDArray[np.i
 
 
 def _dictionary(name: str) -> Any:
-    import cv2
-
     number = getattr(cv2.aruco, f"DICT_{name}", None)
     if number is None:
         raise InputError(
@@ -300,17 +275,13 @@ def _refined(board: Board, image: Image, view: View) -> View | None:
 
     The window around a corner is so small that it contains no other edges.
     """
-    import cv2
-
-    free = {  # metres from a corner to the nearest other edges, with a margin
-        "checkerboard": 0.3 * board.square,
-        "charuco": 0.4 * (board.square - board.marker),
-        "aprilgrid": 0.6 * min(board.square - board.marker, 0.2 * board.marker),
+    share = {  # of the distance between neighbouring corners
+        "checkerboard": 0.3,
+        "charuco": 0.4 * (1.0 - board.marker / board.square),
+        "aprilgrid": min(0.4, 0.12 * board.marker / (board.square - board.marker)),
     }[board.kind]
-    points = board_points(board)[view.ids]
-    metres, pixels = (np.linalg.norm(at[:, None] - at, axis=2) for at in (points, view.xy))
-    near = (metres > 0.0) & (metres < 1.5 * metres[metres > 0.0].min())
-    reach = int(np.clip(free * (pixels[near] / metres[near]).min(), *_REACH_PX))
+    apart = np.linalg.norm(view.xy[:, None] - view.xy, axis=2)
+    reach = int(np.clip(share * apart[apart > 0.0].min(), *_REACH_PX))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-4)
     start = view.xy.astype(np.float32).reshape(-1, 1, 2)
     moved = cv2.cornerSubPix(image, start, (reach, reach), (-1, -1), criteria)
@@ -323,16 +294,13 @@ def _refined(board: Board, image: Image, view: View) -> View | None:
 
 def _recognised_checkerboard(images: Sequence[Image]) -> Board | None:
     """The checkerboard that at least two images show, with squares of 0.1 m."""
-    import cv2
-
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
     sizes: Counter[tuple[int, int]] = Counter()
     for image in images:
-        found, _, meta = cv2.findChessboardCornersSBWithMeta(image, _SMALLEST, flags)
+        found, _, meta = cv2.findChessboardCornersSBWithMeta(image, (4, 3), flags)
         if found:
             sizes[max(meta.shape), min(meta.shape)] += 1
-    (size, n), *_ = sizes.most_common(1) or [((0, 0), 0)]
-    return Board("checkerboard", *size, 0.1) if n > 1 else None
+    return next((Board("checkerboard", *at, 0.1) for at, n in sizes.most_common(1) if n > 1), None)
 
 
 def _recognised_tags(images: Sequence[Image]) -> Board | None:
@@ -365,12 +333,10 @@ def _layout(
         family: a dictionary of the family of the tags.
         numbers, xy: the detected tags, ``(N,)``, and their corners, ``(N, 4, 2)`` pixels.
     """
-    import cv2
-
     step = 2 if kind == "charuco" else 1  # a ChArUco board has a tag on every other square
     squares = np.indices((step * numbers.max() // columns + 2, columns)).sum(axis=0)
     at = np.argwhere(squares % step == first)[numbers, ::-1].astype(np.float64)
-    H, mask = cv2.findHomography(xy.mean(axis=1), at, cv2.RANSAC, _OFF_PLACE, maxIters=_TRIALS)
+    H, mask = cv2.findHomography(xy.mean(axis=1), at, cv2.RANSAC, _OFF_PLACE, maxIters=200)
     if H is None or (n := int(np.count_nonzero(mask))) < _RECOGNISED_TAGS:
         return 0, None
     fits = mask.ravel() > 0

@@ -43,21 +43,10 @@ app = typer.Typer()
 def calibrate(
     given: SourceOptions,
     board: Annotated[
-        str,
-        option(
-            _BOARD,
-            "KIND|FILE",
-            "[b]checkerboard[/b], [b]charuco[/b], [b]aprilgrid[/b], or a target file of Kalibr, "
-            "which contains all sizes.",
-        ),
+        str, option(_BOARD, "KIND|FILE", "checkerboard, charuco, aprilgrid, or a target of Kalibr.")
     ],
     size: Annotated[
-        str,
-        option(
-            _BOARD,
-            "COLUMNSxROWS",
-            "Inner corners of a checkerboard, squares of a ChArUco board, tags of an AprilGrid.",
-        ),
+        str, option(_BOARD, "COLUMNSxROWS", "Inner corners, squares (charuco), tags (aprilgrid).")
     ] = "",
     square: Annotated[
         float | None,
@@ -65,7 +54,7 @@ def calibrate(
             _BOARD,
             "METRES",
             "Side of a square; for an AprilGrid, the distance from one tag to the next. A single "
-            "camera and a checkerboard do not need it.",
+            "camera that films a checkerboard does not need it.",
         ),
     ] = None,
     marker: Annotated[
@@ -85,12 +74,7 @@ def calibrate(
     ] = "pinhole",
     out: Annotated[
         Path,
-        option(
-            OUTPUT,
-            "FILE",
-            "Calibration to write, and beside it a page that ends in .html. Earlier files of this "
-            "name are renamed.",
-        ),
+        option(OUTPUT, "FILE", "Calibration to write, beside its page; earlier ones are renamed."),
     ] = Path("calibration.yaml"),
 ) -> None:
     """Calibrate a camera or a stereo pair from images of a board; exit code 1 if the result is
@@ -229,7 +213,7 @@ def _search(raw: RawSource, board: Board) -> tuple[list[Frame], list[Image]]:
     examined: list[Image] = []
     with Console(shown=True).count_bar("images", total) as advance:
         for n, frame in enumerate(_frames(raw, _MOST_SEARCHED)):
-            name = frame.file.name if frame.file else f"{frame.timestamp:.2f} s"
+            name = frame.file.name if frame.file else f"{frame.timestamp:.3f} s"
             images = [cast("Image", image) for image in frame.read(map) if image is not None]
             views = [find_corners(board, image, name) for image in images]
             if len(views) == 2 and views[0] and views[1]:

@@ -101,13 +101,8 @@ def _camera(side: str, fit: CameraFit) -> list[Finding]:
     cosines = np.abs(fit.T_camera_board[:, 2, 2])
     tilted = np.count_nonzero(cosines < np.cos(np.radians(_TILT)))
     cells = _cells(fit)
-    covered = np.bincount(cells, minlength=_CELLS[0] * _CELLS[1]).reshape(_CELLS) > 0
-    parts = {
-        "left": covered[:2],
-        "right": covered[-2:],
-        "top": covered[:, :2],
-        "bottom": covered[:, -2:],
-    }
+    full = np.bincount(cells, minlength=_CELLS[0] * _CELLS[1]).reshape(_CELLS) > 0
+    parts = {"left": full[:2], "right": full[-2:], "top": full[:, :2], "bottom": full[:, -2:]}
     emptiest = min(parts, key=lambda name: float(parts[name].mean()))
     shared = _shared(cells, np.concatenate(fit.residuals))
     return [
@@ -118,8 +113,7 @@ def _camera(side: str, fit: CameraFit) -> list[Finding]:
             "film the board tilted by 20 to 45 degrees in all directions",
         ),
         judge(
-            f"{side}coverage", covered.mean() < _COVERED,
-            f"corners in {covered.mean():.0%} of the image",
+            f"{side}coverage", full.mean() < _COVERED, f"corners in {full.mean():.0%} of the image",
             f"film the board everywhere, above all at the {emptiest} of the image",
         ),
         judge(

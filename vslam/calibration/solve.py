@@ -18,17 +18,18 @@ from scipy.optimize import least_squares
 from vslam.calibration.boards import Board, View, board_points
 from vslam.calibration.models import Array, Calibration, CameraModel, Lens, project
 from vslam.errors import InputError, counted
-from vslam.geometry import inverse, se3_exp, transform
+from vslam.geometry import inverse, orthonormalised, se3_exp, transform
 
 Size = tuple[int, int]
 Frame = tuple[View | None, ...]  # the view of each camera; None if it does not see the board
+_Fit = TypeVar("_Fit", "CameraFit", "PairFit")
 
 _MOST_FRAMES = 60
 _FEWEST_VIEWS = 3  # for 8 unknowns of the camera and 6 of each view
 _OUTLIER = 3.0  # times the median error of all views
-_NO_FIT = 0.01  # RMS in image widths; the corners must be those of another board
+_NO_FIT = 0.01  # RMS in image widths, above which the corners are those of another board
 _FEWEST_COMMON = 6  # corners that both images of a pair show
-_SAME_VIEW = 0.02  # image sizes by which the outline of the board moves at least
+_SAME_VIEW = 0.02  # in image sizes; the board is at rest if its outline moves less
 
 
 @dataclass(frozen=True)
@@ -82,8 +83,10 @@ class Estimate:
     @property
     def calibration(self) -> Calibration:
         """The cameras without the data that they were estimated from."""
-        models = [fit.model for fit in self.cameras]
-        return Calibration(*models, T_left_right=self.pair and self.pair.T_left_right)
+        left, right = self.cameras[0].model, self.cameras[-1].model
+        if self.pair is None:
+            return Calibration(left)
+        return Calibration(left, right, self.pair.T_left_right)
 
 
 def rms(residuals: Array) -> float:
@@ -95,11 +98,9 @@ def estimate(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], lens:
     """Estimate one camera, or a stereo pair if there are two ``sizes``.
 
     Args:
-        board: the board in the images.
-        frames: the views of every image or pair of images; corners of a pair must be numbered
+        frames: the views in every image or pair of images. In a pair, the corners must be numbered
             alike (`vslam.calibration.boards.same_order`).
         sizes: width and height of each camera's images.
-        lens: the model of all cameras.
 
     Raises:
         InputError: a camera does not see the board, or as for `fit_camera` and `fit_pair`.
@@ -108,8 +109,7 @@ def estimate(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], lens:
     if not any(seen):
         raise InputError(
             f"no {board} in any of {len(frames)} images; no other board is recognised either, so "
-            "check that this is the right video or folder, and that the board is sharp and not cut "
-            "off."
+            "check that this is the right video or folder and that the board is sharp and complete."
         )
     if not all(seen):
         raise InputError(
@@ -128,8 +128,8 @@ def estimate(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], lens:
 def diverse(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], n: int) -> list[Frame]:
     """Select at most ``n`` frames in which the board is in places that differ most.
 
-    Each frame selected is the one farthest from those selected before. Frames without the board
-    are left out, and so are all frames but one of a board at rest.
+    Each frame selected is the one farthest from those selected before. A board at rest is selected
+    once, and frames without the board are left out.
     """
     frames = [views for views in frames if any(views)]
     outlines = np.array(
@@ -163,11 +163,11 @@ def fit_camera(board: Board, views: Sequence[View], size: Size, lens: Lens) -> C
         InputError: the views are too few or too similar, or the corners are not of this board.
     """
     calibrate: Any = cv2.calibrateCamera
-    flags, dtype = cv2.CALIB_FIX_K3, np.float32
+    flags, dtype = cv2.CALIB_FIX_K3, "float32"
     if lens == "fisheye":
         names: Any = cv2 if hasattr(cv2, "CALIB_FIX_SKEW") else cv2.fisheye  # OpenCV 5 or 4
-        calibrate, dtype = cv2.fisheye.calibrate, np.float64
-        flags = names.CALIB_RECOMPUTE_EXTRINSIC | names.CALIB_FIX_SKEW
+        flags, dtype = names.CALIB_RECOMPUTE_EXTRINSIC | names.CALIB_FIX_SKEW, "float64"
+        calibrate = cv2.fisheye.calibrate
 
     def fit(kept: Sequence[int]) -> CameraFit:
         own = [board_points(board)[views[k].ids] for k in kept]
@@ -236,9 +236,7 @@ def fit_pair(board: Board, left: CameraFit, right: CameraFit) -> PairFit:
                 for view, T, _ in (pairs[k] for k in kept)
             ]
 
-        starts = np.array([pairs[k][2] for k in kept])
-        off = np.linalg.norm(starts - np.median(starts, axis=0), axis=(1, 2))
-        start = starts[off.argmin()]
+        start = orthonormalised(np.median([pairs[k][2] for k in kept], axis=0))
         found = least_squares(
             lambda x: np.concatenate(residuals(se3_exp(x) @ start)).ravel(), np.zeros(6)
         )
@@ -254,12 +252,9 @@ def fit_pair(board: Board, left: CameraFit, right: CameraFit) -> PairFit:
     )
 
 
-_F = TypeVar("_F", CameraFit, PairFit)
-
-
 def _without_outliers(
-    names: Sequence[str], fit: Callable[[Sequence[int]], _F], found_in: str, fix: str
-) -> _F:
+    names: Sequence[str], fit: Callable[[Sequence[int]], _Fit], found_in: str, fix: str
+) -> _Fit:
     """Fit the named views, and repeat it without those whose error is large until none is.
 
     Raises:

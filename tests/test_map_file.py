@@ -533,7 +533,7 @@ def test_a_full_disk_leaves_the_file_that_was_there(slam, file, tmp_path, monkey
 def test_a_map_of_something_else_is_refused(file, tmp_path):
     with pytest.raises(InputError, match="made with the detector bow, not none"):
         Slam.load(file, detector=create_detector("none", CONFIG))
-    with pytest.raises(InputError, match=r"another pyramid, of 8 levels by 1\.2"):
+    with pytest.raises(InputError, match=r"another image pyramid \(8 levels, scale factor 1\.2\)"):
         Slam.load(file, Config(orb=OrbConfig(n_levels=4)))
     header = header_of(file)
     header["detector"]["fingerprint"] = "0" * 16

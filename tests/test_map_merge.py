@@ -141,7 +141,7 @@ def test_maps_of_another_camera_or_detector_are_refused(drives):
     camera = Camera(400.0, 400.0, 400.0, 150.0, 0.5, 800, 300)
     with pytest.raises(ValueError, match="another camera"):
         merge_maps([drives[0], StoredMap(drives[1].map, camera)], CONFIG, create)
-    with pytest.raises(ValueError, match="of the detector none, not bow"):
+    with pytest.raises(ValueError, match="the detector none, not bow"):
         merge_maps([drives[0], StoredMap(drives[1].map, CAMERA)], CONFIG, create)
 
 

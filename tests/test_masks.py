@@ -164,9 +164,9 @@ def test_the_right_image_is_masked_where_it_replaces_a_black_left_one(corridor, 
 def test_step_refuses_a_mask_that_does_not_fit(corridor):
     slam = Slam(corridor.camera, detector="none")
     images = corridor.left[0], corridor.right[0], 0.0
-    with pytest.raises(ValueError, match=r"the mask is \(3, 3\), the camera's images are"):
+    with pytest.raises(ValueError, match=r"the mask has shape \(3, 3\), but the camera"):
         slam.step(*images, mask=np.ones((3, 3), np.uint8))
-    with pytest.raises(ValueError, match="of float64, not of uint8 or bool"):
+    with pytest.raises(ValueError, match="type float64 instead of uint8 or bool"):
         slam.step(*images, mask=np.ones(corridor.left[0].shape))
 
 

@@ -194,7 +194,7 @@ def test_haze_is_the_same_for_one_seed(installed, corridor):
         ("import nothing_there", "broken:make", "broken:make cannot be imported (ModuleNotFound"),
         ("x = (", "broken:make", "cannot be imported (SyntaxError"),
         ("", "broken:make", "cannot be imported (AttributeError"),
-        ("make = 3", "broken:make", "is no function and no class"),
+        ("make = 3", "broken:make", "is neither a function nor a class"),
         (
             "def make(*a): return 1 / 0",
             "broken:make",
@@ -246,7 +246,7 @@ def test_a_name_that_nobody_can_type_is_left_out_with_a_warning(broken, caplog):
 def test_two_packages_with_one_name_are_an_error_and_own_names_win(broken):
     for package in ("broken", "second"):
         broken("make = None", f"[vslam.detectors]\nmine = {package}:make\nbow = x:y\n", package)
-    with pytest.raises(InputError, match=r"second 2.0 and of broken 2.0: two packages"):
+    with pytest.raises(InputError, match=r"second 2.0 and of broken 2.0: several packages"):
         require_detector("mine")
     require_detector("bow")
 

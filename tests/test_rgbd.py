@@ -150,15 +150,15 @@ def test_a_step_takes_depth_in_metres_and_nothing_else(corridor):
     camera = replace(corridor.camera, depth=True)
     left = corridor.left[0]
     depth = corridor_depth(camera, corridor.T_wc[0]).astype(np.float32)
-    with pytest.raises(ValueError, match="uint8 and uint8, not of uint8 and float32"):
+    with pytest.raises(ValueError, match="uint8 and uint8 instead of uint8 and float32"):
         Slam(camera).step(left, corridor.right[0], 0.0)
-    with pytest.raises(ValueError, match=r"uint8 and uint16, not of .* millimetres"):
+    with pytest.raises(ValueError, match=r"uint8 and uint16 instead of .* millimetres"):
         Slam(camera).step(left, depth.astype(np.uint16), 0.0)
-    with pytest.raises(ValueError, match="the camera's"):
+    with pytest.raises(ValueError, match="but the camera's images have"):
         Slam(camera).step(left, depth[1:], 0.0)
     with pytest.raises(ValueError, match="the depth image is None"):
         Slam(camera).step(left, None, 0.0)
-    with pytest.raises(ValueError, match="uint8 and float32, not of uint8"):
+    with pytest.raises(ValueError, match="uint8 and float32 instead of uint8"):
         Slam(corridor.camera).step(left, depth, 0.0)
     assert Slam(camera).step(left, depth, 0.0).n_stereo > 100
 

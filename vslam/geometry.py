@@ -42,10 +42,11 @@ def inverse(T_a_b: Matrix) -> Matrix:
 
 @kernel
 def orthonormalised(T_a_b: Matrix) -> Matrix:
-    """The rigid motion nearest to one that round-off has taken off SO(3).
+    """Project a ``(4, 4)`` motion whose rotation has left SO(3) by round-off to the nearest rigid
+    motion.
 
-    One Newton step of the polar decomposition, R (3 I - R'R) / 2: enough for any drift that a
-    few compositions can cause.
+    One Newton step of the polar decomposition, R (3 I - R'R) / 2, corrects the round-off of a few
+    compositions.
     """
     T = T_a_b.copy()
     for i in range(3):

@@ -15,7 +15,7 @@ from vslam.camera import Camera
 from vslam.features import MIN_DISPARITY, shifted_columns
 from vslam.geometry import Matrix
 
-_ROUNDS = 3  # the speed depends on the disparity, and the disparity on the speed
+_ROUNDS = 3  # of a fixed-point iteration, since speed and disparity depend on each other
 
 
 def rays(
@@ -64,10 +64,10 @@ def columns_without_delay(
         twist: ``(6,)`` of the points relative to the camera, per second.
     """
     x, y = rays(xy, camera)
-    seen = xy[:, 0].astype(np.float64) - u_right
-    disparity = seen
+    measured = xy[:, 0].astype(np.float64) - u_right
+    disparity = measured
     for _ in range(_ROUNDS):
         inverse_depth = np.maximum(disparity, MIN_DISPARITY) / camera.bf
         speed = camera.fx * column_speeds(x, y, inverse_depth, camera.baseline) @ twist
-        disparity = seen + delay * speed
-    return shifted_columns(u_right, xy[:, 0], disparity - seen)
+        disparity = measured + delay * speed
+    return shifted_columns(u_right, xy[:, 0], disparity - measured)

@@ -217,7 +217,7 @@ def test_covariances_are_those_of_errors_in_the_axes_of_ros():
 
 @pytest.mark.parametrize("timestamp", [-0.1, 1.6e12, math.nan])
 def test_times_that_ros_does_not_have_are_refused(timestamp):
-    with pytest.raises(InputError, match="ROS has no time"):
+    with pytest.raises(InputError, match="ROS cannot represent the time"):
         nanoseconds(timestamp)
 
 

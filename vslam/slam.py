@@ -1,4 +1,4 @@
-"""SLAM on a stereo, RGB-D or monocular stream. ``Slam._step`` runs all steps of the method."""
+"""SLAM on a stereo, RGB-D or monocular stream; ``Slam.step`` processes one frame."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ OPTIONS = "run.json"
 
 
 class RunOptions(SourceOptions):
-    """The options as given on the command line; in the file, paths are absolute."""
+    """The options as given on the command line. In the file, paths are absolute."""
 
     perturb: str = "none"
     seed: int = 0
@@ -67,8 +67,8 @@ def resumed_options(folder: Path) -> RunOptions:
     for path in folder.rglob("*"):
         if path.is_symlink():
             raise InputError(
-                f"{path}: this is a link, but a resumed run writes only into its own folder; "
-                "replace the link by the file."
+                f"{path}: this is a symbolic link, but a resumed run writes only into its own "
+                "folder; replace the link by the file."
             )
     return read_options(folder)
 

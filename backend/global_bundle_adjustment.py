@@ -44,7 +44,7 @@ def adjust_globally(
     Args:
         iterations: maximum number of Levenberg-Marquardt iterations.
         tolerance: stop when an iteration reduces the cost by a smaller fraction than this.
-        use: ``(O,)`` bool, observations that take part; None uses all.
+        use: ``(O,)`` bool, whether each observation is used; None uses all.
         stop: called before each iteration; if it returns True, the current estimate is returned.
     """
     n_free, n_observations = problem.n_free, len(problem.camera)

@@ -2,9 +2,10 @@
 VII-C; Strasdat et al., "Scale drift-aware large scale monocular SLAM", RSS 2010).
 
 Each keyframe has a similarity ``S_wc``, a ``(4, 4)`` matrix with the scale in its upper left 3x3
-block, so that ``@`` composes similarities. It maps points in the camera frame, in the unit that the
-map has there before the correction, to the world. Initially all scales are 1; only loop edges
-measure other scales. GTSAM optimises the graph with its built-in Similarity3 factors.
+block, so that ``@`` composes similarities. It maps points from the camera frame, in the unit that
+the map has around the keyframe before the correction, to the world. Initially all scales are 1;
+only loop edges measure other scales. GTSAM optimises the graph with its built-in Similarity3
+factors.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def rigid(S: Matrix) -> Matrix:
 def optimise_similarities(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfig) -> Matrix:
     """``(N, 4, 4)`` similarities that best agree with the edges, starting from ``S_wc``.
 
-    Losses and method are those of ``pose_graph.optimise``; fixed keyframes also keep their scale.
+    Losses and method are those of ``pose_graph.optimise``. Fixed keyframes keep their scale, too.
     """
     import gtsam
 
@@ -92,7 +93,7 @@ def optimise_similarities(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfi
 def sigmas(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
     """``(E, 7)`` standard deviations of rotation, translation and the logarithm of the scale.
 
-    The scale drifts like the pose, as a random walk along the path.
+    The drift of the scale, like that of the pose, is modelled as a random walk along the path.
     """
     scale = graph.sigmas[:, 1] * (config.scale_drift / config.rotation_drift)
     scale[graph.kind == LOOP] = config.loop_scale
@@ -126,7 +127,7 @@ def move_keyframes_similarly(
     VII-C).
 
     The poses of culled keyframes, which are stored relative to living ones, are scaled as well.
-    ``map_.keyframes.unit_scale`` accumulates the scales.
+    ``map_.keyframes.unit_scale`` is multiplied by the scales.
 
     Args:
         keyframes: ``(N,)`` ids of living keyframes.
@@ -153,7 +154,8 @@ def move_keyframes_similarly(
 
 
 def loop_in_new_units(edge: LoopEdge, growth: NDArray[np.float64]) -> LoopEdge:
-    """A loop edge after a correction that multiplied lengths around each keyframe by ``growth``."""
+    """Convert a loop edge after a correction that multiplied lengths around each keyframe by
+    ``growth``."""
     assert edge.T_query_match is not None
     T = edge.T_query_match.copy()
     T[:3, 3] *= growth[edge.match]

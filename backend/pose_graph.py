@@ -249,27 +249,54 @@ def optimise(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
     """
     import gtsam
 
-    noise = gtsam.noiseModel
-    factors, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    hold = noise.Isotropic.Sigma(6, HOLD)
-    for i, T_wc in enumerate(inverses(graph.T_cw)):
-        pose = gtsam.Pose3(T_wc)
-        start.insert(i, pose)
-        if graph.fixed[i]:
-            factors.add(gtsam.PriorFactorPose3(i, pose, hold))
-    cauchy = noise.mEstimator.Cauchy.Create(config.robust_scale)
-    sigmas = np.repeat(graph.sigmas[:, ::-1], 3, axis=1)  # GTSAM: rotation first
-    for (i, j), T_i_j, kind, sigma in zip(
-        graph.edges.tolist(), graph.T_i_j, graph.kind.tolist(), sigmas, strict=True
-    ):
-        plain = noise.Diagonal.Sigmas(sigma)
-        model = noise.Robust.Create(cauchy, plain) if kind == LOOP else plain
-        factors.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(T_i_j), model))
-    result = minimised(factors, start, config)
+    result = optimised_values(
+        graph,
+        [gtsam.Pose3(T_wc) for T_wc in inverses(graph.T_cw)],
+        [gtsam.Pose3(T_i_j) for T_i_j in graph.T_i_j],
+        np.repeat(graph.sigmas[:, ::-1], 3, axis=1),  # GTSAM: rotation first
+        (gtsam.PriorFactorPose3, gtsam.BetweenFactorPose3),
+        config,
+    )
     T_wc = np.array([result.atPose3(i).matrix() for i in range(len(graph.T_cw))])
     T_cw = inverses(T_wc)
     T_cw[graph.fixed] = graph.T_cw[graph.fixed]
     return T_cw
+
+
+def optimised_values(
+    graph: PoseGraph,
+    poses: list[Any],
+    measured: list[Any],
+    sigmas: NDArray[np.float64],
+    factor_types: tuple[Any, Any],
+    config: PoseGraphConfig,
+) -> Any:
+    """The ``gtsam.Values`` of the keyframes that best agree with the edges.
+
+    Args:
+        poses: initial values of the N keyframes, objects of GTSAM.
+        measured: measurements of the E edges, objects of the same type.
+        sigmas: ``(E, D)`` standard deviations of the edges.
+        factor_types: GTSAM's prior and between factors of this type.
+    """
+    import gtsam
+
+    noise = gtsam.noiseModel
+    prior, between = factor_types
+    factors, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    hold = noise.Isotropic.Sigma(sigmas.shape[1], HOLD)
+    for i, pose in enumerate(poses):
+        start.insert(i, pose)
+        if graph.fixed[i]:
+            factors.add(prior(i, pose, hold))
+    cauchy = noise.mEstimator.Cauchy.Create(config.robust_scale)
+    for (i, j), pose, kind, sigma in zip(
+        graph.edges.tolist(), measured, graph.kind.tolist(), sigmas, strict=True
+    ):
+        plain = noise.Diagonal.Sigmas(sigma)
+        model = noise.Robust.Create(cauchy, plain) if kind == LOOP else plain
+        factors.add(between(i, j, pose, model))
+    return minimised(factors, start, config)
 
 
 def minimised(factors: Any, start: Any, config: PoseGraphConfig) -> Any:

@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 from vslam.backend.loop_correction import carry_landmarks_by
 from vslam.backend.pose_graph import (
     GAP,
-    HOLD,
     LOOP,
     WEAK,
     GraphCheck,
     PoseGraph,
     check_edge_errors,
-    minimised,
+    optimised_values,
 )
 from vslam.config import PoseGraphConfig
 from vslam.geometry import Matrix, inverses, se3_log
@@ -57,28 +56,18 @@ def optimise_similarities(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfi
     """
     import gtsam
 
-    noise = gtsam.noiseModel
-
     def as_gtsam(S: Matrix) -> gtsam.Similarity3:
         s = float(scale_of(S))  # GTSAM: s (R p + t)
         return gtsam.Similarity3(S[:3, :3] / s, S[:3, 3] / s, s)
 
-    factors, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    hold = noise.Isotropic.Sigma(7, HOLD)
-    for i, S in enumerate(S_wc):
-        pose = as_gtsam(S)
-        start.insert(i, pose)
-        if graph.fixed[i]:
-            factors.add(gtsam.PriorFactorSimilarity3(i, pose, hold))
-    cauchy = noise.mEstimator.Cauchy.Create(config.robust_scale)
-    measured = similarity(graph.T_i_j, graph.scale)
-    for (i, j), S_i_j, kind, sigma in zip(
-        graph.edges.tolist(), measured, graph.kind.tolist(), sigmas(graph, config), strict=True
-    ):
-        plain = noise.Diagonal.Sigmas(sigma)
-        model = noise.Robust.Create(cauchy, plain) if kind == LOOP else plain
-        factors.add(gtsam.BetweenFactorSimilarity3(i, j, as_gtsam(S_i_j), model))
-    result = minimised(factors, start, config)
+    result = optimised_values(
+        graph,
+        [as_gtsam(S) for S in S_wc],
+        [as_gtsam(S) for S in similarity(graph.T_i_j, graph.scale)],
+        sigmas(graph, config),
+        (gtsam.PriorFactorSimilarity3, gtsam.BetweenFactorSimilarity3),
+        config,
+    )
     found = [result.atSimilarity3(i) for i in range(len(S_wc))]
     R = np.array([pose.rotation().matrix() for pose in found])
     t = np.array([pose.translation() for pose in found])

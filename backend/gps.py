@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.backend.pose_graph import GAP, WEAK, PoseGraph, edge_sigmas, minimised
+from vslam.backend.pose_graph import GAP, WEAK, PoseGraph, edge_sigmas, minimised, parts_of
 from vslam.backend.similarity_graph import scale_of
 from vslam.config import PoseGraphConfig
 from vslam.errors import InputError
@@ -114,7 +114,8 @@ def anchor(
         InputError: the drive is too short for its direction to be known.
     """
     T_wk = inverses(graph.T_cw)
-    part = _parts(graph)
+    measured = (graph.kind != WEAK) & (graph.kind != GAP)
+    part = parts_of(graph.edges[measured], len(graph.keyframes))
     main = align(T_wk, positions, metric=metric)
     if main.unsure > _MAX_UNSURE:
         raise InputError(
@@ -251,18 +252,6 @@ def _aligned(T_wk: Array, S_enu_w: Array) -> tuple[Array, Array]:
     T_enu_k = S_enu_w @ T_wk
     T_enu_k[:, :3, :3] /= scale
     return T_enu_k, np.full(len(T_wk), scale)
-
-
-def _parts(graph: PoseGraph) -> NDArray[np.int64]:
-    """``(N,)`` number of the part of the map that each keyframe is in. Keyframes that are connected
-    by measured edges are in the same part."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    n = len(graph.keyframes)
-    i, j = graph.edges[(graph.kind != WEAK) & (graph.kind != GAP)].T
-    links = coo_array((np.ones(len(i)), (i, j)), shape=(n, n))
-    return np.asarray(connected_components(links, directed=False)[1], np.int64)
 
 
 def _predicted(positions: Positions, T_k: Array, scale: Array) -> Array:

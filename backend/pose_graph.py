@@ -151,7 +151,7 @@ def essential_graph(
         T_i_j=T_i_j,
         kind=kinds,
         sigmas=edge_sigmas(edges, T_i_j, kinds, seconds[edges], len(living), config),
-        fixed=_first_of_parts(edges, len(living)),
+        fixed=parts_of(edges, len(living)) == np.arange(len(living)),
         scale=scales,
     )
 
@@ -218,21 +218,20 @@ def edge_sigmas(
     return sigmas
 
 
-def _first_of_parts(edges: NDArray[np.int64], n: int) -> NDArray[np.bool_]:
-    """``(n,)`` bool, True for the first node of each connected part."""
-    # The smallest node that each node is known to be connected to. Each round follows these links
-    # twice as far as the previous one (pointer jumping).
-    least = np.arange(n)
-    while True:
-        ends = least[edges].min(axis=1, initial=n)
-        known = least.copy()
-        for side in range(2):
-            np.minimum.at(known, least[edges[:, side]], ends)
-            np.minimum.at(known, edges[:, side], ends)
-        known = known[known]
-        if np.array_equal(known, least):
-            return np.asarray(least == np.arange(n))
-        least = known
+def parts_of(edges: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+    """``(n,)`` int64, the first node of the connected part that each node is in (union-find)."""
+    part = list(range(n))
+
+    def first_of(node: int) -> int:
+        while part[node] != node:
+            part[node] = part[part[node]]
+            node = part[node]
+        return node
+
+    for i, j in edges.tolist():
+        first, second = sorted((first_of(i), first_of(j)))
+        part[second] = first
+    return np.array([first_of(node) for node in range(n)], np.int64)
 
 
 def load_optimiser() -> None:

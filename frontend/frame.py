@@ -146,11 +146,11 @@ class Frame:
         self.landmark[features], self.xyz[features] = landmarks, xyz
 
     def drop_matches(self, features: NDArray[np.integer] | slice = slice(None)) -> None:
-        """Let some features, by default all, track nothing."""
+        """Remove the matches of some features; by default, of all."""
         self.landmark[features], self.xyz[features] = -1, np.nan
 
     def snapshot(self) -> Frame:
-        """A copy of the frame that later changes of its pose and matches do not affect."""
+        """A copy that is independent of later changes of the frame's pose and matches."""
         return replace(self, landmark=self.landmark.copy(), xyz=self.xyz.copy())
 
     def restore(self, snapshot: Frame) -> None:
@@ -158,7 +158,7 @@ class Frame:
         vars(self).update(vars(snapshot))
 
     def set_camera_pose(self, T_camera_w: Matrix) -> None:
-        """Set the pose of the frame from the ``(4, 4)`` pose of the camera."""
+        """Set ``T_cw`` from the ``(4, 4)`` pose of the camera (world to camera)."""
         self.T_cw = inverse(self.T_camera_left) @ T_camera_w
 
     @property

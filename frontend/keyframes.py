@@ -24,8 +24,8 @@ class KeyframeEvidence:
         n_reference: ``MapView.n_reference``, number of well-observed landmarks of the reference
             keyframe.
         tracked_close: number of close stereo features of this frame that track a landmark.
-        untracked_close: number of close stereo features that track no landmark; None if the frame
-            was tracked by patches, without features. Then there are assumed to be enough of them.
+        untracked_close: number of close stereo features that track no landmark; None for a frame
+            that was tracked by patches and has no features. It is then assumed to be large enough.
         mapping_idle: whether local mapping of the last keyframe is finished and merged.
         gained_close: number of close points that the first frame after a keyframe tracks, a running
             mean over the last keyframes; infinite if unknown.
@@ -57,8 +57,8 @@ def needs_keyframe(
 ) -> bool:
     """Whether a stereo or RGB-D frame should become a keyframe.
 
-    It should if the last keyframe is old. It also should if the view has changed enough or too few
-    close points are tracked, provided that local mapping is idle or the need is urgent.
+    A keyframe is due if the last one is old. It is also due if the view has changed enough or too
+    few close points are tracked, provided that local mapping is idle or the need is urgent.
 
     A lack of close points is a reason for a keyframe only if a keyframe would provide more. On a
     motorway, close points are scarce and leave the view before they are seen twice, so that even
@@ -69,7 +69,7 @@ def needs_keyframe(
 
     Args:
         depth: whether the camera is RGB-D. Nearly all points that it sees are close and mapped at
-            once, so the counts alone would lead to too few keyframes, although a hand-held camera
+            once, so the counts alone would lead to too few keyframes for a hand-held camera, which
             turns faster than a car.
     """
     max_interval_s = config.depth_max_interval_s if depth else config.max_interval_s
@@ -218,9 +218,9 @@ class KeyframePolicy:
         return is_known_place(evidence, self._config)
 
     def is_due(self, index: int, evidence: KeyframeEvidence) -> bool:
-        """Whether frame ``index``, which was tracked by patches, is to become a keyframe. If a
-        keyframe is expected to be needed soon, the frame is planned in advance, so that its
-        features can be extracted in the meantime."""
+        """Whether frame ``index``, which was tracked by patches, is to become a keyframe. A
+        keyframe that is expected to be needed soon is planned in advance, so that its features can
+        be extracted in the background."""
         if self.due < 0:
             soon = range(self._config.patch_lead_frames + 1)
             planned = (index + k for k in soon if self.wants_keyframe(evidence.ahead(k)))

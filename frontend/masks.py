@@ -14,9 +14,9 @@ from vslam.config import OrbConfig
 from vslam.features import Pyramid
 from vslam.frontend.orb import build_pyramid
 
-# A feature may lie no closer to a masked pixel than this, in pixels of its level. Corner detection
-# and alignment read no farther from a feature (up to a shift of two pixels), so the edge of the
-# mask affects neither.
+# Least distance between a feature and a masked pixel, in pixels of the feature's level. Corner
+# detection and alignment read no pixels farther away (a patch is shifted by at most two pixels), so
+# the edge of the mask affects neither.
 REACH = 4
 _WINDOW = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
 

@@ -61,7 +61,7 @@ def extract(
         pyramid.offsets,
         pyramid.shapes,
         EVERYWHERE if allowed is None else allowed.pixels,
-        _quota(config.n_features, config.n_levels, config.scale_factor),
+        features_per_level(config),
         config.fast_threshold,
         config.fast_threshold_min,
         config.cell_size,
@@ -82,12 +82,7 @@ def with_keypoints(
         octave: ``(N,)`` pyramid levels.
     """
     shapes = found.pyramid.shapes
-    columns: list[list[NDArray]] = [
-        [found.xy],
-        [found.octave],
-        [found.angle],
-        [found.descriptors],
-    ]
+    parts = [(found.xy, found.octave, found.angle, found.descriptors)]
     for level in np.unique(octave).tolist():
         ratio = shapes[0, ::-1] / shapes[level, ::-1]
         pixel = np.rint((xy[octave == level] + 0.5) / ratio - 0.5)
@@ -100,14 +95,12 @@ def with_keypoints(
             continue
         image = found.pyramid.level(level)
         angles = orientations(image, corners, DISC)
-        columns[0].append(((corners + 0.5) * ratio - 0.5).astype(np.float32))
-        columns[1].append(np.full(len(corners), level, np.uint8))
-        columns[2].append(angles)
-        columns[3].append(describe(smoothed(image), corners, angles, PATTERN))
-    joined = [np.concatenate(column) for column in columns]
+        position = ((corners + 0.5) * ratio - 0.5).astype(np.float32)
+        descriptors = describe(smoothed(image), corners, angles, PATTERN)
+        parts.append((position, np.full(len(corners), level, np.uint8), angles, descriptors))
+    joined = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
     order = np.argsort(joined[1], kind="stable")
-    xy, octave, angle, descriptors = (column[order] for column in joined)
-    return Extraction(xy, octave, angle, descriptors, found.pyramid)
+    return Extraction(*(array[order] for array in joined), found.pyramid)
 
 
 @kernel
@@ -126,36 +119,28 @@ def _is_free(pixel, existing):
 
 def scale_factors(config: OrbConfig) -> NDArray[np.float64]:
     """``(L,)`` float64, scale of each level: full-resolution pixels per pixel; 1 for level 0."""
-    return _scales(config.n_levels, config.scale_factor)
-
-
-def _scales(n_levels: int, scale_factor: float) -> NDArray[np.float64]:
-    return scale_factor ** np.arange(n_levels, dtype=np.float64)
-
-
-def features_per_level(config: OrbConfig) -> NDArray[np.int64]:
-    """``(L,)`` int64, ``n_features`` divided among the levels in proportion to 1 / scale (ORB-SLAM,
-    V-A)."""
-    return _quota(config.n_features, config.n_levels, config.scale_factor).copy()
+    return config.scale_factor ** np.arange(config.n_levels, dtype=np.float64)
 
 
 @cache
-def _quota(n_features: int, n_levels: int, scale_factor: float) -> NDArray[np.int64]:
-    weights = 1.0 / _scales(n_levels, scale_factor)
-    share = n_features * weights / weights.sum()
+def features_per_level(config: OrbConfig) -> NDArray[np.int64]:
+    """``(L,)`` int64, ``n_features`` divided among the levels in proportion to 1 / scale (ORB-SLAM,
+    V-A)."""
+    weights = 1.0 / scale_factors(config)
+    share = config.n_features * weights / weights.sum()
     quota = np.floor(share).astype(np.int64)
     # The features lost by rounding down go to the levels that lost the largest fractions.
-    missing = n_features - quota.sum()
+    missing = config.n_features - quota.sum()
     quota[np.argsort(quota - share, kind="stable")[:missing]] += 1
     return quota
 
 
 @cache
 def _layout(
-    height: int, width: int, n_levels: int, scale_factor: float
+    height: int, width: int, config: OrbConfig
 ) -> tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Number of bytes of a pyramid, and the offsets, shapes and scales of its levels."""
-    scales = _scales(n_levels, scale_factor)
+    scales = scale_factors(config)
     shapes = np.round(np.array([height, width]) / scales[:, None]).astype(np.int64).clip(min=1)
     sizes = shapes.prod(axis=1)
     offsets = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
@@ -165,13 +150,13 @@ def _layout(
 def level_shapes(size: tuple[int, int], config: OrbConfig) -> NDArray[np.int64]:
     """``(L, 2)`` heights and widths of the pyramid levels of an image with the given height and
     width."""
-    return _layout(*size, config.n_levels, config.scale_factor)[2]
+    return _layout(*size, config)[2]
 
 
 def build_pyramid(image: NDArray[np.uint8], config: OrbConfig) -> Pyramid:
     """Build the pyramid of an ``(H, W)`` uint8 image: each level is resized bilinearly from the
     previous one."""
-    size, offsets, shapes, scales = _layout(*image.shape, config.n_levels, config.scale_factor)
+    size, offsets, shapes, scales = _layout(*image.shape, config)
     pixels = np.empty(size + SPARE, np.uint8)
     pixels[-SPARE:] = 0
     pyramid = Pyramid(pixels, offsets, shapes, scales)

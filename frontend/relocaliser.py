@@ -41,17 +41,17 @@ class MapAccess(Protocol):
 
     @property
     def is_merged(self) -> bool:
-        """Whether tracking sees everything that has been mapped: no keyframe is being mapped."""
+        """Whether no keyframe is being mapped, so that tracking sees the whole map."""
         ...
 
     def merge(self) -> Map:
-        """Wait for the keyframe that is being mapped, make it visible to tracking, and return the
-        map."""
+        """Wait until no keyframe is being mapped, make the last one visible to tracking, and return
+        the map."""
         ...
 
 
 class Relocaliser:
-    """Searches the whole map for a frame, at the keyframes that it resembles."""
+    """Relocalises frames at the keyframes that they resemble."""
 
     def __init__(self, context: TrackingContext, locate: Locate, recognise: Recognise) -> None:
         """
@@ -80,11 +80,11 @@ class Relocaliser:
             return self._find(frame, owner.merge()) if owner.is_merged else found
         if not found.is_doubtful:
             return found
-        map_ = owner.merge()  # worth the wait, because a doubtful frame will ask for a keyframe
+        map_ = owner.merge()  # worth the wait, because a doubtful frame soon becomes a keyframe
         before = frame.snapshot()
-        elsewhere = self._find(frame, map_)
-        if elsewhere.n_inliers > self._context.config.relocalization.better * found.n_inliers:
-            return elsewhere
+        relocalised = self._find(frame, map_)
+        if relocalised.n_inliers > self._context.config.relocalization.better * found.n_inliers:
+            return relocalised
         frame.restore(before)
         return found
 
@@ -118,9 +118,9 @@ def relocalise(
 ) -> int:
     """Find the pose of a frame, without any prediction, at a place that it resembles.
 
-    The descriptors of the frame are matched with the landmarks of the place, and P3P inside RANSAC
-    estimates a pose; it needs no stereo. Then all landmarks of the surroundings are searched for
-    near their projections, first in a wide window, then in the usual one.
+    The descriptors of the frame are matched with the landmarks of the place, and a pose is
+    estimated by P3P inside RANSAC, which needs no stereo. Then all landmarks of the surroundings
+    are searched for near their projections, first in a wide window, then in the usual one.
 
     Args:
         frame: receives the pose and the matches on success; otherwise both are reset.

@@ -113,8 +113,8 @@ class Tracker:
 
     def predict(self, timestamp: float, frames: FramePoses, view: MapView) -> Matrix:
         """Predict the ``(4, 4)`` pose ``T_cw`` at a time in seconds. The velocity is constant per
-        second, not per frame, so that dropped frames do not distort the prediction. In a loaded
-        map, the reference keyframe's pose is predicted until a frame is tracked.
+        second, not per frame, so that dropped frames do not distort the prediction. Before the
+        first frame of a loaded map, the pose of the reference keyframe is predicted.
 
         Args:
             frames: poses of all earlier frames, including lost ones.
@@ -290,13 +290,13 @@ class Tracker:
 
     def _is_doubtful(self, frame: Frame, n_inliers: int, view: MapView, frames: FramePoses) -> bool:
         """Whether a frame has so few inliers that its matches may be wrong, and there is another
-        reason for doubt: a gap in time, an unknown motion, so that the pose was not predicted, or a
-        sudden drop in the number of inliers, for example after the camera was carried away."""
+        reason for doubt: a gap in time, an unknown motion (so that the pose was not predicted), or
+        a sudden drop in the number of inliers (for example after the camera was carried away)."""
         if self.last is None:
             return False
         config = self._config.relocalization
-        usual = frames.timestamp(-1) - frames.timestamp(-2) if len(frames) > 1 else 0
-        gap = frame.timestamp - self.last.timestamp > config.doubtful_gap * usual > 0.0
+        interval = frames.timestamp(-1) - frames.timestamp(-2) if len(frames) > 1 else 0
+        gap = frame.timestamp - self.last.timestamp > config.doubtful_gap * interval > 0.0
         old = view.n_keyframes > self._config.tracking.young_keyframes
         unpredicted = self.last.twist is None and old
         few = n_inliers < config.doubtful_share * view.n_reference

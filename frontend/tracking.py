@@ -32,8 +32,6 @@ from vslam.map_view import LocalMap
 from vslam.odometry import adjoint
 from vslam.reprojection import stack_uvr
 
-UNLIMITED = np.iinfo(np.int64).max  # as the largest octave
-
 
 @dataclass(frozen=True)
 class TrackingContext:
@@ -111,7 +109,7 @@ def track_motion(
     # only rise (or fall). A monocular camera has no baseline to compare the motion with.
     low, high = octave - 1, octave + 1
     if advance > camera.baseline > 0.0:
-        low, high = octave, np.full_like(octave, UNLIMITED)
+        low, high = octave, np.full_like(octave, len(context.scales))
     elif advance < -camera.baseline < 0.0:
         low, high = np.zeros_like(octave), octave
     matches, inliers = 0, 0

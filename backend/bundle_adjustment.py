@@ -205,7 +205,7 @@ def _adjust(T_start, n_free, points_start, observations, equations, iterations, 
                 if trial < cost:
                     small = cost - trial < tolerance * cost
                     cost = trial
-                    # Swapping replaces a copy, because the next step overwrites the whole trial.
+                    # Swap instead of copying: the next step overwrites the whole trial.
                     T_cw, T_trial = T_trial, T_cw
                     points, points_trial = points_trial, points
                     damping, growth, improved = max(damping * 0.1, 1e-9), 2.0, True

@@ -99,8 +99,8 @@ def find_patches(
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
 
     Returns:
-        ``(N, 2)`` float32 shift from the expected position, rounded to a pixel of its octave, to
-        the position found, in pixels of the octave; NaN if the patch was not found.
+        ``(N, 2)`` float32 shift from the pixel of the octave nearest to the expected position, in
+        pixels of the octave; NaN if the patch was not found.
     """
     view, size = known.view[at], known.size[at]
     warp = warps(T_cw, xyz, known.T_cw, view, size, scales[octave], intrinsics)

@@ -131,8 +131,7 @@ def reconstruct(
     best = int(np.argmax(counts))
     rival = int(np.sort(counts)[-2])
     points, good, cosine = views[best]
-    # The last entry is the cosine of the parallax that min_points points have at least.
-    widest = np.sort(cosine[good])[: config.min_points]
+    widest = np.sort(cosine[good])[: config.min_points]  # cosines of the largest parallaxes
     if (
         counts[best] < max(config.min_points, config.min_point_share * len(match))
         or rival > config.max_rival_share * counts[best]

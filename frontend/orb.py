@@ -74,7 +74,7 @@ def extract(
 def with_keypoints(
     found: Extraction, xy: NDArray[np.float32], octave: NDArray[np.uint8]
 ) -> Extraction:
-    """Add features at those of N given positions that have no feature within ``KEYPOINT_REACH``.
+    """Add a feature at each of N positions that has no other feature within ``KEYPOINT_REACH``.
 
     Args:
         found: the features of the image.
@@ -100,7 +100,8 @@ def with_keypoints(
         parts.append((position, np.full(len(corners), level, np.uint8), angles, descriptors))
     joined = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
     order = np.argsort(joined[1], kind="stable")
-    return Extraction(*(array[order] for array in joined), found.pyramid)
+    xy, octave, angle, descriptors = (array[order] for array in joined)
+    return Extraction(xy, octave, angle, descriptors, found.pyramid)
 
 
 @kernel

@@ -60,7 +60,7 @@ def track_patches(
     known, camera, scales = view.patches, context.camera, context.scales
     config = context.config.alignment
     at = np.searchsorted(view.local_landmarks.ids, known.ids)
-    local = LocalMap(*(values[at] for values in view.local_landmarks))
+    local = LocalMap._make(values[at] for values in view.local_landmarks)
     uvr, radius, octave = predict_landmarks(T_cw, local, 1.0, mask, context)
     margin = _MARGIN * scales[octave]
     size = np.array([camera.width, camera.height])

@@ -78,8 +78,8 @@ class RigCalibration:
         frame.delay_removed = True
 
     def correct_offset(self, frame: Frame) -> None:
-        """Correct the disparities of a frame by the current offset instead of the one by which they
-        have been corrected."""
+        """Update the disparities of a frame from the offset that they contain to the current
+        one."""
         change = self.disparity_offset - frame.disparity_offset
         if change == 0.0:
             return

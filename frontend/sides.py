@@ -37,8 +37,8 @@ class Sides:
     """The difference in exposure between the two images of a pair.
 
     Attributes:
-        darker_stops: by how many stops the right image is darker than the left one; 0 if they
-            differ by less than the threshold, or if no gain explains the difference.
+        darker_stops: by how many stops the right image is darker than the left one, negative if it
+            is brighter; 0 if they differ by less than the threshold, or not by a gain.
         black: the side whose image is black while the other one is not; empty if there is none.
     """
 

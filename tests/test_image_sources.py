@@ -123,10 +123,10 @@ def test_fabmap_matrix_of_pairs_goes_with_the_images_of_one_camera(tmp_path):
 
 def test_fabmap_ground_truth_must_fit_and_hold_something(tmp_path):
     folder = fabmap_folder(tmp_path / "c", 7, np.eye(4))
-    with pytest.raises(InputError, match="a matrix of 4 rows does not belong to 7 images"):
+    with pytest.raises(InputError, match=r"the matrix has 4 rows, but .* has 7 images"):
         open_source(f"fabmap:{folder}")
     savemat(folder / "truth.mat", {"truth": np.zeros((7, 7))})
-    with pytest.raises(InputError, match="no ground truth in it"):
+    with pytest.raises(InputError, match="contains no ground truth"):
         open_source(f"fabmap:{folder}")
     (folder / "truth.mat").write_bytes(b"not a matrix")
     with pytest.raises(InputError, match=r"not a readable \.mat file"):
@@ -168,7 +168,7 @@ def test_photographs_follow_the_kind_in_their_notes(tmp_path):
     assert len(set(zoo.unit)) == 4
     assert len(set(rooms.unit)) == 2
     (tmp_path / "zoo" / "NOTES.txt").write_text("animals\n")
-    with pytest.raises(InputError, match="no kind"):
+    with pytest.raises(InputError, match="must state the kind of the set"):
         open_source(f"photos:{tmp_path}")
 
 

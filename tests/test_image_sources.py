@@ -88,7 +88,7 @@ def test_bad_sources_are_named(tmp_path, spec, message):
 
 def test_test_frames_and_both_collections_are_refused(tmp_path):
     write_kitti_root(tmp_path, frames=range(248, 256))
-    with pytest.raises(InputError, match="frames 248 to 255 contain test data"):
+    with pytest.raises(InputError, match="frames 248 to 255 include test data"):
         refuse_test_data(open_source(f"kitti:{tmp_path}[seq=00]"))
     sources = []
     for name in ("CityCentre", "NewCollege"):

@@ -130,7 +130,7 @@ def create_detector(
             create_detector("bow", config),
             create_detector(_network_of(name), config, weights, images, late=late),
         ]
-        return CombinedDetector(name, detectors, config.siamese.min_shared)
+        return CombinedDetector(name, detectors)
     if name in NETWORKS:
         from vslam.loopclosure.siamese.detector import open_detector
 

@@ -150,12 +150,12 @@ def check_not_empty(path: Path) -> None:
     """Refuse a file without contents.
 
     Raises:
-        UnreadableImageError: the file is empty, or a link to nowhere.
+        UnreadableImageError: the file is empty, missing, or a link to nowhere.
     """
     try:
         empty = path.stat().st_size == 0
-    except (OSError, ValueError):  # ValueError: a path with a zero byte
-        empty = True
+    except (OSError, ValueError) as error:  # ValueError: a path with a zero byte
+        raise UnreadableImageError(path, "no such file; unpack the data again.") from error
     if empty:
         raise UnreadableImageError(path, "the file is empty; download it again.")
 

@@ -256,7 +256,8 @@ def check_times(timestamps: Times) -> list[Finding]:
         bool(gaps.sum() > most or steps[longest] > LONG_GAP * interval),
         f"{int(gaps.sum())} intervals with frames missing, the longest {steps[longest]:.3f} s "
         f"after frame {longest}",
-        "frames were lost on the way to the disk: record to a faster one, or at a lower rate",
+        "frames were lost on the way to the disk, or have no partner of the same time: record to a "
+        "faster disk, at a lower rate, or with synchronised cameras",
     )
     jitter = float(np.std(steps[~gaps])) / interval
     steady = judge(

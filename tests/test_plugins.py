@@ -339,7 +339,9 @@ def test_a_reader_that_fails_costs_one_frame(broken, kitti_tree):
     sequence = open_sequence("mine", kitti_tree, "00")
     with pytest.raises(UnreadableImageError, match=r"broken 2.0 failed at frame 2 \(KeyError"):
         sequence.read(2)
-    with pytest.raises(UnreadableImageError, match=r"gave uint8 \(159, 480\) and .* at frame 3"):
+    with pytest.raises(
+        UnreadableImageError, match=r"returned uint8 \(159, 480\) and .* at frame 3"
+    ):
         sequence.read(3)
     assert np.array_equal(sequence.read(1)[0], open_sequence("kitti", kitti_tree, "00").read(1)[0])
 
@@ -388,12 +390,12 @@ def test_a_run_on_a_reader_that_streams(broken, kitti_tree):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (("return Source", "return dict"), "gave dict, not vslam.datasets.frames.Source"),
+        (("return Source", "return dict"), "returned dict, not vslam.datasets.frames.Source"),
         (("camera=inner.camera", "camera=3"), "camera is int, not vslam.camera.Camera"),
         (("live=LIVE", "n_expected=-1"), "n_expected is -1, neither None nor a number"),
         (
             ("play=play", "stored=(*inner.stored, inner.stored[0])"),
-            "x: the times of its frames do not increase",
+            "x: the times of the frames do not increase",
         ),
     ],
 )

@@ -419,7 +419,7 @@ def test_a_perturbation_that_fails_costs_one_frame(broken):
     assert np.array_equal(law.apply(0, 0.0, image, None)[0], image)
     for frame, says in (
         (1, r"broken 2.0 failed \(ValueError: no; broken.py, line 3\)"),
-        (2, r"gave uint8 \(2, 6\)"),
+        (2, r"returned uint8 \(2, 6\)"),
     ):
         with pytest.raises(UnreadableImageError, match=says):
             law.apply(frame, 0.1, image, None)

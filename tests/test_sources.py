@@ -364,7 +364,7 @@ def test_a_stress_test_of_a_video(folder, tmp_path):
     assert "finished 1 of 1 searches" in done.output
     report = json.loads((tmp_path / "stress" / "stress.json").read_text())
     assert [(b["sequence"], b["law"]) for b in report["boundaries"]] == [("pair", "bias")]
-    assert "desync: looks at the next frame" in report["notes"][0]
+    assert "desync: needs the next frame" in report["notes"][0]
 
 
 def test_other_systems_are_not_tested_on_videos(folder, tmp_path):

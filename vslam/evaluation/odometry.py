@@ -1,4 +1,4 @@
-"""Errors of odometry over short motions, beside what their covariances predict."""
+"""Errors of odometry over short motions, and the errors that its covariances predict."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class MotionErrors:
 
     Attributes:
         first: ``(M,)`` int64, index of the frame in which each motion begins.
-        xi: ``(M, 6)`` errors, metres and radians, in the frame of the camera at the end: the true
-            motion is ``exp(xi) T_last_first``.
-        covariance: ``(M, 6, 6)`` what ``relative_covariance`` predicts.
+        xi: ``(M, 6)`` errors in metres and radians, in the camera frame at the end: the true motion
+            is ``exp(xi) T_last_first``.
+        covariance: ``(M, 6, 6)`` covariances of ``xi`` that ``relative_covariance`` predicts.
     """
 
     first: NDArray[np.int64]
@@ -31,21 +31,20 @@ class MotionErrors:
 
     @property
     def nees(self) -> NDArray[np.float64]:
-        """``(M,)`` normalised estimation error squared, divided by its six degrees of freedom: 1 on
-        average if the covariances are right (Bar-Shalom et al., Estimation with Applications to
+        """``(M,)`` normalised estimation errors squared, divided by the six degrees of freedom: 1
+        on average if the covariances are right (Bar-Shalom et al., Estimation with Applications to
         Tracking and Navigation, 2001, 5.4)."""
         solved = np.linalg.solve(self.covariance, self.xi[:, :, None])[:, :, 0]
-        found: NDArray[np.float64] = (self.xi * solved).sum(axis=1) / 6.0
-        return found
+        return np.asarray((self.xi * solved).sum(axis=1) / 6.0, np.float64)
 
     @property
     def distance(self) -> NDArray[np.float64]:
-        """``(M,)`` errors of the distance covered, metres."""
+        """``(M,)`` errors of the translation, metres."""
         return np.asarray(np.linalg.norm(self.xi[:, :3], axis=1), np.float64)
 
     @property
     def sigma(self) -> NDArray[np.float64]:
-        """``(M,)`` predicted standard deviations of the position, metres."""
+        """``(M,)`` predicted standard deviations of the translation, metres."""
         return np.asarray(np.sqrt(np.trace(self.covariance[:, :3, :3], axis1=1, axis2=2)))
 
 
@@ -55,9 +54,10 @@ def motion_errors(
     """Compare the motions of odometry with the true ones.
 
     Args:
-        tracks: one result per frame; only those with an uncertainty and a true pose count.
-        truth: true poses, at the times of frames.
-        interval_s: seconds; every motion ends at the first frame that is so much later.
+        tracks: one result per frame; frames without an uncertainty or a true pose are not used.
+        truth: true poses at the times of frames.
+        interval_s: duration of a motion; it ends at the first frame that is at least this many
+            seconds later.
     """
     true_pose = dict(zip(truth.timestamps.tolist(), truth.T_wc, strict=True))
     usable = [

@@ -122,18 +122,40 @@ def open_video(
             f"{path}: a video has one image per frame; use --side-by-side if each frame holds both "
             "images of a stereo pair, or run with --sensor mono."
         )
+    import cv2
+
     path = Path(path)
     capture = _open(path)
-    _check_size(path, capture)
-    n, own_fps = _count(capture), _own_rate(capture)
+    width, height, count, own_fps = (
+        float(capture.get(key))
+        for key in (
+            cv2.CAP_PROP_FRAME_WIDTH,
+            cv2.CAP_PROP_FRAME_HEIGHT,
+            cv2.CAP_PROP_FRAME_COUNT,
+            cv2.CAP_PROP_FPS,
+        )
+    )
+    # Checked before the decoder allocates the memory that the header asks for.
+    if width * height > MOST_PIXELS:
+        raise InputError(
+            f"{path}: frames of {width:.0f}x{height:.0f} exceed the limit of "
+            f"{MOST_PIXELS / 1e6:.0f} million pixels; scale the video down."
+        )
     first = list(islice(_images(capture), 2))
     if not first:
         raise InputError(f"{path}: holds no image that can be decoded; {_CONVERT}.")
-    times = [timestamp for timestamp, _ in first]
-    if fps is None and len(times) == 2 and times[1] <= times[0]:
+    stamped = len(first) < 2 or first[1][0] > first[0][0]
+    if fps is None and not stamped:
         raise InputError(f"{path}: the video has no time stamps; give --fps.")
-    if fps is not None and len(times) == 2 and times[1] > times[0]:
-        _compare_rates(path, fps, own_fps)
+    if fps is not None and stamped and own_fps > 0 and abs(fps / own_fps - 1.0) > _SAME_RATE:
+        _log.warning(
+            "%s: --fps %g contradicts the video's own %.4g frames per second; leave the option out "
+            "unless the video is wrong.",
+            path,
+            fps,
+            own_fps,
+        )
+    n = int(count) if count >= 1 else None
     return RawSource(
         dataset="video",
         name=path.stem,
@@ -170,44 +192,6 @@ def _open(path: Path) -> Capture:
             f"{path}: not a video, truncated, or in a codec unknown to OpenCV's FFmpeg; {_CONVERT}."
         )
     return capture
-
-
-def _check_size(path: Path, capture: Capture) -> None:
-    """Reject large frames before the decoder allocates the memory that the header asks for."""
-    import cv2
-
-    kinds = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT
-    width, height = (capture.get(kind) for kind in kinds)
-    if width * height > MOST_PIXELS:
-        raise InputError(
-            f"{path}: frames of {width:.0f}x{height:.0f} exceed the limit of "
-            f"{MOST_PIXELS / 1e6:.0f} million pixels; scale the video down."
-        )
-
-
-def _count(capture: Capture) -> int | None:
-    import cv2
-
-    n = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-    return n if n > 0 else None
-
-
-def _own_rate(capture: Capture) -> float:
-    """Frames per second according to the file, 0 if unknown."""
-    import cv2
-
-    return float(capture.get(cv2.CAP_PROP_FPS))
-
-
-def _compare_rates(path: Path, fps: float, own_fps: float) -> None:
-    if own_fps > 0 and abs(fps - own_fps) > _SAME_RATE * own_fps:
-        _log.warning(
-            "%s: --fps %g contradicts the video's own %.4g frames per second; leave the option out "
-            "unless the video is wrong.",
-            path,
-            fps,
-            own_fps,
-        )
 
 
 def _images(capture: Capture) -> Iterator[tuple[float, Image]]:

@@ -152,8 +152,9 @@ def revisits(T_wc: Poses, timestamps: NDArray[np.float64]) -> Revisits:
         timestamps: ``(N,)`` seconds.
     """
     none = np.zeros(0, np.int64)
+    no_revisits = Revisits(none, none, none, none, np.zeros(0))
     if len(T_wc) < 2:
-        return Revisits(none, none, none, none, np.zeros(0))
+        return no_revisits
     path = path_length(T_wc)
     sampled = np.searchsorted(path, np.arange(0.0, path[-1], _SAMPLE_M))
     sampled = np.unique(np.append(sampled, len(T_wc) - 1))
@@ -161,7 +162,7 @@ def revisits(T_wc: Poses, timestamps: NDArray[np.float64]) -> Revisits:
 
     revisiting = np.flatnonzero(match >= 0)
     if not len(revisiting):
-        return Revisits(none, none, none, none, np.zeros(0))
+        return no_revisits
     travelled = path[sampled]
     gap = np.diff(travelled[revisiting])
     interrupted = (np.diff(revisiting) > 1) & (gap >= MAX_INTERRUPTION_M)

@@ -61,28 +61,26 @@ def motion_errors(
     """
     true_pose = dict(zip(truth.timestamps.tolist(), truth.T_wc, strict=True))
     usable = [
-        (track, true_pose[track.timestamp])
+        (track.index, track.timestamp, track.T_odom_camera, track.uncertainty)
         for track in tracks
-        if track.timestamp in true_pose and track.uncertainty is not None
+        if track.timestamp in true_pose
+        and track.T_odom_camera is not None
+        and track.uncertainty is not None
     ]
-    times = np.array([track.timestamp for track, _ in usable])
+    times = np.array([timestamp for _, timestamp, _, _ in usable])
     first: list[int] = []
     xi: list[Matrix] = []
     covariance: list[Matrix] = []
-    for k, (one, T_true_one) in enumerate(usable):
-        last = int(np.searchsorted(times, times[k] + interval_s))
+    for index, t_first, T_first, uncertainty_first in usable:
+        last = int(np.searchsorted(times, t_first + interval_s))
         if last == len(usable):
             break
-        other, T_true_other = usable[last]
-        assert one.T_odom_camera is not None
-        assert other.T_odom_camera is not None
-        assert one.uncertainty is not None
-        assert other.uncertainty is not None
-        T_last_first = inverse(other.T_odom_camera) @ one.T_odom_camera
-        T_true = inverse(T_true_other) @ T_true_one
-        first.append(one.index)
+        _, t_last, T_last, uncertainty_last = usable[last]
+        T_last_first = inverse(T_last) @ T_first
+        T_true = inverse(true_pose[t_last]) @ true_pose[t_first]
+        first.append(index)
         xi.append(se3_log(orthonormalised(T_true @ inverse(T_last_first))))
-        covariance.append(relative_covariance(one.uncertainty, other.uncertainty, T_last_first))
+        covariance.append(relative_covariance(uncertainty_first, uncertainty_last, T_last_first))
     return MotionErrors(
         np.array(first, np.int64),
         np.array(xi, np.float64).reshape(-1, 6),

@@ -160,10 +160,7 @@ class LawKind:
         """Make the law of one strength and seed."""
         if not self.of_scene:
             return EachSide(self.make(strength, stream))  # type: ignore[arg-type]
-        return SceneLaw(name, self.needs, partial(self._made, strength, stream))
-
-    def _made(self, strength: float, stream: RandomStream, scene: Scene) -> PairLaw:
-        return self.make(strength, stream, scene)  # type: ignore[return-value]
+        return SceneLaw(name, self.needs, partial(self.make, strength, stream))  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)

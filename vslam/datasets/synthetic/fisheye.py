@@ -6,7 +6,6 @@ are then warped to two equidistant cameras with different lenses and rotations.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,8 +29,6 @@ _SIDES = (
     (0.962, (-4.7, 5.2), (0.009, -0.004, 0.001, -0.0002), (-0.008, 0.013, -0.012)),
 )
 _NS = 1_000_000_000
-
-Warp = Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
 
 
 @dataclass(frozen=True)
@@ -114,10 +111,11 @@ def render_fisheye(
         for side, model in enumerate(rig.models):
             base = folder / "mav0" / f"cam{side}"
             (base / "data").mkdir(parents=True, exist_ok=True)
-            warp = _warp(_seen_at(model, rig.R_own_rectified[side], wide.camera))
+            x, y = np.moveaxis(_seen_at(model, rig.R_own_rectified[side], wide.camera), 2, 0)
             for k, stamp in enumerate(stamps):
                 image = read_grey(frame_files(rendered, k, depth=False)[side])
-                write_png(base / "data" / f"{stamp}.png", warp(image), 1)
+                warped = cv2.remap(image, x, y, cv2.INTER_LANCZOS4)
+                write_png(base / "data" / f"{stamp}.png", warped, 1)
             listed = "".join(f"{stamp},{stamp}.png\n" for stamp in stamps)
             write(base / "data.csv", f"#timestamp [ns],filename\n{listed}".encode())
             write(base / "sensor.yaml", _sensor(model, T_body[side]).encode())
@@ -137,14 +135,6 @@ def _seen_at(model: CameraModel, R_own_rectified: Array, camera: Camera) -> NDAr
     own = unproject(model, np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
     at = camera.project(own @ R_own_rectified)[:, :2]
     return at.reshape(*u.shape, 2).astype(np.float32)
-
-
-def _warp(at: NDArray[np.float32]) -> Warp:
-    def warp(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        found = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LANCZOS4)
-        return np.asarray(found, np.uint8)
-
-    return warp
 
 
 def _sensor(model: CameraModel, T_body_camera: Array) -> str:

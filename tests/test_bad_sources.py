@@ -55,6 +55,8 @@ def test_topics(folder):
     listed = "image topics are /cam0/image_raw, /cam1/image_raw"
     options = SourceOptions(topics=f"{LEFT},/cam9")
     refused(f"--topics /cam9: not in .*ros1.bag; {listed}", "bag", bag, options)
+    twice = SourceOptions(topics=f"{LEFT},{LEFT}")
+    refused(f"--topics {LEFT},{LEFT}: one topic twice; {listed}", "bag", bag, twice)
     refused("or of the depth, or run with --sensor mono", "bag", bag, SourceOptions(topics=LEFT))
     refused(
         f"choose topics with --topics TOPIC; {listed}", "bag", bag, SourceOptions(), sensor="mono"

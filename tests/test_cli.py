@@ -365,6 +365,22 @@ def test_misspelt_option(call):
     code, _, err = call("run", "--frames", "5")
     assert code == 2
     assert "No such option" in err
+    assert "--max-frames" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        ("eval --seq 00", ["vslam eval takes RUN|FILE: Folder of a run", "are --gt, --align,"]),
+        ("report --data runs", ["vslam report takes FOLDER...: Folders of runs", "--trajectory"]),
+        ("info --seq 00", ["No such option: --seq. Its options are --data"]),
+    ],
+)
+def test_an_option_that_only_other_commands_have(call, words, parts):
+    code, _, err = call(*words.split())
+    assert code == 2
+    text = " ".join(err.replace("│", " ").split())
+    assert all(part in text for part in parts)
 
 
 def shaken(trajectory: Trajectory) -> Trajectory:

@@ -140,7 +140,7 @@ def test_topics_of_bags_with_depth(corridor, depths, calib, tmp_path):
     refused("stereo needs two image topics; image topics are /camera/aligned", alone, calib)
 
 
-def test_folders_by_option_and_by_times(corridor, depths, calib, folders, tmp_path):
+def test_folders_by_option_and_by_times(corridor, depths, calib, folders, tmp_path, caplog):
     times = [1403636579.76 + 0.1 * k for k in range(3)]
     write_images(tmp_path, {"a": corridor.left[:3]}, [f"{t:.6f}.png" for t in times])
     # The second depth image is missing: by order, each would get the next one's.
@@ -148,6 +148,7 @@ def test_folders_by_option_and_by_times(corridor, depths, calib, folders, tmp_pa
     write_images(tmp_path, {"b": [depths[0], depths[2]]}, late)
     source = opened(tmp_path / "a", calib, depth=tmp_path / "b", depth_scale=1000.0)
     np.testing.assert_allclose(source.timestamps, [times[0], times[2]])
+    assert "only 2 of 3 images have a depth image within 20 ms" in caplog.text
     assert np.array_equal(source.read(1)[1], depths[2] * np.float32(0.001))
     assert np.array_equal(source.read(1)[0], corridor.left[2])
     alone = opened(folders, calib, fps=10.0, sensor="mono")

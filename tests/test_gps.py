@@ -286,7 +286,7 @@ def test_a_straight_drive_is_placed_but_not_level():
 def test_a_short_drive_is_refused():
     positions, _ = measured(drive(4)[0])
     graph = graph_of(drive(4)[0], positions.seconds)
-    with pytest.raises(InputError, match="too short for GPS: the fixes do not tell which way"):
+    with pytest.raises(InputError, match="too short for GPS: the fixes do not determine"):
         anchor(graph, positions.seconds, positions, CONFIG, metric=True)
 
 

@@ -15,6 +15,7 @@ _log = logging.getLogger(__name__)
 # Ground truth comes at 100 Hz (TUM), 200 Hz (EuRoC) or 10 Hz (vehicles). At an acceleration of
 # 2 m/s^2, linear interpolation is off by 6 mm in the middle of this gap.
 _MAX_GAP_S = 0.15
+_MANY = 0.1  # share of images without a partner; TUM's sequences have up to 7 %
 
 
 def associate(
@@ -42,6 +43,17 @@ def associate(
             taken.add(j)
     pairs = np.array(sorted(partner.items()), np.int64).reshape(-1, 2)
     return pairs[:, 0], pairs[:, 1]
+
+
+def warn_of_unpaired(source: Path, n_pairs: int, n_images: int) -> None:
+    """Warn if many colour images are left out because no depth image is near them in time."""
+    if n_pairs < (1.0 - _MANY) * n_images:
+        _log.warning(
+            "%s: only %d of %d images have a depth image within 20 ms; the others are left out.",
+            source,
+            n_pairs,
+            n_images,
+        )
 
 
 def poses_at(

@@ -338,6 +338,8 @@ def _choose_topics(
             f"--topics {','.join(topics)}: name the topic of the left images and the topic of the "
             "right images or of the depth, or run with --sensor mono."
         )
+    if len(set(topics)) < len(topics):
+        raise InputError(f"--topics {','.join(topics)}: one topic twice; {listed}.")
     if topics[0] in with_depth:
         raise InputError(
             f"--topics {','.join(topics)}: {topics[0]} holds depth; name the topic of the images "

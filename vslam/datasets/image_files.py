@@ -198,12 +198,12 @@ def check_not_empty(path: Path) -> None:
     """Check that a file has contents.
 
     Raises:
-        UnreadableImageError: the file is missing or empty.
+        UnreadableImageError: the file is missing, empty, or a dangling link.
     """
     try:
         empty = path.stat().st_size == 0
-    except (OSError, ValueError):  # ValueError: a path with a zero byte
-        empty = True
+    except (OSError, ValueError) as error:  # ValueError: a path with a zero byte
+        raise UnreadableImageError(path, "no such file; unpack the data again.") from error
     if empty:
         raise UnreadableImageError(path, "the file is empty; download it again.")
 

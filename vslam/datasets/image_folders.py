@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.datasets.association import associate
+from vslam.datasets.association import associate, warn_of_unpaired
 from vslam.datasets.frames import RawSource
 from vslam.datasets.image_files import (
     checked_files,
@@ -232,6 +232,7 @@ def _near_in_time(first: dict[str, Path], second: dict[str, Path]) -> list[list[
             f"{files[1][0].parent}: by the times in their names, no depth image is within 20 ms of "
             "an image; name folders of one recording."
         )
+    warn_of_unpaired(files[0][0].parent, len(pairs[0]), len(colour))
     return [[side[k] for k in chosen] for side, chosen in zip(files, pairs, strict=True)]
 
 

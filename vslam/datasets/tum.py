@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from vslam.calibration.files import read_calibration
 from vslam.calibration.models import Calibration, CameraModel
-from vslam.datasets.association import associate, poses_at
+from vslam.datasets.association import associate, poses_at, warn_of_unpaired
 from vslam.datasets.frames import Source
 from vslam.datasets.image_files import (
     checked_files,
@@ -95,6 +95,7 @@ def open_tum(
                 f"{folder}: no colour image has a depth image within 20 ms; take rgb.txt and "
                 "depth.txt from one recording, or run on the colour images with --sensor mono."
             )
+        warn_of_unpaired(folder, len(frames), len(times))
     chosen = select_frames(folder, len(frames), start, every, max_frames)
     times = times[frames[chosen]]
     colour = tuple(colour_files[k] for k in frames[chosen])

@@ -262,7 +262,8 @@ def check_times(timestamps: Times) -> list[Finding]:
         bool(gaps.sum() > most or steps[longest] > LONG_GAP * interval),
         f"{int(gaps.sum())} intervals with missing frames, the longest {steps[longest]:.3f} s "
         f"after frame {longest}",
-        "frames were lost during recording: use a faster disk, or a lower rate",
+        "frames were lost during recording, or have no partner of the same time: use a faster "
+        "disk, a lower rate, or synchronised cameras",
     )
     jitter = float(np.std(steps[~gaps])) / interval
     steady = judge(

@@ -156,7 +156,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--data .", ["the folder is empty", "--data"]),
         ("nowhere", ["nowhere", "no such file or folder", "--data"]),
         ("nowhere --data .", ["nowhere: --data also names what to read"]),
-        ("--data other", ["no known data set", "sequences", "mav0", "rgb.txt"]),
+        ("--data other", ["not a known data set", "sequences", "mav0", "rgb.txt"]),
         ("--data 77 --sensor mono", ["camera 77", "no such device"]),
         ("--dataset images --data . --fps 0", ["--fps 0", "positive"]),
         ("--dataset kitti --topics /a,/b", ["--topics", "only for --dataset bag"]),
@@ -365,6 +365,22 @@ def test_misspelt_option(call):
     code, _, err = call("run", "--frames", "5")
     assert code == 2
     assert "No such option" in err
+    assert "--max-frames" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        ("eval --seq 00", ["vslam eval takes RUN|FILE: Folder of a run", "are --gt, --align,"]),
+        ("report --data runs", ["vslam report takes FOLDER...: Folders of runs", "--trajectory"]),
+        ("info --seq 00", ["No such option: --seq. Its options are --data"]),
+    ],
+)
+def test_an_option_that_only_other_commands_have(call, words, parts):
+    code, _, err = call(*words.split())
+    assert code == 2
+    text = " ".join(err.replace("│", " ").split())
+    assert all(part in text for part in parts)
 
 
 def shaken(trajectory: Trajectory) -> Trajectory:

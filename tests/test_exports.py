@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import json
 import struct
 from dataclasses import dataclass, replace
@@ -339,6 +340,24 @@ def test_loops_and_gaps_of_a_run_become_edges(corridor_run, tmp_path):
     expected = np.linalg.inv(T_query_match @ grown.keyframes.T_c_parent[2])
     measured = graph.edges.tolist().index([1, 5])
     np.testing.assert_allclose(graph.T_i_j[measured], expected, atol=1e-9)
+
+
+def test_the_picture_of_a_loop_shows_its_images_and_where_it_lies_in_the_map(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "tools"))
+    tool = importlib.import_module("loop_picture")
+    loop = LoopEdge(6, 1, 0.5, True, "closed", T_query_match=np.eye(4))
+    save_map(tmp_path / "map.npz", StoredMap(small_map(), CAMERA, (loop,)))
+    (tmp_path / "figures").mkdir()
+    seen = np.full((100, 1288, 3), 200, np.uint8)
+    cv2.imwrite(str(tmp_path / "figures" / "loop-18-3.jpg"), seen)
+    picture = tool.draw(tmp_path)
+    np.testing.assert_array_equal(picture[:100], seen)
+    below = picture[100:]
+    green = np.abs(below.astype(int) - (153, 211, 52)).max(axis=2) < 10
+    orange = np.abs(below.astype(int) - (36, 191, 251)).max(axis=2) < 10
+    assert below.shape == (540, 1288, 3)
+    assert 200 < np.count_nonzero(green) < 10_000
+    assert 20 < np.count_nonzero(orange) < 10_000
 
 
 def test_evo_reads_the_csv_of_euroc(tmp_path):

@@ -234,7 +234,9 @@ def test_times_of_a_sequence_are_those_of_its_images(tmp_path):
     assert source.select(np.array([0, 2])).times.tolist() == [0.2, 0.5]
     for damaged in ("0\n1\n", "0\n0.1\n0.2\n0.1\n0.4\n0.5\n"):
         (folder / "times.txt").write_text(damaged)
-        with pytest.raises(InputError, match=r"times\.txt: times must ascend and reach image"):
+        with pytest.raises(
+            InputError, match=r"times\.txt: the times must ascend and include image"
+        ):
             open_source(f"kitti:{tmp_path}")
 
 

@@ -649,6 +649,10 @@ page.onload = () => {
     shown: inner.documentElement.clientWidth,
     needed: inner.documentElement.scrollWidth,
     figures: boxes.map(box => [box.left, box.right, box.height]),
+    drawings: [...inner.querySelectorAll("figure svg")].map(x => x.getBoundingClientRect().right),
+    letters: Math.min(...[...inner.querySelectorAll("figure svg text")].map(x =>
+      parseFloat(page.contentWindow.getComputedStyle(x).fontSize)
+      * x.ownerSVGElement.clientWidth / x.ownerSVGElement.viewBox.baseVal.width)),
     paths: [...inner.querySelectorAll("figure svg path")].length,
     requests: page.contentWindow.performance.getEntriesByType("resource").map(x => x.name),
     font: getComputedStyle(inner.querySelector("td")).fontSize,
@@ -684,6 +688,8 @@ def test_report_in_a_browser_as_wide_as_a_phone(written, tmp_path: Path):
         0 <= left < right <= 400 and height > 100 for left, right, height in found["figures"]
     )
     assert found["paths"] > 10 * len(FIGURES)
+    assert max(found["drawings"]) <= 400
+    assert found["letters"] >= 9
     assert found["needed"] <= found["shown"] <= 400
     assert found["requests"] == []
     assert sorted(set(asked)) == ["/probe.html", "/report.html"]

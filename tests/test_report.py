@@ -22,7 +22,7 @@ from vslam.loops import LoopCorrection, LoopEdge
 from vslam.report.folder import write_results
 from vslam.report.run_page import headlines
 from vslam.report.schema import DetectorFigures, ReportJson
-from vslam.report.summary import summarize
+from vslam.report.summary import evaluate_run, summarize
 from vslam.report.trajectory_figures import loop_closing, top_view
 from vslam.run.loop_pictures import LoopPicture
 from vslam.run.options import RunOptions
@@ -287,6 +287,45 @@ def test_causal_ate_is_of_the_poses_as_they_were_given(written: tuple[RunOutcome
         evaluate_trajectory(given, truth).ate_rmse_m, abs=1e-6
     )
     assert "Causal ATE" in (folder / "report.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("sensor", "scale", "says"),
+    [
+        ({}, 1.0, None),
+        ({}, 1.1, None),
+        ({}, 2.0, "2 times as large as the ground truth: check the baseline"),
+        ({"depth": True}, 0.2, "0.2 times as large as the ground truth: check the depth scale"),
+        ({"baseline": 0.0}, 5.0, None),
+    ],
+)
+def test_a_trajectory_of_another_scale_is_reported(sensor, scale: float, says: str | None):
+    outcome = make_outcome()
+    T_wc = outcome.trajectory.T_wc.copy()
+    T_wc[:, :3, 3] *= scale
+    camera = replace(outcome.sequence.camera, **sensor)
+    outcome = replace(
+        outcome,
+        trajectory=replace(outcome.trajectory, T_wc=T_wc),
+        sequence=replace(outcome.sequence, camera=camera),
+    )
+    warnings = summarize(outcome, evaluate_run(outcome)[0], None, None).warnings
+    assert len(warnings) == (says is not None)
+    assert says is None or says in warnings[0]
+
+
+def test_a_camera_that_stands_still_has_no_scale():
+    outcome = make_outcome()
+    truth, rng = outcome.sequence.ground_truth.copy(), np.random.default_rng(0)
+    truth[:, :3, 3] = rng.normal(0.0, 1e-3, (len(truth), 3))
+    T_wc = truth.copy()
+    T_wc[:, :3, 3] = rng.normal(0.0, 3e-3, (len(truth), 3))
+    outcome = replace(
+        outcome,
+        trajectory=replace(outcome.trajectory, T_wc=T_wc),
+        sequence=replace(outcome.sequence, ground_truth=truth),
+    )
+    assert not summarize(outcome, evaluate_run(outcome)[0], None, None).warnings
 
 
 @pytest.mark.slow

@@ -248,6 +248,17 @@ def test_bad_input_of_tum(copy, tmp_path):
     refused(copy, "depth.txt", "missing", "--sensor mono")
 
 
+def test_images_without_depth_are_counted(copy, caplog):
+    lines = (copy / "depth.txt").read_text().splitlines()
+    (copy / "depth.txt").write_text("\n".join(lines[:-1]))
+    assert len(open_tum(copy, "")) == FRAMES - 1
+    assert not caplog.messages
+    (copy / "depth.txt").write_text("\n".join(lines[:-4]))
+    open_tum(copy, "")
+    (said,) = caplog.messages
+    assert f"only {FRAMES - 4} of {FRAMES} images have a depth image within 20 ms" in said
+
+
 @pytest.mark.parametrize(
     ("image", "part"),
     [
@@ -265,6 +276,8 @@ def test_depth_that_does_not_fit(copy, image, part):
     refused(copy, first.name, part)
     first.write_bytes(b"")
     refused(copy, first.name, "empty")
+    first.unlink()
+    refused(copy, first.name, "no such file")
 
 
 # Runs

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from importlib.metadata import Distribution, EntryPoint, distributions
 from pathlib import Path
@@ -125,6 +125,12 @@ def find_plugins(group: str) -> dict[str, PlugIn]:
             first = found[name].entry_point if name in found else entry_point
             found[name] = PlugIn(group, name, (*others, package), first)
     return dict(sorted(found.items()))
+
+
+def packages_of(names: Collection[str]) -> dict[str, str]:
+    """The packages, with versions, of those ``names`` that are plug-ins, by name."""
+    found = {name: plugin for group in KINDS for name, plugin in find_plugins(group).items()}
+    return {name: " and ".join(found[name].packages) for name in names if name in found}
 
 
 def _entry_points(group: str) -> list[tuple[str, EntryPoint]]:

@@ -80,8 +80,8 @@ def evaluate_files(
     rows = [
         ("frames", matched),
         ("alignment", alignment),
-        ("ATE RMSE", f"{evaluation.ate_rmse_m:.3f} m"),
-        ("ATE mean, max", f"{evaluation.ate_mean_m:.3f} m, {evaluation.ate_max_m:.3f} m"),
+        ("ATE RMSE", f"{evaluation.ate_rmse_m:.4f} m"),
+        ("ATE mean, max", f"{evaluation.ate_mean_m:.4f} m, {evaluation.ate_max_m:.4f} m"),
         ("RPE per frame", f"{evaluation.rpe_m:.4f} m, {evaluation.rpe_deg:.4f} deg"),
     ]
     if evaluation.t_rel_percent is None:

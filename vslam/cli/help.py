@@ -55,6 +55,18 @@ def show_help(command: Any, context: Any) -> None:
         console.print(Padding(Text.from_markup(command.epilog.strip()), (1, 1)))
 
 
+def describe_parameters(command: Any, context: Any) -> str:
+    """Sentences that say what the arguments of a command are, and list its options."""
+    arguments, options = [], []
+    for parameter in command.get_params(context):
+        if parameter.param_type_name == "option":
+            options.append("/".join((*parameter.opts, *parameter.secondary_opts)))
+        else:
+            about = Text.from_markup(parameter.help or "").plain
+            arguments.append(f"{context.command_path} takes {_name(parameter)}: {about}")
+    return " ".join([*arguments, f"Its options are {', '.join(options)}."])
+
+
 def _name(parameter: Any) -> str:
     """``--record/--no-record``, ``--map FILE`` or ``RUN``."""
     if parameter.param_type_name == "argument":

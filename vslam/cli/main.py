@@ -45,8 +45,11 @@ _GROUPS: tuple[ModuleType, ...] = (
 )  # fmt: skip
 
 
+_UsageError: Any = typer.BadParameter.__base__  # typer does not export it
+
+
 class _Command(TyperCommand):
-    """A command with our own help, which suggests a name for a misspelt choice."""
+    """A command with our own help, which says what to use instead of a wrong choice or option."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         from vslam.cli.help import show_help
@@ -58,6 +61,12 @@ class _Command(TyperCommand):
             return super().parse_args(ctx, args)
         except typer.BadParameter as error:
             error.message = _plain(error.message)
+            raise
+        except _UsageError as error:
+            if getattr(error, "possibilities", None) == []:  # nothing is spelt like the option
+                from vslam.cli.help import describe_parameters
+
+                error.message += f". {describe_parameters(self, ctx)}"
             raise
 
 

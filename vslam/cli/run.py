@@ -257,4 +257,9 @@ def _map_to_continue(
         raise InputError(
             f"--detector {detector}: {file} was made with the detector {of_map}; leave it out."
         )
+    if of_map not in DETECTOR_NAMES:
+        raise InputError(
+            f"{file} was made with the detector {of_map}, a plug-in that is not installed here; "
+            "install its package."
+        )
     return file.resolve(), cast("DetectorName", of_map), thresholds

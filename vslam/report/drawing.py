@@ -7,10 +7,11 @@ colours are CSS variables, so that the HTML page follows the reader's light or d
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib import style
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -59,9 +60,11 @@ STYLE = {
     "ytick.color": LINE,
     "ytick.labelcolor": MUTED,
 }
-# Inches, small enough for the text to stay readable on a phone.
-WIDTH, LOW, SQUARE = 5.6, 3.0, 6.6
-DOTS_PER_INCH = 160
+# Inches, small enough for the text to stay readable where a phone shrinks the figure to its width.
+WIDTH, LOW, SQUARE = 4.6, 2.5, 5.4
+DOTS_PER_INCH = 200
+_LEGEND_CHARACTERS = 60  # that fit side by side
+_HANDLE_CHARACTERS = 6  # taken by the line or marker of an entry and the gap to the next
 
 Drawing = tuple[str, str, Figure]  # name, caption and figure
 
@@ -79,9 +82,19 @@ def new_figure(title: str, x_label: str, y_label: str, height: float) -> tuple[F
 
 def add_legend(figure: Figure, axes: Axes) -> None:
     """List all labelled artists below the axes, where a legend never covers data."""
-    count = len(axes.get_legend_handles_labels()[0])
-    columns = count if count <= 5 else min(-(-count // 2), 4)
-    figure.legend(loc="outside lower center", ncols=columns, columnspacing=1.2)
+    labels = axes.get_legend_handles_labels()[1]
+    figure.legend(loc="outside lower center", ncols=_legend_columns(labels), columnspacing=1.2)
+
+
+def _legend_columns(labels: Sequence[str]) -> int:
+    """The most columns, as matplotlib fills them, that are not wider than the figure."""
+    lengths = np.array([len(label) + _HANDLE_CHARACTERS for label in labels])
+    columns = len(lengths)
+    while columns > 1 and (
+        sum(max(column) for column in np.array_split(lengths, columns)) > _LEGEND_CHARACTERS
+    ):
+        columns -= 1
+    return columns
 
 
 def finish_map(figure: Figure, axes: Axes) -> None:

@@ -38,6 +38,9 @@ _OPTIONS = (
     "local_weights", "realtime", "calib", "mask", "gps", "localize", "compare",
 )  # fmt: skip
 
+_WRONG_SCALE = 1.2  # drift changes the scale by a few per cent
+_LEFT_OVER = 0.3  # share of the error, and of the path's size, that a change of scale may leave
+
 
 def summarize(
     outcome: RunOutcome,
@@ -66,7 +69,7 @@ def summarize(
         skipped_messages=outcome.skipped,
         dropped_frames=states[TrackingState.DROPPED],
         frames=frames,
-        warnings=tuple(outcome.warnings),
+        warnings=(*outcome.warnings, *_scale_warnings(outcome, evaluation)),
         alignment=evaluation.alignment if evaluation else None,
         ate_mean_m=evaluation.ate_mean_m if evaluation else None,
         ate_max_m=evaluation.ate_max_m if evaluation else None,
@@ -99,6 +102,30 @@ def summarize(
         thresholds=changed_thresholds(settings["thresholds"]),
         **{name: settings[name] for name in _OPTIONS},
     )
+
+
+def _scale_warnings(outcome: RunOutcome, evaluation: Evaluation | None) -> list[str]:
+    """A warning if the trajectory of a sensor that knows the scale fits the ground truth only after
+    it is scaled."""
+    camera, ground_truth = outcome.sequence.camera, matched_ground_truth(outcome)
+    if evaluation is None or ground_truth is None or camera.monocular:
+        return []
+    estimate, truth = (
+        T_wc[:, :3, 3] - T_wc[:, :3, 3].mean(axis=0)
+        for T_wc in (evaluation.T_wc_aligned, ground_truth.T_wc)
+    )
+    scale = float(np.sum(estimate * truth) / max(np.sum(estimate**2), 1e-12))
+    error, size, left = (
+        np.linalg.norm(x) for x in (truth - estimate, truth, truth - scale * estimate)
+    )
+    if 1.0 / _WRONG_SCALE < scale < _WRONG_SCALE or left > _LEFT_OVER * min(error, size):
+        return []
+    what = (
+        "the depth scale (--depth-scale)"
+        if camera.depth
+        else "the baseline, and that the calibration is for images of this size"
+    )
+    return [f"the trajectory is {1.0 / scale:.2g} times as large as the ground truth: check {what}"]
 
 
 def _lost_before_map(outcome: RunOutcome) -> int:

@@ -17,8 +17,8 @@ Image = NDArray[np.uint8]  # (H, W) grey
 DepthImage = NDArray[np.float32]  # (H, W) metres along z, 0 where unknown
 Sensor = Literal["stereo", "mono", "rgbd"]
 
-# The disparity of an observation is more accurate than its column and row; its reprojection error
-# has this weight (docs/research/motorway.md).
+# Disparities are more accurate than columns and rows, so that the errors of disparities have this
+# weight in the reprojection error (docs/research/motorway.md).
 DISPARITY_WEIGHT = 3.0
 
 # Largest plausible distance of the principal point from the middle, as a share of the image size.
@@ -45,8 +45,8 @@ class Camera:
         width, height: image size in pixels.
         depth: whether the second image is the depth of the left image's pixels instead of a right
             image.
-        right_delay: seconds from the exposure of the left image of a pair to that of the right one;
-            0 for cameras that share a trigger.
+        right_delay: seconds from the exposure of the left image of a pair to that of the right one,
+            negative if the right one comes first; 0 for cameras that share a trigger.
 
     Raises:
         ValueError: a size or focal length is not positive, the baseline is negative, or the

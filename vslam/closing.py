@@ -102,13 +102,13 @@ class LoopClosing:
     def _find(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> _Loop | None:
         """Verify candidates, best first, and return the first true loop. The map is only read."""
         candidates = self.verifier.rate(map_, keyframe, candidates)
-        _, refused = self._consistency.update(keyframe, candidates, map_)
-        refusals = {edge.match: edge for edge in refused}
-        tried = [one for one in candidates if one.promising or one.match not in refusals]
+        _, rejected = self._consistency.update(keyframe, candidates, map_)
+        rejections = {edge.match: edge for edge in rejected}
+        tried = [one for one in candidates if one.promising or one.match not in rejections]
         matches = {one.match for one in tried}
-        self.edges += [edge for edge in refused if edge.match not in matches]
+        self.edges += [edge for edge in rejected if edge.match not in matches]
         for number, candidate in enumerate(tried):
-            edge = self.verifier.verify(map_, candidate, refusals.get(candidate.match))
+            edge = self.verifier.verify(map_, candidate, rejections.get(candidate.match))
             edge = self._consistency.confirm(edge, map_)
             if not edge.accepted:
                 self.edges.append(edge)
@@ -199,7 +199,7 @@ class LoopClosing:
             self._global = None
         keyframes = solution.graph.keyframes
         before = map_.arrays.T_cw[keyframes]
-        # Fusion makes the two sides covisible, so the neighbours of each are collected before.
+        # Fusion makes both sides covisible, so their neighbours are collected before it.
         query_side = [edge.query, *strong_neighbours(map_, edge.query, self._config)]
         match_side = [edge.match, *strong_neighbours(map_, edge.match, self._config)]
         self.closed.append(edge)

@@ -300,8 +300,8 @@ class KeyframeConfig(Section):
     """Too few tracked close points cause a keyframe only if the keyframe could add more new close
     points than this. [OS2 III-E, printed]"""
     min_kept_close: float = Field(0.2, ge=0, le=1)
-    """Where a keyframe adds fewer close points than `min_tracked_close` on average, this share of
-    that average replaces `min_tracked_close` (docs/research/motorway.md). [own]"""
+    """If a keyframe adds fewer close points than `min_tracked_close` on average, this share of that
+    average replaces `min_tracked_close` (docs/research/motorway.md). [own]"""
     first_gain: float = Field(2.0, ge=0)
     """Until the number of close points that a keyframe adds has been observed, it is assumed to be
     this multiple of `min_tracked_close`. [own]"""

@@ -235,7 +235,7 @@ class TrackingState(StrEnum):
 
 @dataclass(frozen=True)
 class TrackResult:
-    """The result of tracking one frame, also of a lost one.
+    """The result of tracking one frame. Lost frames have one, too.
 
     Attributes:
         index: frame number within the run, from 0.

@@ -29,8 +29,8 @@ class KeyframePoses(Protocol):
         ...
 
     def unit_scale(self, keyframe: int) -> float:
-        """The present length, in map units, of something near a keyframe that was one unit long
-        when the keyframe was added; 1 in metric maps."""
+        """Factor by which loops have scaled lengths near a keyframe since it was added; 1 in metric
+        maps."""
         ...
 
 

@@ -21,7 +21,8 @@ _ROUNDS = 3  # of a fixed-point iteration, since speed and disparity depend on e
 def rays(
     xy: NDArray[np.float32], camera: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """``(N,)`` x and ``(N,)`` y at depth 1 in the left camera, for ``(N, 2)`` pixels."""
+    """Normalised image coordinates ``(N,)`` x and ``(N,)`` y of ``(N, 2)`` pixels of the left
+    image."""
     u, v = xy.astype(np.float64).T
     return (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
 

@@ -1,7 +1,7 @@
 """How vslam compiles its kernels, and the bit arithmetic that several of them share.
 
 A kernel is compiled once on each machine and kept in Numba's cache. It releases the GIL, so that
-threads of the pipeline run kernels side by side. ``error_model="numpy"`` and fused multiply-add are
+threads of the pipeline run kernels in parallel. ``error_model="numpy"`` and fused multiply-add are
 the only relaxations; without re-association, a result never depends on how a loop was vectorised.
 
 Numba prepares for compilation before it looks into its cache: it imports support for everything
@@ -233,7 +233,7 @@ def borrowed(typing_context, array):
     """The same array without reference counting, valid while a caller holds the original.
 
     Numba counts a reference whenever an array is passed to another function. This atomic operation
-    costs more than a small function does.
+    takes longer than a small function.
     """
 
     def generate(context, builder, signature, arguments):

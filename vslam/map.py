@@ -3,8 +3,8 @@
 A *row* is one keypoint of one keyframe; the rows of a keyframe are consecutive. The table of rows
 is also the table of observations: ``landmark[row]`` is the landmark that the keypoint observes, and
 ``next_row`` links the rows of each landmark into a chain. Covisibility is not stored, but counted
-from the rows when it is needed. Arrays instead of objects follow DPVO's PatchGraph. Ids of
-keyframes are never reused; ids of landmarks change only when dead landmarks are dropped. Arrays
+from the rows when it is needed. The use of arrays instead of objects follows DPVO's PatchGraph. Ids
+of keyframes are never reused; ids of landmarks change only when dead landmarks are dropped. Arrays
 grow by half their size.
 
 To add a column, declare it in ``Arrays`` or ``KeyframeTable`` with an empty array of its dtype and
@@ -28,7 +28,7 @@ from vslam.loops import LoopEdge
 from vslam.map_kernels import count_shared, detach_keyframe, resolve
 
 NONE = -1
-_FEW_LANDMARKS = 8192  # of 1 MB; dropping fewer dead landmarks is not worth it
+_FEW_LANDMARKS = 8192  # take about 1 MB; dropping fewer dead landmarks is not worth it
 
 
 class Arrays(NamedTuple):
@@ -88,8 +88,8 @@ class KeyframeTable(NamedTuple):
     ``timestamp`` (K,) f8 seconds; ``frame`` (K,) i8 index of the frame that became the keyframe;
     ``parent`` (K,) i8 parent of the keyframe in the spanning tree, or -1;
     ``session`` (K,) i8 the drive, counted from 0, that its timestamp and frame index belong to;
-    ``unit_scale`` (K,) f8 present length, near the keyframe, of what was one unit long when the
-    keyframe was added: always 1 in metric maps, changed by the loops of monocular maps;
+    ``unit_scale`` (K,) f8 factor by which loops have scaled lengths near the keyframe since it was
+    added, always 1 in metric maps;
     ``T_c_parent`` (K, 4, 4) f8 the pose of a culled keyframe relative to its parent, identity while
     the keyframe is alive;
     ``restart`` (K,) u1 nonzero if mapping restarted at this keyframe after the camera was lost, so

@@ -186,7 +186,8 @@ def keyframe_trajectory(map_: Map) -> Trajectory:
 
 
 def in_first_part(map_: Map, closed: Sequence[LoopEdge], frames: FrameTable) -> NDArray[np.bool_]:
-    """``(N,)`` bool: which frames were tracked in the part of the map with its first keyframe.
+    """``(N,)`` bool: which frames were tracked in the part of the map that contains the first
+    keyframe.
 
     Args:
         closed: closed loops; the sub-maps that they join form one part.

@@ -221,7 +221,8 @@ def collect_landmarks(a, keyframes, n_landmarks):
 
 @kernel
 def count_seen_by(a, keyframe, needed):
-    """Count a keyframe's landmarks that ``needed`` or more keyframes observe, including itself."""
+    """Count a keyframe's landmarks that at least ``needed`` keyframes observe, including this
+    one."""
     count = 0
     for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
         if a.landmark[row] < 0:

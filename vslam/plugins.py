@@ -143,7 +143,7 @@ def _entry_points(group: str) -> list[tuple[str, EntryPoint]]:
         package = _package(distribution)
         try:
             points = list(distribution.entry_points.select(group=group))
-        except (TypeError, ValueError) as error:  # a line that is no "name = module:object"
+        except (TypeError, ValueError) as error:  # a line is not "name = module:object"
             _log.warning("%s: its entry points cannot be read (%s)", package, reason(error))
             continue
         found += [(package, point) for point in points]

@@ -48,7 +48,8 @@ def chi_square_ratio(x, y, z, u, v, u_right, inverse_sigma2, pinhole):
     chi-square limit: at most 1 for an inlier. The point must lie in front of the camera.
 
     Args:
-        u, v, u_right: float64 observation; inverse_sigma2: inverse variance of a pixel coordinate.
+        u, v, u_right: float64 observation.
+        inverse_sigma2: inverse variance of a pixel coordinate.
         pinhole: intrinsics as ``unpacked`` returns them.
     """
     fx, fy, cx, cy, bf, disparity_weight = pinhole

@@ -53,7 +53,8 @@ def open_map(
     localize: bool,
     resume: bool,
 ) -> OpenedMap:
-    """Restore detector, images and closed loops from a stored map, or begin a new map (None).
+    """Restore detector, images and closed loops from a stored map, or begin a new map if ``stored``
+    is None.
 
     Args:
         localize: do not change the map; otherwise a new drive begins in it.

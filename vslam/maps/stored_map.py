@@ -80,8 +80,8 @@ class StoredMap:
         the first living keyframe that observes them.
 
         Args:
-            copy: if False and all keypoints are kept, the keypoint arrays, three quarters of a map,
-                are views.
+            copy: if False and all keypoints are kept, the keypoint arrays, which are three quarters
+                of a map, are views instead of copies.
         """
         return self.select(self.map.living_keyframes(), copy=copy)
 

@@ -44,10 +44,10 @@ def loop_matches(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The pixels of the same landmarks in the two keyframes of a closed loop.
 
-    After a loop is closed, the query's inlier features observe the landmarks of the place. A
-    landmark that the match itself does not observe, but another keyframe of the place, is projected
-    into the match. Features that lost their landmark in the bundle adjustment after the loop, and
-    landmarks outside the view of the match, are left out.
+    After a loop is closed, the query's inlier features observe the landmarks of the place. If the
+    match itself does not observe such a landmark, the landmark is projected into it. Features that
+    lost their landmark in the bundle adjustment after the loop, and landmarks outside the view of
+    the match, are left out.
 
     Args:
         map_: the map after the correction of the loop.

@@ -194,7 +194,7 @@ def open_viewer(kind: str) -> Viewer:
     except OSError as error:
         raise InputError(f"--view {kind}: no viewer can be started ({error}).") from error
     if kind == "web":
-        atexit.register(viewer.kill)  # unlike a window, the user could not close this process
+        atexit.register(viewer.kill)  # the user can close a window, but not this process
     deadline = time.monotonic() + _VIEWER_STARTS_S
     while not (_listens(port) and (not page_port or _listens(page_port))):
         if viewer.poll() is not None or time.monotonic() > deadline:

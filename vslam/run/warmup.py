@@ -316,8 +316,8 @@ def compile_bundle_adjustment() -> None:
     adjust(problem, iterations=1)
 
 
-# The second process starts with kernels that the first one does not need. When it comes to the
-# insertion of keyframes, the first process, which starts with it, has already cached those kernels.
+# The second process starts with kernels that the first one does not need. Before it inserts
+# keyframes, the first process, which starts with this, has already cached the kernels for it.
 COMPILE_SHARES: dict[str, tuple[Callable[[], None], ...]] = {
     "first": (compile_insertion, compile_tracking, compile_depth, compile_recognition),
     "second": (

@@ -238,7 +238,7 @@ def test_descriptors_and_images_of_learned_detectors_come_back(tmp_path):
     assert len(table.values) == 2
     other = replace(table, values=np.full_like(table.values, np.nan))
     tables = {**seen.tables, "capsule/descriptors": other}
-    with pytest.raises(ValueError, match="not those of the network"):
+    with pytest.raises(ValueError, match="do not belong to the network"):
         create()[0].restore(replace(seen, tables=tables))
 
 
@@ -544,7 +544,7 @@ def test_a_map_of_something_else_is_refused(file, tmp_path):
         words = data["detector_words_values"].copy()
     words[3] = 10**7
     other = changed(file, tmp_path / "words.npz", detector_words_values=words)
-    with pytest.raises(InputError, match=r"words.npz: the words of the keyframes are not"):
+    with pytest.raises(InputError, match=r"words.npz: the words of the keyframes do not belong"):
         Slam.load(other)
 
 

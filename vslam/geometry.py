@@ -42,8 +42,7 @@ def inverse(T_a_b: Matrix) -> Matrix:
 
 @kernel
 def orthonormalised(T_a_b: Matrix) -> Matrix:
-    """Project a ``(4, 4)`` motion whose rotation has left SO(3) by round-off to the nearest rigid
-    motion.
+    """Project the rotation of a ``(4, 4)`` motion, which is inexact by round-off, back onto SO(3).
 
     One Newton step of the polar decomposition, R (3 I - R'R) / 2, corrects the round-off of a few
     compositions.

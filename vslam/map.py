@@ -112,8 +112,8 @@ class Scalars:
 
     Attributes:
         session: the drive that new keyframes belong to.
-        disparity_offset: pixels by which the stereo pair measures every disparity too small;
-            ``u_right`` of all rows is corrected for it (``backend/disparity_offset.py``).
+        disparity_offset: pixels by which every measured disparity is too small; ``u_right`` of all
+            rows is corrected by it (``backend/disparity_offset.py``).
         offset_information: inverse variance of the measurements behind ``disparity_offset``.
         calibrated_until: the newest keyframe that those measurements used, or -1.
     """

@@ -124,7 +124,8 @@ class Mapper:
         return self._shared.map
 
     def keyframe_pose(self, keyframe: int) -> Matrix:
-        """``T_cw`` of a keyframe at the last merge; while a job runs, only of the reference."""
+        """``T_cw`` of a keyframe at the last merge; while a job runs, it is available only for the
+        reference keyframe."""
         if not self._is_merged and keyframe == self.view.reference:
             return self.view.T_reference
         return self.map.keyframe_pose(keyframe)

@@ -85,8 +85,8 @@ def _moment(
 class LoopPictureRecorder(Recorder):
     """Keeps a small image of each keyframe, and the data for a picture of each closed loop.
 
-    A loop has no picture if its earlier image is missing: it belongs to another drive or to the
-    part of the run before it was resumed, or it was dropped in a very long run.
+    A loop has no picture if its earlier image was not kept, because it belongs to another drive or
+    to the part of the run before it was resumed, or because the run is very long.
 
     Attributes:
         pictures: pictures of the closed loops, in order.

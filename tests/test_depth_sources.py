@@ -130,9 +130,9 @@ def test_topics_of_bags_with_depth(corridor, depths, calib, tmp_path):
     bag = write_bag(tmp_path / "more.bag", "ros1", two | more, STAMPS[:2])
     assert not opened(bag, calib, topics=COLOUR, sensor="mono").camera.depth
     assert opened(bag, calib, topics=f"{COLOUR},{DEPTH}").camera.depth
-    refused("choose with --topics COLOUR,DEPTH; image topics are", bag, calib, sensor="rgbd")
+    refused("choose topics with --topics COLOUR,DEPTH; image topics are", bag, calib, sensor="rgbd")
     refused(f"{DEPTH} holds depth; name the topic", bag, calib, topics=f"{DEPTH},{COLOUR}")
-    refused("encoding 'mono8' is no depth; known are 16UC1", bag, calib,
+    refused("encoding 'mono8' is not depth; known are 16UC1", bag, calib,
             topics=f"{COLOUR},/infra/image_raw", sensor="rgbd")  # fmt: skip
     other = write_bag(tmp_path / "s.bag", "ros1", {**two, DEPTH: small}, STAMPS[:2])
     refused("has 480x80 pixels but the .* have 480x160; .* registered", other, calib)
@@ -172,9 +172,9 @@ def test_bad_folders_with_depth(corridor, depths, calib, folders, tmp_path):
     refused("--depth .*: contradicts --right", folders / "rgb", calib, **both, **options)
     write_images(tmp_path, {"rgb": corridor.left[:3]}, NAMES[:3])
     write_images(tmp_path, {"depth": depths[:2]}, NAMES[:2])
-    refused("2 images but 3 in .* 2 on one side only", tmp_path, calib, **options)
+    refused("2 images but 3 in .* 2 is in only one", tmp_path, calib, **options)
     write_images(tmp_path, {"depth": [depths[0][:80], *depths[1:3]]}, NAMES[:3])
     refused("depth has 480x80 pixels but the colour image has 480x160", tmp_path, calib, **options)
     grey = cv2.convertScaleAbs(depths[0], alpha=0.01)
     write_images(tmp_path, {"depth": [grey, *depths[1:3]]}, NAMES[:3])
-    refused("depth of 8 bits and 1 channels", tmp_path, calib, **options)
+    refused("the depth has 8 bits and 1 channels", tmp_path, calib, **options)

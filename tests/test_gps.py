@@ -132,7 +132,7 @@ BAD = {
     "not a number": (refused(f"{HEAD}\n1,2,3,nan\n"), "line 2 is not a fix of 4 numbers"),
     "latitude": (refused(f"{HEAD}\n1,91,3,4\n"), "the fix at 1 s has latitude 91 and longitude 3"),
     "longitude": (refused(f"{HEAD}\n1,9,200,4\n"), "from -180 to 180"),
-    "other times": (refused(f"{HEAD}\n1e9,48,11,5\n"), "the images from 0.000 to"),
+    "other times": (refused(f"{HEAD}\n1e9,48,11,5\n"), "the images are from 0.000 to"),
     "no packets": (lambda folder: folder, "no data/*.txt"),
     "unequal": (lambda folder: oxts(folder / "oxts", times=2), "2 times for 3 fixes"),
     "no stamps": (lambda folder: oxts(folder / "oxts", times=0), "0 times for 3 fixes"),
@@ -399,9 +399,11 @@ def test_fixes_before_a_stream_are_refused(corridor, tmp_path, fixes):
     good = read_fixes(fixes)
     require_overlap(good, source, fixes)
     early = Fixes(good.times - 100.0, good.geodetic, good.sigma)
-    with pytest.raises(InputError, match=r"to -97\.300 s, the images from 0\.200 s on; give"):
+    with pytest.raises(
+        InputError, match=r"to -97\.300 s but the images are from 0\.200 s on; give"
+    ):
         require_overlap(early, source, fixes)
-    with pytest.raises(InputError, match="a live camera is not yet where the file says"):
+    with pytest.raises(InputError, match="cannot be used with a live camera"):
         require_overlap(good, replace(source, live=True), fixes)
 
 

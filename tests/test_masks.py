@@ -250,12 +250,12 @@ def test_a_wrong_mask_of_one_frame_costs_this_frame(folder, mask, tmp_path):
     ("name", "pixels", "said"),
     [
         ("absent.png", None, "no such file or folder"),
-        ("small.png", np.full((4, 5), 255, np.uint8), "5x4 pixels where the images have 480x160"),
-        ("grey.png", np.full((160, 480), 100, np.uint8), "has pixels of 100; make those"),
-        ("red.png", np.full((160, 480, 3), (0, 0, 255), np.uint8), "has pixels of 76; make"),
-        ("black.png", np.zeros((160, 480), np.uint8), "hides the whole image; make white"),
+        ("small.png", np.full((4, 5), 255, np.uint8), "5x4 pixels but the images have 480x160"),
+        ("grey.png", np.full((160, 480), 100, np.uint8), "has pixels of value 100, but may only"),
+        ("red.png", np.full((160, 480, 3), (0, 0, 255), np.uint8), "has pixels of value 76"),
+        ("black.png", np.zeros((160, 480), np.uint8), "hides the whole image; make the pixels"),
         ("text.png", b"mask", "cannot be decoded"),
-        ("empty", None, "holds no images"),
+        ("empty", None, "holds no masks"),
         ("some/1.png", np.full((160, 480), 255, np.uint8), "is no 0.png for the image 0.jpg; add"),
     ],
 )

@@ -351,7 +351,9 @@ def test_a_reader_that_fails_costs_one_frame(broken, kitti_tree):
     sequence = open_sequence("mine", kitti_tree, "00")
     with pytest.raises(UnreadableImageError, match=r"broken 2.0 failed at frame 2 \(KeyError"):
         sequence.read(2)
-    with pytest.raises(UnreadableImageError, match=r"gave uint8 \(159, 480\) and .* at frame 3"):
+    with pytest.raises(
+        UnreadableImageError, match=r"returned uint8 \(159, 480\) and .* at frame 3"
+    ):
         sequence.read(3)
     assert np.array_equal(sequence.read(1)[0], open_sequence("kitti", kitti_tree, "00").read(1)[0])
 
@@ -400,12 +402,12 @@ def test_a_run_on_a_reader_that_streams(broken, kitti_tree):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (("return Source", "return dict"), "gave dict, not vslam.datasets.frames.Source"),
+        (("return Source", "return dict"), "returned dict, not vslam.datasets.frames.Source"),
         (("camera=inner.camera", "camera=3"), "camera is int, not vslam.camera.Camera"),
         (("live=LIVE", "n_expected=-1"), "n_expected is -1, neither None nor a number"),
         (
             ("play=play", "stored=(*inner.stored, inner.stored[0])"),
-            "x: the times of its frames do not increase",
+            "x: the times of the frames do not increase",
         ),
     ],
 )
@@ -429,7 +431,7 @@ def test_a_perturbation_that_fails_costs_one_frame(broken):
     assert np.array_equal(law.apply(0, 0.0, image, None)[0], image)
     for frame, says in (
         (1, r"broken 2.0 failed \(ValueError: no; broken.py, line 3\)"),
-        (2, r"gave uint8 \(2, 6\)"),
+        (2, r"returned uint8 \(2, 6\)"),
     ):
         with pytest.raises(UnreadableImageError, match=says):
             law.apply(frame, 0.1, image, None)

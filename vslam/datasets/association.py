@@ -1,4 +1,4 @@
-"""Association by time: pairs of images, and ground truth at the times of frames."""
+"""Association by time: pairing images, and interpolating ground truth at the times of frames."""
 
 from __future__ import annotations
 
@@ -21,13 +21,15 @@ _MANY = 0.1  # share of images without a partner; TUM's sequences have up to 7 %
 def associate(
     first: NDArray[np.float64], second: NDArray[np.float64], max_difference: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pair times that are less than ``max_difference`` apart, the nearest first, each once.
+    """Pair times that are less than ``max_difference`` apart.
+
+    The closest pairs are formed first, and each time is used at most once.
 
     Args:
         first, second: ``(N,)`` and ``(M,)`` seconds, increasing.
 
     Returns:
-        ``(P,)`` indices into each, those into ``first`` increasing.
+        ``(P,)`` increasing indices into ``first``, and ``(P,)`` indices into ``second``.
     """
     low = np.searchsorted(second, first - max_difference, side="right")
     high = np.searchsorted(second, first + max_difference, side="left")
@@ -57,15 +59,15 @@ def warn_of_unpaired(source: Path, n_pairs: int, n_images: int) -> None:
 def poses_at(
     source: Path, measured: Trajectory, times: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """Interpolated poses: positions linearly, rotations along the shortest arc.
+    """Interpolate poses at given times: positions linearly, rotations by slerp.
 
     Args:
         source: file to name in the log.
-        times: ``(N,)`` seconds of frames.
+        times: ``(N,)`` seconds.
 
     Returns:
-        ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames outside the measured time or in a gap of more
-        than 0.15 s. None, with a warning, if no frame has a pose.
+        ``(N, 4, 4)`` float64 ``T_wc``, NaN outside the measured time and in gaps longer than
+        0.15 s. None, with a warning, if no time has a pose.
     """
     from scipy.spatial.transform import Rotation, Slerp
 

@@ -1,4 +1,4 @@
-"""Rectification of images when they are decoded."""
+"""Rectification of the images of a source as they are decoded."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from vslam.datasets.frames import Images, RawSource, Size, Source, TimedFrame, d
 from vslam.datasets.image_files import with_depth
 from vslam.errors import InputError
 
-_CUT = {(1, 0): "column", (0, 1): "row", (1, 1): "column and row"}  # by missing (columns, rows)
+_MISSING = {(1, 0): "column", (0, 1): "row", (1, 1): "column and row"}  # by (columns, rows)
 
 
 def rectified(raw: RawSource, calibration: Calibration) -> Source:
-    """A source whose images are rectified as they are read; the maps are computed once.
+    """Rectify the images of a source as they are read.
 
-    Images that are already rectified stay unchanged.
+    The rectification maps are computed once. Images that are already rectified stay unchanged.
 
     Raises:
         InputError: the images do not have the calibrated size, the calibration of the right camera
-            is missing, or as `vslam.calibration.rectification.rectify`.
+            is missing, or `vslam.calibration.rectification.rectify` rejects the calibration.
     """
     if raw.depth:  # depth is registered to the left image
         alone = _rectification_for(calibration, raw.sizes[:1])
@@ -36,7 +36,7 @@ def rectified(raw: RawSource, calibration: Calibration) -> Source:
         rectification = _rectification_for(calibration, raw.sizes)
     frame = partial(_rectified_frame, rectification)
     T_wc = raw.ground_truth
-    if T_wc is not None:  # the rectified left camera is turned but not moved
+    if T_wc is not None:  # rectification rotates the left camera about its centre
         T_wc = T_wc.copy()
         T_wc[:, :3, :3] = T_wc[:, :3, :3] @ rectification.R_left_rectified
     return Source(
@@ -63,15 +63,15 @@ def _rectification_for(calibration: Calibration, sizes: Several[Size]) -> Rectif
     models = [model for model in (calibration.left, calibration.right) if model is not None]
     for model, (width, height) in zip(models, sizes, strict=True):
         if (model.width, model.height) != (width, height):
-            cut = model.width - width, model.height - height
+            missing = model.width - width, model.height - height
             fix = "take the calibration of these images"
-            if max(cut) == 1 and min(cut) >= 0:
+            if missing in _MISSING:
                 fix = (
-                    f"an encoder seems to have cut off the last {_CUT[cut]}; write this size into "
-                    "the calibration and keep its other numbers"
+                    f"an encoder seems to have cut off the last {_MISSING[missing]}; write this "
+                    "size into the calibration and keep its other numbers"
                 )
             elif (2 * model.width, model.height) == (width, height):
-                fix = "use --side-by-side if each holds both images of a stereo pair"
+                fix = "use --side-by-side if each image holds both images of a stereo pair"
             raise InputError(
                 f"{calibration.source}: made for {model.width}x{model.height} pixels but the "
                 f"images have {width}x{height}; {fix}."
@@ -94,7 +94,7 @@ def _rectified_frame(rectification: Rectification, frame: TimedFrame) -> TimedFr
 
 
 def _read(rectification: Rectification, frame: TimedFrame, image_map: ImageMap) -> Images:
-    """Rectify the images of a frame; depth takes the nearest pixel."""
+    """Read and rectify the images of a frame; depth is not interpolated between pixels."""
     left, second = frame.read(image_map)
     sides: list[Callable[[], Image | DepthImage]] = [partial(rectification.left, left)]
     if second is not None and rectification.camera.depth:

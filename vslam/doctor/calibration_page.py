@@ -1,4 +1,4 @@
-"""The verdicts on a calibration from images of a board, and its page."""
+"""Checks of a calibration from images of a board, and its page."""
 
 from __future__ import annotations
 
@@ -20,27 +20,28 @@ from vslam.report.page import Code, Page, Section, Tile, Tiles
 from vslam.report.render import html, write_files
 
 _FEW_VIEWS = 10
-_TILT, _FEW_TILTED = 15.0, 3  # degrees; a board that is never tilted fixes no focal length
-_CELLS = (8, 6)  # of the image, across and down
-_COVERED = 0.6  # share of the cells; corners hardly reach the outermost pixels
-_LARGE_PX = 0.5  # RMS, in images of the common width or less; wider ones may have more
+# Degrees, and number of views tilted by more. Without tilt, the focal length is not determined.
+_TILT, _FEW_TILTED = 15.0, 3
+_CELLS = (8, 6)  # cells of the image, across and down
+_COVERED = 0.6  # smallest share of cells with corners, which hardly reach the outermost pixels
+_LARGE_PX = 0.5  # largest RMS in images of the common width; in wider images, it grows with width
 _COMMON_WIDTH = 640
-_APART_PX = 2.0  # RMS, between the cameras
-_SHARED = 0.2  # of the squared residuals, in neighbouring corners
+_APART_PX = 2.0  # largest RMS between the cameras
+_SHARED = 0.2  # largest share of the squared residuals that neighbouring corners have in common
 _MOST_DROPPED = 0.25
-_ARROW = 0.02  # of the image width: length of an arrow of the RMS error
+_ARROW = 0.02  # length of an arrow of the RMS error, relative to the image width
 
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A calibration and what it was estimated from.
+    """A calibration and the estimates that it consists of.
 
     Attributes:
-        board: what was filmed.
+        board: the board in the images.
         calibration: the result.
         fits: the estimate of each camera, left first.
-        pair: the estimate of the transformation; None for a single camera.
-        n_seen: images that show the board, and images searched.
+        pair: the estimate of the transformation between the cameras; None for a single camera.
+        n_seen: number of images that show the board, and of all images.
     """
 
     board: Board
@@ -51,10 +52,10 @@ class Calibrated:
 
 
 def findings_of(result: Calibrated) -> list[Finding]:
-    """The verdicts, for each camera and then for the pair."""
+    """Check each camera, and then the pair."""
     found = [finding for side, fit in _sides(result) for finding in _camera(side, fit)]
     if result.pair is not None:
-        n, error = len(result.pair.names), _total(result.pair.errors)
+        n, error = len(result.pair.names), _rms(result.pair.errors)
         fix = "trigger both cameras together, or film the board again while it stands still"
         found += [
             _kept("pairs", n, result.pair.dropped),
@@ -79,7 +80,7 @@ def write_page(result: Calibrated, findings: Sequence[Finding], text: str, path:
     """
     values: list[tuple[str, str, str]] = []
     for side, fit in _sides(result):
-        m, n, error = fit.model, len(fit.views), _total(fit.errors)
+        m, n, error = fit.model, len(fit.views), _rms(fit.errors)
         values += [
             (f"{side}focal length", f"{m.fx:.2f}, {m.fy:.2f} px", f"{m.width}x{m.height}"),
             (f"{side}error", f"{error:.3f} px", f"RMS of {n} views"),
@@ -106,12 +107,12 @@ def _sides(result: Calibrated) -> list[tuple[str, CameraFit]]:
     return list(zip(names, result.fits, strict=True))
 
 
-def _total(errors: Array) -> float:
+def _rms(errors: Array) -> float:
     return float(np.sqrt((errors**2).mean()))
 
 
 def _camera(side: str, fit: CameraFit) -> list[Finding]:
-    m, n, error = fit.model, len(fit.views), _total(fit.errors)
+    m, n, error = fit.model, len(fit.views), _rms(fit.errors)
     views = _kept(f"{side}views", n, fit.dropped)
     if n < _FEW_VIEWS:
         fix = f"film the board in at least {_FEW_VIEWS} different places and directions"
@@ -132,7 +133,7 @@ def _camera(side: str, fit: CameraFit) -> list[Finding]:
         ),
         judge(
             f"{side}coverage", share < _COVERED, f"corners in {share:.0%} of the image",
-            f"film the board everywhere, above all at the {emptiest} of the image",
+            f"film the board in all parts of the image, above all on the {emptiest}",
         ),
         judge(
             f"{side}residuals", error > most, f"{error:.3f} px RMS",
@@ -140,24 +141,25 @@ def _camera(side: str, fit: CameraFit) -> list[Finding]:
         ),
         judge(
             f"{side}lens", shared > _SHARED,
-            f"{m.lens}; {shared:.0%} of the residuals depend on the place in the image",
+            f"{m.lens}; {shared:.0%} of the residuals depend on the position in the image",
             f"try --lens {other}",
         ),
     ]  # fmt: skip
 
 
 def _kept(check: str, n: int, dropped: Sequence[tuple[str, float]]) -> Finding:
+    """Check how many images were dropped as outliers."""
     measured = f"{n} {check.split()[-1]}"
     if dropped:
         named = ", ".join(f"{name} ({error:.1f} px)" for name, error in dropped)
-        measured += f"; dropped because they do not fit: {named}"
+        measured += f"; dropped as outliers: {named}"
     fix = "film the board again in good light, flat and still"
     return judge(check, len(dropped) > _MOST_DROPPED * (n + len(dropped)), measured, fix)
 
 
 def _coverage(at: Array) -> tuple[float, str]:
-    """The share of the image that corners cover, and where they cover least; ``at`` is ``(N, 2)``,
-    from 0 to 1."""
+    """The share of the image that corners cover, and the edge where they cover least; ``at`` holds
+    ``(N, 2)`` positions from 0 to 1."""
     cells = np.zeros(_CELLS, bool)
     cells.flat[_cells(at)] = True
     parts = {"left": cells[:2], "right": cells[-2:], "top": cells[:, :2], "bottom": cells[:, -2:]}
@@ -166,7 +168,7 @@ def _coverage(at: Array) -> tuple[float, str]:
 
 def _shared(at: Array, residuals: Array) -> float:
     """The share of the squared residuals that neighbours in the image have in common: about 0 for
-    noise, most of them for a model that does not fit the lens."""
+    noise, nearly 1 for a model that does not fit the lens."""
     cells = _cells(at)
     n = np.bincount(cells)
     sums = np.stack([np.bincount(cells, weights=column) for column in residuals.T], axis=1)
@@ -185,7 +187,7 @@ def _drawings(result: Calibrated) -> Iterator[Drawing]:
         m, name = fit.model, side.strip() or "camera"
         figure, axes = new_figure(f"Corners and residuals: {name}", "x (px)", "y (px)", LOW + 0.8)
         xy = np.concatenate([view.corners.xy for view in fit.views])
-        times = _ARROW * m.width / _total(fit.errors)
+        times = _ARROW * m.width / _rms(fit.errors)
         axes.quiver(
             *xy.T, *(times * np.concatenate(fit.residuals).T), angles="xy", scale_units="xy",
             scale=1, color=BLUE, width=0.002,
@@ -193,8 +195,8 @@ def _drawings(result: Calibrated) -> Iterator[Drawing]:
         axes.set(xlim=(0, m.width), ylim=(m.height, 0), aspect="equal")
         yield (
             f"corners-{name}",
-            f"Every corner of all views with its residual, enlarged {times:.0f} times. Arrows "
-            "should point anywhere, and corners should fill the image.",
+            f"The corners of all views with their residuals, enlarged {times:.0f} times. Arrows "
+            "should have random directions, and corners should fill the image.",
             figure,
         )
         figure, axes = new_figure(f"Error of each view: {name}", "view", "RMS (px)", LOW)

@@ -14,7 +14,7 @@ from vslam.report.render import html
 
 
 def write_page(diagnosis: Diagnosis, title: str, path: Path) -> None:
-    """Write the page as self-contained HTML: faults with their fixes first, then other checks.
+    """Write the page as self-contained HTML: faults with their fixes first, then the other checks.
 
     Raises:
         ResultsError: the file cannot be written.

@@ -642,7 +642,7 @@ def test_eval(call, tmp_path):
     code, out, _ = call("eval", "estimate.txt", "--gt", "gt.txt")
     assert code == 0
     assert "50 of 50 have a ground truth" in out
-    assert "0.100 m" in out
+    assert "0.1000 m" in out
     assert "evo_ape kitti gt.txt estimate.txt --align\n" in out
     code, out, _ = call("eval", "estimate.txt", "--gt", "gt.txt", "--json")
     assert json.loads(out)["ate_rmse_m"] == pytest.approx(0.1, rel=1e-3)

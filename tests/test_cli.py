@@ -143,7 +143,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
     ("words", "parts"),
     [
         ("--detector capsule --weights no.safetensors", ["no.safetensors", "no such file"]),
-        ("--detector none --weights no.npz", ["--weights", "none has no weights"]),
+        ("--detector none --weights no.npz", ["--weights", "'none' has no weights"]),
         ("--detector bow --weights no.npz", ["--weights no.npz", "vocabulary"]),
         ("--dataset synthetic --seq 77", ["synthetic route 77", "choose one of demo"]),
         ("--dataset kitti", ["data/kitti", "cvlibs.net", "--data", "$KITTI_ROOT"]),
@@ -642,7 +642,7 @@ def test_eval(call, tmp_path):
     code, out, _ = call("eval", "estimate.txt", "--gt", "gt.txt")
     assert code == 0
     assert "50 of 50 have a ground truth" in out
-    assert "0.100 m" in out
+    assert "0.1000 m" in out
     assert "evo_ape kitti gt.txt estimate.txt --align\n" in out
     code, out, _ = call("eval", "estimate.txt", "--gt", "gt.txt", "--json")
     assert json.loads(out)["ate_rmse_m"] == pytest.approx(0.1, rel=1e-3)

@@ -177,13 +177,13 @@ def stored_frames(
     files: Several[Path] | None = None,
     colour: Callable[[Path], NDArray[np.uint8]] | None = None,
 ) -> tuple[TimedFrame, ...]:
-    """Make frames whose images one function reads by the index of the frame.
+    """Make stored frames from a function that reads the images of any of them.
 
     Args:
         timestamps: ``(N,)`` float64 seconds, increasing.
-        read: decodes the images of the frame with an index, see `TimedFrame`.
+        read: decodes the images of the frame with a given index, see `TimedFrame`.
         files: the files of the left images.
-        colour: decodes such a file in colour, see `TimedFrame`.
+        colour: decodes a file in colour, see `TimedFrame`.
     """
     frames = [TimedFrame(time, partial(read, k)) for k, time in enumerate(timestamps.tolist())]
     if files is None:
@@ -200,7 +200,7 @@ def stored_frames(
 
 
 def decoded(sides: Several[Callable[[], Image | DepthImage]], image_map: ImageMap = map) -> Images:
-    """Decode the images of a frame by one function per image."""
+    """Decode the images of a frame, with one function per image."""
     left, *second = image_map(_call, sides)
     return np.asarray(left, np.uint8), second[0] if second else None
 

@@ -17,7 +17,8 @@ from vslam.datasets.frames import Images, RawSource, Size, Source, TimedFrame, d
 from vslam.datasets.image_files import with_depth
 from vslam.errors import InputError
 
-_MISSING = {(1, 0): "column", (0, 1): "row", (1, 1): "column and row"}  # by (columns, rows)
+# Names by the number of missing columns and rows.
+_MISSING = {(1, 0): "column", (0, 1): "row", (1, 1): "column and row"}
 
 
 def rectified(raw: RawSource, calibration: Calibration) -> Source:

@@ -24,7 +24,7 @@ _FEW_VIEWS = 10
 _TILT, _FEW_TILTED = 15.0, 3
 _CELLS = (8, 6)  # cells of the image, across and down
 _COVERED = 0.6  # smallest share of cells with corners, which hardly reach the outermost pixels
-_LARGE_PX = 0.5  # largest RMS in images of the common width; in wider images, it grows with width
+_LARGE_PX = 0.5  # largest RMS in images of the common width; grows with the width of wider images
 _COMMON_WIDTH = 640
 _APART_PX = 2.0  # largest RMS between the cameras
 _SHARED = 0.2  # largest share of the squared residuals that neighbouring corners have in common
@@ -34,7 +34,7 @@ _ARROW = 0.02  # length of an arrow of the RMS error, relative to the image widt
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A calibration and the estimates that it consists of.
+    """A calibration and its estimates.
 
     Attributes:
         board: the board in the images.

@@ -132,7 +132,7 @@ def _lay_bricks(rng: Rng, image: Grey, px: float, py: float) -> None:
 
 @dataclass(frozen=True)
 class _Painter:
-    """Draws on ``image`` in metres; ``px`` and ``py`` are texels per metre."""
+    """Draws on ``image`` with coordinates in metres; ``px`` and ``py`` are texels per metre."""
 
     rng: Rng
     image: Grey

@@ -57,8 +57,8 @@ class BowDetector:
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
         """Candidates for a keyframe that was added.
 
-        They are living keyframes that are neither recent nor covisible with it, and they score at
-        least as high as its lowest-scoring covisible keyframe. Without covisible keyframes, any
+        They are keyframes in the map that are neither recent nor covisible with it, and they score
+        at least as high as its lowest-scoring covisible keyframe. Without covisible keyframes, any
         score suffices.
         """
         config = self.config
@@ -77,7 +77,7 @@ class BowDetector:
     def locate(
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
-        """Living keyframes that look similar to a frame that is not in the map, best first."""
+        """Keyframes in the map that look similar to a frame outside the map, best first."""
         words = self.vocabulary.words(features.descriptors)
         likeness = self._index.compare(bow_vector(self.vocabulary, words))
         eligible = map_.arrays.keyframe_alive[: len(likeness.score)].copy()

@@ -35,17 +35,18 @@ class LoopConsistency:
     def __init__(self, config: ConsistencyConfig) -> None:
         self.config = config
         self._series: list[ResembledPlace] = []
-        self._verified: list[tuple[int, LoopEdge]] = []  # the turn of its verification, and an edge
-        self._turn = 0  # number of updates
+        self._verified: list[tuple[int, LoopEdge]] = []  # verified edges, each with its turn
+        self._turn = 0  # number of updates so far
 
     def update(
         self, keyframe: int, candidates: list[LoopCandidate], map_: Map
     ) -> tuple[list[LoopCandidate], list[LoopEdge]]:
         """Check whether enough consecutive keyframes resembled the place of each candidate.
 
-        The place of a candidate is its match with the covisible keyframes. It continues the longest
-        series of keyframes that resembled an overlapping place. Candidates at the same place share
-        one series, so there are never more new series than candidates.
+        The place of a candidate is the set of its match and the keyframes covisible with the match.
+        The candidate continues the longest series of keyframes that resembled an overlapping place.
+        Candidates at the same place share one series, so there are never more new series than
+        candidates.
 
         Returns:
             The candidates with enough keyframes, and a rejected edge for each of the others.
@@ -85,8 +86,8 @@ class LoopConsistency:
         tolerances, so true loops imply the same drift and false ones do not.
 
         Returns:
-            The edge, no longer accepted if too few keyframes agree so far. A keyframe counts once,
-            even if several of its edges agree.
+            The edge; it is marked as not accepted if too few keyframes agree so far. A keyframe
+            counts once, even if several of its edges agree.
         """
         if not edge.accepted:
             return edge

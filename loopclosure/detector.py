@@ -36,15 +36,15 @@ class LoopDetector(Protocol):
         ...
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
-        """Candidates for a keyframe that was added, best first: similar living keyframes that are
-        neither recent nor covisible with it."""
+        """Candidates for a keyframe that was added, best first: similar keyframes in the map that
+        are neither recent nor covisible with it."""
         ...
 
     def locate(
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
-        """Living keyframes that look similar to a frame that is not in the map, best first. The
-        query of these candidates is -1."""
+        """Keyframes in the map that look similar to a frame outside the map, best first. The query
+        of these candidates is -1."""
         ...
 
     def memory(self) -> DetectorMemory:

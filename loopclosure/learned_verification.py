@@ -184,7 +184,7 @@ def recognise(
     camera: Camera,
     config: Config,
 ) -> Sighting | None:
-    """Estimate the pose of a frame that is not in the map at the place of a keyframe.
+    """Estimate the pose of a frame outside the map at the place of a keyframe.
 
     Args:
         query: local descriptors of the frame's image.

@@ -19,8 +19,8 @@ def beyond_reach(map_: Map, keyframe: int, config: SiameseConfig) -> NDArray[np.
     map is monocular.
 
     Within a sub-map, keyframes that face another direction than the camera are out of reach at any
-    distance, because odometry knows directions to a few degrees, and the detectors do not recognise
-    a place from behind or from the side.
+    distance, because the heading from odometry is accurate to a few degrees, and the detectors do
+    not recognise a place from behind or from the side.
 
     Args:
         keyframe: id of the current keyframe.

@@ -73,8 +73,8 @@ def verify(
 
     Returns:
         An edge that is accepted with the reason "verified", or rejected with another reason. The
-        pose and the numbers of matches come from the last step that was completed. The features (of
-        the query) and landmarks (living ones of the place) are the inliers, without duplicates.
+        pose and the numbers of matches come from the last step that was completed. The inliers are
+        features of the query and landmarks of the place, without duplicates.
     """
     query, match = candidate.query, candidate.match
     edge = LoopEdge.of(candidate)
@@ -309,7 +309,8 @@ def spread_reason(
     Args:
         uv: ``(M, 2)`` predicted pixels of the landmarks that should be visible.
         seen: ``(M,)`` bool, the inliers.
-        min_elsewhere: least number of inliers outside the third of the image with the most.
+        min_elsewhere: least number of inliers outside the vertical strip, a third of the image
+            wide, that contains most of them.
     """
     expected, occupied = occupied_cells(uv, camera), occupied_cells(uv[seen], camera)
     if occupied < max(config.min_cells, config.min_cell_ratio * expected):

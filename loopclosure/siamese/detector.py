@@ -93,7 +93,7 @@ class SiameseDetector:
     def locate(
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
-        """The living keyframes that are most similar to a frame that is not in the map, best first.
+        """The keyframes in the map that are most similar to a frame outside the map, best first.
 
         There is no threshold, because relocalisation verifies candidates by geometry anyway.
         """
@@ -109,7 +109,7 @@ class SiameseDetector:
         return self._best(-1, p, rating, map_)
 
     def memory(self) -> DetectorMemory:
-        """See :class:`LoopDetector`. The memory has the descriptors that were computed so far."""
+        """See :class:`LoopDetector`. The memory contains the descriptors computed so far."""
         first = np.concatenate([[0], np.cumsum(self._described)]).astype(np.int64)
         table = PerKeyframe(first, self._descriptors[self._row[self._described]])
         return DetectorMemory(self.name, self._network.fingerprint, {"descriptors": table})
@@ -132,7 +132,8 @@ class SiameseDetector:
         return self._row >= 0
 
     def _searchable(self, map_: Map) -> NDArray[np.bool_]:
-        """``(n,)`` bool, living keyframes that have a descriptor or an image to compute it from."""
+        """``(n,)`` bool, keyframes in the map that have a descriptor or an image to compute it
+        from."""
         n = min(map_.n_keyframes, len(self._row))
         able = self._described[:n].copy()
         able[[k for k in np.flatnonzero(~able).tolist() if self._stored(k)]] = True

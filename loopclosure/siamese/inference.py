@@ -68,7 +68,7 @@ class OnnxNetwork:
             raise InputError(f"{path}: {_FOREIGN}; {_FIX}.") from error
 
     def embed(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """``(D,)`` float32 descriptor of norm 1 of an ``(H, W)`` uint8 image with H, W =
+        """``(D,)`` float32 descriptor of norm 1 of a uint8 image with the height and width
         ``size``."""
         (descriptor,) = self._embedding.run(None, {"image": image})
         return np.asarray(descriptor, np.float32)

@@ -1,5 +1,5 @@
-"""Reads the images of a KITTI sequence. Its poses or a loop matrix tell which images show the same
-place."""
+"""Reads the images of a KITTI sequence. Its poses or a loop matrix determine which images show the
+same place."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Reads pairs of images that ``vslam synth --pairs`` rendered. The camera poses tell whether images
-of different pairs show the same place."""
+"""Reads pairs of images that ``vslam synth --pairs`` rendered. The camera poses determine whether
+images of different pairs show the same place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reads sets of photographs. Their folders and a NOTES.txt tell which ones show the same place."""
+"""Reads sets of photographs. Their folders and a NOTES.txt determine which show the same place."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ from vslam.loopclosure.training.lite import (
 )
 from vslam.loopclosure.training.preprocessing import Unrolling, standardised, textured
 
-_LEAST_SHARE = 0.02  # least weight of a view, so that an image without texture has equal weights
+_LEAST_SHARE = 0.02  # smallest weight of a view; without texture, all views of an image have it
 
 
 class Layout(NamedTuple):
@@ -190,7 +190,8 @@ class CapsuleBranch(nn.Module):
     With several views, the descriptor is the concatenation of the views' descriptors from left to
     right. Each is scaled by the share of its view that shows texture, because fog or a covered lens
     does not distinguish places. For lite0, the views are cut from the early features of the whole
-    image, which are thus computed only once and see the surroundings of a view instead of padding.
+    image. These are computed only once, and at the border of a view they depend on its surroundings
+    instead of padding.
     """
 
     def __init__(self, shape: CapsuleShape) -> None:

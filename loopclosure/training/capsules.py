@@ -49,10 +49,10 @@ def route(
         alive: ``(I,)`` bool; the other capsules are ignored, as if they were removed.
 
     Returns:
-        Output capsules ``v`` ``(N, J, D)``, and ``e`` ``(N, T, J, P)`` and ``total``
-        ``(N, 1, J, 1)`` or ``(1,)``, whose quotient is the coupling coefficients; see
-        :func:`couplings`. The routing itself divides the sums over P by ``total`` instead of ``e``,
-        which takes a sixth of the divisions.
+        Output capsules ``v`` ``(N, J, D)``, and the coupling coefficients as numerators ``e``
+        ``(N, T, J, P)`` and denominators ``total`` ``(N, 1, J, 1)`` or ``(1,)``; see
+        :func:`couplings`. It takes a sixth of the divisions to divide the sums over P instead of
+        ``e``.
     """
     n, types, places, size = u.shape
     outputs, _, _, depth = W.shape
@@ -60,20 +60,20 @@ def route(
     rows = u.reshape(n * types, places, size)
     present = None if alive is None else alive.view(types, 1, places)
 
-    def combined(e: Tensor, total: Tensor) -> Tensor:
-        """``s`` ``(N, J, D)``."""
+    def weighted_sums(e: Tensor, total: Tensor) -> Tensor:
+        """``s`` ``(N, J, D)`` with the coupling coefficients ``e / total``."""
         pooled = torch.bmm(e.view(n * types, outputs, places), rows)
         pooled = pooled.view(n, types, outputs, size) / total
         pooled = pooled.permute(2, 0, 1, 3).reshape(outputs, n, types * size)
         return torch.bmm(pooled, W_j).transpose(0, 1)
 
     def agreements(v: Tensor) -> Tensor:
-        """Outputs ``(N, J, D)`` to agreements ``(N, T, J, P)``."""
+        """Agreements ``(N, T, J, P)`` of the prediction vectors with the outputs ``(N, J, D)``."""
         back = torch.bmm(v.transpose(0, 1), W_j.transpose(1, 2)).view(outputs, n, types, size)
         back = back.permute(1, 2, 0, 3).reshape(n * types, outputs, size)
         return torch.bmm(back, rows.transpose(1, 2)).view(n, types, outputs, places)
 
-    def undivided(b: Tensor) -> tuple[Tensor, Tensor]:
+    def softmax_parts(b: Tensor) -> tuple[Tensor, Tensor]:
         """Numerators and denominator of Eq. 6 for logits ``(N, T, J, P)``, which it overwrites."""
         if over == "output":
             c = torch.softmax(b, dim=2)
@@ -88,7 +88,7 @@ def route(
 
     with torch.no_grad():
         if iterations == 1:
-            e, total = undivided(u.new_zeros((n, types, outputs, places)))
+            e, total = softmax_parts(u.new_zeros((n, types, outputs, places)))
         else:
             # With b = 0, all couplings are equal. The first sums are therefore means, which are the
             # same for all outputs and need no softmax.
@@ -101,9 +101,9 @@ def route(
             s = torch.bmm(means.expand(outputs, -1, -1), W_j).transpose(0, 1)
             b = agreements(squash(s))
             for _ in range(iterations - 2):
-                b += agreements(squash(combined(*undivided(b))))
-            e, total = undivided(b)
-    return squash(combined(e, total)), e, total
+                b += agreements(squash(weighted_sums(*softmax_parts(b))))
+            e, total = softmax_parts(b)
+    return squash(weighted_sums(e, total)), e, total
 
 
 def couplings(e: Tensor, total: Tensor) -> Tensor:
@@ -145,7 +145,8 @@ class CapsuleLayer(nn.Module):
         kept = places if kept is None else kept
         self.iterations, self.over, self.places = iterations, over, places
         # A mean over thousands of capsules is a short vector, and short outputs give no agreement.
-        # With half this deviation, the couplings stay equal; with twice, a few capsules get all.
+        # With half of this deviation, the couplings stay equal; with twice this deviation, a few
+        # capsules get nearly all of the coupling.
         deviation = _DEVIATION * (types * places / size) ** 0.5 if over == "primary" else 1.0
         self.W = nn.Parameter(torch.randn(outputs, types, size, depth) * deviation)
         self.gains = nn.Parameter(torch.ones(types, kept, size))

@@ -63,7 +63,7 @@ class Pairs:
 
 
 def refuse_test_data(sources: list[ImageSource]) -> None:
-    """Check that the sources leave the test data alone.
+    """Check that training on the sources leaves the test data unused.
 
     Raises:
         InputError: the sources include test frames of KITTI, or both FAB-MAP collections.

@@ -57,7 +57,7 @@ class Separable(nn.Module):
 
 
 class Stem(nn.Module):
-    """An ordinary 7x7 convolution, because a single grey channel cannot be separated."""
+    """An ordinary 7x7 convolution, because separation saves nothing with a single grey channel."""
 
     def __init__(self, outputs: int, stride: int) -> None:
         super().__init__()

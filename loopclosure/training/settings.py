@@ -87,7 +87,7 @@ _BEST = TrainSettings(
     validation_images=400,
 )
 PRESETS = {
-    # As in the paper, which does not give the augmentation strengths and the mining.
+    # The settings of the paper, which does not state the augmentation strengths and the mining.
     "paper": TrainSettings(),
     # Every image of a batch is compared with every other, under stronger changes. Most pairs show
     # the same place, since the contrast takes different places from the other pairs. Half of a

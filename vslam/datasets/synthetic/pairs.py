@@ -184,16 +184,9 @@ def _look_alikes(route: Route, town: Town, passes: Passes, threads: int) -> NDAr
     The similarity of two places is the correlation of their small, blurred, normalised views.
     """
     chosen = np.unique(np.linspace(0, len(route.T_wc) - 1, _PLACES).astype(int))
-    camera = route.camera
-    small = Camera(
-        camera.fx / _SMALL,
-        camera.fy / _SMALL,
-        camera.cx / _SMALL,
-        camera.cy / _SMALL,
-        camera.baseline,
-        camera.width // _SMALL,
-        camera.height // _SMALL,
-    )
+    c = route.camera
+    fx, fy, cx, cy = (x / _SMALL for x in (c.fx, c.fy, c.cx, c.cy))
+    small = Camera(fx, fy, cx, cy, c.baseline, c.width // _SMALL, c.height // _SMALL)
     renderer = Renderer(small, town.atlas, town.sky, threads)
     moment = passes.at(0)
     seen = []

@@ -157,17 +157,18 @@ def built_in_route(name: str) -> Route:
     right = np.stack([np.cos(heading), -np.sin(heading)], axis=1)
     path = middle + right * (_LANE * lane)[:, None]
     xz = _drive(path, leg.speed)
-    ahead = middle[-1] + np.outer(np.linspace(0, 130, 200), middle[-1] - middle[-8]) / (
-        np.linalg.norm(middle[-1] - middle[-8])
-    )
-    behind = middle[0] + np.outer(np.linspace(40, 0, 80), middle[0] - middle[8]) / (
-        np.linalg.norm(middle[0] - middle[8])
-    )
+    ahead = _straight(middle[-1], middle[-1] - middle[-8], np.linspace(0, 130, 200))
+    behind = _straight(middle[0], middle[0] - middle[8], np.linspace(40, 0, 80))
     roads = roads_of([np.vstack([behind, middle, ahead])])
     seed = sum(map(ord, name))
     terrain = _terrain(roads.xz, lambda at: plan.hills * _waves(at, seed))
     camera = _CAMERAS[plan.camera]
     return Route(name, plan.about, plan.land, camera, _poses(xz, terrain), roads, terrain)
+
+
+def _straight(start: Float, direction: Float, metres: Float) -> Float:
+    """``(K, 2)`` points at ``(K,)`` distances from a point in a direction."""
+    return start + np.outer(metres, direction) / np.linalg.norm(direction)
 
 
 def route_of_poses(T_wc: Float, name: str, calibration: str = "00-02") -> Route:

@@ -57,14 +57,12 @@ class Route:
     def yaw_rate(self) -> Float:
         """``(N,)`` float64, rad/s."""
         heading = np.unwrap(np.arctan2(self.T_wc[:, 0, 2], self.T_wc[:, 2, 2]))
-        rate: Float = np.gradient(heading) * RATE
-        return rate
+        return np.asarray(np.gradient(heading) * RATE)
 
     @property
     def ground_truth(self) -> Float:
         """``(N, 4, 4)`` float64 ``T_wc`` with the first left camera as the world, as in KITTI."""
-        first: Float = np.linalg.inv(self.T_wc[0])
-        return first @ self.T_wc
+        return np.asarray(np.linalg.inv(self.T_wc[0]) @ self.T_wc)
 
 
 @dataclass(frozen=True)
@@ -348,7 +346,6 @@ def _heights_of(xz: Float, up: Float) -> Callable[[Float], Float]:
         # Away from the road, the ground has the height of the road.
         scale = np.maximum(distance[:, :1], 8.0)
         weight = np.exp(-0.5 * ((distance - distance[:, :1]) / scale) ** 2)
-        total: Float = (averaged[near] * weight).sum(axis=1) / weight.sum(axis=1)
-        return total
+        return np.asarray((averaged[near] * weight).sum(axis=1) / weight.sum(axis=1))
 
     return height

@@ -14,10 +14,10 @@ from vslam.calibration.models import Array, Calibration
 from vslam.calibration.rectification import rectify
 from vslam.calibration.solve import CameraFit, PairFit
 from vslam.doctor.findings import Finding, judge, sections
-from vslam.errors import InputError
+from vslam.errors import InputError, write_file
 from vslam.report.drawing import BLUE, GREY, LOW, RED, Drawing, draw, new_figure
 from vslam.report.page import Code, Page, Section, Tile, Tiles
-from vslam.report.render import html, write_files
+from vslam.report.render import html
 
 _FEW_VIEWS = 10
 # Degrees, and number of views tilted by more. Without tilt, the focal length is not determined.
@@ -99,7 +99,7 @@ def write_page(result: Calibrated, findings: Sequence[Finding], text: str, path:
             Section("Calibration file", [Code(text)]),
         ],
     )
-    write_files(path.parent, {path.name: html(page)}, "name another file with --out")
+    write_file(path, html(page), "name another file with --out")
 
 
 def _sides(result: Calibrated) -> list[tuple[str, CameraFit]]:

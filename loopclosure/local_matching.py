@@ -145,7 +145,12 @@ def likeness(a: DescriptorMaps, b: DescriptorMaps, least: float) -> float:
 
 
 def homography_share(coarse: CoarseMatches, a: DescriptorMaps, b: DescriptorMaps) -> float:
-    """Share of the cells of the smaller image whose coarse matches fit a single homography.
+    """``homography_inliers`` as a share of the cells of the smaller image."""
+    return homography_inliers(coarse, a, b) / _fewest_cells(a, b)
+
+
+def homography_inliers(coarse: CoarseMatches, a: DescriptorMaps, b: DescriptorMaps) -> int:
+    """Number of coarse matches that fit a single homography.
 
     A homography is not an exact model of a street, but distant points fit it, and near points
     deviate from it by only a cell or two. In images of different places, far fewer matches fit any
@@ -154,12 +159,12 @@ def homography_share(coarse: CoarseMatches, a: DescriptorMaps, b: DescriptorMaps
     import cv2
 
     if len(coarse.a) < 4:
-        return 0.0
+        return 0
     _, inlier = cv2.findHomography(
         a.scale * positions(coarse.a, a), b.scale * positions(coarse.b, b),
         cv2.RANSAC, _HOMOGRAPHY_PIXELS, maxIters=_HOMOGRAPHY_DRAWS,
     )  # fmt: skip
-    return 0.0 if inlier is None else float(inlier.sum() / _fewest_cells(a, b))
+    return 0 if inlier is None else int(inlier.sum())
 
 
 def _fewest_cells(a: DescriptorMaps, b: DescriptorMaps) -> int:

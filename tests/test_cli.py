@@ -143,7 +143,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
     ("words", "parts"),
     [
         ("--detector capsule --weights no.safetensors", ["no.safetensors", "no such file"]),
-        ("--detector none --weights no.npz", ["--weights", "none has no weights"]),
+        ("--detector none --weights no.npz", ["--weights", "'none' has no weights"]),
         ("--detector bow --weights no.npz", ["--weights no.npz", "vocabulary"]),
         ("--dataset synthetic --seq 77", ["synthetic route 77", "choose one of demo"]),
         ("--dataset kitti", ["data/kitti", "cvlibs.net", "--data", "$KITTI_ROOT"]),

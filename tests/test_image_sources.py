@@ -74,7 +74,7 @@ def test_kitti_takes_frames_by_number(tmp_path):
         ("kitti:{}[seq=00,first=0,last=5,near=25]", "near=25: must be above 0 and below 25 m"),
         ("kitti:{}[seq=00,first=0,last=5,near=nan]", "near=nan: must be above 0"),
         ("films:{}", "where KIND is one of"),
-        ("pairs:{}", r"pairs\.csv: no list of pairs"),
+        ("pairs:{}", r"pairs\.csv: missing or not a list of pairs"),
         ("photos:{}", "no set of photographs"),
         ("fabmap:{}", "no images"),
         ("pack:{}/none.npz", "not a pack of places"),

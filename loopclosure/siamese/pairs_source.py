@@ -36,7 +36,8 @@ def read_pairs(folder: Path) -> list[ImageSource]:
         poses = [[float(row[key]) for key in _VIEW] for *_, row in rows] if has_poses else []
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise InputError(
-            f"{path}: no list of pairs (columns a, b, same); write it with 'vslam synth --pairs'."
+            f"{path}: missing or not a list of pairs with the columns a, b and same; write it with "
+            "'vslam synth --pairs'."
         ) from error
     if not rows:
         raise InputError(f"{path}: contains no pair; write it again with 'vslam synth --pairs'.")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.config import LearnedMatchingConfig, VerificationConfig
+from vslam.config import VerificationConfig
 from vslam.geometry import Matrix
 from vslam.lab.loopbench.conditions import Condition
 from vslam.lab.loopbench.detectors import (
@@ -17,7 +17,7 @@ from vslam.lab.loopbench.detectors import (
 from vslam.lab.loopbench.node_matching import match_by_node
 from vslam.lab.loopbench.schema import Curve, Gain, Score, Verified
 from vslam.lab.loopbench.sets import QuerySet, TestSet
-from vslam.loopclosure.local_matching import homography_share, match_coarse
+from vslam.loopclosure.local_matching import homography_inliers, match_coarse
 from vslam.loopclosure.precision_recall import (
     PrecisionRecall,
     accepted_at,
@@ -28,7 +28,7 @@ from vslam.loopclosure.precision_recall import (
 )
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
 
-MIN_SHARE = 0.18  # of the coarse cells; on KITTI 00, 99.7 % of wrong best images have less
+MIN_CELLS, LEAST_COSINE = 90, 0.5  # of coarse matches that fit one homography
 MIN_MATCHES = 20  # that fit one epipolar geometry (ORB-SLAM, VII-B, requires 20 in 3D)
 _EPIPOLAR_PIXELS = 2.0
 _CURVE_POINTS = 200
@@ -191,13 +191,14 @@ class Verification:
         return self._by_orb[key]
 
     def by_learned(self, query: int, image: int) -> bool:
-        """Whether enough cells of the coarse grid roughly fit one homography."""
+        """Whether enough similar cells of the coarse grids roughly fit one homography. Their number
+        does not depend on how much of the images is sky or road, as their share would."""
         key = query, image
         if key not in self._by_learned:
             a = self._local.of(self._queries[query].image)
             b = self._local.of(self._gallery[image].image)
-            coarse = match_coarse(a, b, LearnedMatchingConfig().coarse_alike)
-            self._by_learned[key] = homography_share(coarse, a, b) >= MIN_SHARE
+            matches = match_coarse(a, b, LEAST_COSINE)
+            self._by_learned[key] = homography_inliers(matches, a, b) >= MIN_CELLS
         return self._by_learned[key]
 
 

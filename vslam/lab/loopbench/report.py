@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from vslam.lab.loopbench.curves import draw_curves
-from vslam.lab.loopbench.measure import LENGTH, MIN_MATCHES, MIN_SHARE
+from vslam.lab.loopbench.measure import LENGTH, MIN_CELLS, MIN_MATCHES
 from vslam.lab.loopbench.schema import LoopsJson, OnlineScore, Score
 from vslam.report.page import Bullets, Page, Pairs, Section, Table
 from vslam.report.render import html, markdown, write_files
@@ -26,8 +26,8 @@ _ABOUT_RECALL = "The highest recall without a wrong pair, and the precision at a
 _ABOUT_VERIFIED = (
     "Share of the queries with a place in the gallery whose best image shows this place; then the "
     f"shares for which, in addition, at least {MIN_MATCHES} ORB matches fit one epipolar geometry, "
-    "matches of learned local descriptors that fit one homography cover "
-    f"{100 * MIN_SHARE:.0f} % of the image, or at least one of the two tests passes."
+    f"at least {MIN_CELLS} coarse matches of learned local descriptors fit one homography, or at "
+    "least one of the two tests passes."
 )
 _ABOUT_SEQUENCES = (
     "Share of the queries whose best image shows their place, by scores of single images and of "

@@ -616,9 +616,9 @@ def test_interrupted_run_keeps_its_results(call, root, pipeline):
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        ("", "vslam doctor says what is wrong"),
-        ("--perturb night:9", "under --perturb night:9; a weaker one"),
-        ("--sensor mono", "one camera must move sideways"),
+        ("", "vslam doctor checks images"),
+        ("--perturb night:9", "under --perturb night:9; a weaker perturbation"),
+        ("--sensor mono", "a single camera must move sideways"),
     ],
 )
 def test_a_run_that_tracked_nothing_exits_with_1_and_says_why(call, root, pipeline, words, why):

@@ -253,7 +253,7 @@ def test_a_wrong_mask_of_one_frame_costs_this_frame(folder, mask, tmp_path):
         ("small.png", np.full((4, 5), 255, np.uint8), "5x4 pixels but the images have 480x160"),
         ("grey.png", np.full((160, 480), 100, np.uint8), "has pixels of value 100, but may only"),
         ("red.png", np.full((160, 480, 3), (0, 0, 255), np.uint8), "has pixels of value 76"),
-        ("black.png", np.zeros((160, 480), np.uint8), "hides the whole image; make the pixels"),
+        ("black.png", np.zeros((160, 480), np.uint8), "hides the whole image; paint used"),
         ("text.png", b"mask", "cannot be decoded"),
         ("empty", None, "holds no masks"),
         ("some/1.png", np.full((160, 480), 255, np.uint8), "is no 0.png for the image 0.jpg; add"),
@@ -305,4 +305,4 @@ def test_report_and_doctor_show_the_mask(call, kitti_tree, mask, tmp_path):
     assert code == 0, out
     assert "the mask hides 31.2 % of the image" in out
     page = (tmp_path / "doctor.html").read_text()
-    assert "the mask hides what is red" in page
+    assert "the mask hides the red part" in page

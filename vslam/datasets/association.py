@@ -46,10 +46,10 @@ def associate(
 
 
 def warn_of_unpaired(source: Path, n_pairs: int, n_images: int) -> None:
-    """Warn if many colour images are left out because no depth image is near them in time."""
+    """Warn if many colour images are skipped because no depth image is near them in time."""
     if n_pairs < (1.0 - _MANY) * n_images:
         _log.warning(
-            "%s: only %d of %d images have a depth image within 20 ms; the others are left out.",
+            "%s: only %d of %d images have a depth image within 20 ms; the others are skipped.",
             source,
             n_pairs,
             n_images,

@@ -339,7 +339,7 @@ def _choose_topics(
             "right images or of the depth, or run with --sensor mono."
         )
     if len(set(topics)) < len(topics):
-        raise InputError(f"--topics {','.join(topics)}: one topic twice; {listed}.")
+        raise InputError(f"--topics {','.join(topics)}: names one topic twice; {listed}.")
     if topics[0] in with_depth:
         raise InputError(
             f"--topics {','.join(topics)}: {topics[0]} holds depth; name the topic of the images "

@@ -17,7 +17,7 @@ from vslam.camera import DepthImage, Image
 Message = Any  # classes that rosbags generates from the bag's message definitions
 
 _COMPRESSED_DEPTH = "compressedDepth"  # format of image_transport: a 12-byte header, then a PNG
-_MILLIMETRES = 1000.0  # per metre: the unit of 16-bit depth; 32-bit depth is in metres (REP 118)
+_MM_PER_M = 1000.0  # 16-bit depth is in millimetres, 32-bit depth in metres (REP 118)
 _DEPTH_ENCODINGS = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -154,7 +154,7 @@ def _compressed_depth(message: Message, scale: float | None) -> DepthImage:
 
 
 def _metres(image: NDArray[Any], scale: float | None) -> DepthImage:
-    scale = scale or (_MILLIMETRES if image.dtype.kind == "u" else 1.0)
+    scale = scale or (_MM_PER_M if image.dtype.kind == "u" else 1.0)
     metres = np.asarray(image, np.float32) * np.float32(1.0 / scale)
     return np.where(np.isfinite(metres), metres, np.float32(0.0))
 

@@ -172,35 +172,19 @@ _AnySource = TypeVar("_AnySource", Source, RawSource)
 
 
 def stored_frames(
-    timestamps: NDArray[np.float64],
-    read: Callable[[int, ImageMap], Images],
-    files: Several[Path] | None = None,
-    colour: Callable[[Path], NDArray[np.uint8]] | None = None,
+    timestamps: NDArray[np.float64], read: Callable[[int, ImageMap], Images]
 ) -> tuple[TimedFrame, ...]:
-    """Make frames whose images one function reads by the index of the frame.
+    """Make stored frames from a function that reads the images of any of them.
 
     Args:
         timestamps: ``(N,)`` float64 seconds, increasing.
-        read: decodes the images of the frame with an index, see `TimedFrame`.
-        files: the files of the left images.
-        colour: decodes such a file in colour, see `TimedFrame`.
+        read: decodes the images of the frame with a given index, see `TimedFrame`.
     """
-    frames = [TimedFrame(time, partial(read, k)) for k, time in enumerate(timestamps.tolist())]
-    if files is None:
-        return tuple(frames)
-    return tuple(
-        replace(
-            frame,
-            file=file,
-            colour=None if colour is None else partial(colour, file),
-            name=file.name,
-        )
-        for frame, file in zip(frames, files, strict=True)
-    )
+    return tuple(TimedFrame(time, partial(read, k)) for k, time in enumerate(timestamps.tolist()))
 
 
 def decoded(sides: Several[Callable[[], Image | DepthImage]], image_map: ImageMap = map) -> Images:
-    """Decode the images of a frame by one function per image."""
+    """Decode the images of a frame, with one function per image."""
     left, *second = image_map(_call, sides)
     return np.asarray(left, np.uint8), second[0] if second else None
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.calibration.models import Calibration
-from vslam.camera import Camera, DepthImage, Image, ImageMap
-from vslam.datasets.frames import Images, RawSource, Size, decoded, stored_frames
+from vslam.camera import Camera, DepthImage, Image
+from vslam.datasets.frames import RawSource, Size, TimedFrame, decoded
 from vslam.errors import InputError, UnreadableImageError
 from vslam.untrusted import MOST_PIXELS, require_utf8
 
@@ -48,27 +48,29 @@ def checked_files(
         check_not_empty(path)
     depth = depth_scale is not None
     sizes = tuple(image_size(side[0]) for side in (sides[:1] if depth else sides))
-    grey = [partial(_read_grey_of, size) for size in sizes]
-    readers: list[Callable[[Path], Image | DepthImage]] = [*grey]
-    if depth_scale is not None:
-        readers.append(partial(_read_depth, sizes[0], depth_scale))
 
-    def read(index: int, image_map: ImageMap) -> Images:
-        each = [partial(reader, side[index]) for reader, side in zip(readers, sides, strict=True)]
-        return decoded(each, image_map)
-
-    stored = stored_frames(timestamps, read, sides[0], read_colour)
-    if len(sizes) == 2:
-        stored = tuple(
-            replace(frame, sides=(partial(grey[0], left), partial(grey[1], right)))
-            for frame, left, right in zip(stored, *sides, strict=True)
+    def frame(timestamp: float, *files: Path) -> TimedFrame:
+        grey = [
+            partial(_read_grey_of, size, file) for size, file in zip(sizes, files, strict=False)
+        ]
+        decoders: list[Callable[[], Image | DepthImage]] = [*grey]
+        if depth_scale is not None:
+            decoders.append(partial(_read_depth, sizes[0], depth_scale, files[1]))
+        return TimedFrame(
+            timestamp,
+            partial(decoded, decoders),
+            sides=(grey[0], grey[1]) if len(grey) == 2 else None,
+            file=files[0],
+            colour=partial(read_colour, files[0]),
+            name=files[0].name,
         )
+
     source = RawSource(
         dataset=dataset,
         name=name,
         sizes=sizes,
         depth=depth,
-        stored=stored,
+        stored=tuple(map(frame, timestamps.tolist(), *sides)),
         ground_truth=ground_truth,
     )
     if depth:

@@ -165,7 +165,7 @@ def _find_sides(
         pairs = ", ".join(" and ".join(names) for names in kinds)
         first, option = ("colour", "--depth") if sensor == "rgbd" else ("left", "--right")
         raise InputError(
-            f"{folder}: looked for pairs of images in {pairs}{_near_miss(folder)}; name the folder "
+            f"{folder}: found no pairs of images in {pairs}{_near_miss(folder)}; name the folder "
             f"of the {first} images with --data and the other folder with {option}, or run with "
             "--sensor mono."
         )
@@ -177,7 +177,7 @@ def _near_miss(folder: Path) -> str:
     above = folder.resolve().parent
     for names in PAIRS + DEPTH_PAIRS:
         if all(list_images(above / name) for name in names) and folder.resolve().name in names:
-            return f", and {above} has both (name it with --data)"
+            return f", but {above} has both (name it with --data)"
         sides = [bool(list_images(folder / name)) for name in names]
         if any(sides):
             there, missing = names if sides[0] else names[::-1]

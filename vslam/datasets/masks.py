@@ -1,7 +1,7 @@
 """Masks that select which pixels of the left images of a source are used.
 
 As in COLMAP and OpenCV, a mask is black (0) at pixels to ignore and white (255) elsewhere. It has
-the size of the original images, and is rectified as they are.
+the size of the original images and is rectified together with them.
 """
 
 from __future__ import annotations
@@ -87,5 +87,5 @@ def _read(source: Source, path: Path) -> Image:
     if source.rectify_mask is not None:
         mask = source.rectify_mask(mask)
     if not mask.any():
-        raise UnreadableImageError(path, "hides the whole image; make the pixels to use white.")
+        raise UnreadableImageError(path, "hides the whole image; paint used pixels white (255).")
     return mask

@@ -141,9 +141,9 @@ def unfilter(lines, image):
     height, width = image.shape
     n = np.uintp(width)
     steps = width + LANES - 1
-    # Both arrays hold all lanes of one step after the other. ``decoded`` has an additional first
-    # lane with the line above the block, and begins with two steps of zeros, which are the pixels
-    # left of the image.
+    # Both arrays hold the lanes of each step side by side. ``decoded`` has an additional first lane
+    # with the line above the block, and begins with two steps of zeros for the pixels left of the
+    # image.
     coded = np.zeros(steps * LANES, np.uint8)
     decoded = np.zeros((steps + 2) * (LANES + 1), np.uint8)
     left, above = np.zeros(LANES, np.int16), np.zeros(LANES, np.int16)

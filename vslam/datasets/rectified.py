@@ -6,6 +6,7 @@ from collections.abc import Callable
 from collections.abc import Sequence as Several
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,8 @@ from vslam.datasets.frames import Images, RawSource, Size, Source, TimedFrame, d
 from vslam.datasets.image_files import with_depth
 from vslam.errors import InputError
 
-_MISSING = {(1, 0): "column", (0, 1): "row", (1, 1): "column and row"}  # by (columns, rows)
+# Names by the number of missing columns and rows.
+_MISSING = {(1, 0): "column", (0, 1): "row", (1, 1): "column and row"}
 
 
 def rectified(raw: RawSource, calibration: Calibration) -> Source:
@@ -81,13 +83,15 @@ def _rectification_for(calibration: Calibration, sizes: Several[Size]) -> Rectif
 
 def _rectified_frame(rectification: Rectification, frame: TimedFrame) -> TimedFrame:
     file = frame.file if rectification.identity else None
-    colour = None if frame.colour is None else partial(_read_colour, rectification, frame.colour)
+    colour = None
+    if frame.colour is not None:
+        colour = partial(_read_one, frame.colour, rectification.left)
     sides = None
     if frame.sides is not None:
         left, right = frame.sides
         sides = (
-            lambda: np.asarray(rectification.left(left()), np.uint8),
-            lambda: np.asarray(rectification.right(right()), np.uint8),
+            partial(_read_one, left, rectification.left),
+            partial(_read_one, right, rectification.right),
         )
     read = partial(_read, rectification, frame)
     return replace(frame, read=read, sides=sides, file=file, colour=colour)
@@ -104,7 +108,7 @@ def _read(rectification: Rectification, frame: TimedFrame, image_map: ImageMap) 
     return decoded(sides, image_map)
 
 
-def _read_colour(
-    rectification: Rectification, colour: Callable[[], NDArray[np.uint8]]
+def _read_one(
+    read: Callable[[], NDArray[np.uint8]], rectify: Callable[[NDArray[np.uint8]], NDArray[Any]]
 ) -> NDArray[np.uint8]:
-    return np.asarray(rectification.left(colour()), np.uint8)
+    return np.asarray(rectify(read()), np.uint8)

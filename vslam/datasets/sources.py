@@ -80,7 +80,7 @@ _NOT_MONOCULAR = ("right", "depth", "depth_scale")
 def open_source(
     options: SourceOptions, on_render: Callable[[int, int], None] | None = None
 ) -> Source:
-    """Open a data set, or images of any camera, which the user's calibration rectifies.
+    """Open a data set, or images of any camera, which are rectified with the user's calibration.
 
     Args:
         on_render: see `vslam.datasets.open_sequence`.
@@ -128,7 +128,7 @@ def _open_images(dataset: str, options: SourceOptions) -> Source:
 
 
 def open_raw(options: SourceOptions) -> RawSource:
-    """Open unrectified images, from which cameras are calibrated; their times are not used.
+    """Open unrectified images to calibrate their cameras; times are not used.
 
     Without ``sensor``, a video or live camera is monocular unless ``side_by_side`` is set, and a
     folder that itself holds images is monocular unless ``right`` is given.

@@ -117,14 +117,10 @@ def open_video(
         InputError: the file is missing or cannot be decoded, there are neither time stamps nor
             ``fps``, or stereo is asked for but a frame holds one image.
     """
-    if not side_by_side and not monocular:
-        raise InputError(
-            f"{path}: a video has one image per frame; use --side-by-side if each frame holds both "
-            "images of a stereo pair, or run with --sensor mono."
-        )
     import cv2
 
     path = Path(path)
+    _check_sides(f"{path}: a video", side_by_side, monocular)
     capture = _open(path)
     width, height, count, own_fps = (
         float(capture.get(key))
@@ -163,6 +159,15 @@ def open_video(
         play=partial(_play, path, n, fps, side_by_side, monocular),
         n_expected=n,
     )
+
+
+def _check_sides(source: str, side_by_side: bool, monocular: bool) -> None:
+    """Check that a stereo pair is side by side, because videos have one image per frame."""
+    if not side_by_side and not monocular:
+        raise InputError(
+            f"{source} has one image per frame; use --side-by-side if each frame holds both "
+            "images of a stereo pair, or run with --sensor mono."
+        )
 
 
 def _play(
@@ -224,11 +229,7 @@ def open_camera(device: str, *, side_by_side: bool = False, monocular: bool = Fa
             but a frame holds one image.
     """
     name = _name(device)
-    if not side_by_side and not monocular:
-        raise InputError(
-            f"camera {name}: a camera has one image per frame; use --side-by-side if each frame "
-            "holds both images of a stereo pair, or run with --sensor mono."
-        )
+    _check_sides(f"camera {name}: a camera", side_by_side, monocular)
     capture = _open_device(int(device)) if device.isdecimal() else _open_url(device, name)
     decoded, image = capture.read()
     if not decoded:

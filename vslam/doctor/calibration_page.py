@@ -14,17 +14,17 @@ from vslam.calibration.models import Array, Calibration
 from vslam.calibration.rectification import rectify
 from vslam.calibration.solve import CameraFit, PairFit
 from vslam.doctor.findings import Finding, judge, sections
-from vslam.errors import InputError
+from vslam.errors import InputError, write_file
 from vslam.report.drawing import BLUE, GREY, LOW, RED, Drawing, draw, new_figure
 from vslam.report.page import Code, Page, Section, Tile, Tiles
-from vslam.report.render import html, write_files
+from vslam.report.render import html
 
 _FEW_VIEWS = 10
 # Degrees, and number of views tilted by more. Without tilt, the focal length is not determined.
 _TILT, _FEW_TILTED = 15.0, 3
 _CELLS = (8, 6)  # cells of the image, across and down
 _COVERED = 0.6  # smallest share of cells with corners, which hardly reach the outermost pixels
-_LARGE_PX = 0.5  # largest RMS in images of the common width; in wider images, it grows with width
+_LARGE_PX = 0.5  # largest RMS in images of the common width; grows with the width of wider images
 _COMMON_WIDTH = 640
 _APART_PX = 2.0  # largest RMS between the cameras
 _SHARED = 0.2  # largest share of the squared residuals that neighbouring corners have in common
@@ -34,7 +34,7 @@ _ARROW = 0.02  # length of an arrow of the RMS error, relative to the image widt
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A calibration and the estimates that it consists of.
+    """A calibration and its estimates.
 
     Attributes:
         board: the board in the images.
@@ -99,7 +99,7 @@ def write_page(result: Calibrated, findings: Sequence[Finding], text: str, path:
             Section("Calibration file", [Code(text)]),
         ],
     )
-    write_files(path.parent, {path.name: html(page)}, "name another file with --out")
+    write_file(path, html(page), "name another file with --out")
 
 
 def _sides(result: Calibrated) -> list[tuple[str, CameraFit]]:

@@ -21,7 +21,7 @@ _EPIPOLAR_PX = 1.5
 _REFINED_PX = 3.0  # largest error of a keypoint in a coarse octave
 _WINDOW = (15, 15)
 _MIN_MATCHES = 12
-_ANOTHER_VIEW = 0.25  # of the image width: median motion of matches from which a view is another
+_ANOTHER_VIEW = 0.25  # of the image width: smallest median motion between two different views
 
 
 @dataclass(frozen=True)

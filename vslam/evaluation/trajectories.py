@@ -108,8 +108,7 @@ def evaluate_trajectory(
 
     T_wc_aligned = np.array(aligned.poses_se3)
     errors = np.asarray(ape.error)
-    distances = path_length(ground_truth.T_wc)
-    drift = kitti_drift(T_wc_aligned, ground_truth.T_wc)
+    t_rel, r_rel = kitti_drift(T_wc_aligned, ground_truth.T_wc) or (None, None)
     return Evaluation(
         frames=len(errors),
         alignment=alignment,
@@ -120,11 +119,11 @@ def evaluate_trajectory(
         ate_max_m=float(errors.max()),
         errors_m=errors,
         T_wc_aligned=T_wc_aligned,
-        distances_m=distances,
+        distances_m=path_length(ground_truth.T_wc),
         rpe_m=_rmse(np.asarray(rpe_m.error)),
         rpe_deg=_rmse(np.asarray(rpe_deg.error)),
-        t_rel_percent=None if drift is None else drift[0],
-        r_rel_deg_per_100m=None if drift is None else drift[1],
+        t_rel_percent=t_rel,
+        r_rel_deg_per_100m=r_rel,
     )
 
 

@@ -22,7 +22,8 @@ def name_of_world(outcome: RunOutcome) -> str:
 
 
 def world_of(outcome: RunOutcome, evaluation: Evaluation) -> World:
-    """The transformation of a map, from the alignment of the trajectory that built it."""
+    """The transformation from a map to its ground truth, by the alignment of the trajectory that
+    built the map."""
     truth = matched_ground_truth(outcome)
     assert truth is not None
     kept = np.isin(outcome.trajectory.timestamps, truth.timestamps)

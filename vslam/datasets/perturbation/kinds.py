@@ -15,7 +15,7 @@ from vslam.datasets.frames import Source
 from vslam.errors import InputError
 
 RandomStream = tuple[int, int]
-"""The user's seed and a number for the law, with which the seed of each generator begins."""
+"""The user's seed and a number for the law, which begin the seed of each generator of the law."""
 
 Law = Callable[[int, float, int, Image], Image]
 """``(frame, t, side, image) -> image`` of the same shape; t is in seconds since the first frame;
@@ -124,7 +124,7 @@ class SceneLaw:
 
 @dataclass(frozen=True)
 class LawKind:
-    """A kind of law; a strength and a seed make a law of it.
+    """A kind of law, which makes laws of any strength and seed.
 
     Attributes:
         make: ``(strength, stream) -> Law``, or ``(strength, stream, scene) -> PairLaw`` if
@@ -132,7 +132,7 @@ class LawKind:
         unit: unit of the strength.
         default: strength if none is given.
         weakest, strongest: range that ``vslam stress`` searches. ``strongest`` is the smaller
-            number where a small strength has a large effect, as a small visibility in fog.
+            number if a small strength has a large effect, for example a short visibility in fog.
         about: a description in a few words.
         least, most: allowed range of strengths.
         logarithmic: whether strengths are compared by their ratio rather than their difference.

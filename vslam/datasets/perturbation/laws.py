@@ -204,16 +204,17 @@ def _row(sequence: Source, perturbation: Perturbation, index: int, label: str) -
     t = float(sequence.timestamps[index] - sequence.timestamps[0])
     left, second = sequence.read(index)
     try:
-        first, other = perturbation.apply(index, t, left, second)
+        new_left, new_second = perturbation.apply(index, t, left, second)
     except DroppedFrameError:
-        first, other = np.zeros_like(left), None if second is None else np.zeros_like(left)
-    pairs = {"left": (left, first)}
-    if other is not None and other.dtype == np.uint8:
-        pairs["right"] = np.asarray(second, np.uint8), np.asarray(other, np.uint8)
+        black = np.zeros_like(left)
+        new_left, new_second = black, None if second is None else black
+    pairs = {"left": (left, new_left)}
+    if new_second is not None and new_second.dtype == np.uint8:
+        pairs["right"] = np.asarray(second, np.uint8), np.asarray(new_second, np.uint8)
     changes = {side: after.astype(float) - before for side, (before, after) in pairs.items()}
     side = max(changes, key=lambda name: float(np.abs(changes[name]).mean()))
     change = np.clip(_MIDDLE + _AMPLIFIED * changes[side], 0, 255).astype(np.uint8)
-    panels = {f"{label}: left as it is": left}
+    panels = {f"{label}: original left image": left}
     panels |= {f"{name} perturbed": after for name, (_, after) in pairs.items()}
     panels[f"change of {side}, times {_AMPLIFIED:g}"] = change
     return np.hstack([_titled(title, image) for title, image in panels.items()])

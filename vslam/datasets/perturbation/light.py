@@ -23,7 +23,7 @@ _JUMPS_PER_S = 3.0 / 60.0
 _JUMP_WIDENING = 1.5
 _GREYS = np.arange(256, dtype=np.float64)
 
-FULL_WELL = 10_000.0  # electrons at grey value 255; about that of a 3.75 um pixel (Sony ICX267)
+FULL_WELL = 10_000.0  # electrons at grey value 255, as in a Sony ICX267
 READ_NOISE = 10.0  # electrons, typical for such sensors
 _TUNNEL_STOPS = 3.0
 _TUNNELS_PER_S = 1.0 / 5.0

@@ -132,7 +132,7 @@ def _lay_bricks(rng: Rng, image: Grey, px: float, py: float) -> None:
 
 @dataclass(frozen=True)
 class _Painter:
-    """Draws on ``image`` in metres; ``px`` and ``py`` are texels per metre."""
+    """Draws on ``image`` with coordinates in metres; ``px`` and ``py`` are texels per metre."""
 
     rng: Rng
     image: Grey
@@ -245,7 +245,8 @@ class _Painter:
             rows, columns = self._slices(x + 0.07, top + 0.07, x1 - 0.07, height - 0.42)
             pane = self.image[rows, columns]
             if min(pane.shape) > 4:
-                pane[:] = 34 + 10 * noise(self.rng, pane.shape[0], pane.shape[1], 0.8 * self.px, 3)
+                tall, wide = pane.shape
+                pane[:] = 34 + 10 * noise(self.rng, tall, wide, 0.8 * self.px, 3)
                 self._goods(pane)
                 lights[rows, columns] = 0.7
             x = x1 + 0.25

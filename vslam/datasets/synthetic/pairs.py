@@ -24,11 +24,10 @@ from vslam.datasets.synthetic.town import Town, build_town
 
 _HEIGHT = 0.25  # m, largest change of the camera's height
 _EXPOSURE = 0.25  # standard deviation of the logarithm of the ratio of the two exposures
-# Different places are farther apart than this (m). In one street, that is along parallel headings,
-# their distance exceeds the second, or their distance across the street the third.
+# Places are different if they are more than _APART m apart and not in one street: places in one
+# street have parallel headings, are within _SIGHT m, and at most _STREET m apart across the street.
 _APART, _SIGHT, _STREET = 40.0, 160.0, 25.0
-# Another pass through a place is at most this far (m) and this many degrees away, and more than
-# this many frames earlier or later.
+# Two passes through a place differ by at most 4 m and 30 degrees, and by more than 60 frames.
 _TOGETHER, _ALIGNED, _LATER = 4.0, 30.0, 60
 _ALIKE = 5  # number of the most similar places that count as look-alikes of a place
 _PLACES, _SMALL = 160, 8  # number of places that are compared; factor by which views are reduced
@@ -185,16 +184,9 @@ def _look_alikes(route: Route, town: Town, passes: Passes, threads: int) -> NDAr
     The similarity of two places is the correlation of their small, blurred, normalised views.
     """
     chosen = np.unique(np.linspace(0, len(route.T_wc) - 1, _PLACES).astype(int))
-    camera = route.camera
-    small = Camera(
-        camera.fx / _SMALL,
-        camera.fy / _SMALL,
-        camera.cx / _SMALL,
-        camera.cy / _SMALL,
-        camera.baseline,
-        camera.width // _SMALL,
-        camera.height // _SMALL,
-    )
+    c = route.camera
+    fx, fy, cx, cy = (x / _SMALL for x in (c.fx, c.fy, c.cx, c.cy))
+    small = Camera(fx, fy, cx, cy, c.baseline, c.width // _SMALL, c.height // _SMALL)
     renderer = Renderer(small, town.atlas, town.sky, threads)
     moment = passes.at(0)
     seen = []

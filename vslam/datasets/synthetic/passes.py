@@ -22,7 +22,7 @@ from vslam.datasets.synthetic.terrain import CLEARANCE
 from vslam.datasets.synthetic.town import Town
 
 _NEAR, _LEFT = 60.0, 75.0  # m: distances at which a place is reached, and at which it is left
-_AGAIN, _STRETCH = 60, 15  # frames: shortest time until a revisit, and its shortest length
+_AGAIN, _STRETCH = 60, 15  # frames: shortest time until a revisit, and its shortest duration
 _SHADOW_MAPS = 8  # number of shadow maps that are kept
 _CLOUD = 12.0  # frames; a cloud hides the sun while it moves between two passes
 _CAR_REACH = np.array([1.1, 2.7])  # half the width and length of the largest car, m
@@ -66,7 +66,7 @@ class Passes:
         return surfaces.select((surfaces.thing < 0) | present[surfaces.thing])
 
     def _light(self, frame: int, number: int) -> tuple[Light, float]:
-        """Light and darkness of the night (0 to 1) at a frame of pass ``number``.
+        """The light at a frame of pass ``number``, and how dark the night is (0 to 1).
 
         The sun stands still during a pass, and moves behind a cloud between two passes. Night falls
         slowly during the whole drive.

@@ -13,7 +13,7 @@ from vslam.kernels import borrowed, inline, kernel
 NEAR = 0.2  # m
 FAR = 400.0  # m
 LAYER_STEP = 1e-3  # relative depth by which a layer is drawn in front of the next lower one
-_SEAM = 1e-6  # overlap of neighbours, as a fraction of an edge, so that no sample falls between
+_SEAM = 1e-6  # overlap of neighbours as a fraction of an edge, so that there are no gaps
 
 # Columns of the result of ``find_visible``: the coefficients of affine functions of the pixel
 # (u, v) for s/z, t/z, 1/z and for both texture coordinates over z, and then single numbers.
@@ -72,7 +72,7 @@ def find_visible(surfaces, atlas, camera, light):
     corner = np.empty((4, 3))
     left, right = (-1.0 - cx) / fx, (width - cx) / fx
     for q in range(len(origin)):
-        # Vector operations are written out, because NumPy is slow for vectors of length three.
+        # Products are written out, because matrix products are slow for vectors of length three.
         ox, oy, oz = origin[q, 0] - T_wc[0, 3], origin[q, 1] - T_wc[1, 3], origin[q, 2] - T_wc[2, 3]
         sx, sy, sz = edge_s[q, 0], edge_s[q, 1], edge_s[q, 2]
         tx, ty, tz = edge_t[q, 0], edge_t[q, 1], edge_t[q, 2]

@@ -57,14 +57,12 @@ class Route:
     def yaw_rate(self) -> Float:
         """``(N,)`` float64, rad/s."""
         heading = np.unwrap(np.arctan2(self.T_wc[:, 0, 2], self.T_wc[:, 2, 2]))
-        rate: Float = np.gradient(heading) * RATE
-        return rate
+        return np.asarray(np.gradient(heading) * RATE)
 
     @property
     def ground_truth(self) -> Float:
         """``(N, 4, 4)`` float64 ``T_wc`` with the first left camera as the world, as in KITTI."""
-        first: Float = np.linalg.inv(self.T_wc[0])
-        return first @ self.T_wc
+        return np.asarray(np.linalg.inv(self.T_wc[0]) @ self.T_wc)
 
 
 @dataclass(frozen=True)
@@ -157,17 +155,18 @@ def built_in_route(name: str) -> Route:
     right = np.stack([np.cos(heading), -np.sin(heading)], axis=1)
     path = middle + right * (_LANE * lane)[:, None]
     xz = _drive(path, leg.speed)
-    ahead = middle[-1] + np.outer(np.linspace(0, 130, 200), middle[-1] - middle[-8]) / (
-        np.linalg.norm(middle[-1] - middle[-8])
-    )
-    behind = middle[0] + np.outer(np.linspace(40, 0, 80), middle[0] - middle[8]) / (
-        np.linalg.norm(middle[0] - middle[8])
-    )
+    ahead = _straight(middle[-1], middle[-1] - middle[-8], np.linspace(0, 130, 200))
+    behind = _straight(middle[0], middle[0] - middle[8], np.linspace(40, 0, 80))
     roads = roads_of([np.vstack([behind, middle, ahead])])
     seed = sum(map(ord, name))
     terrain = _terrain(roads.xz, lambda at: plan.hills * _waves(at, seed))
     camera = _CAMERAS[plan.camera]
     return Route(name, plan.about, plan.land, camera, _poses(xz, terrain), roads, terrain)
+
+
+def _straight(start: Float, direction: Float, metres: Float) -> Float:
+    """``(K, 2)`` points at ``(K,)`` distances from a point in a direction."""
+    return start + np.outer(metres, direction) / np.linalg.norm(direction)
 
 
 def route_of_poses(T_wc: Float, name: str, calibration: str = "00-02") -> Route:
@@ -347,7 +346,6 @@ def _heights_of(xz: Float, up: Float) -> Callable[[Float], Float]:
         # Away from the road, the ground has the height of the road.
         scale = np.maximum(distance[:, :1], 8.0)
         weight = np.exp(-0.5 * ((distance - distance[:, :1]) / scale) ** 2)
-        total: Float = (averaged[near] * weight).sum(axis=1) / weight.sum(axis=1)
-        return total
+        return np.asarray((averaged[near] * weight).sum(axis=1) / weight.sum(axis=1))
 
     return height

@@ -94,8 +94,8 @@ def _log2(bits):
 
 @inline
 def _trilinear(texels, offset, number, log_w, log_h, bits, u, v):
-    """Texture ``number`` at ``(u, v)``, averaged over the texels of level 0 in a pixel, whose
-    number per direction is the float32 with these ``bits``. Two levels are blended over the middle
+    """Texture ``number`` at ``(u, v)``, averaged over a pixel. ``bits`` are those of a float32, the
+    number of texels of level 0 per pixel in one direction. Two levels are blended over the middle
     half of an octave."""
     low, part = _log2(bits)
     top = max(log_w, log_h)

@@ -74,19 +74,16 @@ def list_stored(cache: Path) -> list[Stored]:
     """All sequences in a cache folder, complete or not."""
     found = []
     for record in sorted(cache.glob(f"*/sequences/*/{_RECORD}")):
-        manifest = _read_record(record.parent)
-        if manifest:
-            size = sum(p.stat().st_size for p in record.parent.rglob("*") if p.is_file())
-            found.append(
-                Stored(
-                    record.parents[2],
-                    record.parent.name,
-                    int(manifest["route"]["frames"]),
-                    "checksums" in manifest,
-                    size,
-                )
-            )
+        folder, root = record.parent, record.parents[2]
+        if manifest := _read_record(folder):
+            frames, complete = int(manifest["route"]["frames"]), "checksums" in manifest
+            found.append(Stored(root, folder.name, frames, complete, _folder_size(folder)))
     return found
+
+
+def _folder_size(folder: Path) -> int:
+    """Total size of the files in a folder in bytes."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def place_folder(cache: Path) -> Path:
@@ -94,16 +91,11 @@ def place_folder(cache: Path) -> Path:
     return cache / f"v{VERSION}-places"
 
 
-def place_folders(cache: Path) -> list[Path]:
-    """The `place_folder` of each version that exists."""
-    return sorted(cache.glob("v*-places"))
-
-
 def clean(cache: Path, name: str | None = None) -> int:
     """Remove everything, or all variations of one route; returns the number of freed bytes."""
     freed = 0
-    for places in place_folders(cache) if name is None else []:
-        freed += sum(p.stat().st_size for p in places.rglob("*") if p.is_file())
+    for places in cache.glob("v*-places") if name is None else []:
+        freed += _folder_size(places)
         shutil.rmtree(places)
     for stored in list_stored(cache):
         if name in (None, stored.name):

@@ -36,7 +36,7 @@ _ROADS = {
 
 @dataclass(frozen=True)
 class Town:
-    """A town of T things; a thing that changes occurs twice, as it is before and after.
+    """A town of T things; an object before and after a change is two things.
 
     Attributes:
         surfaces: all surfaces, in the route's world.

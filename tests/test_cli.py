@@ -500,7 +500,7 @@ def test_summary_counts_loops(call, root, with_detector):
 
 def test_summary_without_a_detector(call, root, pipeline):
     _, out, _ = call("run", "--data", root, "--max-frames", 10, "--detector", "none")
-    assert re.search("Loops +off +no detector; the ground truth revisits no stretch", out)
+    assert re.search("Loops +off +no detector; the drive revisits no stretch", out)
 
 
 def detectors_in(out: str) -> list[list[str]]:

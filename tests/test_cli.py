@@ -155,7 +155,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--data nowhere", ["nowhere", "no such file or folder", "--data"]),
         ("--data .", ["the folder is empty", "--data"]),
         ("nowhere", ["nowhere", "no such file or folder", "--data"]),
-        ("nowhere --data .", ["nowhere: --data also names what to read"]),
+        ("nowhere --data .", ["nowhere: --data also names data"]),
         ("--data other", ["not a known data set", "sequences", "mav0", "rgb.txt"]),
         ("--data 77 --sensor mono", ["camera 77", "no such device"]),
         ("--dataset images --data . --fps 0", ["--fps 0", "positive"]),
@@ -174,7 +174,7 @@ def test_run_refuses_without_data(call, words, parts, tmp_path):
 def test_a_bare_command_without_data_says_what_to_do(call, command):
     code, out, err = call(command)
     assert (code, out) == (2, "")
-    assert err.startswith("error: there is nothing to read; ")
+    assert err.startswith("error: there is no data to read; ")
     ways = [line.strip().split("  ")[0] for line in err.splitlines()[1:]]
     assert ways == ["--dataset synthetic", "DATA --calib FILE", "--data FOLDER"]
     assert not any(Path().iterdir())
@@ -311,7 +311,7 @@ def test_help_is_grouped_and_short(call, monkeypatch):
     ]  # fmt: skip
     assert len(out.splitlines()) <= 110
     assert "<" not in out + call("--help")[1] + call("map", "--help")[1]  # types
-    assert "│ --map FILE " in out
+    assert "│ --map FILE|FOLDER " in out
     assert "First frame. [default: 0]" in out
 
 
@@ -516,7 +516,7 @@ def test_summary_counts_loops(call, root, with_detector):
 
 def test_summary_without_a_detector(call, root, pipeline):
     _, out, _ = call("run", "--data", root, "--max-frames", 10, "--detector", "none")
-    assert re.search("Loops +off +no detector; the ground truth revisits no stretch", out)
+    assert re.search("Loops +off +no detector; the drive revisits no stretch", out)
 
 
 def detectors_in(out: str) -> list[list[str]]:

@@ -511,7 +511,7 @@ def test_refusals(corridor_run, kitti_tree, tmp_path):
     text = times.read_text()
     times.unlink()
     times.write_text("".join(f"{1.0 + float(line)}\n" for line in text.split()))
-    assert "made on with --data" in refusal(*words, "--data", other)
+    assert "use --data to name" in refusal(*words, "--data", other)
     # A report of another version, and none.
     run = tmp_path / "run"
     run.mkdir()
@@ -520,7 +520,9 @@ def test_refusals(corridor_run, kitti_tree, tmp_path):
     assert "missing or damaged" in refusal("export", "g2o", run, *out)
     report = json.loads((corridor_run / "report.json").read_text())
     (run / "report.json").write_text(json.dumps({**report, "schema_version": 3, "eyes": 2}))
-    assert "report schema 3, this version reads 5" in refusal("export", "g2o", run, *out)
+    assert "report schema 3, but this version of vslam reads 5" in refusal(
+        "export", "g2o", run, *out
+    )
     np.savez(tmp_path / "new.npz", schema=1, keyframe_first_row=np.zeros(1))
     assert "a map of schema 1" in refusal("map", "info", tmp_path / "new.npz")
     assert not (tmp_path / "out").exists()
@@ -535,7 +537,7 @@ def test_what_can_be_exported_of_a_live_camera(corridor_run, tmp_path):
     (run / "report.json").write_text(json.dumps({**report, "dataset": "camera"}))
     for kind in ("colmap", "nerfstudio", "ply"):
         message = refusal("export", kind, run)
-        assert "what a camera has shown cannot be seen again" in message
+        assert "images of a live camera are not stored" in message
         assert "export g2o, euroc or ply --no-colours" in message
     vslam("export", "ply", run, "--no-colours")
     vslam("export", "g2o", run)

@@ -290,7 +290,7 @@ def test_localise_by_the_command_line(kitti_tree, mapped, tmp_path):
     assert result.exit_code == 0, result.output
     assert re.search(r"In the map +100\.0 % +of the frames", result.output)
     assert re.search(r"Error in the map +0\.0\d+ m", result.output)
-    assert "first fix after 0.00 s, found at 1 of 1 attempt" in result.output
+    assert "found in 1 of 1 attempt, first after 0.00 s" in result.output
     report = report_of(tmp_path)
     assert report["localize"]
     assert report["detector"] == "both"

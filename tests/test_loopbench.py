@@ -280,7 +280,7 @@ def test_report_says_who_wins_in_all_three_files(vocabulary, tmp_path):
     assert read == found
     text, page = (tmp_path / "loops.md").read_text(), (tmp_path / "loops.html").read_text()
     for shown in (text, page):
-        assert "none: liar -0." in shown
+        assert "none: AP of liar minus that of bow is -0." in shown
         assert "worse on walls" in shown
         assert "1.000" in shown
     assert page.count("<svg") == 1

@@ -184,7 +184,10 @@ def test_a_document_is_read_as_it_was_written_and_by_its_version_alone(tmp_path:
     for text, says in (
         ("{", "missing or damaged"),
         ("[1]", "missing or damaged"),
-        ('{"schema_version": 1, "metres": 1.5}', "report schema 1, this version reads 2"),
+        (
+            '{"schema_version": 1, "metres": 1.5}',
+            "report schema 1, but this version of vslam reads 2",
+        ),
         ('{"schema_version": 2, "feet": 5}', "missing or damaged"),
     ):
         path.write_text(text)

@@ -444,7 +444,7 @@ def test_compared_trajectories_are_in_the_top_view(looped: tuple[RunOutcome, Pat
     alone = top_view(outcome, None, None, None).axes[0].lines
     own, compared = (line for line in alone if line.get_label() == "bow")
     np.testing.assert_allclose(own.get_xdata() + 40.0, compared.get_xdata(), atol=1e-6)
-    assert "Dashed: the detectors compared" in (folder / "report.html").read_text()
+    assert "Dashed: the detectors of --compare" in (folder / "report.html").read_text()
 
 
 def test_rejected_loops_do_not_drown_the_table(looped: tuple[RunOutcome, Path]) -> None:
@@ -487,7 +487,7 @@ def test_closed_loops_are_shown_in_pictures(tmp_path: Path) -> None:
     # The wrong one first, then the one by learned descriptors; that of frame 400 has no picture.
     names = ["loop-360-200.jpg", "loop-320-68.jpg", "loop-264-12.jpg"]
     captions = [
-        "Frame 360 (right) was wrongly taken for the place of frame 200 (left): 84 matches agree; "
+        "Frame 360 (right) was wrongly matched to the place of frame 200 (left): 84 matches agree; "
         "proposed by bow, verified by ORB descriptors.",
         "Frame 320 (right) shows the place of frame 68 (left): 84 matches agree; "
         "proposed by bow and capsule, verified by learned descriptors.",
@@ -585,7 +585,7 @@ def test_a_right_loop_on_a_revisit_too_short_to_count_is_explained() -> None:
     assert (report.revisit_stretches, report.loops_closed, report.loops[0].right) == (0, 1, True)
     note = headlines(report)[-1].note
     assert note.startswith(
-        "the ground truth revisits no stretch of 20 m or more (1 right on shorter ones), "
+        "the drive revisits no stretch of 20 m or more (1 right on shorter ones), "
     )
 
 
@@ -624,7 +624,7 @@ def test_a_monocular_report_speaks_of_no_stereo_and_no_metres(make, tmp_path: Pa
     report_of(replace(outcome, sequence=without_truth, compared=()), tmp_path)
     text = (tmp_path / "report.md").read_text()
     assert "stereo" not in text.lower().replace("| stereo ", "")  # a stage of the made-up run
-    assert "in the unit of the map" in text or "Moved" not in text
+    assert "in units of the map" in text or "Moved" not in text
     assert not re.search(r"\d\.\d\d m\b", text)
     assert top_view(outcome, None, None, None).axes[0].get_xlabel() == "x (map units)"
 

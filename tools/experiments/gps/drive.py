@@ -1,13 +1,13 @@
-"""Measure what GPS does to the error of a drive.
+"""Measure the effect of GPS on the error of a drive.
 
     python tools/experiments/gps/drive.py RUN [RUN ...] --seeds 5
 
-Simulates a receiver along the ground truth of finished runs: one fix a second, with white noise, a
-bias that walks at random, gaps, and jumps by 20 m that last ten seconds. Prints the root mean
-square error of the positions of the run without GPS (after the alignment of its sensor), of the
-fixes, of the fixes interpolated at the times of the frames, and of the run with GPS: after SE3
-alignment, and without any. All are means over the seeds. Then prints the median CPU time that
-adding the fixes took after the drive.
+The script simulates a receiver along the ground truth of finished runs: one fix per second, with
+white noise, a bias that follows a random walk, gaps, and jumps by 20 m that last ten seconds. It
+prints the RMSE of the positions of the run without GPS (after the alignment for its sensor), of the
+fixes, of the fixes interpolated at the times of the frames, and of the run with GPS; the last two
+with and without SE3 alignment. All are means over the seeds. Then it
+prints the median CPU time that adding the fixes took after the drive.
 """
 
 from __future__ import annotations
@@ -39,13 +39,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", type=Path, nargs="+", help="folders of runs with ground truth")
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--noise", type=float, default=1.0, help="m, of each axis")
-    parser.add_argument("--walk", type=float, default=0.05, help="of the bias, m per root second")
-    parser.add_argument("--gaps", type=int, default=3, help="of 30 s each")
-    parser.add_argument("--jumps", type=int, default=3)
-    parser.add_argument("--hertz", type=float, default=1.0)
-    parser.add_argument("--sigma", type=float, default=1.5, help="that the receiver states, m")
-    parser.add_argument("--correlation", type=float, default=gps.CORRELATION_S, help="s")
+    parser.add_argument("--noise", type=float, default=1.0, help="white noise per axis, m")
+    parser.add_argument(
+        "--walk", type=float, default=0.05, help="random walk of the bias, m/sqrt s"
+    )
+    parser.add_argument("--gaps", type=int, default=3, help="number of gaps of 30 s")
+    parser.add_argument("--jumps", type=int, default=3, help="number of jumps")
+    parser.add_argument("--hertz", type=float, default=1.0, help="fixes per second")
+    parser.add_argument("--sigma", type=float, default=1.5, help="accuracy that fixes claim, m")
+    parser.add_argument(
+        "--correlation", type=float, default=gps.CORRELATION_S, help="correlation time assumed, s"
+    )
     options = parser.parse_args()
     gps.CORRELATION_S = options.correlation
     print("| run | positions of | error after alignment, m | error, m | refused, wrongly refused |")
@@ -110,7 +114,7 @@ def errors(positions: NDArray[np.float64], truth: Trajectory) -> tuple[float, fl
 def simulated(
     truth: Trajectory, options: argparse.Namespace, seed: int
 ) -> tuple[Fixes, NDArray[np.bool_]]:
-    """Fixes along the ground truth, and which of them have jumped."""
+    """Fixes along the ground truth, and whether each of them lies in a jump."""
     rng = np.random.default_rng(seed)
     first, last = truth.timestamps[[0, -1]]
     times = np.arange(first, last, 1.0 / options.hertz)

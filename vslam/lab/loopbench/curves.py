@@ -27,7 +27,7 @@ _COLORS = [GREY, BLUE, VIOLET, AMBER, GREEN, RED]
 _DASHES = ["-", "--", ":"]  # for the first six detectors, the next six, and the rest
 _VERIFIED = {"nothing": "-", "both": ":"}
 
-# Panel, curve, label in the legend (or empty), colour and dashes.
+# Panel, curve, label in the legend (may be empty), colour and dashes.
 Line = tuple[str, Curve | DecisionCurve, str, str, str]
 
 

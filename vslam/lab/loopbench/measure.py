@@ -33,9 +33,9 @@ MIN_MATCHES = 20  # that fit one epipolar geometry (ORB-SLAM, VII-B, requires 20
 _EPIPOLAR_PIXELS = 2.0
 _CURVE_POINTS = 200
 _RESAMPLES = 200  # bootstrap resamples of the queries
-# Of sequences, as in OpenSeqSLAM (Sünderhauf et al., ICRA 2013 workshop).
-LENGTH = 10  # queries
-SPEEDS = (0.8, 0.9, 1.0, 1.1, 1.2)  # images of the gallery for each query
+# Matching of sequences, as in OpenSeqSLAM (Sünderhauf et al., ICRA 2013 workshop).
+LENGTH = 10  # queries in a sequence
+SPEEDS = (0.8, 0.9, 1.0, 1.1, 1.2)  # gallery images per query
 _LEAST_P = 1e-6  # probabilities nearer to 0 or 1 are clipped
 
 
@@ -45,7 +45,7 @@ def measure(
     detectors: DetectorSet,
     seed: int,
 ) -> tuple[list[Score], list[Gain]]:
-    """Measure all detectors on a set under a condition; empty if the set does not have it."""
+    """Measure all detectors on a set; empty if the condition cannot be applied to the set."""
     query_set = test_set.query_set(condition, seed)
     if query_set is None:
         return [], []
@@ -115,7 +115,7 @@ def _score(
 def _best_images(
     scores: Matrix, relation: NDArray[np.int8]
 ) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
-    """The best image of each query for which its relation is known, and this relation."""
+    """The most similar image with a known relation to each query, and this relation."""
     best = np.where(relation != UNKNOWN, scores, -np.inf).argmax(1)
     return best, relation[np.arange(len(best)), best]
 
@@ -123,8 +123,8 @@ def _best_images(
 def thinned(curve: PrecisionRecall) -> Curve:
     """The best precision at equal steps of recall, and the end where every pair is accepted.
 
-    With equal steps over the pairs, the whole curve of a good detector would lie in the first step,
-    because it ranks the few true pairs before thousands of others.
+    Equal steps in the number of pairs would not show the curve of a good detector, which ranks the
+    few true pairs before thousands of others: nearly all of it would lie within the first step.
     """
     points = drawn_points(curve)
     return Curve(
@@ -148,7 +148,7 @@ def _gain(
     found: dict[str, Matrix],
     relation: NDArray[np.int8],
 ) -> Gain:
-    """Difference in AP with a bootstrap interval over the queries."""
+    """The difference in AP, with a bootstrap interval over the queries."""
     known, rng = relation != UNKNOWN, np.random.default_rng(0)
 
     def gain(rows: NDArray[np.integer]) -> float:
@@ -170,7 +170,7 @@ def _gain(
 
 
 class Verification:
-    """Tests by local descriptors whether two images show one place; caches the results."""
+    """Tests by local features whether two images show the same place; caches the results."""
 
     def __init__(
         self,
@@ -203,7 +203,7 @@ class Verification:
 
 
 def epipolar_inliers(a: DescribedImage, b: DescribedImage) -> int:
-    """Number of matches of two images that fit the best fundamental matrix found."""
+    """Number of ORB matches between two images that fit the best fundamental matrix found."""
     import cv2
 
     config = VerificationConfig()
@@ -221,18 +221,18 @@ def epipolar_inliers(a: DescribedImage, b: DescribedImage) -> int:
 
 
 def sequence_scores(scores: Matrix) -> Matrix:
-    """The mean score along the best line that ends at each query and image.
+    """The mean score along the best line that ends at each query and gallery image.
 
-    Sequences recognise a stretch of the way instead of one image. As in SeqSLAM (Milford and Wyeth,
-    ICRA 2012), the scores of a query and its predecessors are added along lines through the
+    A sequence recognises a stretch of road instead of a single image. As in SeqSLAM (Milford and
+    Wyeth, ICRA 2012), the scores of a query and its predecessors are added along lines through the
     gallery, one for each speed.
 
     Args:
         scores: ``(Q, G)`` of queries and images in driving order; higher is more similar.
 
     Returns:
-        ``(Q, G)``. Outside the gallery, a line takes the mean score of the query; the first queries
-        have shorter lines.
+        ``(Q, G)``. Where a line leaves the gallery, the mean score of the query is added; the lines
+        of the first queries are shorter.
     """
     n_queries, n_images = scores.shape
     usual = scores.mean(1)
@@ -248,6 +248,6 @@ def sequence_scores(scores: Matrix) -> Matrix:
 
 
 def log_odds(p: Matrix) -> Matrix:
-    """Log odds of probabilities, which can be added over independent observations."""
+    """Log odds of probabilities; those of independent observations can be added."""
     p = np.clip(p, _LEAST_P, 1.0 - _LEAST_P)
     return np.asarray(np.log(p / (1.0 - p)))

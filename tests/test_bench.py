@@ -514,7 +514,7 @@ def test_a_video_is_a_grid_of_one_sequence(corridor, tmp_path: Path, monkeypatch
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        ("--data 0", "--data 0: a live camera gives each image once; record a video"),
+        ("--data 0", "--data 0: a live camera cannot be repeated; record a video"),
         ("--dataset video --data a.mkv --seqs 00", "--seq 00: only for data sets, not video"),
     ],
 )

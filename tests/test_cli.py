@@ -607,7 +607,7 @@ def test_interrupted_run_keeps_its_results(call, root, pipeline):
     pipeline.interrupted = "Ctrl-C"
     code, out, _ = call("run", "--data", root, "--max-frames", 10)
     assert code == 1
-    assert "Interrupted: Ctrl-C. The results cover the 10 frames before it." in out
+    assert "Interrupted: Ctrl-C. The results cover the 10 frames before that." in out
     folder = Path("runs") / Path("runs/latest").readlink()
     assert (folder / "trajectory.tum").is_file()
     assert f"\ncontinue  vslam run --resume {folder}\n" in out

@@ -183,7 +183,7 @@ def test_vslam_selects_frames_of_a_reader(installed, corridor, tmp_path: Path):
     left, second = sequence.read(1)
     assert np.array_equal(left, corridor.left[5])
     assert second is None
-    with pytest.raises(InputError, match=r"--calib: the reader frames .* leave it out"):
+    with pytest.raises(InputError, match=r"--calib: the reader frames .* leave the option out"):
         open_sequence("frames", data, calib=[Path("a.yaml")])
     with pytest.raises(InputError, match=r"elsewhere\.npz: no such file"):  # its own words
         open_sequence("frames", data, "elsewhere")

@@ -425,17 +425,18 @@ def test_commands_train_convert_and_show(call, tmp_path):
     assert same(load(tmp_path / "back.npz"), load(tmp_path / "vocabulary.npz"))
     code, out, _ = call("info", "v.txt")
     assert code == 0
-    assert f"words     {load(tmp_path / 'back.npz').n_words}, of which" in out
+    n_words = load(tmp_path / "back.npz").n_words
+    assert f"words     {n_words}, {n_words} of them with weight 0" in out
     assert call("info")[0] == 0
 
 
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        (("train", "nowhere"), "nowhere: no image there"),
+        (("train", "nowhere"), "nowhere: no images found"),
         (("train", "broken.jpg"), "1 of 1 images cannot be read"),
         (("train", "broken.jpg", "--out", "v.dat"), "must end in .npz or in .txt"),
-        (("train", "broken.jpg", "--out", "none/v.npz"), "there is no folder none"),
+        (("train", "broken.jpg", "--out", "none/v.npz"), "the folder none does not exist"),
         (("convert", "v.npz", "v.dat"), "must end in .npz or in .txt"),
         (("convert", "v.npz", "v.txt"), "v.npz: not a vocabulary (No such file"),
         (("info", "broken.jpg"), "must end in .npz or in .txt"),

@@ -14,7 +14,7 @@ from source_files import write_images, write_video
 
 from vslam.calibration.boards import (
     Board,
-    Corners,
+    View,
     board_points,
     other_board,
     read_board,
@@ -22,11 +22,12 @@ from vslam.calibration.boards import (
 )
 from vslam.calibration.files import read_calibration, write_calibration
 from vslam.calibration.models import Calibration, CameraModel, project, unproject
-from vslam.calibration.solve import View, diverse, fit_camera, fit_pair
+from vslam.calibration.solve import Estimate, diverse, fit_camera, fit_pair
 from vslam.cli.calibrate import _frames
 from vslam.datasets.frames import RawSource, TimedFrame
-from vslam.doctor.calibration_page import Calibrated, findings_of
+from vslam.doctor.calibration_page import findings_of
 from vslam.errors import BrokenSourceError, InputError
+from vslam.geometry import transform
 
 PINHOLE = CameraModel(
     300.0, 300.6, 193.2, 142.8, 384, 288, "pinhole", (-0.25, 0.07, 0.0005, -0.0004)
@@ -67,16 +68,14 @@ def rendered(board: Board, model: CameraModel, views: list[np.ndarray], seed: in
     return [renderer.image(T, rng) for T in views]
 
 
-def seen_at(board: Board, model: CameraModel, T: np.ndarray, noise: float, rng) -> Corners:
-    """Exact corners with noise, without an image."""
-    points = board_points(board)
-    xy = project(model, points @ T[:3, :3].T + T[:3, 3])
-    return Corners(np.arange(len(xy)), xy + rng.normal(0.0, noise, xy.shape))
-
-
-def exact_views(board: Board, model: CameraModel, views: list[np.ndarray]) -> list[View]:
-    rng = np.random.default_rng(0)
-    return [View(str(k), seen_at(board, model, T, 0.05, rng)) for k, T in enumerate(views)]
+def exact_views(board: Board, model: CameraModel, poses: list[np.ndarray]) -> list[View]:
+    """Projected corners with a little noise, without images."""
+    rng, points = np.random.default_rng(0), board_points(board)
+    found = []
+    for k, T in enumerate(poses):
+        xy = project(model, transform(T, points))
+        found.append(View(str(k), np.arange(len(xy)), xy + rng.normal(0.0, 0.05, xy.shape)))
+    return found
 
 
 @pytest.fixture
@@ -124,8 +123,7 @@ def test_second_try_keeps_the_result_of_the_first_and_refuses_other_files(calibr
     assert (code, "Next" in out) == (1, False)
     *_, ending = out.splitlines()
     assert ending == (
-        "Do not use this calibration, because it has faults; do what the fixes above say, and try "
-        "again."
+        "Do not use this calibration, because it has faults; apply the fixes above, and try again."
     )
     first = Path("a.yaml").read_text(), Path("a.html").read_text()
     Path("a.yaml").write_text("left: of an earlier try\n")
@@ -136,7 +134,7 @@ def test_second_try_keeps_the_result_of_the_first_and_refuses_other_files(calibr
     assert "a-2.html: the earlier a.html" in calibrate(*words, "a.yaml")[1]
     Path("b.yaml").write_text("left_out: 1\n")
     for name, said in (
-        ("b.yaml", "--out b.yaml: is another program's file; name a new one."),
+        ("b.yaml", "--out b.yaml: is another program's file; give another name."),
         ("none/a.yaml", "--out none/a.yaml: there is no folder none; create it first."),
         ("board", "--out board: is a folder"),
         ("a.html", "--out a.html: a calibration is YAML"),
@@ -219,17 +217,16 @@ def test_written_calibration_is_read_as_the_same(tmp_path):
 
 def test_views_that_do_not_fit_are_dropped_and_named():
     views = exact_views(CHECKERBOARD, PINHOLE, poses(CHECKERBOARD, PINHOLE, 14))
-    bent = views[5].corners
-    noise = np.random.default_rng(1).normal(0.0, 2.0, bent.xy.shape)
-    views[5] = View("5", replace(bent, xy=bent.xy + noise))
+    noise = np.random.default_rng(1).normal(0.0, 2.0, views[5].xy.shape)
+    views[5] = replace(views[5], xy=views[5].xy + noise)
     fit = fit_camera(CHECKERBOARD, views, (384, 288), "pinhole")
     check_camera(fit.model, PINHOLE)
     assert [name for name, _ in fit.dropped] == ["5"]
     other = fit_camera(CHECKERBOARD, views[:5] + views[6:], (384, 288), "pinhole")
     assert fit.model.fx == pytest.approx(other.model.fx, abs=2e-5)
-    found = findings_of(Calibrated(CHECKERBOARD, Calibration(fit.model), (fit,), None, (14, 14)))
+    found = findings_of(Estimate((fit,)))
     assert {f.verdict for f in found} == {"good"}
-    assert "dropped as outliers: 5 (" in found[0].measured
+    assert "dropped because they do not fit: 5 (" in found[0].measured
 
 
 @pytest.mark.slow
@@ -245,24 +242,22 @@ def test_pairs_that_were_not_taken_together_are_dropped():
     ]
     pair = fit_pair(CHECKERBOARD, *fits)
     assert [name for name, _ in pair.dropped] == ["3"]
-    both = Calibration(fits[0].model, fits[1].model, pair.T_left_right)
-    check_pair(both, PINHOLE)
+    check_pair(Estimate(tuple(fits), pair).calibration, PINHOLE)
 
 
 def test_checkerboard_numbered_from_the_other_end_is_renumbered():
     board = Board("checkerboard", 8, 6, 0.03)
-    (T,) = poses(board, PINHOLE, 1)
-    left = seen_at(board, PINHOLE, T, 0.0, np.random.default_rng(0))
+    (left,) = exact_views(board, PINHOLE, poses(board, PINHOLE, 1))
     assert np.array_equal(same_order(board, left, replace(left, xy=left.xy[::-1])).xy, left.xy)
 
 
 def test_diverse_views_leave_out_a_board_that_stands_still():
     moving = poses(CHECKERBOARD, PINHOLE, 9)
     film = [moving[0]] * 30 + moving[1:]
-    views = [(view,) for view in exact_views(CHECKERBOARD, PINHOLE, film)]
-    chosen = diverse(CHECKERBOARD, views, [(384, 288)], 60)
+    frames = [(None,), *((view,) for view in exact_views(CHECKERBOARD, PINHOLE, film))]
+    chosen = [int(view.name) for (view,) in diverse(CHECKERBOARD, frames, [(384, 288)], 60)]
     assert (len(chosen), chosen[1:]) == (9, list(range(30, 38)))
-    assert len(diverse(CHECKERBOARD, views, [(384, 288)], 4)) == 4
+    assert len(diverse(CHECKERBOARD, frames, [(384, 288)], 4)) == 4
 
 
 def test_doubtful_calibration_is_judged_in_plain_words():
@@ -270,8 +265,7 @@ def test_doubtful_calibration_is_judged_in_plain_words():
     flat[:3, 3] = -0.12, -0.08, 0.4
     views = exact_views(CHECKERBOARD, PINHOLE, [*poses(CHECKERBOARD, PINHOLE, 2), flat])
     fit = fit_camera(CHECKERBOARD, views, (384, 288), "pinhole")
-    result = Calibrated(CHECKERBOARD, Calibration(fit.model), (fit,), None, (3, 3))
-    faults = {f.check: f.measured for f in findings_of(result) if f.verdict == "fault"}
+    faults = {f.check: f.measured for f in findings_of(Estimate((fit,))) if f.verdict == "fault"}
     assert faults["views"] == "3 views, too few"
     assert faults["tilt"] == "2 views are tilted by more than 15 degrees"
     assert faults["coverage"].startswith("corners in ")
@@ -282,8 +276,7 @@ def test_lens_of_the_other_model_is_a_fault():
     faults = {}
     for lens in ("pinhole", "fisheye"):
         fit = fit_camera(CHECKERBOARD, views, (384, 288), lens)
-        result = Calibrated(CHECKERBOARD, Calibration(fit.model), (fit,), None, (14, 14))
-        faults[lens] = [f.check for f in findings_of(result) if f.verdict == "fault"]
+        faults[lens] = [f.check for f in findings_of(Estimate((fit,))) if f.verdict == "fault"]
     assert "lens" in faults["pinhole"]
     assert faults["fisheye"] == []
 
@@ -295,15 +288,13 @@ def test_swapped_cameras_are_a_fault():
         for side in ([np.linalg.inv(T_LEFT_RIGHT) @ T for T in views], views)
     )
     pair = fit_pair(CHECKERBOARD, left, right)
-    calibration = Calibration(left.model, right.model, pair.T_left_right)
-    found = findings_of(Calibrated(CHECKERBOARD, calibration, (left, right), pair, (14, 14)))
-    (fault,) = [f for f in found if f.verdict == "fault"]
+    (fault,) = [f for f in findings_of(Estimate((left, right), pair)) if f.verdict == "fault"]
     assert (fault.check, "0.060 m to the left" in fault.measured) == ("rectification", True)
 
 
 def test_too_few_views_and_another_board_are_errors():
     views = exact_views(APRILGRID, PINHOLE, poses(APRILGRID, PINHOLE, 8))
-    with pytest.raises(InputError, match="is found in only 2 usable images, and 3 are the least"):
+    with pytest.raises(InputError, match="is found in only 2 usable images, but 3 are needed"):
         fit_camera(APRILGRID, views[:2], (384, 288), "pinhole")
     other = replace(APRILGRID, columns=3, rows=4)
     with pytest.raises(InputError, match="do not fit a flat AprilGrid of 3x4 tags"):
@@ -346,7 +337,7 @@ def test_images_without_the_board_are_an_error_that_says_what_was_looked_for(cal
         (("pair", *rest, "9x6"), "--square is missing"),
         (("pair", *rest, "9x6", "--square", 30), "give both in metres, such as 0.025 for 25 mm"),
         (("pair", *rest, "9"), "--size 9: give columns and rows, such as 9x6."),
-        (("pair", "--board", "none.yaml"), "--board none.yaml: is no file; give"),
+        (("pair", "--board", "none.yaml"), "--board none.yaml: there is no such file; give"),
     ):
         code, _, err = calibrate(*words)
         message = err[err.index("error: ") :]

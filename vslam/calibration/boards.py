@@ -1,20 +1,23 @@
-"""Calibration boards, the detection of their corners by OpenCV, and the recognition of a board that
-is not the expected one.
+"""Calibration boards: their geometry, the detection of their corners, and the recognition of
+another board than the expected one.
 
-A board is flat. Its frame has x to the right, y down and z away from the viewer; an AprilGrid's is
-Kalibr's, with y up and z towards the viewer.
+A board lies in the plane z = 0 of its frame. The frame of a checkerboard or ChArUco board has x to
+the right, y down and z away from the viewer; that of an AprilGrid is Kalibr's, with y up and z
+towards the viewer.
 """
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, cast
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,29 +28,28 @@ from vslam.errors import InputError
 
 Kind = Literal["checkerboard", "charuco", "aprilgrid"]
 
-_FEWEST_CORNERS = 8  # of a view; a homography needs four
+_FEWEST_CORNERS = 8  # in a view; a homography needs four
 _FEWEST_TAGS = 4
-_LARGEST_M = 0.5  # side of a square; larger numbers are usually millimetres
-_TAGS = "APRILTAG_36h11"
-_BORDERS = (2, 1)  # bits of black around a tag: Kalibr prints 2, most other programs 1
+_LARGEST_M = 0.5  # side of a square; a larger number is usually in millimetres
+_TAGS = "APRILTAG_36H11"
+_BORDERS = (2, 1)  # black bits around a tag: Kalibr prints 2, most other programs 1
 _SEARCHED_PX = 960  # longer side of the image in which a checkerboard is searched
-_REACH_PX = (2, 6)  # of the refinement, to each side
+_REACH_PX = (2, 6)  # least and greatest half width of the window in which a corner is refined
 
-# For the recognition of a board. Houses and fences show a few false tags and small checkerboards;
-# more than these, or the same one twice, come from a board.
+# To recognise a board. A few false tags and a small false checkerboard appear in any image of
+# houses, so it takes more tags than that, or the same checkerboard in two images.
 _RECOGNISED_TAGS = 6
-_SMALLEST = (4, 3)
-_SIZES = (50, 100, 250, 1000)
+_SIZES = (50, 100, 250, 1000)  # of the dictionaries of a family; each begins with the smaller ones
 _FAMILIES = (
-    *((f"{bits}X{bits}_1000", 1) for bits in (4, 5, 6, 7)),
+    *((f"{bits}X{bits}_50", 1) for bits in (4, 5, 6, 7)),
     ("ARUCO_ORIGINAL", 1),
-    *((_TAGS, bits) for bits in _BORDERS),
-)  # the largest dictionary of each family, and the bits of black around its tags
-_TRIED_TAGS = 50
+    *((_TAGS, border) for border in _BORDERS),
+)  # a dictionary of each family, and the black bits around its tags
 _MOST_COLUMNS = 40
-_OFF_PLACE = 0.25  # distance of a tag from its place in the layout, in tag sides
-_TRIALS = 200  # of RANSAC; few tags are wrong
-_SAME_RATIO = 0.12  # relative error of marker / square, which blur makes too small
+_OFF_PLACE = 0.2  # largest distance of a tag from its place in the layout, in squares
+_SAME_RATIO = 0.12  # relative error of the measured marker / square, which blur decreases
+
+_Found = tuple[NDArray[np.int64], Array] | None  # ids and xy of a `View`
 
 
 @dataclass(frozen=True)
@@ -55,15 +57,15 @@ class Board:
     """A printed board.
 
     Attributes:
-        kind: what is printed.
+        kind: the pattern.
         columns, rows: inner corners of a checkerboard, squares of a ChArUco board, tags of an
             AprilGrid.
-        square: side of a square in metres; of an AprilGrid, the distance from one tag to the next.
+        square: side of a square in metres; for an AprilGrid, distance from one tag to the next.
         marker: side of the black marker or tag in metres; 0 for a checkerboard.
-        dictionary: OpenCV's name of a ChArUco board's markers, without ``DICT_``.
+        dictionary: OpenCV's name of a ChArUco board's markers, without ``DICT_``, in capitals.
 
     Raises:
-        InputError: a size is impossible.
+        InputError: a size is impossible, or the dictionary is unknown or has too few markers.
     """
 
     kind: Kind
@@ -76,15 +78,22 @@ class Board:
     def __post_init__(self) -> None:
         if not 0 <= self.marker < self.square <= _LARGEST_M:
             raise InputError(
-                f"a board has no squares of {self.square:g} m with markers of {self.marker:g} m; "
-                "give both in metres, such as 0.025 for 25 mm, and the marker smaller."
+                f"a board cannot have squares of {self.square:g} m and markers of {self.marker:g} "
+                "m; give both in metres, such as 0.025 for 25 mm."
             )
         least = 1 if self.kind == "aprilgrid" else 3
         if not all(least <= n <= 100 for n in (self.columns, self.rows)):
             raise InputError(
-                f"a {self.kind} has no size of {self.columns}x{self.rows}; give {least} to 100 "
-                "columns and rows."
+                f"a {self.kind} cannot have the size {self.columns}x{self.rows}; give {least} to "
+                "100 columns and rows."
             )
+        if self.kind == "charuco":
+            n = len(_dictionary(self.dictionary).bytesList)
+            if n < self.columns * self.rows // 2:
+                raise InputError(
+                    f"--dictionary {self.dictionary}: {n} markers are too few for this board; give "
+                    "the --size and the --dictionary that were printed."
+                )
 
     def __str__(self) -> str:
         size = f"{self.columns}x{self.rows}"
@@ -96,36 +105,33 @@ class Board:
 
 
 @dataclass(frozen=True)
-class Corners:
-    """The corners of a board that one image shows.
+class View:
+    """The corners of a board that are visible in one image.
 
     Attributes:
+        name: the image, in messages.
         ids: ``(N,)`` int64, rows of `board_points`.
         xy: ``(N, 2)`` float64 pixels.
     """
 
+    name: str
     ids: NDArray[np.int64]
     xy: Array
 
 
-Finder = Callable[[Image], Corners | None]
-
-
 def read_board(path: Path) -> Board:
-    """Read a target of Kalibr: an ``aprilgrid`` or a ``checkerboard``.
+    """Read a target file of Kalibr: an ``aprilgrid`` or a ``checkerboard``.
 
     Raises:
-        InputError: the file is no such target, a key is missing, or a size is impossible.
+        InputError: the file is of another kind, a key is missing, or a size is impossible.
     """
     document = read_document(path)
     kind = document.text("target_type")
-    marker = 0.0
     if kind == "aprilgrid":
-        names = "tagCols", "tagRows"
-        marker = document.number("tagSize")
+        names, marker = ("tagCols", "tagRows"), document.number("tagSize")
         square = marker * (1 + document.number("tagSpacing"))
     elif kind == "checkerboard":
-        names = "targetCols", "targetRows"
+        names, marker = ("targetCols", "targetRows"), 0.0
         square = document.number("colSpacingMeters")
         if square != document.number("rowSpacingMeters"):
             raise InputError(f"{path}: the fields of the board are not square; use another board.")
@@ -142,70 +148,56 @@ def read_board(path: Path) -> Board:
 
 def board_points(board: Board) -> Array:
     """``(N, 3)`` float64, the corners of a board in its frame, in metres."""
-    first = 1 if board.kind == "charuco" else 0  # its inner corners, counted from its outer one
-    across, down = np.meshgrid(np.arange(first, board.columns), np.arange(first, board.rows))
-    flat = np.column_stack([across.ravel(), down.ravel(), np.zeros(across.size)])
-    points = np.asarray(flat * board.square, np.float64)
+    first = 1 if board.kind == "charuco" else 0  # the origin is a ChArUco board's outer corner
+    x, y = np.meshgrid(np.arange(first, board.columns), np.arange(first, board.rows))
+    points = board.square * np.stack([x, y, np.zeros(x.shape)], axis=-1).reshape(-1, 3)
     if board.kind != "aprilgrid":
-        return points
-    # The corners of a tag clockwise, from the lower right one on: where OpenCV begins with a tag
-    # that Kalibr prints.
-    around = np.array([[1, 0, 0], [0, 0, 0], [0, 1, 0], [1, 1, 0]]) * board.marker
+        return np.asarray(points, np.float64)
+    # The corners of a tag in OpenCV's order, which starts at the lower right as Kalibr prints it.
+    around = board.marker * np.array([[1, 0, 0], [0, 0, 0], [0, 1, 0], [1, 1, 0]])
     return np.asarray((points[:, None] + around).reshape(-1, 3))
 
 
-def corner_finder(board: Board) -> Finder:
-    """The function that finds the corners of a board in an ``(H, W)`` uint8 image; it returns None
-    for an image that does not show enough of the board.
-
-    Raises:
-        InputError: the dictionary has too few markers for the board.
-    """
-    finders = {
-        "checkerboard": _checkerboard_finder,
-        "charuco": _charuco_finder,
-        "aprilgrid": _aprilgrid_finder,
-    }
-    find, points = finders[board.kind](board), board_points(board)
-
-    def find_refined(image: Image) -> Corners | None:
-        found = find(image)
-        return None if found is None else _refined(board, points, image, found)
-
-    return find_refined
+def find_corners(board: Board, image: Image, name: str = "") -> View | None:
+    """Find a board in an ``(H, W)`` uint8 image; None if too few corners are visible."""
+    find = {
+        "checkerboard": _find_checkerboard,
+        "charuco": _find_charuco,
+        "aprilgrid": _find_aprilgrid,
+    }[board.kind]
+    found = find(board, image)
+    return None if found is None else _refined(board, image, View(name, *found))
 
 
-def same_order(board: Board, left: Corners, right: Corners) -> Corners:
-    """The right corners, numbered like the left ones.
+def same_order(board: Board, left: View, right: View) -> View:
+    """The right view, with its corners numbered like those of the left one.
 
-    A checkerboard that looks the same upside down may be numbered from either end. Of all the
-    numberings, that of the left image gives the most similar directions.
+    A checkerboard that looks the same upside down may be numbered from either end. The numbering
+    under which the two images look most alike is the same one in both.
     """
     if board.kind != "checkerboard":
         return right
     grid = right.xy.reshape(board.rows, board.columns, 2)
     turned = [np.rot90(grid, k) for k in range(4)]
-    numbered = [g.reshape(-1, 2) for g in turned if g.shape == grid.shape]
-    centred = left.xy - left.xy.mean(axis=0)
-    off = [float(np.linalg.norm(xy - xy.mean(axis=0) - centred)) for xy in numbered]
-    return Corners(right.ids, numbered[int(np.argmin(off))])
+    xy = [each.reshape(-1, 2) for each in turned if each.shape == grid.shape]
+    return replace(right, xy=min(xy, key=lambda each: np.std(each - left.xy, axis=0).sum()))
 
 
 def other_board(board: Board, images: Sequence[Image]) -> str:
-    """What images show instead of ``board`` and the options that describe it, as a clause; empty if
-    they show this board, or none that is recognised."""
+    """A clause that names the board in ``images`` and the options that describe it; empty if it is
+    ``board``, or if no board is recognised."""
     small = [_reduced(image)[0] for image in images]
-    found = _tagged_board(small) or _checkerboard(small)
+    found = _recognised_tags(small) or _recognised_checkerboard(small)
     if found is None:
         return ""
-    if found.kind == board.kind and found.columns == board.columns:  # some rows may be out of sight
+    if found.kind == board.kind and found.columns == board.columns:  # some rows may be out of view
         found = replace(found, rows=max(found.rows, board.rows))
-    family, given = (each.dictionary.rpartition("_")[0] for each in (found, board))
+    family, given = (re.sub(r"_\d+$", "", each.dictionary) for each in (found, board))
     if found.kind != "charuco" or family == given:
         found = replace(found, dictionary=board.dictionary)
     ratio = found.marker / found.square
-    known = replace(found, square=board.square, marker=board.marker) == board
-    if known and abs(board.marker / board.square - ratio) <= _SAME_RATIO * ratio:
+    same_layout = replace(found, square=board.square, marker=board.marker) == board
+    if same_layout and abs(board.marker / board.square - ratio) <= _SAME_RATIO * ratio:
         return ""
     options = f"--board {found.kind} --size {found.columns}x{found.rows}"
     options += f" --dictionary {found.dictionary}" if found.kind == "charuco" else ""
@@ -215,214 +207,145 @@ def other_board(board: Board, images: Sequence[Image]) -> str:
     return f"the images show {article} {found}: give {options}"
 
 
-def _checkerboard_finder(board: Board) -> Finder:
-    import cv2
-
-    def find(image: Image) -> Corners | None:
-        small, times = _reduced(image)
-        found, xy = cv2.findChessboardCornersSB(
-            small, (board.columns, board.rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE
-        )
-        if not found:
-            return None
-        whole = (xy.reshape(-1, 2).astype(np.float64) + 0.5) * times - 0.5
-        return Corners(np.arange(len(xy)), whole)
-
-    return find
+def _find_checkerboard(board: Board, image: Image) -> _Found:
+    small, times = _reduced(image)
+    size, flags = (board.columns, board.rows), cv2.CALIB_CB_NORMALIZE_IMAGE
+    found, xy = cv2.findChessboardCornersSB(small, size, flags=flags)
+    if not found:
+        return None
+    return np.arange(len(xy)), (xy.reshape(-1, 2).astype(np.float64) + 0.5) * times - 0.5
 
 
 def _reduced(image: Image) -> tuple[Image, float]:
-    """An image in which a checkerboard is found quickly, and how many times smaller it is."""
-    import cv2
-
+    """An image small enough to find a checkerboard quickly, and by what factor it is smaller."""
     times = max(1.0, max(image.shape) / _SEARCHED_PX)
     small = cv2.resize(image, None, None, 1 / times, 1 / times, cv2.INTER_AREA)
     return cast("Image", small), times
 
 
-def _charuco_finder(board: Board) -> Finder:
-    import cv2
-
+def _find_charuco(board: Board, image: Image) -> _Found:
     size, markers = (board.columns, board.rows), _dictionary(board.dictionary)
-    if len(markers.bytesList) < board.columns * board.rows // 2:
-        raise InputError(
-            f"--dictionary {board.dictionary}: has too few markers for {size[0]}x{size[1]} "
-            "squares; give the size and the dictionary that are printed."
-        )
-    detectors = []
+    layout = cv2.aruco.CharucoBoard(size, board.square, board.marker, markers)
     for legacy in (False, True):  # OpenCV before 4.6 began boards of even height with a marker
-        layout = cv2.aruco.CharucoBoard(size, board.square, board.marker, markers)
         layout.setLegacyPattern(legacy)
-        detectors.append(cv2.aruco.CharucoDetector(layout))
-    points = board_points(board)
-
-    def find(image: Image) -> Corners | None:
-        for detector in detectors[: 1 + (board.rows % 2 == 0)]:
-            xy, ids, _, _ = detector.detectBoard(image)
-            if ids is not None and len(ids) >= _FEWEST_CORNERS:
-                rows = np.asarray(ids, np.int64).ravel()
-                if np.ptp(points[rows, :2], axis=0).all():  # corners in a row fix no pose
-                    return Corners(rows, xy.reshape(-1, 2).astype(np.float64))
-        return None
-
-    return find
+        xy, ids, _, _ = cv2.aruco.CharucoDetector(layout).detectBoard(image)
+        if ids is not None and len(ids) >= _FEWEST_CORNERS:
+            rows = np.asarray(ids, np.int64).ravel()
+            if np.ptp(board_points(board)[rows, :2], axis=0).all():  # a line of corners has no pose
+                return rows, xy.reshape(-1, 2).astype(np.float64)
+    return None
 
 
-def _aprilgrid_finder(board: Board) -> Finder:
-    detectors = [_tag_detector(_TAGS, border) for border in _BORDERS]
-    points = board_points(board)
-
-    def find(image: Image) -> Corners | None:
-        for detect in detectors:
-            numbers, xy = detect(image)
-            known = numbers < board.columns * board.rows
-            if np.count_nonzero(known) >= _FEWEST_TAGS:
-                ids = (4 * numbers[known, None] + np.arange(4)).ravel()
-                at = xy[known].reshape(-1, 2)
-                # Other programs than Kalibr do not print the tags upside down, which shows only in
-                # the grid as a whole.
-                ids = min(ids, ids ^ 2, key=lambda each: _off_plane(points[each], at))
-                return Corners(ids, at)
-        return None
-
-    return find
+def _find_aprilgrid(board: Board, image: Image) -> _Found:
+    for border in _BORDERS:
+        numbers, xy = _find_tags(image, _TAGS, border)
+        known = numbers < board.columns * board.rows
+        if np.count_nonzero(known) >= _FEWEST_TAGS:
+            ids = (4 * numbers[known, None] + np.arange(4)).ravel()
+            at, plane = xy[known].reshape(-1, 2), np.add(board_points(board), [0, 0, 1])
+            # Unlike Kalibr, most programs print the tags upright, so that corners 0 and 2 swap:
+            # their order is the one that an affine map of the grid to the image fits best.
+            error = [np.linalg.lstsq(plane[each], at)[1].sum() for each in (ids, ids ^ 2)]
+            return ids if error[0] <= error[1] else ids ^ 2, at
+    return None
 
 
-def _tag_detector(
-    name: str, border: int, most: int | None = None
-) -> Callable[[Image], tuple[NDArray[np.int64], Array]]:
-    """The function that finds the first tags of a dictionary, or all: ``(N,)`` their numbers and
-    ``(N, 4, 2)`` their corners."""
-    import cv2
-
+def _find_tags(image: Image, dictionary: str, border: int) -> tuple[NDArray[np.int64], Array]:
+    """The numbers, ``(N,)``, and corners, ``(N, 4, 2)`` pixels, of the tags in an image."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border
-    dictionary = _dictionary(name)
-    dictionary.bytesList = dictionary.bytesList[:most]
-    detector = cv2.aruco.ArucoDetector(dictionary, parameters)
-
-    def detect(image: Image) -> tuple[NDArray[np.int64], Array]:
-        corners, numbers, _ = detector.detectMarkers(image)
-        found = np.empty(0) if numbers is None else numbers
-        return found.ravel().astype(np.int64), np.array(corners, np.float64).reshape(-1, 4, 2)
-
-    return detect
+    detector = cv2.aruco.ArucoDetector(_dictionary(dictionary), parameters)
+    corners, numbers, _ = detector.detectMarkers(image)
+    found = np.empty(0) if numbers is None else numbers
+    return found.ravel().astype(np.int64), np.array(corners, np.float64).reshape(-1, 4, 2)
 
 
 def _dictionary(name: str) -> Any:
-    import cv2
+    number = getattr(cv2.aruco, f"DICT_{name}", None)
+    if number is None:
+        raise InputError(
+            f"--dictionary {name}: OpenCV has no such markers; give a name such as 4X4_50, "
+            "5X5_1000, ARUCO_ORIGINAL or APRILTAG_36H11."
+        )
+    return cv2.aruco.getPredefinedDictionary(number)
 
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
 
+def _refined(board: Board, image: Image, view: View) -> View | None:
+    """Move corners to the intersection of their edges, and drop those that moved far.
 
-def _refined(board: Board, points: Array, image: Image, corners: Corners) -> Corners | None:
-    """Corners moved to where the edges meet; those that moved far are left out.
-
-    The window is small enough to show nothing but the two edges of a corner.
+    The window around a corner is so small that it contains no other edges.
     """
-    import cv2
-
-    alone = {
-        "checkerboard": 0.3 * board.square,
-        "charuco": 0.4 * (board.square - board.marker),
-        "aprilgrid": 0.6 * min(board.square - board.marker, 0.2 * board.marker),
-    }
-    xy = corners.xy
-    metres, pixels = (np.linalg.norm(at[:, None] - at, axis=2) for at in (points[corners.ids], xy))
-    near = (metres > 0.0) & (metres < 1.5 * metres[metres > 0.0].min())
-    smallest = (pixels[near] / metres[near]).min()  # pixels per metre
-    reach = int(np.clip(alone[board.kind] * smallest, *_REACH_PX))
+    share = {  # of the distance between neighbouring corners
+        "checkerboard": 0.3,
+        "charuco": 0.4 * (1.0 - board.marker / board.square),
+        "aprilgrid": min(0.4, 0.12 * board.marker / (board.square - board.marker)),
+    }[board.kind]
+    apart = np.linalg.norm(view.xy[:, None] - view.xy, axis=2)
+    reach = int(np.clip(share * apart[apart > 0.0].min(), *_REACH_PX))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-4)
-    start = xy.astype(np.float32).reshape(-1, 1, 2)
+    start = view.xy.astype(np.float32).reshape(-1, 1, 2)
     moved = cv2.cornerSubPix(image, start, (reach, reach), (-1, -1), criteria)
-    refined = np.asarray(moved, np.float64).reshape(-1, 2)
-    kept = np.linalg.norm(refined - xy, axis=1) <= reach
-    if board.kind == "checkerboard":  # only a whole grid can be numbered
-        return Corners(corners.ids, np.where(kept[:, None], refined, xy))
-    if np.count_nonzero(kept) < _FEWEST_CORNERS:
-        return None
-    return Corners(corners.ids[kept], refined[kept])
+    xy = np.asarray(moved, np.float64).reshape(-1, 2)
+    kept = np.linalg.norm(xy - view.xy, axis=1) <= reach
+    if board.kind == "checkerboard":  # its numbering needs every corner
+        return replace(view, xy=np.where(kept[:, None], xy, view.xy))
+    return View(view.name, view.ids[kept], xy[kept]) if kept.sum() >= _FEWEST_CORNERS else None
 
 
-def _off_plane(points: Array, xy: Array) -> float:
-    """How badly a homography fits corners, in pixels."""
-    import cv2
-
-    H, _ = cv2.findHomography(points[:, :2], xy)
-    if H is None:
-        return float("inf")
-    mapped = cv2.perspectiveTransform(points[None, :, :2], H)[0]
-    return float(np.linalg.norm(mapped - xy, axis=1).mean())
-
-
-def _checkerboard(images: Sequence[Image]) -> Board | None:
+def _recognised_checkerboard(images: Sequence[Image]) -> Board | None:
     """The checkerboard that at least two images show, with squares of 0.1 m."""
-    import cv2
-
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
     sizes: Counter[tuple[int, int]] = Counter()
     for image in images:
-        found, _, meta = cv2.findChessboardCornersSBWithMeta(image, _SMALLEST, flags)
+        found, _, meta = cv2.findChessboardCornersSBWithMeta(image, (4, 3), flags)
         if found:
             sizes[max(meta.shape), min(meta.shape)] += 1
-    (size, n), *_ = sizes.most_common(1) or [((0, 0), 0)]
-    return Board("checkerboard", *size, 0.1) if n > 1 else None
+    return next((Board("checkerboard", *at, 0.1) for at, n in sizes.most_common(1) if n > 1), None)
 
 
-def _tagged_board(images: Sequence[Image]) -> Board | None:
-    """The ChArUco board or AprilGrid of which an image shows most tags, with squares of 0.1 m."""
-    # The first tags of every dictionary tell the family, in a twentieth of the time of all tags.
-    detectors = [(family, _tag_detector(*family, _TRIED_TAGS)) for family in _FAMILIES]
-    n, image, (name, border) = max(
-        (
-            (len(detect(image)[0]), image, family)
-            for image in images
-            for family, detect in detectors
-        ),
-        key=itemgetter(0),
-    )
+def _recognised_tags(images: Sequence[Image]) -> Board | None:
+    """The ChArUco board or AprilGrid in the image with the most tags, with squares of 0.1 m."""
+    counts = [
+        (len(_find_tags(image, *family)[0]), image, family)
+        for image, family in product(images, _FAMILIES)
+    ]
+    n, image, (family, border) = max(counts, key=itemgetter(0))
     if n < _RECOGNISED_TAGS:
         return None
-    numbers, xy = _tag_detector(name, border)(image)
-    kinds: tuple[tuple[Kind, int], ...] = (("charuco", 1), ("charuco", 0))
-    if name == _TAGS:
-        kinds += (("aprilgrid", 0),)
+    numbers, xy = _find_tags(image, family.replace("_50", "_1000"), border)
+    kinds: list[tuple[Kind, int]] = [("charuco", 1), ("charuco", 0)]
+    kinds += [("aprilgrid", 0)] if family == _TAGS else []
     layouts = [
-        _layout(kind, first, columns, name, numbers, xy)
+        _layout(kind, first, columns, family, numbers, xy)
         for (kind, first), columns in product(kinds, range(3, _MOST_COLUMNS))
     ]
     _, found = max(layouts, key=itemgetter(0))
-    return found if found is not None and corner_finder(found)(image) is not None else None
+    return found if found is not None and find_corners(found, image) is not None else None
 
 
 def _layout(
     kind: Kind, first: int, columns: int, family: str, numbers: NDArray[np.int64], xy: Array
 ) -> tuple[int, Board | None]:
-    """How many tags fit a board of so many columns, and the board; none of it if they are few.
+    """How many tags fit a board with this number of columns, and the board; None if few fit.
 
     Args:
-        first: the square of the first row that has the first tag.
-        family: dictionary of the tags.
-        numbers, xy: the tags that are seen, ``(N,)``, and their corners, ``(N, 4, 2)`` pixels.
+        first: the column of tag 0, which is in the first row.
+        family: a dictionary of the family of the tags.
+        numbers, xy: the detected tags, ``(N,)``, and their corners, ``(N, 4, 2)`` pixels.
     """
-    import cv2
-
-    step = 2 if kind == "charuco" else 1  # tags are on every other square
+    step = 2 if kind == "charuco" else 1  # a ChArUco board has a tag on every other square
     squares = np.indices((step * numbers.max() // columns + 2, columns)).sum(axis=0)
     at = np.argwhere(squares % step == first)[numbers, ::-1].astype(np.float64)
-    side = float(np.median(np.linalg.norm(xy - np.roll(xy, 1, axis=1), axis=2)))
-    H, mask = cv2.findHomography(
-        at, xy.mean(axis=1), cv2.RANSAC, _OFF_PLACE * side, maxIters=_TRIALS
-    )
+    H, mask = cv2.findHomography(xy.mean(axis=1), at, cv2.RANSAC, _OFF_PLACE, maxIters=200)
     if H is None or (n := int(np.count_nonzero(mask))) < _RECOGNISED_TAGS:
         return 0, None
     fits = mask.ravel() > 0
-    tags = cv2.perspectiveTransform(xy.reshape(1, -1, 2), np.linalg.inv(H)).reshape(-1, 4, 2)[fits]
+    tags = cv2.perspectiveTransform(xy[fits].reshape(1, -1, 2), H).reshape(-1, 4, 2)
     ratio = float(np.median(np.linalg.norm(tags - np.roll(tags, 1, axis=1), axis=2)))
     if not 0.0 < ratio < 1.0:
         return 0, None
-    bits, _, size = family.rpartition("_")
-    if size == "1000":  # the smaller dictionaries are its first markers
-        family = f"{bits}_{next(n for n in _SIZES if n > numbers[fits].max())}"
+    if family.endswith("_50"):
+        least = next(size for size in _SIZES if size > numbers[fits].max())
+        family = family.replace("_50", f"_{least}")
     rows = max(3 if kind == "charuco" else 1, int(at[fits, 1].max()) + 1)
     return n, Board(kind, columns, rows, 0.1, 0.1 * ratio, family)

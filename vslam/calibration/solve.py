@@ -1,36 +1,35 @@
-"""Estimation of camera models and of the transformation of a pair from views of a board.
+"""Estimation of cameras, and of the transformation between two, from views of a board.
 
-OpenCV estimates; this module chooses views, drops those that do not fit, and measures residuals
-with vslam's own camera models.
+OpenCV estimates the cameras. This module selects views, drops those that do not fit, and measures
+residuals with vslam's own camera models.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any, TypeVar
 
+import cv2
 import numpy as np
+from scipy.optimize import least_squares
 
-from vslam.calibration.boards import Board, Corners, board_points
-from vslam.calibration.models import Array, CameraModel, Lens, project
+from vslam.calibration.boards import Board, View, board_points
+from vslam.calibration.models import Array, Calibration, CameraModel, Lens, project
 from vslam.errors import InputError, counted
+from vslam.geometry import inverse, orthonormalised, se3_exp, transform
 
 Size = tuple[int, int]
+Frame = tuple[View | None, ...]  # the view of each camera; None if it does not see the board
+_Fit = TypeVar("_Fit", "CameraFit", "PairFit")
 
-FEWEST_VIEWS = 3  # an estimate has 8 unknowns of the camera and 6 of each view
-_OUTLIER = 3.0  # medians of the views' errors
-_NO_FIT = 0.01  # of the image width: RMS of a board that is another one
+_MOST_FRAMES = 60
+_FEWEST_VIEWS = 3  # for 8 unknowns of the camera and 6 of each view
+_OUTLIER = 3.0  # times the median error of all views
+_NO_FIT = 0.01  # RMS in image widths, above which the corners are those of another board
 _FEWEST_COMMON = 6  # corners that both images of a pair show
-_SAME_VIEW = 0.02  # of the image size, by which the board's outline moved between two views
-
-
-@dataclass(frozen=True)
-class View:
-    """An image in which a camera sees the board; ``name`` identifies it to the user."""
-
-    name: str
-    corners: Corners
+_SAME_VIEW = 0.02  # in image sizes; the board is at rest if its outline moves less
 
 
 @dataclass(frozen=True)
@@ -39,18 +38,18 @@ class CameraFit:
 
     Attributes:
         model: the camera.
-        views: those that it was estimated from.
-        residuals: for each, ``(N, 2)`` float64, where a corner is seen minus where the model puts
-            it, in pixels.
+        views: the V views.
+        residuals: for each view, ``(N, 2)`` float64 pixels: the corners in the image minus the
+            projected corners of the board.
         T_camera_board: ``(V, 4, 4)`` float64.
-        dropped: views that do not fit, and their RMS error in pixels.
+        dropped: names of views that do not fit, with their RMS errors in pixels.
     """
 
     model: CameraModel
     views: tuple[View, ...]
     residuals: tuple[Array, ...]
     T_camera_board: Array
-    dropped: tuple[tuple[str, float], ...]
+    dropped: tuple[tuple[str, float], ...] = ()
 
     @property
     def errors(self) -> Array:
@@ -64,16 +63,30 @@ class PairFit:
 
     Attributes:
         T_left_right: ``(4, 4)`` float64, maps points of the right camera to the left one.
-        names: of the pairs.
-        errors: ``(P,)`` float64, how far the right camera sees the corners from where the board's
-            pose in the left camera puts them: RMS in pixels.
-        dropped: pairs that do not fit, and their errors.
+        errors: ``(P,)`` float64, for each pair the RMS distance in pixels between the corners in
+            the right image and those predicted from the left image.
+        dropped: names of pairs that do not fit, with their errors.
     """
 
     T_left_right: Array
-    names: tuple[str, ...]
     errors: Array
-    dropped: tuple[tuple[str, float], ...]
+    dropped: tuple[tuple[str, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One camera, or the two of a stereo pair (left first) and the transformation between them."""
+
+    cameras: tuple[CameraFit, ...]
+    pair: PairFit | None = None
+
+    @property
+    def calibration(self) -> Calibration:
+        """The cameras without the data that they were estimated from."""
+        left, right = self.cameras[0].model, self.cameras[-1].model
+        if self.pair is None:
+            return Calibration(left)
+        return Calibration(left, right, self.pair.T_left_right)
 
 
 def rms(residuals: Array) -> float:
@@ -81,204 +94,181 @@ def rms(residuals: Array) -> float:
     return float(np.sqrt((residuals**2).sum(axis=1).mean()))
 
 
-def diverse(
-    board: Board, views: Sequence[Sequence[View]], sizes: Sequence[Size], n: int
-) -> list[int]:
-    """At most ``n`` views that differ most, in their order; those of a board that stands still
-    count once.
-
-    Each next view is the one whose board lies farthest from those chosen before.
+def estimate(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], lens: Lens) -> Estimate:
+    """Estimate one camera, or a stereo pair if there are two ``sizes``.
 
     Args:
-        views: what is seen at a time, of one camera or of both.
+        frames: the views in every image or pair of images. In a pair, the corners must be numbered
+            alike (`vslam.calibration.boards.same_order`).
         sizes: width and height of each camera's images.
+
+    Raises:
+        InputError: a camera does not see the board, or as for `fit_camera` and `fit_pair`.
     """
-    if not views:
-        return []
+    seen = [sum(views[side] is not None for views in frames) for side in range(len(sizes))]
+    if not any(seen):
+        raise InputError(
+            f"no {board} in any of {len(frames)} images; no other board is recognised either, so "
+            "check that this is the right video or folder and that the board is sharp and complete."
+        )
+    if not all(seen):
+        raise InputError(
+            f"the {'right' if seen[0] else 'left'} camera never sees the {board}, which the other "
+            f"one sees in {max(seen)} of {len(frames)} images; hold it where both cameras see it, "
+            "or give --sensor mono."
+        )
+    chosen = diverse(board, frames, sizes, _MOST_FRAMES)
+    cameras = tuple(
+        fit_camera(board, [v for views in chosen if (v := views[side])], size, lens)
+        for side, size in enumerate(sizes)
+    )
+    return Estimate(cameras, fit_pair(board, *cameras) if len(cameras) == 2 else None)
+
+
+def diverse(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], n: int) -> list[Frame]:
+    """Select at most ``n`` frames in which the board is in places that differ most.
+
+    Each frame selected is the one farthest from those selected before. A board at rest is selected
+    once, and frames without the board are left out.
+    """
+    frames = [views for views in frames if any(views)]
     outlines = np.array(
-        [
-            [_outline(board, v.corners, size) for v, size in zip(seen, sizes, strict=True)]
-            for seen in views
-        ]
-    ).reshape(len(views), -1)
-    chosen = [int(np.argmin(np.linalg.norm(outlines - np.median(outlines, axis=0), axis=1)))]
-    far = np.linalg.norm(outlines - outlines[chosen[0]], axis=1)
+        [[_outline(board, *seen) for seen in zip(views, sizes, strict=True)] for views in frames]
+    ).reshape(len(frames), -1)
+    chosen = [0]
+    far = np.linalg.norm(outlines - outlines[0], axis=1)
     while len(chosen) < n and far.max() > _SAME_VIEW:
         chosen.append(int(far.argmax()))
         far = np.minimum(far, np.linalg.norm(outlines - outlines[chosen[-1]], axis=1))
-    return sorted(chosen)
+    return [frames[k] for k in sorted(chosen)]
+
+
+def _outline(board: Board, view: View | None, size: Size) -> Array:
+    """The corners of the board's outline, ``(8,)`` in image sizes. A homography finds those that
+    are out of view; they count as at most half an image away."""
+    points = board_points(board)[:, :2]
+    H = None if view is None else cv2.findHomography(points[view.ids], view.xy)[0]
+    if H is None:
+        return np.full(8, -0.5)
+    box = np.array([list(product(*zip(points.min(axis=0), points.max(axis=0), strict=True)))])
+    return np.asarray((cv2.perspectiveTransform(box, H)[0] / size).clip(-0.5, 1.5).ravel())
 
 
 def fit_camera(board: Board, views: Sequence[View], size: Size, lens: Lens) -> CameraFit:
-    """Estimate a camera: ``k1 k2 p1 p2`` of a pinhole camera, ``k1 k2 k3 k4`` of a fisheye camera.
+    """Estimate a camera, with distortion ``k1 k2 p1 p2`` (pinhole) or ``k1 k2 k3 k4`` (fisheye).
 
-    Views whose error is more than three times the median are dropped, and the estimate repeated.
+    Views whose error exceeds three times the median are dropped, and the estimate is repeated.
 
     Raises:
-        InputError: too few views, views that fix no camera, or corners that are not of this board.
+        InputError: the views are too few or too similar, or the corners are not of this board.
     """
-    points = board_points(board)
+    calibrate: Any = cv2.calibrateCamera
+    flags, dtype = cv2.CALIB_FIX_K3, "float32"
+    if lens == "fisheye":
+        names: Any = cv2 if hasattr(cv2, "CALIB_FIX_SKEW") else cv2.fisheye  # OpenCV 5 or 4
+        flags, dtype = names.CALIB_RECOMPUTE_EXTRINSIC | names.CALIB_FIX_SKEW, "float64"
+        calibrate = cv2.fisheye.calibrate
 
-    def fit(kept: Sequence[View]) -> tuple[CameraFit, Array]:
-        found = _fit(points, kept, size, lens)
-        return found, found.errors
+    def fit(kept: Sequence[int]) -> CameraFit:
+        own = [board_points(board)[views[k].ids] for k in kept]
+        xy = [views[k].xy for k in kept]
+        both = ([each[None].astype(dtype) for each in every] for every in (own, xy))
+        try:
+            _, K, D, turns, shifts = calibrate(*both, size, None, None, flags=flags)
+        except cv2.error as error:
+            raise InputError(
+                f"the {len(kept)} views do not determine a {lens} camera; film the board in more "
+                "places and tilted in more directions, or try the other --lens."
+            ) from error
+        # OpenCV's threads sum in varying order; rounding makes equal images give equal numbers.
+        fx, fy, cx, cy = (round(float(K[at]), 5) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        distortion = tuple(round(k, 8) for k in np.ravel(D)[:4].tolist())
+        model = CameraModel(fx, fy, cx, cy, *size, lens, distortion)
+        T_camera_board = np.tile(np.eye(4), (len(kept), 1, 1))
+        for T, turn, shift in zip(T_camera_board, turns, shifts, strict=True):
+            T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
+        residuals = tuple(
+            at - project(model, transform(T, p))
+            for T, p, at in zip(T_camera_board, own, xy, strict=True)
+        )
+        return CameraFit(model, tuple(views[k] for k in kept), residuals, T_camera_board)
 
-    fix = "film it in 20 or more different places and directions"
-    found, dropped = _without_outliers(views, fit, f"the {board} is found", fix)
+    found = _without_outliers(
+        [view.name for view in views],
+        fit,
+        f"the {board} is found in only",
+        "film it in 20 or more different places and directions",
+    )
     error = rms(np.concatenate(found.residuals))
     if not error <= _NO_FIT * size[0]:
         raise InputError(
             f"the corners do not fit a flat {board} ({error:.0f} px RMS); check --size, --square "
             "and --marker, or try the other --lens."
         )
-    return replace(found, dropped=dropped)
+    return found
 
 
 def fit_pair(board: Board, left: CameraFit, right: CameraFit) -> PairFit:
-    """Estimate the transformation between two cameras from their views of the same names, whose
-    corners are numbered alike (`vslam.calibration.boards.same_order`).
+    """Estimate the transformation between two cameras from their views of the same name.
+
+    Pairs are dropped like the views of `fit_camera`.
 
     Raises:
-        InputError: fewer than three pairs.
+        InputError: fewer than three pairs are left.
     """
     points = board_points(board)
-    right_views = zip(right.views, right.T_camera_board, strict=True)
-    of_right = {view.name: (view.corners, T) for view, T in right_views}
-    pairs = []
-    for view, T_left_board in zip(left.views, left.T_camera_board, strict=True):
-        if view.name in of_right:
-            other, T_right_board = of_right[view.name]
-            ids, _, seen = np.intersect1d(view.corners.ids, other.ids, return_indices=True)
-            if len(ids) >= _FEWEST_COMMON:
-                start = T_right_board @ np.linalg.inv(T_left_board)
-                pairs.append(_Pair(view.name, points[ids], other.xy[seen], T_left_board, start))
+    in_left = {v.name: (v, T) for v, T in zip(left.views, left.T_camera_board, strict=True)}
+    pairs = []  # the right view of the corners that both see, T_left_board, T_right_left
+    for view, T_right_board in zip(right.views, right.T_camera_board, strict=True):
+        if view.name in in_left:
+            other, T_left_board = in_left[view.name]
+            common = np.isin(view.ids, other.ids)
+            if np.count_nonzero(common) >= _FEWEST_COMMON:
+                both = View(view.name, view.ids[common], view.xy[common])
+                pairs.append((both, T_left_board, T_right_board @ inverse(T_left_board)))
 
-    def fit(kept: Sequence[_Pair]) -> tuple[PairFit, Array]:
-        T = _transformation(right.model, kept)
-        errors = np.array([rms(pair.residuals(right.model, T)) for pair in kept])
-        T_left_right = np.asarray(np.linalg.inv(T).round(9), np.float64)
-        return PairFit(T_left_right, tuple(pair.name for pair in kept), errors, ()), errors
+    # cv2.fisheye.stereoCalibrate needs the same number of corners in every view, which a board that
+    # is partly out of view does not have.
+    def fit(kept: Sequence[int]) -> PairFit:
+        def residuals(T_right_left: Array) -> list[Array]:
+            return [
+                view.xy - project(right.model, transform(T_right_left @ T, points[view.ids]))
+                for view, T, _ in (pairs[k] for k in kept)
+            ]
 
-    fix = "film it where both cameras see it"
-    found, dropped = _without_outliers(pairs, fit, f"both cameras see the {board}", fix)
-    return replace(found, dropped=dropped)
+        start = orthonormalised(np.median([pairs[k][2] for k in kept], axis=0))
+        found = least_squares(
+            lambda x: np.concatenate(residuals(se3_exp(x) @ start)).ravel(), np.zeros(6)
+        )
+        T_right_left = se3_exp(found.x) @ start
+        errors = np.array([rms(each) for each in residuals(T_right_left)])
+        return PairFit(inverse(T_right_left).round(9), errors)
 
-
-@dataclass(frozen=True)
-class _Pair:
-    """A board's ``(N, 3)`` points, where the right camera sees them, its pose in the left camera,
-    and the transformation that the fits of both cameras give."""
-
-    name: str
-    points: Array
-    right: Array
-    T_left_board: Array
-    T_right_left: Array
-
-    def residuals(self, model: CameraModel, T_right_left: Array) -> Array:
-        return self.right - project(model, _moved(T_right_left @ self.T_left_board, self.points))
-
-
-_V = TypeVar("_V", View, _Pair)
-_F = TypeVar("_F", CameraFit, PairFit)
+    return _without_outliers(
+        [view.name for view, *_ in pairs],
+        fit,
+        f"both cameras see the {board} in only",
+        "film it where both cameras see it",
+    )
 
 
 def _without_outliers(
-    views: Sequence[_V], fit: Callable[[Sequence[_V]], tuple[_F, Array]], seen: str, fix: str
-) -> tuple[_F, tuple[tuple[str, float], ...]]:
-    """What ``fit`` makes of the views without those whose error is large, and their names and
-    errors; ``fit`` returns its result and the error of each view.
+    names: Sequence[str], fit: Callable[[Sequence[int]], _Fit], found_in: str, fix: str
+) -> _Fit:
+    """Fit the named views, and repeat it without those whose error is large until none is.
 
     Raises:
-        InputError: too few views are left; ``seen`` and ``fix`` are parts of the sentence.
+        InputError: too few views are left; ``found_in`` and ``fix`` are parts of the message.
     """
-    kept = list(views)
+    kept = list(range(len(names)))
     dropped: list[tuple[str, float]] = []
-    while len(kept) >= FEWEST_VIEWS:
-        found, errors = fit(kept)
-        out = ~(errors <= _OUTLIER * np.nanmedian(errors))  # NaN: a board behind the camera
-        if not out.any():
-            return found, tuple(dropped)
-        dropped += [(kept[k].name, float(errors[k])) for k in np.flatnonzero(out)]
-        kept = [view for view, bad in zip(kept, out, strict=True) if not bad]
+    while len(kept) >= _FEWEST_VIEWS:
+        found = fit(kept)
+        good = found.errors <= _OUTLIER * np.nanmedian(found.errors)  # NaN: behind the camera
+        if good.all():
+            return replace(found, dropped=tuple(dropped))
+        dropped += [(names[kept[k]], float(found.errors[k])) for k in np.flatnonzero(~good)]
+        kept = [kept[k] for k in np.flatnonzero(good)]
     raise InputError(
-        f"{seen} in only {counted(len(kept), 'usable image')}, and {FEWEST_VIEWS} are the least; "
-        f"{fix}."
+        f"{found_in} {counted(len(kept), 'usable image')}, but {_FEWEST_VIEWS} are needed; {fix}."
     )
-
-
-def _fit(points: Array, views: Sequence[View], size: Size, lens: Lens) -> CameraFit:
-    import cv2
-
-    own = [points[view.corners.ids] for view in views]
-    xy = [view.corners.xy for view in views]
-    try:
-        if lens == "fisheye":
-            names: Any = cv2 if hasattr(cv2, "CALIB_FIX_SKEW") else cv2.fisheye  # OpenCV 5, 4
-            flags = names.CALIB_RECOMPUTE_EXTRINSIC | names.CALIB_FIX_SKEW
-            calibrate: Any = cv2.fisheye.calibrate  # its types know no None
-            _, K, D, turns, shifts = calibrate(
-                [p[None] for p in own], [p[None] for p in xy], size, None, None, flags=flags
-            )
-        else:
-            _, K, D, turns, shifts = cv2.calibrateCamera(
-                [p.astype(np.float32) for p in own], [p.astype(np.float32) for p in xy], size,
-                None, None, flags=cv2.CALIB_FIX_K3,
-            )  # fmt: skip
-    except cv2.error as error:
-        raise InputError(
-            f"the {len(views)} views fix no {lens} camera; film the board in more places and "
-            "tilted in more directions, or try the other --lens."
-        ) from error
-    # OpenCV's threads add up in any order; rounded, equal images give equal numbers.
-    fx, fy, cx, cy = (round(float(K[at]), 5) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    distortion = tuple(round(k, 8) for k in np.ravel(D)[:4].tolist())
-    model = CameraModel(fx, fy, cx, cy, *size, lens, distortion)
-    T_camera_board = np.tile(np.eye(4), (len(views), 1, 1))
-    for T, turn, shift in zip(T_camera_board, turns, shifts, strict=True):
-        T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
-    residuals = tuple(
-        seen - project(model, _moved(T, p))
-        for T, p, seen in zip(T_camera_board, own, xy, strict=True)
-    )
-    return CameraFit(model, tuple(views), residuals, T_camera_board, ())
-
-
-def _transformation(right: CameraModel, pairs: Sequence[_Pair]) -> Array:
-    """``T_right_left`` that minimises the residuals of the right images.
-
-    ``cv2.fisheye.stereoCalibrate`` takes only views with equally many corners, and those of a board
-    that an image shows in part are not. Here both lenses are solved in the same way.
-    """
-    import cv2
-    from scipy.optimize import least_squares
-
-    def residuals(T_right_left: Array) -> Array:
-        return np.concatenate([pair.residuals(right, T_right_left) for pair in pairs])
-
-    def transformation(x: Array) -> Array:
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = cv2.Rodrigues(x[:3])[0], x[3:]
-        return T
-
-    starts = [pair.T_right_left for pair in pairs]
-    start = min(starts, key=lambda T: float(np.median(np.linalg.norm(residuals(T), axis=1))))
-    x = np.concatenate([cv2.Rodrigues(start[:3, :3])[0].ravel(), start[:3, 3]])
-    return transformation(least_squares(lambda x: residuals(transformation(x)).ravel(), x).x)
-
-
-def _moved(T: Array, points: Array) -> Array:
-    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
-
-
-def _outline(board: Board, corners: Corners, size: Size) -> Array:
-    """Where the corners of the board's outline are, ``(8,)`` in image sizes, by a homography; those
-    that are not seen lie at most half an image outside."""
-    import cv2
-
-    points = board_points(board)[:, :2]
-    H, _ = cv2.findHomography(points[corners.ids], corners.xy)
-    (x0, y0), (x1, y1) = points.min(axis=0), points.max(axis=0)
-    box = np.array([[[x0, y0], [x1, y0], [x1, y1], [x0, y1]]])
-    at = np.zeros((4, 2)) if H is None else cv2.perspectiveTransform(box, H)[0]
-    return np.asarray((at / size).clip(-0.5, 1.5).ravel())

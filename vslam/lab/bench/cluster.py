@@ -52,8 +52,8 @@ def run_on_cluster(
         futures = client.map(_run_on_worker, cells, options=options, stop=stop.name, pure=False)
         cell_of = {future.key: cell for future, cell in zip(futures, cells, strict=True)}
         for future in as_completed(futures, loop=client.loop):
-            cell, error = cell_of[future.key], future.exception()
-            outcome = future.result() if error is None else Failed(cell, _first_line(error))
+            cell, failure = cell_of[future.key], future.exception()
+            outcome = future.result() if failure is None else Failed(cell, _first_line(failure))
             future.release()  # otherwise Dask repeats the finished cells of a worker that dies
             publish(outcome, out)
             yield outcome

@@ -1,12 +1,12 @@
 """Sparse Cholesky factorisation of symmetric systems of 6x6 blocks, one block row per keyframe.
 
-The structure is analysed once for all iterations of an optimiser: an elimination order by minimum
-degree (George and Liu, "The evolution of the minimum degree ordering algorithm", SIAM Review 1989)
-and the fill-in. A graph of a few thousand keyframes is small enough to be eliminated explicitly on
-bit sets: the degrees are exact, and the neighbours of a keyframe when it is eliminated are the
-nonzero blocks of its column of the factor. The numeric factorisation is left-looking (Davis,
-"Direct Methods for Sparse Linear Systems", section 4.8) and works on blocks. Everything is
-deterministic: the same input gives the same bytes on every run.
+The structure is analysed once for all iterations of an optimiser. The analysis gives a minimum
+degree elimination order (George and Liu, "The evolution of the minimum degree ordering algorithm",
+SIAM Review 1989) and the fill-in. A graph of a few thousand keyframes is small enough to simulate
+the elimination on bit sets: the degrees are exact, and the neighbours that a keyframe has when it
+is eliminated are the nonzero blocks of its column of the factor. The numeric factorisation is
+left-looking (Davis, "Direct Methods for Sparse Linear Systems", section 4.8) and works on blocks.
+Everything is deterministic: the same input gives the same bytes on every run.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ class Structure(NamedTuple):
     elimination order.
 
     Attributes:
-        order: ``(n,)`` int64, the caller's index of the block that is eliminated i-th.
-        first: ``(n + 1,)`` int64, the slots of column c are ``first[c]:first[c + 1]``.
+        order: ``(n,)`` int64, the caller's index of the i-th block in elimination order.
+        first: ``(n + 1,)`` int64; the slots of column c are ``first[c]:first[c + 1]``.
         row: ``(slots,)`` int32, block row of each slot, ascending within a column. The first slot
-            of a column is on the diagonal, the second is its parent in the elimination tree.
-        row_first: ``(n + 1,)`` int64, the blocks of row r to the left of the diagonal are
+            of a column is on the diagonal.
+        row_first: ``(n + 1,)`` int64; the blocks of row r to the left of the diagonal are
             ``row_slot[row_first[r]:row_first[r + 1]]``.
         row_slot, row_column: ``(slots - n,)`` int32, slot and column of each block below the
             diagonal, row by row, columns ascending.
@@ -45,9 +45,9 @@ class Structure(NamedTuple):
 
 
 def analyse(n: int, pairs: NDArray[np.int64]) -> Structure:
-    """Elimination order and fill-in of a system of ``n`` block rows.
+    """Compute the elimination order and the fill-in of a system of ``n`` block rows.
 
-    Uses ``n * n / 8`` bytes of memory while it runs.
+    This takes ``n * n / 8`` bytes of temporary memory.
 
     Args:
         pairs: ``(M, 2)`` block rows that are coupled, in any order; repetitions are allowed.
@@ -73,15 +73,15 @@ def _analyse(n, pairs):
     position = np.full(n, -1, np.int64)
     first = np.zeros(n + 1, np.int64)
     for step in range(n):
-        # Minimum degree; ties are broken by index, that is, by time.
+        # Minimum degree; of several, the one with the lowest index, that is, the oldest.
         chosen, least = -1, n
         for i in range(n):
             if position[i] < 0 and degree[i] < least:
                 chosen, least = i, degree[i]
         order[step], position[chosen] = chosen, step
         first[step + 1] = first[step] + least + 1
-        # Its neighbours become neighbours of each other. Its own set is kept as the column of the
-        # factor.
+        # The neighbours of the chosen block become neighbours of each other. The chosen block keeps
+        # its set of neighbours, which is its column of the factor.
         for i in range(n):
             if not adjacent[chosen, i // 64] >> np.uint64(i % 64) & one:
                 continue
@@ -93,8 +93,8 @@ def _analyse(n, pairs):
             for word in range(words):
                 count += np.int64(popcount(adjacent[i, word]))
             degree[i] = count
-    # Going through the columns in ascending order sorts the columns of each row, and then going
-    # through the rows sorts the rows of each column: transposing twice sorts.
+    # Sort by transposing twice: visiting the columns in ascending order sorts the columns of each
+    # row, and then visiting the rows in ascending order sorts the rows of each column.
     slots = first[n]
     row_first = np.zeros(n + 1, np.int64)
     for step in range(n):
@@ -126,11 +126,11 @@ def _analyse(n, pairs):
 
 @kernel
 def panel(structure, column):
-    """Offset in ``S`` of the panel of a column, and the width of the panel.
+    """Offset ``begin`` of the panel of a column in ``S``, and the width of the panel.
 
-    A panel holds the blocks of one column side by side and transposed: element (i, j) of the
-    k-th block is ``S[begin + j * width + 6 * k + i]``. So the rows of a panel are long, which suits
-    vector instructions.
+    A panel holds the transposed blocks of one column side by side: element (i, j) of the k-th block
+    is ``S[begin + j * width + 6 * k + i]``. So the rows of a panel are long, as vector instructions
+    require.
     """
     first = structure.first[column]
     return BLOCK * BLOCK * first, BLOCK * (structure.first[column + 1] - first)
@@ -138,13 +138,13 @@ def panel(structure, column):
 
 @kernel
 def factor_solve(structure, S, x):
-    """Solve ``S x = rhs`` in place; returns False if S is not positive definite.
+    """Solve ``S x = rhs`` in place. Returns False if S is not positive definite.
 
     Args:
         structure: the ``Structure`` of S.
         S: ``(36 * slots,)`` float64, the lower triangle in elimination order, one panel per column
-            (see ``panel``), with zeros in the fill-in; only the lower triangle of diagonal blocks
-            is read. Overwritten with the factor.
+            (see ``panel``), with zeros in the fill-in. Only the lower triangle of diagonal blocks
+            is read. S is overwritten with the factor.
         x: ``(n, 6)`` float64 right-hand side in elimination order; overwritten with the solution.
     """
     first, row = structure.first, structure.row
@@ -199,11 +199,11 @@ def factor_solve(structure, S, x):
 
 @inner_kernel
 def add_product(S, start, pivot, end, row, place, update):
-    """Accumulate in ``update`` what an earlier column, with slots ``start:end``, subtracts from the
-    current one.
+    """Add to ``update`` what an earlier column, with slots ``start:end``, subtracts from the
+    current column.
 
-    ``pivot`` is the slot of the earlier column in the row of the current one. Blocks that are
-    adjacent in both columns are multiplied together, because long rows fill vector registers.
+    ``pivot`` is the slot of the earlier column whose row is that of the current column. Blocks that
+    are adjacent in both columns are multiplied together, because long rows fill vector registers.
     """
     width = np.uintp(BLOCK * (end - start))
     begin = np.uintp(BLOCK * BLOCK * start)
@@ -214,7 +214,7 @@ def add_product(S, start, pivot, end, row, place, update):
         after = slot + 1
         while after < end and place[row[after]] == target + BLOCK * (after - slot):
             after += 1
-        # A signed index could be negative and count from the end; the check for that would prevent
+        # Unsigned indices, because the test whether a signed index is negative would prevent
         # vectorisation.
         t, length = np.uintp(target), np.uintp(BLOCK * (after - slot))
         a0 = begin + np.uintp(BLOCK * (slot - start))
@@ -237,8 +237,8 @@ def add_product(S, start, pivot, end, row, place, update):
 
 @inner_kernel
 def factor_panel(S, base, width):
-    """Factor the diagonal block of a column and divide the blocks below by it; returns False if the
-    block is not positive definite."""
+    """Factor the diagonal block of a column, and divide the blocks below by the factor. Returns
+    False if the diagonal block is not positive definite."""
     begin, columns = np.uintp(base), np.uintp(width)
     for j in range(np.uintp(BLOCK)):
         own = begin + j * columns

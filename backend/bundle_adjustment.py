@@ -1,9 +1,9 @@
 """Bundle adjustment of keyframe poses and landmarks: Levenberg-Marquardt on the Schur complement.
 
-The problem is that of ORB-SLAM2 (section III-C): reprojection errors of monocular (u, v) and stereo
-(u, v, u_right) observations with the Huber loss. Landmarks are eliminated one at a time. The
-reduced camera system is dense and solved by Cholesky factorisation (Triggs et al., "Bundle
-adjustment - a modern synthesis", section 6).
+As in ORB-SLAM2 (section III-C), reprojection errors of monocular (u, v) and stereo (u, v, u_right)
+observations are minimised with the Huber loss. Landmarks are eliminated one at a time. The reduced
+camera system is dense and is solved by Cholesky factorisation (Triggs et al., "Bundle adjustment -
+a modern synthesis", section 6).
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ class BundleProblem:
         T_cw: ``(K, 4, 4)`` poses of the cameras (world to camera).
         n_free: the first ``n_free`` cameras are optimised, the others are held fixed.
         points: ``(P, 3)`` landmarks in the world frame.
-        first: ``(P + 1,)`` int64, the observations of point p are ``first[p]:first[p + 1]``.
+        first: ``(P + 1,)`` int64; the observations of point p are ``first[p]:first[p + 1]``.
         camera: ``(O,)`` int64, index of the camera of each observation.
         uvr: ``(O, 3)`` float64 observed u, v, u_right; NaN u_right for a monocular observation.
         inverse_sigma2: ``(O,)`` float64, inverse variance of u and v.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         disparity_weight: ``(O,)`` float64, standard deviation of u and v over that of the
-            disparity; None takes the weight in ``intrinsics`` for all.
+            disparity; None uses the weight in ``intrinsics`` for all observations.
     """
 
     T_cw: NDArray[np.float64]
@@ -55,7 +55,7 @@ class BundleProblem:
 
 class Observations(NamedTuple):
     """The observations of a ``BundleProblem`` as arguments of kernels; ``used`` is ``(O,)`` bool,
-    the observations that take part."""
+    whether each observation is used."""
 
     first: NDArray[np.int64]
     camera: NDArray[np.int64]
@@ -112,7 +112,7 @@ def adjust(
 
     Args:
         iterations: maximum number of iterations.
-        use: ``(O,)`` bool, observations that take part; None uses all.
+        use: ``(O,)`` bool, whether each observation is used; None uses all.
         tolerance: stop when an iteration reduces the cost by a smaller fraction than this.
     """
     T_cw, points, cost, inlier, count = _adjust(
@@ -128,7 +128,7 @@ def adjust(
 
 
 def observations_of(problem: BundleProblem, use: NDArray[np.bool_] | None) -> Observations:
-    """The observations of a problem as arguments of kernels; ``use`` as in ``adjust``."""
+    """The observations of a problem as arguments of kernels; for ``use`` see ``adjust``."""
     return Observations(
         problem.first,
         problem.camera,
@@ -141,7 +141,7 @@ def observations_of(problem: BundleProblem, use: NDArray[np.bool_] | None) -> Ob
 
 
 def empty_equations(n_free: int, n_points: int, n_observations: int) -> NormalEquations:
-    """Allocate the normal equations. W starts at 0, because blocks of fixed cameras and unused
+    """Allocate the normal equations. W is set to 0, because blocks of fixed cameras and of unused
     observations are never written."""
     return NormalEquations(
         np.zeros((n_observations, 3, 6)),
@@ -160,7 +160,8 @@ def _in_camera(T, p, q):
 
 @kernel
 def robust_cost(T_cw, points, observations, inlier):
-    """Half the sum of the Huber losses; sets ``inlier`` by the chi-square test."""
+    """Half the sum of the Huber losses. Writes into ``inlier`` whether each observation passes the
+    chi-square test."""
     first, camera, uvr, inverse_sigma2, disparity_weight, used, intrinsics = observations
     fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
     cost = 0.0
@@ -204,7 +205,7 @@ def _adjust(T_start, n_free, points_start, observations, equations, iterations, 
                 if trial < cost:
                     small = cost - trial < tolerance * cost
                     cost = trial
-                    # Swap instead of copying: the next step overwrites all of the trial.
+                    # Swap instead of copying: the next step overwrites the whole trial.
                     T_cw, T_trial = T_trial, T_cw
                     points, points_trial = points_trial, points
                     damping, growth, improved = max(damping * 0.1, 1e-9), 2.0, True
@@ -332,8 +333,8 @@ def reduce_points(n_free, observations, equations, damping, S, rhs, V_inverse):
 
 @inner_kernel
 def invert_damped(V, damping, N):
-    """Write the inverse of a point's ``(3, 3)`` block, with damped diagonal, into ``N``; zeros if
-    the block is singular, so that the point does not move."""
+    """Write the inverse of a point's ``(3, 3)`` block with a damped diagonal into ``N``. If the
+    block is singular, write zeros, so that the point does not move."""
     scale = 1.0 + damping
     v00, v11, v22 = V[0, 0] * scale, V[1, 1] * scale, V[2, 2] * scale
     v01, v02, v12 = V[0, 1], V[0, 2], V[1, 2]
@@ -370,8 +371,8 @@ def step_points(n_free, observations, equations, camera_step, V_inverse, points,
 
 @kernel
 def step_cameras(n_free, camera_step, T_cw, T_trial):
-    """Move each free camera by its twist. Matrices are copied element by element, because for a
-    whole-array assignment Numba compiles a broadcasting error message, which takes seconds."""
+    """Move each free camera by its twist. Matrices are copied element by element, because Numba
+    takes seconds to compile the broadcasting check of a whole-array assignment."""
     for k in range(n_free):
         T = orthonormalised(compose(se3_exp(camera_step[6 * k : 6 * k + 6]), T_cw[k]))
         for i in range(4):
@@ -381,8 +382,8 @@ def step_cameras(n_free, camera_step, T_cw, T_trial):
 
 @kernel
 def cholesky_solve(S, x):
-    """Solve ``S x = rhs`` in place from the upper triangle of S; returns False if S is not positive
-    definite."""
+    """Solve ``S x = rhs`` in place, where ``x`` holds the right-hand side on entry. Only the upper
+    triangle of S is read. Returns False if S is not positive definite."""
     n = len(x)
     for i in range(n):
         row = S[i]

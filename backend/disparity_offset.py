@@ -1,14 +1,15 @@
 """Estimates a constant error of all disparities of a stereo pair from the motion of the camera.
 
-A calibration may leave a rotation of some hundredths of a degree between the two cameras, or an
-error of a tenth of a pixel in a principal point. Both shift all disparities by nearly the same
-amount, so that depths are wrong by a fraction that grows with the depth. A single stereo pair does
-not reveal this. A moving camera does, because one motion must explain how both near and far points
-move in the image. So the offset is one more unknown of bundle adjustment, common to all keyframes
-(self-calibration: Triggs et al., "Bundle adjustment - a modern synthesis", section 10).
+After calibration, there may still be an unknown rotation of some hundredths of a degree between the
+two cameras, or an error of a tenth of a pixel in a principal point. Both shift all disparities by
+nearly the same amount, so that depths are wrong by a fraction that grows with the depth. A single
+stereo pair does not reveal this. A moving camera does, because one motion must explain how both
+near and far points move in the image. So the offset is one more unknown of bundle adjustment,
+common to all keyframes (self-calibration: Triggs et al., "Bundle adjustment - a modern synthesis",
+section 10).
 
-The offset is estimated in disjoint windows of keyframes. Their estimates are combined by their
-information (inverse variance), starting from a prior of mean 0.
+The offset is estimated in disjoint windows of keyframes. The estimates are weighted by their
+information (inverse variance) and combined with a prior of mean 0.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from vslam.features import shifted_columns
 from vslam.map import Map
 from vslam.map_kernels import collect_landmarks
 
-STEP = 0.2  # pixels between the three costs that a parabola is fitted to
+STEP = 0.2  # pixels between the three offsets for which the cost is computed
 ITERATIONS = 15
 TOLERANCE = 1e-5  # relative; a change of the offset by STEP changes the cost by some thousandths
 
@@ -62,10 +63,10 @@ def _calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None
 
 def remaining_offset(problem: BundleProblem) -> tuple[float, float]:
     """The offset that must be added to all disparities of a bundle problem, in pixels, and its
-    information (inverse variance); 0, 0 if the problem does not determine it.
+    information (inverse variance); 0, 0 if the problem does not determine the offset.
 
     The cost after bundle adjustment is nearly quadratic in the offset, so a parabola is fitted to
-    it at three offsets.
+    the costs at three offsets.
     """
     first = adjust(problem, iterations=5)
     start = replace(problem, T_cw=first.T_cw, points=first.points)

@@ -1,4 +1,4 @@
-"""Fusion: merges landmarks that are the same point in the world (ORB-SLAM, VI-C)."""
+"""Fusion: merges landmarks that represent the same point in the world (ORB-SLAM, VI-C)."""
 
 from __future__ import annotations
 
@@ -24,16 +24,14 @@ def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config)
     """
     neighbours = fusion_neighbours(map_, keyframe, config)
     for neighbour in neighbours:
-        landmarks = map_.landmarks_of(keyframe)
-        fuse_into(map_, landmarks, neighbour, camera, config)
-    a = map_.arrays
-    landmarks = collect_landmarks(a, np.array(neighbours, np.int64), map_.n_landmarks)
+        fuse_into(map_, map_.landmarks_of(keyframe), neighbour, camera, config)
+    landmarks = collect_landmarks(map_.arrays, np.array(neighbours, np.int64), map_.n_landmarks)
     fuse_into(map_, landmarks, keyframe, camera, config)
 
 
 def fusion_neighbours(map_: Map, keyframe: int, config: Config) -> list[int]:
-    """The best covisible keyframes, and the best five covisible keyframes of each of them
-    (ORB-SLAM2)."""
+    """The best covisible keyframes of a keyframe, and the best five covisible keyframes of each of
+    them (ORB-SLAM2)."""
     first, _ = map_.covisible(keyframe)
     chosen = first[: config.mapping.fuse_neighbours].tolist()
     known = {keyframe, *chosen}
@@ -53,13 +51,13 @@ def fuse_loop(
     camera: Camera,
     config: Config,
 ) -> int:
-    """Fuse the landmarks that both sides of a loop have of the same points (ORB-SLAM, VII-D).
+    """Fuse landmarks of both sides of a loop that represent the same points (ORB-SLAM, VII-D).
 
-    First the pairs that verification matched are fused; then the landmarks of each side are
+    First the pairs that verification matched are fused. Then the landmarks of each side are
     projected into the keyframes of the other side.
 
     Args:
-        edge: the loop, with its features and landmarks.
+        edge: the loop; its ``features`` and ``landmarks`` must be set.
         query_side, match_side: keyframes around the two ends of the loop, with corrected poses.
 
     Returns:
@@ -81,8 +79,8 @@ def fuse_loop(
 
 @kernel
 def _fuse_pairs(a, rows, landmarks, keyframe):
-    """Let each row observe its landmark. If the row already observes another landmark, the two are
-    merged. Returns the number of fusions."""
+    """Let each row observe its landmark. If the row already observes another landmark, merge the
+    two. Returns the number of fusions."""
     fused = 0
     for i in range(len(rows)):
         row, landmark = rows[i], landmarks[i]
@@ -170,7 +168,7 @@ def _fuse(
             continue
         octave = predict_octave(distance, a.distance_range[landmark, 1], log_scale, len(scales))
         r = window * scales[octave]
-        # With a plain -1, Numba would also compile ``link`` for a literal.
+        # With a literal -1, Numba would compile ``link`` a second time, for a literal argument.
         best, best_distance = np.int64(-1), max_distance + 1
         column_first, column_last = max(0, int((u - r) / CELL)), int((u + r) / CELL)
         column_last = min(columns - 1, column_last)
@@ -197,7 +195,7 @@ def _fuse(
         other = a.landmark[best]
         if other < 0:
             link(a, best, landmark)
-            a.certainty[best] = 1  # matched by descriptor alone, so no better than a keypoint
+            a.certainty[best] = 1  # not aligned, so its position is no better than a keypoint's
         elif a.n_observations[other] > a.n_observations[landmark]:
             merge_landmarks(a, landmark, other)
         else:

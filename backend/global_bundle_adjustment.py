@@ -1,9 +1,9 @@
 """Bundle adjustment of hundreds of keyframes with loops.
 
-Problem, loss and steps are those of ``bundle_adjustment``; only the reduced camera system differs.
-Keyframes that share no landmark are not coupled, so the system is stored as sparse 6x6 blocks and
-factorised by ``block_cholesky`` (Triggs et al., "Bundle adjustment - a modern synthesis", section
-6.3).
+Problem, loss and steps are those of ``bundle_adjustment``; only the reduced camera system is
+different. Keyframes that share no landmark are not coupled, so the system is stored as sparse 6x6
+blocks and factorised by ``block_cholesky`` (Triggs et al., "Bundle adjustment - a modern
+synthesis", section 6.3).
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ def adjust_globally(
     use: NDArray[np.bool_] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> BundleSolution:
-    """Minimise the robust reprojection error: ``bundle_adjustment.adjust`` for many keyframes.
+    """Minimise the robust reprojection error, like ``bundle_adjustment.adjust``, for many
+    keyframes.
 
     A keyframe must not observe a landmark more than once. The global interpreter lock is released
     nearly all the time.
@@ -44,7 +45,7 @@ def adjust_globally(
     Args:
         iterations: maximum number of Levenberg-Marquardt iterations.
         tolerance: stop when an iteration reduces the cost by a smaller fraction than this.
-        use: ``(O,)`` bool, observations that take part; None uses all.
+        use: ``(O,)`` bool, whether each observation is used; None uses all.
         stop: called before each iteration; if it returns True, the current estimate is returned.
     """
     n_free, n_observations = problem.n_free, len(problem.camera)
@@ -103,9 +104,9 @@ def adjust_globally(
             break
     cost = robust_cost(T_cw, points, observations, inlier)
     points_trial[points_order] = points
-    inlier_as_given = np.empty_like(inlier)
-    inlier_as_given[order] = inlier
-    return BundleSolution(T_cw[rank], points_trial, cost, inlier_as_given, done)
+    inlier_unsorted = np.empty_like(inlier)
+    inlier_unsorted[order] = inlier
+    return BundleSolution(T_cw[rank], points_trial, cost, inlier_unsorted, done)
 
 
 @kernel
@@ -113,8 +114,9 @@ def working_order(first, rank, n_cameras):
     """Sort points and observations for cache-friendly access to the reduced camera system.
 
     The observations of a point are sorted by the elimination order of their cameras, so that of any
-    two the first one gives the column and the second one the row. Points are sorted by their first
-    camera, so that blocks that are written in sequence are adjacent in memory.
+    two observations, the first gives the column of their block and the second gives the row. Points
+    are sorted by their first camera, so that blocks that are written in sequence are close together
+    in memory.
 
     Args:
         first: ``(P + 1,)`` as in ``BundleProblem``.
@@ -155,7 +157,7 @@ def coupled_cameras(first, camera, used, n_free):
     """``(M, 2)`` int64 pairs of free cameras that observe a common point, without repetitions."""
     start, points = points_of_cameras(first, camera, used, n_free)
     met = np.empty(n_free, np.int64)
-    last = np.full(n_free, -1)  # the last camera i in whose pass each camera was counted
+    last = np.full(n_free, -1)  # the last camera i with which each camera was paired
     count = 0
     for i in range(n_free):
         count += cameras_met(i, start, points, first, camera, used, n_free, last, met)
@@ -173,7 +175,7 @@ def coupled_cameras(first, camera, used, n_free):
 
 @inner_kernel
 def points_of_cameras(first, camera, used, n_free):
-    """Points that each free camera observes: those of camera k are
+    """Points that each free camera observes. Those of camera k are
     ``points[start[k]:start[k + 1]]``. Returns ``start`` int64 and ``points`` ``(N,)`` int32."""
     start = np.zeros(n_free + 2, np.int64)
     for o in range(len(camera)):
@@ -192,8 +194,8 @@ def points_of_cameras(first, camera, used, n_free):
 
 @inner_kernel
 def cameras_met(i, start, points, first, camera, used, n_free, last, met):
-    """Write the free cameras after ``i`` that observe a common point with it into ``met``; returns
-    their number. ``last`` prevents repetitions."""
+    """Write the free cameras with an index above ``i`` that observe a point in common with camera
+    ``i`` into ``met``, and return their number. ``last`` prevents repetitions."""
     n = 0
     for p in points[start[i] : start[i + 1]]:
         for o in range(first[p], first[p + 1]):
@@ -208,7 +210,8 @@ def cameras_met(i, start, points, first, camera, used, n_free, last, met):
 @kernel
 def pair_slots(structure, first, camera, used, n_free):
     """``(N,)`` int32, the slot in the factor of each pair of used observations of a point, in the
-    order in which ``reduce_points_sparsely`` visits them. Cameras are in elimination order."""
+    order in which ``reduce_points_sparsely`` visits these pairs. Cameras are in elimination
+    order."""
     count = 0
     for p in range(len(first) - 1):
         seen = 0
@@ -236,8 +239,8 @@ def pair_slots(structure, first, camera, used, n_free):
 def reduce_points_sparsely(
     structure, slots, n_free, observations, equations, damping, S, x, V_inverse
 ):
-    """Eliminate the points: write the reduced camera system ``S x = rhs``, with S in panels and the
-    right-hand side in ``x``."""
+    """Eliminate the points: write the reduced camera system ``S x = rhs`` into ``S``, as panels of
+    ``block_cholesky``, and its right-hand side into ``x``."""
     first, camera, used = observations.first, observations.camera, observations.used
     W, V, g, U, b = equations
     for i in range(len(S)):

@@ -30,8 +30,8 @@ class GlobalSnapshot:
         keyframes: ``(K,)`` int64, id of each camera of the problem.
         landmarks: ``(P,)`` int32, id of each point.
         rows: ``(O,)`` int64, row of each observation in the map's arrays.
-        n_keyframes, n_landmarks: sizes of the map at the time of the snapshot; keyframes and
-            landmarks with these ids or greater ones are newer.
+        n_keyframes, n_landmarks: sizes of the map at the time of the snapshot. Keyframes and
+            landmarks with these ids or greater ones are newer than the snapshot.
     """
 
     problem: BundleProblem
@@ -45,21 +45,22 @@ class GlobalSnapshot:
 def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
     """Copy all living keyframes and landmarks into a bundle problem.
 
-    The first keyframe is fixed. So is the first keyframe of every part of the map that no landmark
-    connects to it, because nothing else determines the position of that part.
+    The first keyframe is fixed. So is the first keyframe of every other part of the map that no
+    landmark connects to it, because the position of that part is otherwise undetermined.
     """
     living = map_.living_keyframes()
     landmarks = map_.living_landmarks().astype(np.int32)
     part = connected_parts(map_.arrays, landmarks, map_.n_keyframes)
-    held = part[living] == living
-    keyframes = np.concatenate([living[~held], living[held]])
-    problem, rows = assemble(map_, living[~held], living[held], landmarks, camera)
+    first = part[living] == living
+    free, fixed = living[~first], living[first]
+    keyframes = np.concatenate([free, fixed])
+    problem, rows = assemble(map_, free, fixed, landmarks, camera)
     return GlobalSnapshot(problem, keyframes, landmarks, rows, map_.n_keyframes, map_.n_landmarks)
 
 
 @kernel
 def connected_parts(a, landmarks, n_keyframes):
-    """``(K,)`` int64, the first keyframe of the connected part of the map that each keyframe is in.
+    """``(K,)`` int64, for each keyframe the first keyframe of its connected part of the map.
 
     Keyframes that observe a common landmark are connected (union-find).
     """
@@ -86,7 +87,7 @@ def connected_parts(a, landmarks, n_keyframes):
 
 
 def merge_solution(map_: Map, snapshot: GlobalSnapshot, solution: BundleSolution) -> None:
-    """Apply the solution of a snapshot to the map, which may have changed since.
+    """Apply the solution of a snapshot to the map, which may have changed in the meantime.
 
     Keyframes and landmarks of the snapshot that are still alive take their new positions. Newer
     keyframes keep their pose relative to their parent in the spanning tree (Mur-Artal and Tardós,
@@ -104,8 +105,8 @@ def merge_solution(map_: Map, snapshot: GlobalSnapshot, solution: BundleSolution
             T_k_parent = compose(T_cw_old[k], inverse(T_cw_old[parent]))
             a.T_cw[k] = orthonormalised(compose(T_k_parent, a.T_cw[parent]))
     carry_landmarks(map_, np.arange(snapshot.n_landmarks, map_.n_landmarks), T_cw_old)
-    lives = a.landmark_alive[snapshot.landmarks]
-    a.xyz[snapshot.landmarks[lives]] = solution.points[lives]
+    living = a.landmark_alive[snapshot.landmarks]
+    a.xyz[snapshot.landmarks[living]] = solution.points[living]
     observed = np.repeat(snapshot.landmarks, np.diff(snapshot.problem.first))
     remove_unchanged(a, snapshot.rows[~solution.inlier], observed[~solution.inlier])
     refresh_landmarks(a, map_.living_landmarks().astype(np.int32), map_.scales)

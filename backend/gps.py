@@ -1,17 +1,17 @@
-"""Puts a finished map on the Earth: GPS fixes join its pose graph.
+"""Georeferences a finished map: GPS fixes are added to its pose graph.
 
 The map frame is first aligned with the local east-north-up frame (ENU) by RANSAC over Umeyama's
-closed form (TPAMI 1991), each part of the map by itself that tracking did not connect with the
-others. Then the keyframes are optimised with the edges of the essential graph and a GPS factor for
-each fix. No keyframe is held.
+closed form (TPAMI 1991). Parts of the map that tracking did not connect are aligned separately.
+Then the keyframes are optimised with the edges of the essential graph and a GPS factor for each
+fix. No keyframe is held fixed.
 
-Fixes have the Cauchy loss at first, which begins wide and narrows, so that a map that has drifted
-far is drawn towards its fixes and not away from them. Afterwards, fixes that fail a chi-square test
-are refused, and the others get a Gaussian loss.
+At first, fixes have a Cauchy loss whose scale is large and shrinks, so that even a map that has
+drifted far is pulled to its fixes. Afterwards, fixes that fail a chi-square test are discarded, and
+the others have a Gaussian loss.
 
 The error of GPS is mostly a bias that changes slowly (atmosphere, reflections): a hundred fixes in
-ten seconds say little more than one. So all fixes within ``CORRELATION_S`` together have the weight
-of a single one.
+ten seconds provide little more information than one. So all fixes within ``CORRELATION_S`` together
+have the weight of a single fix.
 """
 
 from __future__ import annotations
@@ -21,39 +21,39 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.backend.pose_graph import GAP, WEAK, PoseGraph, edge_sigmas, minimised
+from vslam.backend.pose_graph import GAP, WEAK, PoseGraph, edge_sigmas, minimised, parts_of
+from vslam.backend.similarity_graph import scale_of
 from vslam.config import PoseGraphConfig
 from vslam.errors import InputError
 from vslam.geometry import inverses
 
-# Constants of the method; docs/research/gps.md shows what other values of the first do.
-CORRELATION_S = 10.0
-GATE = 11.34  # chi-square of three degrees of freedom that 1 % of the good fixes exceed
-_MEDIAN = 2.366  # that half of them exceed
-_CAUCHY = 2.0  # scale of the narrowest loss, in standard deviations
-_NARROWING = 3.0  # from one optimisation to the next
-_DRIFT = 0.02  # of the map, as a share of its radius, that the alignment allows
-_DRAWS, _MOST_DRAWN = 1000, 500  # of RANSAC: triples, and fixes that are drawn from
+CORRELATION_S = 10.0  # docs/research/gps.md compares other values
+GATE = 11.34  # chi-square with three degrees of freedom that 1 % of correct fixes exceed
+_MEDIAN = 2.366  # median of this chi-square distribution
+_CAUCHY = 2.0  # smallest scale of the Cauchy loss, in standard deviations
+_NARROWING = 3.0  # factor by which this scale shrinks from one optimisation to the next
+_DRIFT = 0.02  # tolerance of RANSAC for the drift of the map, as a share of the map's radius
+_DRAWS, _MOST_DRAWN = 1000, 500  # RANSAC: number of samples, and of fixes that they are drawn from
 _UP_WEIGHT = 1e-3  # see _umeyama
-_METRIC = 0.02  # standard deviation of the scale of a metric map, by errors of its calibration
-_MOST_UNSURE = 0.1  # rad, of the alignment
-_LOOSE = np.array([0.3, 0.3, 0.3, 100.0, 100.0, 100.0])  # rad and m, of the prior
-_STRETCH = 0.1  # of the edges of a monocular map while its local scale is sought
-_WINDOW = 25  # keyframes before and after, for the local scale of a monocular map
+_METRIC = 0.02  # standard deviation of the scale of a metric map, from errors of its calibration
+_MAX_UNSURE = 0.1  # largest accepted standard deviation of the directions of an alignment, rad
+_LOOSE = np.array([0.3, 0.3, 0.3, 100.0, 100.0, 100.0])  # standard deviations of priors, rad and m
+_STRETCH = 0.1  # ``stretch`` of a monocular map while its local scale is being estimated
+_WINDOW = 25  # keyframes before and after a keyframe from which its local scale is estimated
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Positions:
-    """M positions of the camera that GPS has measured.
+    """M positions of the camera that were measured by GPS.
 
     Attributes:
         seconds: ``(M,)`` times.
-        keyframe: ``(M,)`` int64, index of the keyframe that each is relative to.
-        arm: ``(M, 3)`` the position in the frame of that keyframe, in units of the map.
-        enu: ``(M, 3)`` the measured position, east, north and up of a datum, in metres.
-        sigma: ``(M, 3)`` its standard deviations in metres.
+        keyframe: ``(M,)`` int64, index of the keyframe whose frame ``arm`` is in.
+        arm: ``(M, 3)`` estimated position in the frame of this keyframe, in units of the map.
+        enu: ``(M, 3)`` measured position east, north and up of a datum, in metres.
+        sigma: ``(M, 3)`` standard deviations of ``enu`` in metres.
     """
 
     seconds: Array
@@ -63,12 +63,13 @@ class Positions:
     sigma: Array
 
     def select(self, chosen: NDArray[np.bool_]) -> Positions:
-        """Some of the positions."""
+        """The positions where the ``(M,)`` bool ``chosen`` is True."""
         return Positions(*(values[chosen] for values in vars(self).values()))
 
     @property
     def crowding(self) -> Array:
-        """``(M,)`` number of positions within ``CORRELATION_S`` of each, itself included."""
+        """``(M,)`` number of positions in a window of ``CORRELATION_S`` around each position,
+        itself included."""
         times = np.sort(self.seconds)
         first = np.searchsorted(times, self.seconds - 0.5 * CORRELATION_S, "left")
         last = np.searchsorted(times, self.seconds + 0.5 * CORRELATION_S, "right")
@@ -83,10 +84,10 @@ class Anchored:
         T_enu_k: ``(N, 4, 4)`` poses of the keyframes, in metres.
         scale: ``(N,)`` metres per unit of the map at each keyframe.
         used: ``(M,)`` bool, the fixes that passed the test.
-        residual_m: root mean square of the distances between these and the trajectory.
-        S_enu_w: ``(4, 4)`` the alignment of the whole map before the optimisation.
-        level: False if the fixes lie on a straight line, so that the rotation about it was taken
-            from the assumption that the camera stands upright.
+        residual_m: root mean square distance of the used fixes from the trajectory.
+        S_enu_w: ``(4, 4)`` alignment of the whole map before the optimisation.
+        level: False if the fixes lie on a straight line, so that the camera was assumed to be
+            upright to determine the rotation about this line.
     """
 
     T_enu_k: Array
@@ -100,32 +101,34 @@ class Anchored:
 def anchor(
     graph: PoseGraph, seconds: Array, positions: Positions, config: PoseGraphConfig, *, metric: bool
 ) -> Anchored:
-    """Move the keyframes of a finished map to where its drive and the GPS fixes say.
+    """Move the keyframes of a finished map to the poses in the ENU frame that best agree with its
+    essential graph and the GPS fixes.
 
     Args:
         graph: the essential graph of the map.
         seconds: ``(N,)`` times of its keyframes.
-        metric: whether the unit of the map is the metre, except for errors of the calibration. The
-            scale of a monocular map is estimated freely, and its drift with it.
+        metric: whether the unit of the map is the metre, except for errors of the calibration.
+            Otherwise (monocular map), the scale and its drift are estimated without a prior.
 
     Raises:
         InputError: the drive is too short for its direction to be known.
     """
     T_wk = inverses(graph.T_cw)
-    part = _parts(graph)
+    measured = (graph.kind != WEAK) & (graph.kind != GAP)
+    part = parts_of(graph.edges[measured], len(graph.keyframes))
     main = align(T_wk, positions, metric=metric)
-    if main.unsure > _MOST_UNSURE:
+    if main.unsure > _MAX_UNSURE:
         raise InputError(
-            "the drive is too short for GPS: the fixes do not tell which way it went; drive "
+            "the drive is too short for GPS: the fixes do not determine its direction; drive "
             "farther, or use a receiver with a smaller error."
         )
-    T_enu_k, scale = _moved(T_wk, main.S_enu_w)
+    T_enu_k, scale = _aligned(T_wk, main.S_enu_w)
     for label in np.unique(part) if part.any() else ():
         at = part[positions.keyframe] == label
         own = align(T_wk, positions.select(at), metric=metric) if at.sum() >= 3 else main
-        if own.unsure <= _MOST_UNSURE:
+        if own.unsure <= _MAX_UNSURE:
             inside = part == label
-            T_enu_k[inside], scale[inside] = _moved(T_wk[inside], own.S_enu_w)
+            T_enu_k[inside], scale[inside] = _aligned(T_wk[inside], own.S_enu_w)
 
     width = 2.0 * float(np.sqrt(np.median(_chi2(positions, T_enu_k, scale))))
     width = max(width, _CAUCHY * _NARROWING ** (1 if metric else 4))
@@ -140,18 +143,18 @@ def anchor(
     used = np.ones(len(positions.seconds), np.bool_)
     for _ in range(2):
         chi2 = _chi2(positions, T_enu_k, scale)
-        # Receivers promise too much: where the residuals are larger, these count.
+        # Receivers underestimate their errors, so the gate is widened if the residuals are larger.
         used = chi2 <= GATE * max(1.0, float(np.median(chi2)) / _MEDIAN)
         chosen = positions.select(used)
         T_enu_k = _optimised(graph, seconds, T_enu_k, scale, chosen, config)
-    apart = np.linalg.norm(_residuals(positions, T_enu_k, scale)[used], axis=1)
-    residual = float(np.sqrt(np.mean(apart**2)))
-    return Anchored(T_enu_k, scale, used, residual, main.S_enu_w, main.unsure_about <= _MOST_UNSURE)
+    distance = np.linalg.norm(_residuals(positions, T_enu_k, scale)[used], axis=1)
+    residual = float(np.sqrt(np.mean(distance**2)))
+    return Anchored(T_enu_k, scale, used, residual, main.S_enu_w, main.unsure_about <= _MAX_UNSURE)
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """A similarity from the map to ENU, and how sure it is.
+    """A similarity from the map to ENU, and its uncertainty.
 
     Attributes:
         S_enu_w: ``(4, 4)``.
@@ -167,52 +170,55 @@ class Alignment:
 def align(T_wk: Array, positions: Positions, *, metric: bool, seed: int = 0) -> Alignment:
     """Align a map with its fixes by RANSAC.
 
-    The scale of a metric map is estimated, too, as far as the fixes are surer of it than the
-    calibration (``_METRIC``): a baseline that is 1 % too long makes the map 1 % too large.
+    A baseline that is 1 % too long makes a metric map 1 % too large. So the scale of a metric map
+    is estimated as well, from the fixes and the calibration, weighted by their uncertainty
+    (``_METRIC`` is that of the calibration).
 
     Args:
         T_wk: ``(N, 4, 4)`` poses of the keyframes in the map.
         positions: at least three.
+        metric: see ``anchor``.
+        seed: seed of the random samples.
     """
-    at, enu = _at(positions, T_wk, np.ones(len(T_wk))), positions.enu
+    path, enu = _predicted(positions, T_wk, np.ones(len(T_wk))), positions.enu
     up = -T_wk[positions.keyframe, :3, 1]
     sigma = float(np.sqrt(np.mean(positions.sigma**2)))
     radius = float(np.sqrt(np.sum(np.median((enu - np.median(enu, axis=0)) ** 2, axis=0))))
-    near = max(np.sqrt(GATE) * sigma, _DRIFT * radius)
+    tolerance = max(np.sqrt(GATE) * sigma, _DRIFT * radius)
 
     rng = np.random.default_rng(seed)
     drawn = np.unique(np.linspace(0, len(enu) - 1, min(len(enu), _MOST_DRAWN)).astype(int))
     triples = drawn[np.argsort(rng.random((_DRAWS, len(drawn))), axis=1)[:, :3]]
     fixed = 1.0 if metric else None
-    S = _umeyama(at[triples], enu[triples], up[triples], fixed)
-    apart = np.linalg.norm(_mapped(S, at[drawn]) - enu[drawn], axis=-1)
-    best = S[np.argmin(np.minimum(apart / near, 1.0).sum(axis=1))]
+    S = _umeyama(path[triples], enu[triples], up[triples], fixed)
+    distance = np.linalg.norm(_mapped(S, path[drawn]) - enu[drawn], axis=-1)
+    best = S[np.argmin(np.minimum(distance / tolerance, 1.0).sum(axis=1))]
     for _ in range(3):
-        inliers = np.linalg.norm(_mapped(best, at) - enu, axis=-1) <= near
+        inliers = np.linalg.norm(_mapped(best, path) - enu, axis=-1) <= tolerance
         if inliers.sum() < 3:
             inliers[:] = True
-        best = _umeyama(at[inliers], enu[inliers], up[inliers], fixed)
-    path = _mapped(best, at[inliers])
-    spread = np.linalg.eigvalsh(np.cov(path.T, bias=True))[::-1]
+        matches = path[inliers], enu[inliers], up[inliers]
+        best = _umeyama(*matches, fixed)
+    spread = np.linalg.eigvalsh(np.cov(_mapped(best, path[inliers]).T, bias=True))[::-1]
     independent = float(np.sum(1.0 / positions.select(inliers).crowding))
     error = sigma / np.sqrt(independent)
     if metric:
-        free = _umeyama(at[inliers], enu[inliers], up[inliers], None)
-        apart = np.sqrt(np.mean((_mapped(free, at[inliers]) - enu[inliers]) ** 2))
-        variance = max(sigma, apart) ** 2 / (independent * max(spread.sum(), 1e-12))
+        free = _umeyama(*matches, None)
+        residual = np.sqrt(np.mean((_mapped(free, path[inliers]) - enu[inliers]) ** 2))
+        variance = max(sigma, residual) ** 2 / (independent * max(spread.sum(), 1e-12))
         share = _METRIC**2 / (_METRIC**2 + variance)
-        scale = 1.0 + share * (_scale_of(free) - 1.0)
-        best = _umeyama(at[inliers], enu[inliers], up[inliers], scale)
+        scale = 1.0 + share * (float(scale_of(free)) - 1.0)
+        best = _umeyama(*matches, scale)
     unsure, unsure_about = error / np.sqrt(np.maximum([spread[0], spread[1:].sum()], 1e-12))
     return Alignment(best, float(unsure), float(unsure_about))
 
 
 def _umeyama(p: Array, q: Array, up: Array, fixed: float | None) -> Array:
-    """``(..., 4, 4)`` similarities that map ``(..., M, 3)`` points p to q; their scale is ``fixed``
-    unless that is None.
+    """``(..., 4, 4)`` similarities that map ``(..., M, 3)`` points p to q. Their scale is ``fixed``
+    or, if that is None, estimated.
 
-    Points on a line leave the rotation about it open. There, the camera's upward axes ``up``
-    decide, with a weight that is too small to matter anywhere else.
+    Points on a line do not determine the rotation about this line. In this case the upward axes
+    ``up`` of the camera determine it; their weight is too small to matter otherwise.
     """
     p_mean, q_mean = p.mean(axis=-2), q.mean(axis=-2)
     p0, q0 = p - p_mean[..., None, :], q - q_mean[..., None, :]
@@ -235,43 +241,28 @@ def _umeyama(p: Array, q: Array, up: Array, fixed: float | None) -> Array:
     return S
 
 
-def _scale_of(S: Array) -> float:
-    return float(np.cbrt(np.linalg.det(S[:3, :3])))
-
-
 def _mapped(S: Array, points: Array) -> Array:
     """``(..., M, 3)`` images of ``(M, 3)`` points under ``(..., 4, 4)`` similarities."""
     return points @ np.swapaxes(S[..., :3, :3], -2, -1) + S[..., None, :3, 3]
 
 
-def _moved(T_wk: Array, S_enu_w: Array) -> tuple[Array, Array]:
+def _aligned(T_wk: Array, S_enu_w: Array) -> tuple[Array, Array]:
     """Poses ``T_enu_k`` and scales of keyframes after an alignment."""
-    scale = _scale_of(S_enu_w)
+    scale = float(scale_of(S_enu_w))
     T_enu_k = S_enu_w @ T_wk
     T_enu_k[:, :3, :3] /= scale
     return T_enu_k, np.full(len(T_wk), scale)
 
 
-def _parts(graph: PoseGraph) -> NDArray[np.int64]:
-    """``(N,)`` the part of the map of each keyframe: parts are joined by measured edges."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    n = len(graph.keyframes)
-    i, j = graph.edges[(graph.kind != WEAK) & (graph.kind != GAP)].T
-    links = coo_array((np.ones(len(i)), (i, j)), shape=(n, n))
-    return np.asarray(connected_components(links, directed=False)[1], np.int64)
-
-
-def _at(positions: Positions, T_k: Array, scale: Array) -> Array:
-    """``(M, 3)`` where keyframes at these poses put the positions."""
-    of = positions.keyframe
-    arm = positions.arm * scale[of, None]
-    return np.einsum("mij,mj->mi", T_k[of, :3, :3], arm) + T_k[of, :3, 3]
+def _predicted(positions: Positions, T_k: Array, scale: Array) -> Array:
+    """``(M, 3)`` positions of the camera according to the ``(N, 4, 4)`` poses of the keyframes."""
+    k = positions.keyframe
+    arm = positions.arm * scale[k, None]
+    return np.einsum("mij,mj->mi", T_k[k, :3, :3], arm) + T_k[k, :3, 3]
 
 
 def _residuals(positions: Positions, T_enu_k: Array, scale: Array) -> Array:
-    return _at(positions, T_enu_k, scale) - positions.enu
+    return _predicted(positions, T_enu_k, scale) - positions.enu
 
 
 def _chi2(positions: Positions, T_enu_k: Array, scale: Array) -> Array:
@@ -280,7 +271,7 @@ def _chi2(positions: Positions, T_enu_k: Array, scale: Array) -> Array:
 
 def _local_scale(T_wk: Array, T_enu_k: Array, scale: Array, part: NDArray[np.int64]) -> Array:
     """``(N,)`` metres per unit of the map: the ratio of the lengths of the path around each
-    keyframe, within its part of the map; the previous ``scale`` where there is no path."""
+    keyframe, within its part of the map; the previous ``scale`` if this path has no length."""
     scale = scale.copy()
     for label in np.unique(part):
         inside = np.flatnonzero(part == label)
@@ -307,8 +298,9 @@ def _optimised(
     """``(N, 4, 4)`` poses that best agree with edges and fixes, starting from ``T_enu_k``.
 
     Args:
-        cauchy: scale of the loss on fixes, in their standard deviations; None for a Gaussian loss.
-        stretch: standard deviation of the lengths of edges, as a share of them, beside that of
+        cauchy: scale of the Cauchy loss of fixes, in their standard deviations; None for a Gaussian
+            loss.
+        stretch: relative standard deviation of the lengths of edges, in addition to
             ``edge_sigmas``.
     """
     import gtsam
@@ -319,7 +311,8 @@ def _optimised(
     for i, T in enumerate(T_enu_k):
         pose = gtsam.Pose3(T)
         start.insert(i, pose)
-        if graph.fixed[i]:  # keeps parts without fixes, and rotations about a straight drive
+        # Determines the poses of parts without fixes, and rotations about a straight drive.
+        if graph.fixed[i]:
             factors.add(gtsam.PriorFactorPose3(i, pose, loose))
     edges, T_i_j = graph.edges, graph.T_i_j.copy()
     T_i_j[:, :3, 3] *= scale[edges].mean(axis=1)[:, None]

@@ -26,9 +26,8 @@ RECENT_KEYFRAMES = 3  # a landmark is on probation for this many keyframes (ORB-
 
 
 def map_keyframe(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Run all steps of local mapping for a keyframe that was just inserted and linked to its
-    landmarks: culling of landmarks, triangulation, fusion, local bundle adjustment and culling of
-    keyframes."""
+    """Run local mapping for a keyframe that was just inserted and linked to its landmarks: culling
+    of landmarks, triangulation, fusion, local bundle adjustment and culling of keyframes."""
     cull_recent_landmarks(map_, keyframe, camera, config)
     triangulate_with_neighbours(map_, keyframe, camera, config)
     refresh_keyframe(map_, keyframe)
@@ -45,20 +44,12 @@ def refresh_keyframe(map_: Map, keyframe: int) -> None:
 
 def cull_recent_landmarks(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
     """Erase recent landmarks that tracking rarely finds, or that too few keyframes observe."""
-    _cull_landmarks(
-        map_.arrays,
-        int(
-            np.searchsorted(
-                map_.arrays.first_keyframe[: map_.n_landmarks], keyframe - RECENT_KEYFRAMES
-            )
-        ),
-        map_.n_landmarks,
-        keyframe,
-        config.mapping.min_found_ratio,
-        # A stereo observation counts twice. One stereo and one monocular observation are too few
-        # for a stereo map, and two observations are too few for a monocular map.
-        2 if camera.monocular else 3,
-    )
+    a, n = map_.arrays, map_.n_landmarks
+    first = int(np.searchsorted(a.first_keyframe[:n], keyframe - RECENT_KEYFRAMES))
+    # A stereo observation counts twice. One stereo and one monocular observation are too few in a
+    # stereo map, and two observations are too few in a monocular map.
+    too_few = 2 if camera.monocular else 3
+    _cull_landmarks(a, first, n, keyframe, config.mapping.min_found_ratio, too_few)
 
 
 @kernel
@@ -75,7 +66,7 @@ def _cull_landmarks(a, first, last, keyframe, min_found_ratio, too_few):
 def adjust_locally(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
     """Local bundle adjustment (ORB-SLAM, VI-D).
 
-    Optimises the keyframe, its covisible keyframes and all landmarks that they observe. Other
+    The keyframe, its covisible keyframes and all landmarks that they observe are optimised. Other
     keyframes that observe these landmarks are fixed, and so is the first keyframe, which defines
     the world frame. Observations that fail the chi-square test afterwards are removed.
     """
@@ -109,7 +100,7 @@ def local_window(
     if 0 in window:
         fixed = np.concatenate([[0], fixed])
     if len(fixed) == 0 and len(free) > 1:
-        # A sub-map without a connection to the rest: its oldest keyframe defines its frame.
+        # The sub-map is not connected to the rest, so its oldest keyframe defines its frame.
         free, fixed = free[1:], free[:1]
     return free.astype(np.int64), fixed.astype(np.int64), landmarks
 
@@ -125,8 +116,8 @@ def strong_neighbours(map_: Map, keyframe: int, config: Config) -> NDArray[np.in
 
 @kernel
 def window_landmarks(a, window, n_landmarks, n_keyframes):
-    """``(P,)`` int32, landmarks that the keyframes of a window observe; ``(K,)`` bool, other
-    keyframes that observe them."""
+    """``(P,)`` int32, landmarks that the keyframes of a window observe; ``(K,)`` bool, whether each
+    keyframe outside the window observes any of them."""
     seen = np.zeros(n_landmarks, np.bool_)
     others = np.zeros(n_keyframes, np.bool_)
     for keyframe in window:
@@ -188,9 +179,9 @@ def remove_observations(a, rows):
 
 
 def cull_keyframes(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Cull redundant covisible keyframes: those of whose close landmarks most are also observed by
-    at least three other keyframes at the same or a finer scale (ORB-SLAM, VI-E). For a monocular
-    camera all landmarks count as close."""
+    """Cull redundant covisible keyframes. A keyframe is redundant if at least three other keyframes
+    also observe most of its close landmarks, at a finer or about the same scale (ORB-SLAM, VI-E).
+    For a monocular camera, all landmarks count as close."""
     neighbours, shared = map_.covisible(keyframe)
     close = config.stereo.close_depth_baselines * camera.baseline
     restarts = map_.restarts
@@ -205,7 +196,8 @@ def cull_keyframes(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
 @kernel
 def count_redundant(a, keyframe, bf, close_depth):
     """Number of close landmarks of a keyframe, and number of these that at least three other
-    keyframes observe. If ``bf`` is 0 (monocular camera), all landmarks count as close."""
+    keyframes observe at a finer or about the same scale. If ``bf`` is 0 (monocular camera), all
+    landmarks count as close."""
     seen, redundant = 0, 0
     for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
         landmark = a.landmark[row]

@@ -1,4 +1,4 @@
-"""Moves keyframes and their landmarks after a loop correction."""
+"""Moves keyframes and their landmarks, for example after a loop correction."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ def move_keyframes(
     """Set the poses of keyframes, and move each landmark rigidly with its anchor keyframe.
 
     The anchor of a landmark is the keyframe that first observed it (ORB-SLAM, VII-C) or, if that
-    was culled, the oldest one that observes it. A landmark whose anchor is not among ``keyframes``
-    does not move. Relative to the anchor nothing changes, so the distance range is kept and the
-    normal is rotated with the anchor; both are exact if all observers move alike. Culled keyframes
-    need no update, because their poses are stored relative to living keyframes.
+    keyframe was culled, the oldest one that observes it. A landmark whose anchor is not among
+    ``keyframes`` does not move. Relative to the anchor nothing changes, so the distance range is
+    kept and the normal is rotated with the anchor; this is exact if all observers move alike.
+    Culled keyframes need no update, because their poses are stored relative to living keyframes.
 
     Args:
         keyframes: ``(N,)`` ids of living keyframes.
@@ -52,8 +52,8 @@ def carry_landmarks_by(map_: Map, motion: NDArray[np.float64], moved: NDArray[np
     """Move all landmarks by the motions of their anchors.
 
     Args:
-        motion: ``(K, 4, 4)`` world-to-world motion of each keyframe. It may be a similarity; then
-            the caller must refresh the normals and distance ranges of the landmarks.
+        motion: ``(K, 4, 4)`` world-to-world motion of each keyframe. If it is a similarity, the
+            caller must refresh the normals and distance ranges of the landmarks.
         moved: ``(K,)`` bool, keyframes that have a motion.
     """
     _carry(map_.arrays, np.arange(map_.n_landmarks), motion, moved)
@@ -61,8 +61,8 @@ def carry_landmarks_by(map_: Map, motion: NDArray[np.float64], moved: NDArray[np
 
 @kernel
 def _motions(T_cw_old, T_cw_new, moved):
-    """``(K, 4, 4)`` world-to-world motion of each keyframe: a point fixed to the keyframe moves
-    from p to ``motion p``."""
+    """``(K, 4, 4)`` world-to-world motion of each keyframe: a point p that is fixed to the keyframe
+    moves to ``motion p``."""
     motion = np.zeros((len(moved), 4, 4))
     for k in range(len(moved)):
         if moved[k]:

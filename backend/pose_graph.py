@@ -1,4 +1,4 @@
-"""Pose-graph optimisation after a loop closure, and the test whether its result is plausible.
+"""Pose-graph optimisation after a loop closure, and a test of whether its result is plausible.
 
 The graph is the essential graph of ORB-SLAM (Mur-Artal et al., T-RO 2015, III-D and VII-C):
 spanning tree, strong covisibility edges and loop edges. Poses are ``T_cw`` on input and output.
@@ -37,8 +37,9 @@ class PoseGraph:
         kind: ``(E,)`` uint8, TREE, COVISIBLE, WEAK, LOOP or GAP.
         sigmas: ``(E, 2)`` standard deviations of translation (m) and rotation (rad), per axis.
         fixed: ``(N,)`` bool, keyframes that are held fixed: one in each connected part.
-        scale: ``(E,)`` factor from lengths around j to lengths around i; ``T_i_j`` is in the unit
-            of i. 1 except for loops of monocular maps (``similarity_graph``).
+        scale: ``(E,)`` factor that converts lengths in the unit around j to the unit around i.
+            ``T_i_j`` is in the unit around i. The factor is 1 except for loops of monocular maps
+            (``similarity_graph``).
     """
 
     keyframes: NDArray[np.int64]
@@ -57,11 +58,11 @@ class GraphCheck:
 
     Attributes:
         consistent: whether the correction is plausible.
-        reason: "consistent", or in a few words why it is not.
+        reason: "consistent", or in a few words why the correction is not plausible.
         strain: total chi-square of the tree, covisibility and gap edges, that is, how much drift
             the correction implies relative to the drift model.
-        closed: number of loop edges that were violated before; the limit on the strain is
-            proportional to it.
+        closed: number of loop edges that were violated before the optimisation; the limit on the
+            strain is proportional to it.
         loop_error: ``(E,)`` chi-square of the loop edges, NaN for other edges.
     """
 
@@ -83,23 +84,23 @@ def essential_graph(
 ) -> PoseGraph:
     """The essential graph of a map, to be built *before* the new loop changes the map.
 
-    Tree and covisibility edges are measured by the poses in the map. If landmarks of the new loop
-    were already fused, keyframes on both sides of it would be covisible, and these edges would
-    preserve the drift. So correct the map and fuse landmarks only after the graph was found to be
-    consistent.
+    The measurements of tree and covisibility edges are taken from the poses in the map. If
+    landmarks of the new loop were already fused, keyframes on both sides of it would be covisible,
+    and their edges would preserve the drift. So correct the map and fuse landmarks only after the
+    graph was found to be consistent.
 
-    A loop edge replaces any other edge between its two keyframes. If an end of a loop was culled,
-    the living keyframe that its pose is stored relative to takes its place; if several loops then
-    join the same keyframes, the last one counts.
+    A loop edge replaces any other edge between its two keyframes. If a keyframe of a loop was
+    culled, the living keyframe that its pose is stored relative to takes its place. If several
+    loops then connect the same keyframes, only the last one is used.
 
     Args:
         loops: all closed loops, the new one last; each has a pose.
         weak: keyframes at which the map was restarted after tracking was lost, including culled
             ones. A tree edge across such a restart, whose ends share hardly any landmarks, was not
             measured but predicted.
-        unpredicted: the restarts for which there was no prediction either; tree edges across them
-            are always WEAK.
-        driven: whether the camera is on a vehicle. Then a predicted edge is trusted as far as the
+        unpredicted: restarts for which there was no prediction either; tree edges across them are
+            always WEAK.
+        driven: whether the camera is on a vehicle. If so, a predicted edge is trusted as far as the
             motion of a car can be predicted over that time (GAP); otherwise the camera may have
             been carried anywhere (WEAK).
 
@@ -112,16 +113,16 @@ def essential_graph(
     T_cw = map_.arrays.T_cw[living]
     pairs, shared = covisible_pairs(map_.arrays, living, map_.n_keyframes, config.min_shared_tree)
     seen = set(map(tuple, pairs.tolist()))
-    # The kind of each edge by its pair of ends; later entries overwrite earlier ones.
+    # The kind of each edge by its two ends; later entries overwrite earlier ones.
     kind = dict.fromkeys(map(tuple, pairs[shared >= config.min_shared].tolist()), COVISIBLE)
-    restarts, unpredicted_restarts = (np.array(sorted(at), np.int64) for at in (weak, unpredicted))
+    restarts, unpredicted_restarts = (np.array(sorted(k), np.int64) for k in (weak, unpredicted))
     for child, parent in zip(living.tolist(), map_.parents[living].tolist(), strict=True):
         if parent >= 0:
             pair = (min(parent, child), max(parent, child))
-            if not _passes(pair, restarts) or pair in seen:
+            if not _spans(pair, restarts) or pair in seen:
                 kind[pair] = TREE
             else:
-                kind[pair] = GAP if driven and not _passes(pair, unpredicted_restarts) else WEAK
+                kind[pair] = GAP if driven and not _spans(pair, unpredicted_restarts) else WEAK
     measured: dict[tuple[int, int], tuple[NDArray[np.float64], float]] = {}
     for loop in loops:
         found = loop_of_living(map_, loop)
@@ -150,26 +151,27 @@ def essential_graph(
         T_i_j=T_i_j,
         kind=kinds,
         sigmas=edge_sigmas(edges, T_i_j, kinds, seconds[edges], len(living), config),
-        fixed=_first_of_parts(edges, len(living)),
+        fixed=parts_of(edges, len(living)) == np.arange(len(living)),
         scale=scales,
     )
 
 
 def connectivity(map_: Map) -> NDArray[np.int64]:
-    """``(n_keyframes,)`` int64, how well the map is connected at each keyframe: the largest number
-    of landmarks that an earlier keyframe shares with this or a later one; 0 for the first."""
+    """``(n_keyframes,)`` int64, how well each keyframe is connected to the earlier part of the map:
+    the largest number of landmarks that any earlier keyframe shares with this or any later one; 0
+    for the first keyframe."""
     living = map_.living_keyframes()
     pairs, shared = covisible_pairs(map_.arrays, living, map_.n_keyframes, 1)
-    held = np.zeros(map_.n_keyframes, np.int64)
+    most = np.zeros(map_.n_keyframes, np.int64)
     order = np.argsort(shared, kind="stable")  # so that greater numbers overwrite smaller ones
-    for (one, other), n in zip(pairs[order].tolist(), shared[order].tolist(), strict=True):
-        held[one + 1 : other + 1] = n
-    return held
+    for (first, second), n in zip(pairs[order].tolist(), shared[order].tolist(), strict=True):
+        most[first + 1 : second + 1] = n
+    return most
 
 
-def _passes(pair: tuple[int, int], keyframes: NDArray[np.int64]) -> bool:
-    """Whether any of the sorted ids is greater than the first of a pair, and not greater than the
-    second."""
+def _spans(pair: tuple[int, int], keyframes: NDArray[np.int64]) -> bool:
+    """Whether any of the sorted ids ``keyframes`` is greater than the first of a pair of ids, and
+    not greater than the second."""
     low, high = np.searchsorted(keyframes, pair, side="right")
     return bool(low < high)
 
@@ -186,9 +188,9 @@ def edge_sigmas(
 
     Drift is modelled as a random walk, so the variance of a tree or covisibility edge grows with
     its length. All these edges are derived from one measurement, the estimated path. If they were
-    treated as independent, a path would be stiffer the more edges run along it. Therefore each
-    variance is multiplied by the number of edges that cover the path at its ends, so that all edges
-    together are as stiff as the drift model says, however many there are.
+    treated as independent, a path with more edges would be stiffer. Therefore each variance is
+    multiplied by the number of edges that cover the path at its ends, so that the edges together
+    are as stiff as the drift model, regardless of their number.
 
     The translation of a GAP edge may be wrong by a share of the predicted distance, or by the
     distance that a slow car drives in that time. Nothing is known about a WEAK edge.
@@ -216,62 +218,88 @@ def edge_sigmas(
     return sigmas
 
 
-def _first_of_parts(edges: NDArray[np.int64], n: int) -> NDArray[np.bool_]:
-    """``(n,)`` bool, True for the first node of each connected part."""
-    # The smallest node that each node is known to be connected to. Each round follows these links
-    # twice as far (pointer jumping).
-    least = np.arange(n)
-    while True:
-        ends = least[edges].min(axis=1, initial=n)
-        known = least.copy()
-        for side in range(2):
-            np.minimum.at(known, least[edges[:, side]], ends)
-            np.minimum.at(known, edges[:, side], ends)
-        known = known[known]
-        if np.array_equal(known, least):
-            return np.asarray(least == np.arange(n))
-        least = known
+def parts_of(edges: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+    """``(n,)`` int64, the first node of the connected part that each node is in (union-find)."""
+    part = list(range(n))
+
+    def first_of(node: int) -> int:
+        while part[node] != node:
+            part[node] = part[part[node]]
+            node = part[node]
+        return node
+
+    for i, j in edges.tolist():
+        first, second = sorted((first_of(i), first_of(j)))
+        part[second] = first
+    return np.array([first_of(node) for node in range(n)], np.int64)
 
 
 def load_optimiser() -> None:
-    """Import GTSAM ahead of the first loop; this takes a tenth of a second, too long while frames
-    of a live camera are waiting."""
+    """Import GTSAM before the first loop. The import takes a tenth of a second, which is too long
+    while frames of a live camera are waiting."""
     import gtsam  # noqa: F401
 
 
 def optimise(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
     """``(N, 4, 4)`` poses ``T_cw`` that best agree with the edges, by Levenberg-Marquardt.
 
-    Loop edges have the Cauchy loss, so that one that contradicts the others loses its influence and
-    is detected by ``check_pose_graph``. All other edges have a Gaussian loss.
+    Loop edges have the Cauchy loss, so that a loop that contradicts the others loses its influence
+    and is detected by ``check_pose_graph``. All other edges have a Gaussian loss.
     """
     import gtsam
 
-    noise = gtsam.noiseModel
-    factors, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    hold = noise.Isotropic.Sigma(6, HOLD)
-    for i, T_wc in enumerate(inverses(graph.T_cw)):
-        pose = gtsam.Pose3(T_wc)
-        start.insert(i, pose)
-        if graph.fixed[i]:
-            factors.add(gtsam.PriorFactorPose3(i, pose, hold))
-    cauchy = noise.mEstimator.Cauchy.Create(config.robust_scale)
-    sigmas = np.repeat(graph.sigmas[:, ::-1], 3, axis=1)  # GTSAM: rotation first
-    for (i, j), T_i_j, kind, sigma in zip(
-        graph.edges.tolist(), graph.T_i_j, graph.kind.tolist(), sigmas, strict=True
-    ):
-        plain = noise.Diagonal.Sigmas(sigma)
-        model = noise.Robust.Create(cauchy, plain) if kind == LOOP else plain
-        factors.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(T_i_j), model))
-    result = minimised(factors, start, config)
+    result = optimised_values(
+        graph,
+        [gtsam.Pose3(T_wc) for T_wc in inverses(graph.T_cw)],
+        [gtsam.Pose3(T_i_j) for T_i_j in graph.T_i_j],
+        np.repeat(graph.sigmas[:, ::-1], 3, axis=1),  # GTSAM: rotation first
+        (gtsam.PriorFactorPose3, gtsam.BetweenFactorPose3),
+        config,
+    )
     T_wc = np.array([result.atPose3(i).matrix() for i in range(len(graph.T_cw))])
     T_cw = inverses(T_wc)
     T_cw[graph.fixed] = graph.T_cw[graph.fixed]
     return T_cw
 
 
+def optimised_values(
+    graph: PoseGraph,
+    poses: list[Any],
+    measured: list[Any],
+    sigmas: NDArray[np.float64],
+    factor_types: tuple[Any, Any],
+    config: PoseGraphConfig,
+) -> Any:
+    """The ``gtsam.Values`` of the keyframes that best agree with the edges.
+
+    Args:
+        poses: initial values of the N keyframes, objects of GTSAM.
+        measured: measurements of the E edges, objects of the same type.
+        sigmas: ``(E, D)`` standard deviations of the edges.
+        factor_types: GTSAM's prior and between factors of this type.
+    """
+    import gtsam
+
+    noise = gtsam.noiseModel
+    prior, between = factor_types
+    factors, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    hold = noise.Isotropic.Sigma(sigmas.shape[1], HOLD)
+    for i, pose in enumerate(poses):
+        start.insert(i, pose)
+        if graph.fixed[i]:
+            factors.add(prior(i, pose, hold))
+    cauchy = noise.mEstimator.Cauchy.Create(config.robust_scale)
+    for (i, j), pose, kind, sigma in zip(
+        graph.edges.tolist(), measured, graph.kind.tolist(), sigmas, strict=True
+    ):
+        plain = noise.Diagonal.Sigmas(sigma)
+        model = noise.Robust.Create(cauchy, plain) if kind == LOOP else plain
+        factors.add(between(i, j, pose, model))
+    return minimised(factors, start, config)
+
+
 def minimised(factors: Any, start: Any, config: PoseGraphConfig) -> Any:
-    """``gtsam.Values`` that minimise a ``gtsam.NonlinearFactorGraph``, by Levenberg-Marquardt."""
+    """The ``gtsam.Values`` that minimise a ``gtsam.NonlinearFactorGraph`` (Levenberg-Marquardt)."""
     import gtsam
 
     parameters = gtsam.LevenbergMarquardtParams()
@@ -283,12 +311,13 @@ def minimised(factors: Any, start: Any, config: PoseGraphConfig) -> Any:
 def check_pose_graph(
     graph: PoseGraph, T_cw: NDArray[np.float64], config: PoseGraphConfig
 ) -> GraphCheck:
-    """Test whether an optimised graph is plausible, or the new loop is wrong and must be rejected.
+    """Test whether an optimised graph is plausible. If it is not, the new loop is wrong and must be
+    rejected.
 
     There are two tests. First, a loop edge whose residual is still large contradicts the other
-    loops or too much of the path. Second, the strain (the chi-square of tree, covisibility and gap
-    edges) has six degrees of freedom per closed loop if the drift follows the model; if it is
-    several times larger, no plausible drift explains the loop. A single loop across a WEAK edge
+    loops or too much of the path. Second, the strain (the total chi-square of tree, covisibility
+    and gap edges) has six degrees of freedom per closed loop if the drift follows the model; if it
+    is several times larger, no plausible drift explains the loop. A single loop across a WEAK edge
     always passes, because it causes no strain.
 
     Args:
@@ -305,7 +334,7 @@ def check_edge_errors(
     after: NDArray[np.float64],
     config: PoseGraphConfig,
 ) -> GraphCheck:
-    """``check_pose_graph``, given the ``(E,)`` chi-square of each edge before and after the
+    """``check_pose_graph`` for given ``(E,)`` chi-squares of the edges before and after the
     optimisation."""
     loop = graph.kind == LOOP
     loop_error = np.where(loop, after, np.nan)
@@ -326,8 +355,8 @@ def check_edge_errors(
 
 @kernel
 def edge_errors(T_cw, edges, T_i_j, sigmas):
-    """``(E,)`` chi-square of each edge: the squared norm of the logarithm of its residual motion,
-    divided by the standard deviations."""
+    """``(E,)`` chi-square of each edge: the squared norm of the logarithm of its residual motion
+    after division by the standard deviations."""
     chi2 = np.empty(len(edges))
     for e in range(len(edges)):
         T = compose(T_cw[edges[e, 0]], inverse(T_cw[edges[e, 1]]))

@@ -2,9 +2,10 @@
 VII-C; Strasdat et al., "Scale drift-aware large scale monocular SLAM", RSS 2010).
 
 Each keyframe has a similarity ``S_wc``, a ``(4, 4)`` matrix with the scale in its upper left 3x3
-block, so that ``@`` composes similarities. It maps points in the camera frame, in the unit that the
-map has there before the correction, to the world. Initially all scales are 1; only loop edges
-measure other scales. GTSAM optimises the graph with its built-in Similarity3 factors.
+block, so that ``@`` composes similarities. It maps points from the camera frame, in the unit that
+the map has around the keyframe before the correction, to the world. Initially all scales are 1;
+only loop edges measure other scales. GTSAM optimises the graph with its built-in Similarity3
+factors.
 """
 
 from __future__ import annotations
@@ -17,13 +18,12 @@ from numpy.typing import NDArray
 from vslam.backend.loop_correction import carry_landmarks_by
 from vslam.backend.pose_graph import (
     GAP,
-    HOLD,
     LOOP,
     WEAK,
     GraphCheck,
     PoseGraph,
     check_edge_errors,
-    minimised,
+    optimised_values,
 )
 from vslam.config import PoseGraphConfig
 from vslam.geometry import Matrix, inverses, se3_log
@@ -52,32 +52,22 @@ def rigid(S: Matrix) -> Matrix:
 def optimise_similarities(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfig) -> Matrix:
     """``(N, 4, 4)`` similarities that best agree with the edges, starting from ``S_wc``.
 
-    Losses and method are those of ``pose_graph.optimise``; fixed keyframes also keep their scale.
+    Losses and method are those of ``pose_graph.optimise``. Fixed keyframes keep their scale, too.
     """
     import gtsam
-
-    noise = gtsam.noiseModel
 
     def as_gtsam(S: Matrix) -> gtsam.Similarity3:
         s = float(scale_of(S))  # GTSAM: s (R p + t)
         return gtsam.Similarity3(S[:3, :3] / s, S[:3, 3] / s, s)
 
-    factors, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    hold = noise.Isotropic.Sigma(7, HOLD)
-    for i, S in enumerate(S_wc):
-        pose = as_gtsam(S)
-        start.insert(i, pose)
-        if graph.fixed[i]:
-            factors.add(gtsam.PriorFactorSimilarity3(i, pose, hold))
-    cauchy = noise.mEstimator.Cauchy.Create(config.robust_scale)
-    measured = similarity(graph.T_i_j, graph.scale)
-    for (i, j), S_i_j, kind, sigma in zip(
-        graph.edges.tolist(), measured, graph.kind.tolist(), sigmas(graph, config), strict=True
-    ):
-        plain = noise.Diagonal.Sigmas(sigma)
-        model = noise.Robust.Create(cauchy, plain) if kind == LOOP else plain
-        factors.add(gtsam.BetweenFactorSimilarity3(i, j, as_gtsam(S_i_j), model))
-    result = minimised(factors, start, config)
+    result = optimised_values(
+        graph,
+        [as_gtsam(S) for S in S_wc],
+        [as_gtsam(S) for S in similarity(graph.T_i_j, graph.scale)],
+        sigmas(graph, config),
+        (gtsam.PriorFactorSimilarity3, gtsam.BetweenFactorSimilarity3),
+        config,
+    )
     found = [result.atSimilarity3(i) for i in range(len(S_wc))]
     R = np.array([pose.rotation().matrix() for pose in found])
     t = np.array([pose.translation() for pose in found])
@@ -92,7 +82,7 @@ def optimise_similarities(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfi
 def sigmas(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
     """``(E, 7)`` standard deviations of rotation, translation and the logarithm of the scale.
 
-    The scale drifts like the pose, as a random walk along the path.
+    The drift of the scale, like that of the pose, is modelled as a random walk along the path.
     """
     scale = graph.sigmas[:, 1] * (config.scale_drift / config.rotation_drift)
     scale[graph.kind == LOOP] = config.loop_scale
@@ -126,7 +116,7 @@ def move_keyframes_similarly(
     VII-C).
 
     The poses of culled keyframes, which are stored relative to living ones, are scaled as well.
-    ``map_.keyframes.unit_scale`` accumulates the scales.
+    ``map_.keyframes.unit_scale`` is multiplied by the scales.
 
     Args:
         keyframes: ``(N,)`` ids of living keyframes.
@@ -153,7 +143,8 @@ def move_keyframes_similarly(
 
 
 def loop_in_new_units(edge: LoopEdge, growth: NDArray[np.float64]) -> LoopEdge:
-    """A loop edge after a correction that multiplied lengths around each keyframe by ``growth``."""
+    """Convert a loop edge after a correction that multiplied lengths around each keyframe by
+    ``growth``."""
     assert edge.T_query_match is not None
     T = edge.T_query_match.copy()
     T[:3, 3] *= growth[edge.match]

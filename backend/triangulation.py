@@ -1,5 +1,5 @@
-"""Creates landmarks from the stereo features of a keyframe, and by triangulation of features that
-two keyframes see."""
+"""Creates landmarks from the stereo features of a keyframe, and by triangulating features of two
+keyframes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera
 from vslam.config import Config
-from vslam.geometry import inverse
+from vslam.geometry import inverse, transform
 from vslam.kernels import hamming, inner_kernel, kernel
 from vslam.map import NONE, Map
 from vslam.map_kernels import link_many
@@ -23,11 +23,11 @@ def map_stereo_points(
 ) -> NDArray[np.int32]:
     """Create landmarks from the close stereo features of a keyframe that observe no landmark yet.
 
-    If fewer than ``mapping.min_stereo_points`` features are close, the nearest ones up to that
-    number are considered (ORB-SLAM2, section III-E).
+    If fewer than ``mapping.min_stereo_points`` features are close, the nearest features up to this
+    number are used (ORB-SLAM2, section III-E).
 
     Args:
-        far: whether to map far features as well.
+        far: whether to use far features as well.
 
     Returns:
         ``(N,)`` ids of the new landmarks.
@@ -41,8 +41,7 @@ def map_stereo_points(
     among_nearest = np.arange(len(nearest)) < config.mapping.min_stereo_points
     nearest = nearest[far | close | among_nearest]
     new = nearest[a.landmark[rows][nearest] == NONE]
-    T_wc = inverse(a.T_cw[keyframe])
-    xyz = camera.backproject(xy[new], depth[new]) @ T_wc[:3, :3].T + T_wc[:3, 3]
+    xyz = transform(inverse(a.T_cw[keyframe]), camera.backproject(xy[new], depth[new]))
     ids = map_.add_landmarks(xyz, a.descriptor[rows][new], keyframe)
     link_many(map_.arrays, rows.start + new, ids)
     return ids
@@ -51,8 +50,8 @@ def map_stereo_points(
 def triangulate_with_neighbours(
     map_: Map, keyframe: int, camera: Camera, config: Config
 ) -> NDArray[np.int32]:
-    """Match features of a keyframe without a landmark with those of its covisible keyframes along
-    epipolar lines, and triangulate them (ORB-SLAM, VI-C). Returns the ``(N,)`` ids of the new
+    """Match the features of a keyframe that have no landmark with those of its covisible keyframes
+    along epipolar lines, and triangulate them (ORB-SLAM, VI-C). Returns the ``(N,)`` ids of the new
     landmarks."""
     neighbours, _ = map_.covisible(keyframe)
     created = [np.empty(0, np.int32)]
@@ -77,21 +76,21 @@ def triangulate_with_neighbours(
         ids = map_.add_landmarks(xyz, a.descriptor[rows_1], keyframe)
         link_many(map_.arrays, rows_1, ids)
         link_many(map_.arrays, rows_2, ids)
-        # Matched by descriptor alone, so no more certain than a keypoint.
+        # The match was not aligned, so its position is no better than a keypoint's.
         map_.arrays.certainty[rows_2] = 1
         created.append(ids)
     return np.concatenate(created)
 
 
 def median_depth(map_: Map, keyframe: int) -> float:
-    """Median depth of the landmarks that a keyframe observes, as a measure of the scene's scale."""
+    """Median depth of the landmarks that a keyframe observes, a measure of the scene's scale."""
     points, T_cw = map_.arrays.xyz[map_.landmarks_of(keyframe)], map_.arrays.T_cw[keyframe]
     return float(np.median(points @ T_cw[2, :3] + T_cw[2, 3]))
 
 
 @inner_kernel
 def unmapped_rows(a, keyframe):
-    """Rows of a keyframe that observe no landmark, ``(N,)`` int64."""
+    """``(N,)`` int64 rows of a keyframe that observe no landmark."""
     first, last = a.first_row[keyframe], a.first_row[keyframe + 1]
     return first + np.flatnonzero(a.landmark[first:last] < 0)
 
@@ -105,13 +104,13 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
         k1, k2: ids of the keyframes.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         scales: ``(levels,)`` pyramid scale factors.
-        min_baseline: least distance between the cameras.
+        min_baseline: least distance between the cameras, in units of the map.
         max_distance: largest Hamming distance of a match, bits.
         max_cosine: greatest cosine of the parallax of a match without stereo.
 
     Returns:
-        ``(N, 3)`` positions in the world, and ``(N,)`` int64 rows of the observations of each
-        keyframe.
+        ``(N, 3)`` positions in the world, ``(N,)`` int64 rows of the observations of keyframe
+        ``k1``, and those of ``k2``.
     """
     fx, fy, cx, cy, bf, _ = intrinsics
     T1, T2 = a.T_cw[k1], a.T_cw[k2]
@@ -127,7 +126,7 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
     count = 0
     if dot3(gap, gap) < min_baseline**2 or dot3(gap, gap) == 0.0 or n2 == 0:
         return xyz[:0], out_1[:0], out_2[:0]
-    # Centre of camera 1 in the frame of camera 2; it projects to the epipole.
+    # t is the centre of camera 1 in the frame of camera 2; it projects to the epipole.
     t, d, point = np.empty(3), np.empty(3), np.empty(3)
     ray_1, ray_2, from_1, from_2 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
@@ -195,8 +194,8 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
                 T2, point, a.xy[row_2], a.u_right[row_2], scales[a.octave[row_2]], intrinsics
             )
         ):
-            # The ratio of the distances must agree with that of the scales, up to a factor of 1.5
-            # beyond one level.
+            # The ratio of the distances must agree with the ratio of the scales, up to one level
+            # times a factor of 1.5.
             for m in range(3):
                 from_1[m], from_2[m] = point[m] - centre_1[m], point[m] - centre_2[m]
             far = np.sqrt(dot3(from_1, from_1) / dot3(from_2, from_2))
@@ -233,8 +232,8 @@ def perpendicular(t):
 
 @kernel
 def direction(u, v):
-    """Direction of the line through the origin and (u, v): a number in [0, 2) that grows with the
-    angle of the line over half a turn, without trigonometric functions."""
+    """Direction of the line through the origin and (u, v), as a number in [0, 2) that grows with
+    the angle of the line from 0 to 180 degrees. Needs no trigonometric functions."""
     if v < 0.0 or (v == 0.0 and u < 0.0):
         u, v = -u, -v
     if u > 0.0:
@@ -246,18 +245,19 @@ def direction(u, v):
 def sorted_about_epipole(x, y, gate, intrinsics, across):
     """Index features by the epipolar planes that pass within their gate.
 
-    All epipolar planes contain the baseline. Seen along it, a plane is a line through the origin,
-    and the square of gate size around a feature is a parallelogram. The parallelogram spans an
-    interval of directions, or all of them if the epipole is inside.
+    All epipolar planes contain the baseline. Seen along the baseline, a plane is a line through the
+    origin, and the square around a feature whose half side is the gate is a parallelogram. The
+    parallelogram covers an interval of directions, or all directions if the epipole is inside.
 
     Args:
         x, y: ``(n,)`` float32, pixels.
         gate: ``(n,)`` float32, greatest squared distance from the epipolar line, pixels squared.
+        intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         across: ``(2, 3)``, axes of the view along the baseline, see ``perpendicular``.
 
     Returns:
-        ``start`` ``(SECTIONS + 1,)`` and ``items`` int32: the features that a plane whose direction
-        is in bin s may pass are ``items[start[s]:start[s + 1]]``, ascending.
+        ``start`` ``(SECTIONS + 1,)`` and ``items`` int32: the features near a plane whose direction
+        is in bin s are among ``items[start[s]:start[s + 1]]``, ascending.
     """
     n = len(x)
     low, high = np.empty(n, np.int64), np.empty(n, np.int64)
@@ -272,7 +272,7 @@ def sorted_about_epipole(x, y, gate, intrinsics, across):
             y_k = y[j] + (reach if corner // 2 else -reach)
             u_k, v_k = seen_along(x_k, y_k, intrinsics, across)
             if u * u_k + v * v_k <= 0.0:
-                least, most = -1.0, 1.0  # at least a right angle: the epipole may be inside
+                least, most = -1.0, 1.0  # at least 90 degrees, so the epipole may be inside
                 break
             apart = direction(u_k, v_k) - middle
             apart += 2.0 * ((apart < -1.0) - (apart > 1.0))
@@ -322,19 +322,19 @@ def world_ray(T_cw, xy, intrinsics, ray):
 def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_cosine, point):
     """Triangulate a landmark and write its position in the world into ``point`` ``(3,)``.
 
-    Usually the two rays are intersected. Where the stereo pair of one keyframe sees the landmark
-    with more parallax than the rays have, the stereo point of that keyframe is taken instead.
+    Usually the two rays are intersected. If the stereo pair of one keyframe sees the landmark with
+    more parallax than the two rays have, the stereo point of that keyframe is used instead.
 
     Args:
         depth_1, depth_2: stereo depths of the features, NaN without one.
         ray_1, ray_2: ``(3,)`` rays, see ``world_ray``.
         centre_1, centre_2: ``(3,)`` positions of the cameras in the world.
-        baseline: of the stereo pair.
+        baseline: baseline of the stereo pair.
         max_cosine: greatest cosine of the parallax of two rays without stereo.
 
     Returns:
-        False if there is neither enough parallax nor a stereo depth, or the rays do not meet in
-        front of both cameras.
+        Whether the landmark was triangulated: False if there is neither enough parallax nor a
+        stereo depth, or the rays do not meet in front of both cameras.
     """
     dot = dot3(ray_1, ray_2)
     square_1, square_2 = dot3(ray_1, ray_1), dot3(ray_2, ray_2)

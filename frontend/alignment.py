@@ -1,12 +1,12 @@
 """Sub-pixel alignment of matches: a landmark's patch is registered to the image at its keypoint.
 
-FAST finds a corner at whole pixels of one pyramid level, typically half a pixel off. When the
-camera approaches the scene, this error is biased towards the focus of expansion
+FAST places a corner at a whole pixel of a pyramid level, so it is typically off by half a pixel.
+When the camera approaches the scene, this error is biased towards the focus of expansion
 (docs/research/motorway.md). So the patch of a keyframe that saw the landmark is warped into the
 view of the frame and shifted until it agrees with the image. This is the "feature alignment" of SVO
 (Forster et al., ICRA 2014, III-B), solved by inverse compositional Lucas-Kanade (Baker and
-Matthews, IJCV 2004, section 3.2). Brightness and contrast of a patch may change: both are estimated
-with the shift.
+Matthews, IJCV 2004, section 3.2). Changes of brightness and contrast are estimated together with
+the shift.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from vslam.kernels import inner_kernel, kernel
 HALF = 4  # half width of the window that is compared, pixels
 SIDE = 2 * HALF + 1
 WIDE = SIDE + 2  # one more pixel on each side, for the gradients
-MIN_VARIANCE = 1.0  # grey levels squared; a patch with less has no texture
+MIN_VARIANCE = 1.0  # grey levels squared; a patch with a smaller variance has no texture
 MIN_CORNERNESS = 0.05  # determinant of the 2x2 normal matrix over the product of its diagonal
-STILL = 0.03  # pixels; a smaller step ends the iteration
+STILL = 0.03  # pixels; the iteration ends with a smaller step
 
 
 def align_frame(
@@ -85,18 +85,22 @@ def find_patches(
     intrinsics: NDArray[np.float64],
     config: AlignmentConfig,
 ) -> NDArray[np.float32]:
-    """Find the patches of N landmarks near where they are expected in an image.
+    """Find the patches of N landmarks near their expected positions in an image.
 
     Args:
-        pyramid: of the image.
-        xy: ``(N, 2)`` expected positions, full-resolution pixels, and ``(N,)`` ``octave``.
+        pyramid: the pyramid of the image.
+        xy: ``(N, 2)`` expected positions, full-resolution pixels.
+        octave: ``(N,)`` pyramid levels in which the patches are searched for.
         T_cw: ``(4, 4)`` pose of the camera of the image.
-        xyz: ``(N, 3)`` the landmarks, in the world.
-        known: their patches, in the rows ``at`` ``(N,)``.
-        scales: full-resolution pixels per pixel of each octave.
+        xyz: ``(N, 3)`` positions of the landmarks in the world.
+        known: patches of landmarks.
+        at: ``(N,)`` index into ``known`` of each landmark.
+        scales: ``(levels,)`` full-resolution pixels per pixel of each octave.
+        intrinsics: ``(6,)``, see ``Camera.intrinsics``.
 
     Returns:
-        ``(N, 2)`` shift from the nearest pixel of the octave, in its pixels; NaN if not found.
+        ``(N, 2)`` float32 shift from the pixel of the octave nearest to the expected position, in
+        pixels of the octave; NaN if the patch was not found.
     """
     view, size = known.view[at], known.size[at]
     warp = warps(T_cw, xyz, known.T_cw, view, size, scales[octave], intrinsics)
@@ -144,7 +148,8 @@ def warps(T_cw, xyz, T_seen, view, size_seen, size, intrinsics):
         if not (depth > 0.0 and p[2] > 0.0):
             continue
         for k in range(2):
-            # One pixel along u or v in the keyframe, moved onto the plane and seen from the frame.
+            # A step of one pixel along u or v in the keyframe, projected via the plane into the
+            # frame.
             for r in range(3):
                 column[r] = 0.0
                 for m in range(3):
@@ -161,12 +166,13 @@ def warps(T_cw, xyz, T_seen, view, size_seen, size, intrinsics):
 
 @kernel
 def align(seen, reference, centre, which, warp, iterations, max_shift, min_correlation):
-    """Find in each of N patches the point that its reference patch is centred on.
+    """Find the landmark of a reference patch in each of N patches.
 
     Args:
         seen: ``(N, PATCH_PIXELS)`` uint8 patches of the frame.
         reference: ``(P, PATCH_PIXELS)`` uint8 patches of keyframes.
-        centre: ``(P, 2)`` float32, the point in each reference patch, pixels from its middle.
+        centre: ``(P, 2)`` float32, position of the landmark in each reference patch, pixels from
+            its middle.
         which: ``(N,)`` index of the reference of each seen patch.
         warp: ``(N, 2, 2)`` float32, see ``warps``.
         iterations: maximum number of Gauss-Newton steps.
@@ -210,8 +216,8 @@ def align(seen, reference, centre, which, warp, iterations, max_shift, min_corre
 
 @inner_kernel
 def draw(patch, centre, warp, out):
-    """Warp a patch by bilinear interpolation around ``centre``; returns False, with ``out``
-    untouched, if the warped window would leave the patch.
+    """Warp a patch around ``centre`` with bilinear interpolation. Returns False and leaves ``out``
+    unchanged if the warped window is not inside the patch.
 
     Args:
         patch: ``(PATCH_PIXELS,)`` uint8.
@@ -225,8 +231,8 @@ def draw(patch, centre, warp, out):
     reach_y = far * (abs(yx) + abs(yy)) + abs(centre[1])
     if not max(reach_x, reach_y) <= np.float32(PATCH_RADIUS - 0.01):
         return False
-    # Fixed-point coordinates (1 / 65536 pixel): a bit shift separates the whole and the fractional
-    # part much faster than floating-point arithmetic does.
+    # Coordinates are in fixed point (1 / 65536 pixel): a bit shift separates the whole and the
+    # fractional part much faster than floating-point arithmetic.
     one, part = np.float32(65536.0), np.float32(1.0 / 65536.0)
     x_first = np.int32((np.float32(PATCH_RADIUS) + centre[0] - far * (xx + xy)) * one)
     y_first = np.int32((np.float32(PATCH_RADIUS) + centre[1] - far * (yx + yy)) * one)
@@ -248,17 +254,18 @@ def draw(patch, centre, warp, out):
 
 @inner_kernel
 def prepare(wide, template, slope_x, slope_y):
-    """Subtract the mean from the template, and from its gradients their projections on a change of
-    brightness or contrast, so that neither affects the shift.
+    """Compute the template and its gradients from a warped window. The mean of the template is
+    subtracted, and the gradients are made orthogonal to changes of brightness and contrast, so that
+    such changes do not affect the shift.
 
     Returns:
         Sum of squares of the template, and the entries xx, xy, yy of the 2x2 normal matrix.
     """
-    half, nil, count = np.float32(0.5), np.float32(0.0), np.float32(SIDE * SIDE)
-    # Sums of products of 1, the template t and its gradients x, y. Grey values are taken relative
-    # to the middle pixel, so that float32 sums lose few digits.
+    half, zero, count = np.float32(0.5), np.float32(0.0), np.float32(SIDE * SIDE)
+    # Sums of products of 1, the template t and its gradients x, y. Grey values are relative to the
+    # middle pixel, so that float32 sums lose few digits.
     middle = wide[WIDE * WIDE // 2]
-    t, x, y, tt, tx, ty, xx, xy, yy = nil, nil, nil, nil, nil, nil, nil, nil, nil
+    t, x, y, tt, tx, ty, xx, xy, yy = zero, zero, zero, zero, zero, zero, zero, zero, zero
     for r in range(SIDE):
         for c in range(SIDE):
             k = np.uintp((r + 1) * WIDE + c + 1)
@@ -272,7 +279,7 @@ def prepare(wide, template, slope_x, slope_y):
     t, x, y = t / count, x / count, y / count
     energy = tt - count * t * t
     if energy < np.float32(MIN_VARIANCE) * count:
-        return energy, nil, nil, nil
+        return energy, zero, zero, zero
     on_x, on_y = (tx - count * t * x) / energy, (ty - count * t * y) / energy
     for r in range(SIDE):
         for c in range(np.uintp(SIDE)):
@@ -288,26 +295,26 @@ def prepare(wide, template, slope_x, slope_y):
 
 @inner_kernel
 def compare(image, x, y, template, slope_x, slope_y):
-    """Compare the window of the image that is shifted by ``x, y`` from its middle with the
-    template.
+    """Compare the template with the window of the image that is shifted by ``x, y`` from the middle
+    of the image.
 
     Returns:
-        Sum of squares of the window after its mean is subtracted, and its inner products with the
+        Sum of squares of the window minus its mean, and the inner products of the window with the
         template and with both gradients.
     """
-    one, nil = np.float32(1.0), np.float32(0.0)
+    one, zero = np.float32(1.0), np.float32(0.0)
     left, top = int(np.floor(x)), int(np.floor(y))
     part_x, part_y = x - np.float32(left), y - np.float32(top)
-    a, b = (one - part_y) * (one - part_x), (one - part_y) * part_x
-    c_, d = part_y * (one - part_x), part_y * part_x
-    total, square, product, b_x, b_y = nil, nil, nil, nil, nil
+    w00, w01 = (one - part_y) * (one - part_x), (one - part_y) * part_x
+    w10, w11 = part_y * (one - part_x), part_y * part_x
+    total, square, product, b_x, b_y = zero, zero, zero, zero, zero
     for r in range(SIDE):
         above = image[PATCH_RADIUS - HALF + r + top]
         below = image[PATCH_RADIUS - HALF + r + top + 1]
         for c in range(SIDE):
             k = PATCH_RADIUS - HALF + c + left
-            value = a * above[k] + b * above[k + 1] + c_ * below[k] + d * below[k + 1]
-            # Template and gradients have zero mean, so the mean of the window cancels.
+            value = w00 * above[k] + w01 * above[k + 1] + w10 * below[k] + w11 * below[k + 1]
+            # The template and its gradients have zero mean, so the mean of the window cancels.
             total += value
             square += value * value
             product += value * template[r, c]

@@ -1,8 +1,8 @@
 """FAST corners of one image: scores, non-maximum suppression, even distribution.
 
 The FAST score of a pixel is the largest threshold at which it is still a corner. It is computed for
-every pixel without a branch: compiled to vector minima and maxima of bytes, this takes 0.3 ms for a
-KITTI image, less than the usual test that tries to stop early.
+every pixel without branches: compiled to vector minima and maxima of bytes, this takes 0.3 ms for a
+KITTI image, less than the usual test that rejects most pixels early.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from vslam.kernels import inline, inner_kernel, kernel, trailing_zeros
 def fast_scores(pixels, height, width):
     """FAST-9 score of each pixel.
 
-    A pixel of value c is a corner at threshold t if 9 contiguous pixels of its circle are all
-    brighter than c + t, or all darker than c - t. The score is the largest such t plus 1, and 0 if
-    there is none. For a bright arc that is its smallest pixel minus c; for the pixel it is the
-    maximum over the 16 arcs of both polarities. Minima over runs of 2, 4 and 8 pixels are shared
-    between arcs, which leaves 31 minima and maxima per polarity. Unsigned indices let the compiler
-    drop the wrap-around test and use bytes as lanes.
+    A pixel with value c is a corner at threshold t if 9 contiguous pixels of its circle are all
+    brighter than c + t, or all darker than c - t. The score is the largest such t plus 1, or 0 if
+    there is none. For an arc of 9 bright pixels, this is the smallest value in the arc minus c; the
+    score is the maximum over all 16 arcs and both polarities. Minima over runs of 2, 4 and 8 pixels
+    are shared between arcs, which leaves 31 minima and maxima per polarity. Indices are unsigned,
+    so that the compiler needs no test for negative ones and vectorises the loop over bytes.
 
     Args:
         pixels: ``(height * width,)`` uint8.
@@ -51,8 +51,8 @@ def fast_scores(pixels, height, width):
             a9, a11, a13, a15 = min(p9, p10), min(p11, p12), min(p13, p14), min(p15, p0)
             b1, b3, b5, b7 = min(a1, a3), min(a3, a5), min(a5, a7), min(a7, a9)
             b9, b11, b13, b15 = min(a9, a11), min(a11, a13), min(a13, a15), min(a15, a1)
-            # A run of 8 that starts at an odd pixel becomes an arc of 9 with the pixel before it
-            # or the one after it.
+            # A run of 8 pixels that starts at an odd pixel is part of two arcs of 9: with the pixel
+            # before it, and with the pixel after it.
             bright = max(
                 max(
                     max(min(min(b1, b5), max(p0, p9)), min(min(b3, b7), max(p2, p11))),
@@ -83,14 +83,14 @@ def fast_scores(pixels, height, width):
 
 @kernel
 def local_maxima(scores, margin, threshold, threshold_min, cell):
-    """Corners that no neighbour outscores. A corner with a score of at most ``threshold`` is kept
-    only in a cell without a stronger one.
+    """Corners that no neighbour outscores (non-maximum suppression). Weak corners are kept only in
+    cells without a strong one.
 
     Args:
         scores: ``(height, width)`` uint8, see ``fast_scores``.
-        margin: pixels along the border where no corner is wanted.
-        threshold, threshold_min: a score above ``threshold`` is strong, one of ``threshold_min`` or
-            less is ignored.
+        margin: width of the border without corners, pixels.
+        threshold: corners with a higher score are strong, the others are weak.
+        threshold_min: pixels with this score or a lower one are no corners.
         cell: side of the cells, pixels.
 
     Returns:
@@ -101,7 +101,7 @@ def local_maxima(scores, margin, threshold, threshold_min, cell):
     xs, ys = np.empty(capacity, np.int32), np.empty(capacity, np.int32)
     score = np.empty(capacity, np.uint8)
     column_of = np.arange(width) // cell
-    strong = np.zeros(width // cell + 1, np.bool_)  # cells of the current row that have one
+    strong = np.zeros(width // cell + 1, np.bool_)  # cells of the current row with a strong corner
     n = first = 0  # number of corners, and index of the first one in the current row of cells
     weakest = np.uint8(threshold_min)
     length = np.uintp(width - 2 * margin)
@@ -114,7 +114,7 @@ def local_maxima(scores, margin, threshold, threshold_min, cell):
         below = scores[y + 1, margin - 1 : width - margin + 1]
         for x in range(length):
             s = here[x + 1]
-            # Of neighbours with equal scores, the first in row order wins.
+            # Of neighbours with equal scores, the first in row order is kept.
             before = max(max(above[x], above[x + 1]), max(above[x + 2], here[x]))
             after = max(max(below[x], below[x + 1]), max(below[x + 2], here[x + 2]))
             is_corner[x] = (s > max(before, weakest)) & (s >= after)
@@ -140,8 +140,8 @@ def local_maxima(scores, margin, threshold, threshold_min, cell):
 
 @kernel
 def spread(x, y, score, width, height, quota):
-    """Choose up to ``quota`` corners that are spread evenly: the best corner of each cell of the
-    coarsest grid in which at least ``quota`` cells have one.
+    """Choose up to ``quota`` evenly spread corners: the best corner of each cell, for the largest
+    cells of which at least ``quota`` contain a corner.
 
     The cell size is found by bisection, as in Bailo et al. ("Efficient adaptive non-maximal
     suppression", PRL 2018).
@@ -159,8 +159,8 @@ def spread(x, y, score, width, height, quota):
         for i in range(n):
             kept[i] = i
         return kept
-    # Corners are at least 2 px apart, so cells of 1 px hold one each; cells of size ``high`` are
-    # fewer than the quota.
+    # Each corner has a cell of size 1 to itself. There are fewer cells of size ``high`` than the
+    # quota.
     low, high = 1, int(np.sqrt(width * height / quota)) + 2
     is_occupied = np.empty(width * height, np.uint8)
     while high - low > 1:
@@ -200,8 +200,8 @@ def spread(x, y, score, width, height, quota):
 
 @inline
 def cell_of(x, y, inverse, columns):
-    """Index of the cell of a pixel. ``inverse`` is one over the cell size, because multiplying is
-    many times faster than dividing."""
+    """Index of the cell of a pixel. ``inverse`` is the inverse of the cell size, because
+    multiplication is many times faster than division."""
     half = np.float32(0.5)
     return int((y + half) * inverse) * columns + int((x + half) * inverse)
 
@@ -226,7 +226,7 @@ def occupies(x, y, width, height, size, quota, is_occupied):
 @inner_kernel
 def occupy(x, y, score, width, size, best_of_cell):
     """Write the index of the best corner of each cell of ``size`` x ``size`` pixels into
-    ``best_of_cell``: the first one of equal scores, -1 for an empty cell."""
+    ``best_of_cell``: the first of those with equal scores, -1 for an empty cell."""
     columns = (width + size - 1) // size
     best_of_cell[:] = -1
     inverse = np.float32(1.0 / size)

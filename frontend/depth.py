@@ -17,15 +17,15 @@ def columns_of_depth(
     camera: Camera,
     config: DepthConfig,
 ) -> NDArray[np.float32]:
-    """Column that each keypoint would have in the right camera of a virtual stereo pair.
+    """Column that each keypoint would have in the right image of a virtual stereo pair.
 
-    A keypoint at column u whose nearest pixel has depth d gets ``u - fx b / d``. With this model, a
-    constant error in pixels means an error in depth that grows with the square of the depth, as it
-    does for structured light.
+    A keypoint at column u whose nearest pixel has depth d gets ``u - fx b / d``. In this model, a
+    constant error in pixels corresponds to an error in depth that grows with the square of the
+    depth, as it does for structured light.
 
-    A corner at a depth discontinuity has two depths. Where the contour of a near object crosses the
-    background, the corner is not a point of the scene: it slides along the contour as the camera
-    moves. Block matching of a stereo pair rejects most of these corners; here they get no column.
+    The depth of a corner at a depth discontinuity is ambiguous. Where the contour of a near object
+    crosses the background, the corner is not a point of the scene: it slides along the contour as
+    the camera moves. Stereo matching rejects most of these corners; here they get no column.
 
     Args:
         xy: ``(N, 2)`` keypoints of the left image, pixels.
@@ -51,7 +51,7 @@ def depth_around(xy, radius, depth, max_ratio):
 
     Args:
         radius: ``(N,)`` int64, half width of the neighbourhood that is checked, pixels.
-        max_ratio: largest ratio of the farthest to the nearest known depth in it.
+        max_ratio: largest accepted ratio of the farthest to the nearest known depth in it.
 
     Returns:
         ``(N,)`` float32 metres; 0 where the depth is unknown or the ratio is exceeded.

@@ -25,11 +25,11 @@ from vslam.frontend.weak_images import extract_in_any_light
 
 
 class Corners(NamedTuple):
-    """What was found in the images of one moment, before stereo matching.
+    """The features of a frame before stereo matching.
 
     Attributes:
         found: the features of the image of ``side``.
-        right: those of the right image, to be matched with; None if there is nothing to match.
+        right: the features of the right image, for stereo matching; None if there is none.
         depth: ``(H, W)`` float32 metres, of an RGB-D camera; else None.
         side: see ``Extracted``.
         sides: the comparison of the left and the right image; None without a right image.
@@ -43,18 +43,18 @@ class Corners(NamedTuple):
 
 
 class FrameImages:
-    """The images of one moment. The second image is read, and features are extracted, when they are
-    first asked for: a frame that is tracked by patches needs neither.
+    """The images of a frame. The second image is read, and features are extracted, only when they
+    are first needed: a frame that is tracked by patches needs neither.
 
     Attributes:
         left: ``(H, W)`` uint8.
-        mask: of the left image; None if all of it is used.
-        pyramid: of the left image; None if frames are not tracked by patches.
+        mask: the mask of the left image; None if all pixels are used.
+        pyramid: the pyramid of the left image; None if frames are not tracked by patches.
         coarse: ``coarse_levels`` of that pyramid, or None.
-        sides: the comparison of the left and the right image; None without a right image, or if it
-            has not been read.
-        problem: why the second image cannot be read, so that the left one is used alone; None if it
-            can, or has not been asked for.
+        sides: the comparison of the left and the right image; None if there is no right image, or
+            it has not been read.
+        problem: why the second image could not be read, so that only the left one is used; None if
+            there was no such problem.
     """
 
     def __init__(
@@ -68,10 +68,10 @@ class FrameImages:
         """
         Args:
             left: ``(H, W)`` uint8.
-            read_second: gives the second image, or raises UnreadableImageError.
-            image_map: applies a function to both images, in turn or in parallel; the result does
-                not depend on it.
-            mask: of the left image; None uses all of it.
+            read_second: returns the second image, or raises UnreadableImageError.
+            image_map: applies a function to both images, one after the other or in parallel; the
+                result is the same.
+            mask: the mask of the left image; None uses all pixels.
         """
         self.left = left
         self.mask = mask
@@ -90,11 +90,11 @@ class FrameImages:
             self.coarse = coarse_levels(self.pyramid)
 
     def find_corners(self) -> Corners:
-        """Read the second image, and do all of the extraction that does not depend on tracking.
-        Another thread may call this ahead of the one that needs the features."""
+        """Read the second image, and extract the features that do not depend on tracking. Another
+        thread may call this before the features are needed."""
         with self._lock:
             if self._corners is None:
-                self._corners = self._found()
+                self._corners = self._find_corners()
             return self._corners
 
     @cached_property
@@ -103,19 +103,19 @@ class FrameImages:
         return matched(self.find_corners(), self._context)
 
     def extracted_with(self, keypoints: Keypoints) -> Extracted:
-        """The features, and others at given positions of the left image."""
+        """The features, and additional ones at given positions and levels of the left image."""
         return matched(self.find_corners(), self._context, keypoints)
 
     @cached_property
     def image(self) -> Image:
-        """``(H, W)`` uint8 that the features are extracted from, by which places are recognised. It
-        shows nothing where it is masked."""
-        seen = self.left
+        """The ``(H, W)`` uint8 image that the features are extracted from, for place recognition.
+        Masked pixels are filled (``Mask.filled``)."""
+        image = self.left
         if self.find_corners().side == Side.RIGHT:
-            seen = np.array(self._second, np.uint8)  # a copy: the right image is the caller's
-        return seen if self.mask is None else self.mask.filled(seen)
+            image = np.array(self._second, np.uint8)  # a copy, because the caller owns the image
+        return image if self.mask is None else self.mask.filled(image)
 
-    def _found(self) -> Corners:
+    def _find_corners(self) -> Corners:
         try:
             self._second = self._read_second()
         except UnreadableImageError as error:
@@ -132,16 +132,16 @@ def find_corners(
     image_map: ImageMap = map,
     mask: Mask | None = None,
 ) -> Corners:
-    """The first step of extraction: the features of each image alone. If the left image is black,
-    they are extracted from the right image and have no columns in the other one.
+    """The first step of extraction: the features of each image. If the left image is black, only
+    the right image is used, and its features have no stereo match.
 
     Args:
         left: ``(H, W)`` uint8.
         second: ``(H, W)``: the right image, uint8; for an RGB-D camera the depth in metres,
-            float32; None for a single image, whose features have no column in a right image.
-        mask: of the image whose features are tracked, which is the right one if the left one is
-            black. A right image is not masked for stereo matching: what is masked in the left image
-            has no match in it.
+            float32; None if there is only the left image.
+        mask: the mask of the image whose features are tracked: the left one, or the right one if
+            the left one is black. For stereo matching the right image needs no mask, because masked
+            pixels of the left image have no features to match.
     """
     camera, config = context.camera, context.config
     allowed = None if mask is None else mask.levels
@@ -166,14 +166,14 @@ def matched(
     """The second step of extraction: stereo matching.
 
     Args:
-        keypoints: positions at which the left image gets features, too (``with_keypoints``).
+        keypoints: positions in the left image for additional features (``with_keypoints``).
     """
     camera, config = context.camera, context.config
     found, right, depth, side, _ = corners
     if depth is not None:
         scale = context.scales[found.octave]
         u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
-        # No pyramid, so the frame is not aligned: depth cameras have a rolling shutter, which
+        # No pyramid, so that matches are not aligned: depth cameras have a rolling shutter, which
         # moves points by more than alignment corrects.
         return Extracted(_features(found, u_right))
     if keypoints is not None and side == Side.LEFT:

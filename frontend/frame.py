@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import NewType, Protocol
 
 import numpy as np
@@ -20,10 +20,10 @@ class FeatureSource(Protocol):
 
     Attributes:
         extracted: the features.
-        image: ``(H, W)`` uint8 that they are extracted from.
-        sides: the comparison of the left and the right image; None without a right image, or if it
-            has not been read.
-        problem: why the right image cannot be read; None if it can, or has not been asked for.
+        image: the ``(H, W)`` uint8 image that they are extracted from.
+        sides: the comparison of the left and the right image; None if there is no right image, or
+            it has not been read.
+        problem: why the right image could not be read; None if there was no such problem.
     """
 
     sides: Sides | None
@@ -33,7 +33,7 @@ class FeatureSource(Protocol):
     def extracted(self) -> Extracted: ...
 
     def extracted_with(self, keypoints: Keypoints) -> Extracted:
-        """The features, and others at given positions and levels of the left image."""
+        """The features, and additional ones at given positions and levels of the left image."""
         ...
 
     @property
@@ -50,8 +50,8 @@ class Frame:
     Attributes:
         index: number of the frame in the run, from 0.
         timestamp: seconds.
-        image: ``(H, W)`` uint8 image of the camera, for loop detectors that need it; None without
-            one, and until ``extract``.
+        image: ``(H, W)`` uint8 image of the camera, for loop detectors that need it; None before
+            ``extract``, or if the frame has no image.
         features, grid: the N features of that image, and a grid to search them by position.
         pyramid, row_offset, side: see ``Extracted``.
         T_camera_left: ``(4, 4)`` transform from the left camera to the camera: the identity, or
@@ -63,14 +63,14 @@ class Frame:
         disparity_offset: pixels that have been added to every disparity (``RigCalibration``).
         delay_removed: whether the columns in the right image have been corrected for its delay.
         shift: ``(N, 2)`` float32, pixels from each feature to its aligned position, NaN where the
-            match was not aligned; None if no match was.
+            match was not aligned; None if no match was aligned.
         twist: ``(6,)`` velocity of the camera when the frame was tracked, per second; None if
             unknown.
-        source: where ``extract`` takes the features from; None once they are there. Until then the
-            features are those landmarks that were found by their patches.
-        coarse: ``coarse_levels`` of the image, by which the next frame is aligned; None if it is
-            not.
-        mask: of the image; None if all of it is used.
+        source: the images that ``extract`` takes the features from; None after extraction. Before
+            it, ``features`` has one entry for each landmark that was found by its patch.
+        coarse: ``coarse_levels`` of the image, to which the next frame is aligned; None if frames
+            are not aligned.
+        mask: the mask of the image; None if all pixels are used.
     """
 
     index: int
@@ -121,46 +121,54 @@ class Frame:
 
     @property
     def T_camera_w(self) -> Matrix:
-        """``(4, 4)`` pose of the camera, by which landmarks are projected into its image."""
+        """``(4, 4)`` pose of the camera (world to camera), to project landmarks into its image."""
         T: Matrix = self.T_camera_left @ self.T_cw
         return T
 
     def extract(self, camera: Camera) -> None:
-        """Extract the features of the images, if that has not been done. They replace the landmarks
-        that were found by their patches, and track nothing yet; the pose stays. Where a landmark
-        was found, there is a feature, even if it is no corner for the detector."""
+        """Extract the features of the images, if that has not been done. The pose is kept, but the
+        new features track no landmarks yet. Where a landmark was found by its patch, a feature is
+        extracted even if the detector finds no corner there."""
         if self.source is None:
             return
         source, found = self.source, self.features
         extracted = (
             source.extracted_with((found.xy, found.octave)) if len(found) else source.extracted
         )
-        new = Frame.of(extracted, camera, image=source.image)
-        for name in _OF_FEATURES:
-            setattr(self, name, getattr(new, name))
-        self.source = None
+        new = Frame.of(extracted, camera, self.index, self.timestamp, source.image)
+        new.T_cw, new.twist, new.coarse, new.mask = self.T_cw, self.twist, self.coarse, self.mask
+        self.restore(new)
+
+    def match(
+        self, features: NDArray[np.integer], landmarks: NDArray[np.int32], xyz: Matrix
+    ) -> None:
+        """Let ``(M,)`` features track landmarks with the given ids and ``(M, 3)`` positions."""
+        self.landmark[features], self.xyz[features] = landmarks, xyz
+
+    def drop_matches(self, features: NDArray[np.integer] | slice = slice(None)) -> None:
+        """Remove the matches of some features; by default, of all."""
+        self.landmark[features], self.xyz[features] = -1, np.nan
 
     def snapshot(self) -> Frame:
-        """A copy of the frame that later changes of its pose and matches do not affect."""
+        """A copy that is independent of later changes of the frame's pose and matches."""
         return replace(self, landmark=self.landmark.copy(), xyz=self.xyz.copy())
 
     def restore(self, snapshot: Frame) -> None:
-        """Restore what the frame was when the snapshot was taken."""
-        for field in fields(self):
-            setattr(self, field.name, getattr(snapshot, field.name))
+        """Restore the state of the frame at the time of the snapshot."""
+        vars(self).update(vars(snapshot))
 
     def set_camera_pose(self, T_camera_w: Matrix) -> None:
-        """Set the pose of the frame from the ``(4, 4)`` pose of the camera."""
+        """Set ``T_cw`` from the ``(4, 4)`` pose of the camera (world to camera)."""
         self.T_cw = inverse(self.T_camera_left) @ T_camera_w
 
     @property
     def can_become_keyframe(self) -> bool:
-        """Whether the frame can become a keyframe: the map consists of left images only."""
+        """Whether the frame can become a keyframe: all keyframes are left images."""
         return self.side == Side.LEFT
 
     @property
     def aligned(self) -> NDArray[np.bool_]:
-        """``(N,)`` bool, features whose match was aligned."""
+        """``(N,)`` bool, whether the match of each feature was aligned."""
         if self.shift is None:
             return np.zeros(len(self.features), np.bool_)
         return (self.landmark >= 0) & np.isfinite(self.shift[:, 0])
@@ -180,21 +188,6 @@ class Frame:
         """Number of features with a stereo match (or a depth)."""
         return int(np.count_nonzero(np.isfinite(self.features.u_right)))
 
-
-_OF_FEATURES = (
-    "image",
-    "features",
-    "grid",
-    "pyramid",
-    "row_offset",
-    "side",
-    "T_camera_left",
-    "landmark",
-    "xyz",
-    "disparity_offset",
-    "delay_removed",
-    "shift",
-)
 
 PlacedFrame = NewType("PlacedFrame", Frame)
 """A frame whose pose has been recorded (``Mapper.append_pose``). Only such a frame can become a

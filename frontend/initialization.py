@@ -1,11 +1,11 @@
 """The first two views of a monocular map: their motion and their points (ORB-SLAM, section IV).
 
-A planar scene or a pure rotation leaves the fundamental matrix undetermined; a homography cannot
-explain any other scene. Both models are fitted to the same random samples, and their scores select
-one. A reconstruction is accepted only if one motion explains clearly more points than any other,
-because a map with a wrong start cannot be repaired later.
+A planar scene or a pure rotation does not determine the fundamental matrix; in all other cases a
+homography does not explain the matches. So both models are fitted to the same random samples, and
+one is selected by their scores. A reconstruction is accepted only if one motion explains clearly
+more points than any other, because a map with a wrong start cannot be repaired later.
 
-All samples are fitted and scored in one batch: NumPy is as fast here as a Numba kernel, and needs
+All samples are fitted and scored in one batch: here NumPy is as fast as a Numba kernel, and needs
 no compilation.
 """
 
@@ -26,10 +26,9 @@ from vslam.geometry import Matrix
 from vslam.reprojection import CHI2_MONO, stack_uvr
 
 CHI2_LINE = 3.841  # 95 % quantile with 1 degree of freedom: distance of a point from a line
-# Matches per sample, as the eight-point algorithm needs. A homography needs only four; for it the
-# sample is overdetermined.
+# Matches per sample. The eight-point algorithm needs all of them; a homography needs only four.
 SAMPLE = 8
-# Points with less parallax than this (0.36 degrees) are counted, but not mapped (ORB-SLAM).
+# Points with less parallax (0.36 degrees) are counted, but not mapped (ORB-SLAM).
 MAX_COSINE = 0.99998
 
 
@@ -42,7 +41,7 @@ class TwoViewModel:
         matrix: ``(3, 3)``; a homography maps pixels of view 1 to pixels of view 2, a fundamental
             matrix maps them to epipolar lines in view 2.
         inlier: ``(N,)`` bool, matches that the model explains.
-        homography_share: ``S_H / (S_H + S_F)``, by which the model was selected.
+        homography_share: ``S_H / (S_H + S_F)``, the ratio of scores that selected the model.
     """
 
     kind: Literal["homography", "fundamental"]
@@ -69,7 +68,7 @@ class TwoViews:
 def match_views(
     one: Frame, two: Frame, context: TrackingContext
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Match two frames by descriptor, within a window around the position of each feature.
+    """Match two frames by descriptor, within a window around each feature's position in ``one``.
 
     Returns:
         ``(N,)`` indices of the matched features in ``one``, and ``(N,)`` in ``two``.
@@ -132,8 +131,7 @@ def reconstruct(
     best = int(np.argmax(counts))
     rival = int(np.sort(counts)[-2])
     points, good, cosine = views[best]
-    # Its last entry is the parallax that at least min_points points have.
-    widest = np.sort(cosine[good])[: config.min_points]
+    widest = np.sort(cosine[good])[: config.min_points]  # cosines of the largest parallaxes
     if (
         counts[best] < max(config.min_points, config.min_point_share * len(match))
         or rival > config.max_rival_share * counts[best]
@@ -174,7 +172,7 @@ def select_model(
         scores, inlier = score_all(models, xy_1, xy_2, sigma)
         best = int(np.argmax(scores))
         M, score, explained = models[best], float(scores[best]), inlier[best]
-        # Refitting a model to all its inliers usually gains more inliers.
+        # A model that is fitted to all inliers of the previous one usually has more inliers.
         while np.count_nonzero(explained) >= SAMPLE:
             refit = fit(np.flatnonzero(explained)[None])
             scores, inlier = score_all(refit, xy_1, xy_2, sigma)
@@ -191,8 +189,8 @@ def select_model(
 
 
 def normalised(xy: Matrix) -> tuple[Matrix, Matrix]:
-    """Normalise ``(N, 2)`` points: their mean becomes 0 and their mean distance from it root 2
-    (Hartley, "In defense of the eight-point algorithm", PAMI 1997).
+    """Normalise ``(N, 2)`` points, so that their mean is 0 and their mean distance from it is the
+    square root of 2 (Hartley, "In defense of the eight-point algorithm", PAMI 1997).
 
     Returns:
         The ``(N, 2)`` normalised points, and the ``(3, 3)`` matrix that normalises them.
@@ -234,19 +232,20 @@ def score_homographies(
 ) -> tuple[Matrix, NDArray[np.bool_]]:
     """Scores ``(B,)`` and inliers ``(B, N)`` by the symmetric transfer error (ORB-SLAM, IV)."""
     with np.errstate(all="ignore"):  # collinear samples give NaN errors, which score 0
-        there = _squared(_transferred(H, xy_1) - xy_2) / sigma**2
-        back = _squared(_transferred(_adjugates(H), xy_2) - xy_1) / sigma**2
-    return _score(there, back, CHI2_MONO)
+        error_2 = _squared(_transferred(H, xy_1) - xy_2) / sigma**2
+        error_1 = _squared(_transferred(_adjugates(H), xy_2) - xy_1) / sigma**2
+    return _score(error_1, error_2, CHI2_MONO)
 
 
 def score_fundamentals(
     F: Matrix, xy_1: Matrix, xy_2: Matrix, sigma: Matrix
 ) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Scores ``(B,)`` and inliers ``(B, N)`` by the distances from the epipolar lines of both
+    """Scores ``(B,)`` and inliers ``(B, N)`` by the distances from the epipolar lines in both
     views.
 
-    The distance from a line has one degree of freedom, hence ``CHI2_LINE``; but a perfect match
-    scores as much as with a homography, so that both models can be compared (ORB-SLAM, IV).
+    The distance from a line has one degree of freedom, so the limit is ``CHI2_LINE``. A perfect
+    match has the same score as with a homography, so that both models can be compared (ORB-SLAM,
+    IV).
     """
     one = np.ones((len(xy_1), 1))
     p_1, p_2 = np.hstack([xy_1, one]), np.hstack([xy_2, one])
@@ -254,16 +253,17 @@ def score_fundamentals(
     lines_1 = p_2 @ F
     product = np.einsum("bni,ni->bn", lines_2, p_2) ** 2 / sigma**2
     with np.errstate(all="ignore"):
-        there = product / _squared(lines_2[..., :2])
-        back = product / _squared(lines_1[..., :2])
-    return _score(there, back, CHI2_LINE)
+        error_2 = product / _squared(lines_2[..., :2])
+        error_1 = product / _squared(lines_1[..., :2])
+    return _score(error_1, error_2, CHI2_LINE)
 
 
-def _score(there: Matrix, back: Matrix, limit: float) -> tuple[Matrix, NDArray[np.bool_]]:
-    score = np.zeros(len(there))
-    for error in (there, back):
+def _score(error_1: Matrix, error_2: Matrix, limit: float) -> tuple[Matrix, NDArray[np.bool_]]:
+    """Scores and inliers of B models from the ``(B, N)`` chi-squares in both views."""
+    score = np.zeros(len(error_1))
+    for error in (error_2, error_1):
         score += np.where(error < limit, CHI2_MONO - error, 0.0).sum(axis=1)
-    return score, (there < limit) & (back < limit)
+    return score, (error_1 < limit) & (error_2 < limit)
 
 
 def _transferred(H: Matrix, xy: Matrix) -> Matrix:
@@ -272,7 +272,7 @@ def _transferred(H: Matrix, xy: Matrix) -> Matrix:
 
 
 def _adjugates(H: Matrix) -> Matrix:
-    """Inverses up to scale, which exist for singular matrices as well."""
+    """Adjugates of ``(B, 3, 3)`` matrices: the inverses up to scale, also for singular matrices."""
     a, b, c = H[:, 0], H[:, 1], H[:, 2]
     return np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
 
@@ -293,8 +293,8 @@ def motions_of_essential(E: Matrix) -> list[Matrix]:
 
 def motions_of_homography(A: Matrix) -> list[Matrix]:
     """The eight candidate motions ``T_2_1`` of a calibrated homography (Faugeras and Lustman,
-    "Motion and structure from motion in a piecewise planar environment", 1988); none for a pure
-    rotation."""
+    "Motion and structure from motion in a piecewise planar environment", 1988). The list is empty
+    for a pure rotation."""
     U, (d1, d2, d3), Vt = np.linalg.svd(A)
     if d1 / d2 < 1.00001 or d2 / d3 < 1.00001:
         return []
@@ -342,7 +342,7 @@ def _triangulate(
     # Midpoint of the shortest segment between the rays.
     aa, bb, ab = _squared(ray_1), _squared(ray_2), np.einsum("ni,ni->n", ray_1, ray_2)
     on_1, on_2 = ray_1 @ centre_2, ray_2 @ centre_2
-    with np.errstate(all="ignore"):  # parallel rays
+    with np.errstate(all="ignore"):  # parallel rays give NaN
         determinant = aa * bb - ab * ab
         depth_1 = (bb * on_1 - ab * on_2) / determinant
         depth_2 = (ab * on_1 - aa * on_2) / determinant

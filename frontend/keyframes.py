@@ -16,21 +16,22 @@ from vslam.states import PolicyState
 
 @dataclass(frozen=True)
 class KeyframeEvidence:
-    """The quantities by which a keyframe decision is made.
+    """The quantities that a keyframe decision depends on.
 
     Attributes:
         seconds_since_keyframe: time since the last keyframe, seconds.
         n_inliers: number of landmarks tracked in this frame.
-        n_reference: number of landmarks of the reference keyframe that at least three keyframes
-            observe (in a young map: of all its landmarks).
+        n_reference: ``MapView.n_reference``, number of well-observed landmarks of the reference
+            keyframe.
         tracked_close: number of close stereo features of this frame that track a landmark.
-        untracked_close: number of close stereo features that do not; None for a frame without
-            features, which was tracked by patches: there are always some.
+        untracked_close: number of close stereo features that track no landmark; None for a frame
+            that was tracked by patches and has no features. It is then assumed to be large enough.
         mapping_idle: whether local mapping of the last keyframe is finished and merged.
         gained_close: number of close points that the first frame after a keyframe tracks, a running
             mean over the last keyframes; infinite if unknown.
-        first_close: how many the first frame after the last keyframe tracks.
-        close_ratio: ratio of this number from one frame to the next since then.
+        first_close: number of close points that the first frame after the last keyframe tracks.
+        close_ratio: factor by which the number of tracked close points has changed per frame since
+            that frame.
     """
 
     seconds_since_keyframe: float
@@ -44,8 +45,8 @@ class KeyframeEvidence:
     close_ratio: float = 1.0
 
     def ahead(self, frames: int) -> KeyframeEvidence:
-        """The evidence that is expected some frames later, if as large a share of the tracked close
-        points is lost from frame to frame as before."""
+        """The evidence that is expected some frames later, if the number of tracked close points
+        continues to fall by ``close_ratio`` per frame."""
         close = round(self.tracked_close * self.close_ratio**frames)
         n_inliers = self.n_inliers + close - self.tracked_close
         return replace(self, tracked_close=close, n_inliers=n_inliers)
@@ -54,39 +55,40 @@ class KeyframeEvidence:
 def needs_keyframe(
     evidence: KeyframeEvidence, config: KeyframeConfig, *, depth: bool = False
 ) -> bool:
-    """Whether a stereo or RGB-D frame should become a keyframe: because the last keyframe is old,
-    or because the view has changed enough or too few close points are tracked, and either local
-    mapping is idle or the need is urgent.
+    """Whether a stereo or RGB-D frame should become a keyframe.
 
-    Too few close points ask for a keyframe only if a keyframe would provide more. On a motorway
-    close points are scarce and leave the view before they are seen twice, so that even the first
-    frame after a keyframe tracks too few of them. There the frame only needs a share of what that
-    first frame tracked, provided that enough far points constrain the pose: at least as many as the
-    close points that would otherwise be required. In fog there are no far points, so the full
-    number of close points stays required.
+    A keyframe is due if the last one is old. It is also due if the view has changed enough or too
+    few close points are tracked, provided that local mapping is idle or the need is urgent.
+
+    A lack of close points is a reason for a keyframe only if a keyframe would provide more. On a
+    motorway, close points are scarce and leave the view before they are seen twice, so that even
+    the first frame after a keyframe tracks too few of them. In that case a frame needs only a share
+    of the close points that this first frame tracked, provided that enough far points constrain the
+    pose: at least as many as the close points that would otherwise be required. In fog there are no
+    far points, so the full number of close points is required.
 
     Args:
-        depth: whether the camera is RGB-D. Nearly all that it sees is close and mapped at once, so
-            that the counts alone would ask for too few keyframes, although a hand-held camera turns
-            faster than a car.
+        depth: whether the camera is RGB-D. Nearly all points that it sees are close and mapped at
+            once, so the counts alone would lead to too few keyframes for a hand-held camera, which
+            turns faster than a car.
     """
     max_interval_s = config.depth_max_interval_s if depth else config.max_interval_s
-    wanted: float = config.min_tracked_close
+    required: float = config.min_tracked_close
     tracked_far = evidence.n_inliers - evidence.tracked_close
-    if evidence.gained_close < wanted <= tracked_far:
-        wanted = config.min_kept_close * evidence.gained_close
-    by_patches = evidence.untracked_close is None
-    plenty = evidence.untracked_close is None or evidence.untracked_close > config.min_new_close
-    starved = evidence.tracked_close < wanted and plenty
+    if evidence.gained_close < required <= tracked_far:
+        required = config.min_kept_close * evidence.gained_close
+    gains = evidence.untracked_close is None or evidence.untracked_close > config.min_new_close
+    lacks_close = evidence.tracked_close < required and gains
     moved_on = evidence.n_inliers < config.max_tracked_ratio * evidence.n_reference
-    if by_patches:
-        # Patches are found for longer than features are, so that counts of the map tell little.
+    if evidence.untracked_close is None:
+        # Patches are tracked longer than features, so the number of inliers alone reveals a change
+        # of view too late.
         moved_on |= evidence.tracked_close < config.patch_kept_close * evidence.first_close
     if evidence.seconds_since_keyframe >= max_interval_s:
         return True
-    if not (moved_on or starved):
+    if not (moved_on or lacks_close):
         return False
-    urgent = starved or evidence.n_inliers < config.urgent_ratio * evidence.n_reference
+    urgent = lacks_close or evidence.n_inliers < config.urgent_ratio * evidence.n_reference
     return evidence.mapping_idle or urgent
 
 
@@ -95,13 +97,13 @@ def needs_monocular_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig)
     because a point is mapped only after two keyframes have seen it from different positions;
     redundant keyframes are culled later.
 
-    Time alone never asks for a keyframe: while the camera stands still, nothing new can be
-    triangulated.
+    The time since the last keyframe is no reason by itself: while the camera stands still, nothing
+    new can be triangulated.
     """
     tracked, reference = evidence.n_inliers, evidence.n_reference
     if tracked >= config.monocular_ratio * reference:
         return False
-    # In a sharp turn the view changes faster than it is mapped, so do not wait for mapping.
+    # In a sharp turn the view changes faster than it is mapped, so a keyframe cannot wait.
     urgent = tracked < max(config.monocular_urgent_ratio * reference, config.monocular_min_tracked)
     late = evidence.seconds_since_keyframe >= config.max_interval_s
     return evidence.mapping_idle or urgent or late
@@ -110,11 +112,11 @@ def needs_monocular_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig)
 def count_close(
     state: PolicyState, tracked_close: int, frame: int, config: KeyframeConfig
 ) -> PolicyState:
-    """The state after frame ``frame``, which tracks a number of close points, if it is the first
-    one after a keyframe.
+    """The state after a frame with index ``frame`` that tracks ``tracked_close`` close points. It
+    changes only if this is the first frame after a keyframe.
 
-    A single frame may track few by chance; only several in a row show that close points are scarce.
-    So their mean is an exponential moving average, and it starts at a high value.
+    A single frame may track few close points by chance; only several in a row show that close
+    points are scarce. So an exponential moving average is kept, and it starts at a high value.
     """
     if not state.gain_awaited:
         return state
@@ -123,8 +125,8 @@ def count_close(
 
 
 def close_ratio(state: PolicyState, tracked_close: int, frame: int) -> float:
-    """By which factor the number of tracked close points falls from frame to frame, since the first
-    frame after the last keyframe, if ``frame`` tracks ``tracked_close``."""
+    """Factor by which the number of tracked close points has fallen per frame, from the first frame
+    after the last keyframe to ``frame``, which tracks ``tracked_close``; 1 if it has not fallen."""
     if not 0 < tracked_close < state.first_close:
         return 1.0
     share = tracked_close / state.first_close
@@ -137,7 +139,8 @@ class PlaceEvidence:
 
     Attributes:
         n_inliers: number of landmarks tracked in the frame.
-        n_shared: number of these that the old keyframe observes which shares the most with it.
+        n_shared: number of these landmarks that an old keyframe observes, namely the one that
+            observes the most of them.
         n_place: number of landmarks of that keyframe that at least three keyframes observe.
     """
 
@@ -148,12 +151,12 @@ class PlaceEvidence:
 
 def is_known_place(evidence: PlaceEvidence, config: KeyframeConfig) -> bool:
     """Whether a keyframe here would repeat an old one: the frame tracks as many landmarks as a
-    frame next to the old keyframe should, and shares enough of them with it.
+    frame next to the old keyframe should, and shares enough of them with the old keyframe.
 
     A lack of close points is no reason to map a known place again, because the old keyframe did not
-    provide more of them. At the end of a map the last keyframe has few landmarks that three
-    keyframes observe, so that both ratios would hold until the camera is lost; hence the minimum
-    number of inliers.
+    provide more of them. A minimum number of inliers is required, because the last keyframe of a
+    map has few landmarks that three keyframes observe: beyond the end of the map, both ratios would
+    hold until the camera is lost.
     """
     return (
         evidence.n_inliers >= config.known_min_inliers
@@ -163,8 +166,7 @@ def is_known_place(evidence: PlaceEvidence, config: KeyframeConfig) -> bool:
 
 
 class KeyframePolicy:
-    """Decides whether a tracked frame becomes a keyframe. Only ``observe``, ``is_due``,
-    ``keyframe_made`` and ``restore`` change its state."""
+    """Decides whether a tracked frame becomes a keyframe."""
 
     def __init__(self, context: TrackingContext) -> None:
         self._context = context
@@ -180,7 +182,7 @@ class KeyframePolicy:
     def observe(
         self, frame: Frame, view: MapView, *, seconds_since_keyframe: float, mapping_idle: bool
     ) -> KeyframeEvidence:
-        """Take a tracked frame into account and return the evidence for ``wants_keyframe``."""
+        """Update the state with a tracked frame; returns the evidence for ``wants_keyframe``."""
         tracked = frame.landmark >= 0
         if frame.source is None:
             depth = feature_depth(frame.features, self._context.camera)
@@ -205,24 +207,24 @@ class KeyframePolicy:
         )
 
     def wants_keyframe(self, evidence: KeyframeEvidence) -> bool:
-        """Whether the frame should become a keyframe, unless ``is_known`` holds for its place."""
+        """Whether the frame should become a keyframe, unless its place is known (``is_known``)."""
         camera = self._context.camera
         if camera.monocular:
             return needs_monocular_keyframe(evidence, self._config)
         return needs_keyframe(evidence, self._config, depth=camera.depth)
 
     def is_known(self, evidence: PlaceEvidence) -> bool:
-        """Whether an old keyframe serves instead of a new one."""
+        """Whether an old keyframe makes a new one unnecessary."""
         return is_known_place(evidence, self._config)
 
     def is_due(self, index: int, evidence: KeyframeEvidence) -> bool:
-        """Whether frame ``index``, which was tracked by patches, is to become a keyframe. If one of
-        the next frames is expected to be the one that is wanted, it is planned as a keyframe, so
-        that its features can be extracted meanwhile."""
+        """Whether frame ``index``, which was tracked by patches, is to become a keyframe. A
+        keyframe that is expected to be needed soon is planned in advance, so that its features can
+        be extracted in the background."""
         if self.due < 0:
             soon = range(self._config.patch_lead_frames + 1)
-            wanted = (index + k for k in soon if self.wants_keyframe(evidence.ahead(k)))
-            self._state = replace(self._state, due=next(wanted, -1))
+            planned = (index + k for k in soon if self.wants_keyframe(evidence.ahead(k)))
+            self._state = replace(self._state, due=next(planned, -1))
         if not 0 <= self.due <= index:
             return False
         self._state = replace(self._state, due=-1)

@@ -14,9 +14,9 @@ from vslam.config import OrbConfig
 from vslam.features import Pyramid
 from vslam.frontend.orb import build_pyramid
 
-# Pixels of a level between a feature and the nearest masked pixel. Corner detection and alignment
-# look no farther, and a patch is shifted by at most two pixels, so the edge of the hood is not seen
-# by either of them.
+# Least distance between a feature and a masked pixel, in pixels of the feature's level. Corner
+# detection and alignment read no pixels farther away (a patch is shifted by at most two pixels), so
+# the edge of the mask affects neither.
 REACH = 4
 _WINDOW = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
 
@@ -27,7 +27,7 @@ class Mask:
 
     Attributes:
         used: ``(H, W)`` bool, False where the image is not to be used.
-        levels: 1 for the pixels of the pyramid where a feature may lie, 0 for the others.
+        levels: 1 for the pixels of each pyramid level where a feature may lie, 0 for the others.
     """
 
     used: NDArray[np.bool_]
@@ -35,7 +35,7 @@ class Mask:
 
     @classmethod
     def of(cls, mask: NDArray[np.uint8] | NDArray[np.bool_], config: OrbConfig) -> Self:
-        """The mask that an ``(H, W)`` array describes: 0 where a pixel is not to be used."""
+        """A mask from an ``(H, W)`` array that is 0 where a pixel is not to be used."""
         used = mask > 0
         levels = build_pyramid(used * np.uint8(255), config)
         for index in range(config.n_levels):
@@ -45,7 +45,7 @@ class Mask:
 
     def shows(self, xy: NDArray[np.floating], octave: NDArray[np.integer]) -> NDArray[np.bool_]:
         """``(N,)`` bool: whether features may lie at ``(N, 2)`` positions (full-resolution pixels)
-        of ``(N,)`` octaves. Positions outside the image count as those of its border."""
+        of ``(N,)`` octaves. Positions outside the image are clamped to its border."""
         shapes = self.levels.shapes[octave]
         ratio = self.levels.shapes[0, ::-1] / shapes[:, ::-1]
         pixel = np.rint((np.nan_to_num(xy) + 0.5) / ratio - 0.5)
@@ -54,7 +54,7 @@ class Mask:
         return self.levels.pixels[at] > 0
 
     def filled(self, image: Image) -> Image:
-        """A copy of an ``(H, W)`` uint8 image whose masked pixels have the mean grey of the others,
-        for networks that see the image as a whole."""
+        """A copy of an ``(H, W)`` uint8 image in which masked pixels have the mean grey value of
+        the others, for networks that read the whole image."""
         mean = np.uint8(image[self.used].mean()) if self.used.any() else np.uint8(0)
         return np.where(self.used, image, mean)

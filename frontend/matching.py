@@ -21,13 +21,13 @@ ORIENTATION_BINS = 30
 @kernel
 def predict_view(T, xyz, normal, distance_range, intrinsics, width, height, scales, window):
     """Predict where landmarks appear in an image (ORB-SLAM, V-D). A landmark is visible if it
-    projects into the image, its distance is in its range, and its viewing direction is at most 60
-    degrees from the mean one.
+    projects into the image, its distance is in its range (with a tolerance of 20 %), and its
+    viewing direction is at most 60 degrees from its mean viewing direction.
 
     Args:
         T: ``(4, 4)`` pose of the camera (world to camera).
         xyz, normal: ``(N, 3)`` positions, and mean viewing directions as unit vectors.
-        distance_range: ``(N, 2)`` least and greatest distance at which each is detected.
+        distance_range: ``(N, 2)`` least and greatest distance at which each landmark is detected.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         scales: ``(levels,)`` pyramid scale factors.
         window: search radius at octave 0, pixels.
@@ -67,7 +67,7 @@ def predict_view(T, xyz, normal, distance_range, intrinsics, width, height, scal
             continue
         octave[i] = predict_octave(distance, distance_range[i, 1], log_scale, len(scales))
         uvr[i, 0], uvr[i, 1], uvr[i, 2] = u, v, u - bf / z
-        # The prediction is more accurate for a landmark that is seen from its mean direction.
+        # The prediction is more accurate for a landmark that is seen from near its mean direction.
         radius[i] = (window if cos > 0.998 else 1.6 * window) * scales[octave[i]]
     return uvr, radius, octave
 
@@ -77,9 +77,9 @@ class Projections(NamedTuple):
 
     Attributes:
         uvr: ``(M, 3)`` predicted u, v, u_right.
-        radius: ``(M,)`` half width of the search window, pixels; a landmark whose radius is not
-            positive is skipped.
-        octave_low, octave_high: ``(M,)`` the range of octaves to accept.
+        radius: ``(M,)`` half width of the search window, pixels; landmarks with a radius of 0 are
+            skipped.
+        octave_low, octave_high: ``(M,)`` lowest and highest accepted octave.
         descriptor: ``(M, 4)`` the 32 bytes of each descriptor as four integers.
     """
 
@@ -91,14 +91,14 @@ class Projections(NamedTuple):
 
 
 class Searchable(NamedTuple):
-    """N features of an image with a grid to search them by position.
+    """N features of an image, with a grid to search them by position.
 
     Attributes:
         xy: ``(N, 2)`` pixels.
         octave: ``(N,)``.
         u_right: ``(N,)`` columns in the right image, NaN without one.
         descriptor: ``(N, 4)`` the 32 bytes of each descriptor as four integers.
-        grid: indices of the features in each cell of the image.
+        grid: the features sorted by image cell.
     """
 
     xy: NDArray[np.float32]
@@ -109,7 +109,7 @@ class Searchable(NamedTuple):
 
     @classmethod
     def of_features(cls, features: Features, grid: FeatureGrid) -> Searchable:
-        """View the features of a frame."""
+        """The features of a frame; arrays are not copied."""
         descriptor = features.descriptors.view(np.uint64)
         return cls(features.xy, features.octave, features.u_right, descriptor, grid)
 
@@ -123,12 +123,12 @@ def search_windows(projections, features, free, max_distance, ratio):
         features: ``Searchable`` of the image.
         free: ``(N,)`` bool, features that may be matched.
         max_distance: largest Hamming distance of a match, bits.
-        ratio: largest ratio of the best to the second best distance, tested if both features are of
-            one octave (1 switches the test off).
+        ratio: largest ratio of the best to the second best distance, tested only if both features
+            have the same octave; 1 disables the test.
 
     Returns:
         ``(M,)`` int32 index of the feature or -1, and ``(M,)`` int32 distances. A feature is
-        matched at most once: of several landmarks, the one with the closest descriptor keeps it.
+        matched at most once, to the landmark with the closest descriptor.
     """
     uvr, radius, octave_low, octave_high, descriptors = projections
     xy, octave, u_right, frame_descriptors, grid = features
@@ -169,8 +169,8 @@ def search_windows(projections, features, free, max_distance, ratio):
                     second, second_distance = j, distance
         if best < 0 or best_distance > max_distance:
             continue
-        rivals = second >= 0 and octave[second] == octave[best]
-        if rivals and best_distance > ratio * second_distance:
+        comparable = second >= 0 and octave[second] == octave[best]
+        if comparable and best_distance > ratio * second_distance:
             continue
         previous = owner[best]
         if previous >= 0:
@@ -190,7 +190,7 @@ def search_all(a, b, max_distance, ratio):
     Args:
         a, b: ``(M, 4)`` and ``(N, 4)`` uint64 descriptors.
         max_distance: largest Hamming distance of a match, bits.
-        ratio: largest ratio of the best to the second best distance, for each descriptor of a.
+        ratio: largest ratio of the best to the second best distance, for each descriptor in a.
 
     Returns:
         ``(M,)`` int32 index into b or -1.
@@ -220,8 +220,9 @@ def search_all(a, b, max_distance, ratio):
 
 @kernel
 def consistent_orientation(angle_a, angle_b):
-    """Whether the rotation of each match falls in one of the three fullest of 30 bins (ORB-SLAM,
-    V-C). The second and the third bin count only if they hold at least a tenth of the first.
+    """Whether the rotation of each match falls in one of the three fullest of 30 histogram bins
+    (ORB-SLAM, V-C). The second and the third bin are used only if each holds at least a tenth as
+    many matches as the first.
 
     Args:
         angle_a, angle_b: ``(N,)`` float32 orientations of the matched features, radians.
@@ -249,12 +250,13 @@ def consistent_orientation(angle_a, angle_b):
 
 
 def count_elsewhere(u: NDArray[np.floating], width: int) -> int:
-    """Number of inliers outside the vertical strip, a third of the image wide, that holds the most.
+    """Number of inliers outside a vertical strip that is a third of the image wide, placed so that
+    it contains the most inliers.
 
-    Two different places may share one similar object, for example a facade or a parked car. It can
-    provide a hundred inliers and fix a pose to a centimetre, but all of them lie close together,
-    because the rest of the scene does not match. At a true revisit, inliers are spread over the
-    whole image.
+    Two different places may contain a similar object, for example a facade or a parked car. Such an
+    object can provide a hundred inliers and determine a pose to a centimetre, but all of them lie
+    close together, because the rest of the scene does not match. At a true revisit, inliers are
+    spread over the whole image.
 
     Args:
         u: ``(N,)`` columns of the inliers, pixels.

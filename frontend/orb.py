@@ -19,13 +19,14 @@ from vslam.features import Pyramid
 from vslam.frontend.corners import fast_scores, local_maxima, spread
 from vslam.kernels import borrowed, inner_kernel, kernel
 
-PATCH_RADIUS = 15  # of the disc of the intensity centroid, pixels (Rublee et al., section 3.2)
-LANES = 32  # pixels read per row of the disc: its 31 columns and one of weight 0
-SPARE = 64  # unused bytes at the end of a pyramid
-KEYPOINT_REACH = 2.0  # pixels of a level; features that are nearer show the same corner
+# Radius of the disc for the intensity centroid, pixels (Rublee et al., section 3.2).
+PATCH_RADIUS = 15
+LANES = 32  # pixels read per row of the disc: its 31 columns, and one more with weight 0
+SPARE = 64  # bytes of padding at the end of a pyramid
+KEYPOINT_REACH = 2.0  # pixels of a level; features that are closer together show the same corner
 BLUR_REACH = 3  # radius of the Gaussian before BRIEF, pixels
 MARGIN = 19  # largest distance of a rotated test point from its keypoint (13 sqrt 2), rounded up
-EVERYWHERE = np.empty(0, np.uint8)
+EVERYWHERE = np.empty(0, np.uint8)  # ``allowed`` of the kernels if corners may lie anywhere
 PATTERN: NDArray[np.int8] = np.load(Path(__file__).with_name("orb_pattern.npy"))
 
 
@@ -52,7 +53,7 @@ def extract(
     A pure function, safe to call from several threads.
 
     Args:
-        allowed: 1 for the pixels where a corner may lie, 0 for the others; None allows all.
+        allowed: 1 for pixels where a corner may lie, 0 for the others; None allows all pixels.
     """
     pyramid = build_pyramid(image, config)
     xy, octave, angle, descriptors = extract_levels(
@@ -60,7 +61,7 @@ def extract(
         pyramid.offsets,
         pyramid.shapes,
         EVERYWHERE if allowed is None else allowed.pixels,
-        _quota(config.n_features, config.n_levels, config.scale_factor),
+        features_per_level(config),
         config.fast_threshold,
         config.fast_threshold_min,
         config.cell_size,
@@ -73,87 +74,74 @@ def extract(
 def with_keypoints(
     found: Extraction, xy: NDArray[np.float32], octave: NDArray[np.uint8]
 ) -> Extraction:
-    """Add features at given positions, where the image has none within ``KEYPOINT_REACH``.
+    """Add a feature at each of N positions that has no other feature within ``KEYPOINT_REACH``.
 
     Args:
         found: the features of the image.
-        xy: ``(N, 2)`` full-resolution pixels; the nearest pixels of the levels are taken.
+        xy: ``(N, 2)`` full-resolution pixels; rounded to whole pixels of the levels.
         octave: ``(N,)`` pyramid levels.
     """
     shapes = found.pyramid.shapes
-    columns: list[list[NDArray]] = [
-        [found.xy],
-        [found.octave],
-        [found.angle],
-        [found.descriptors],
-    ]
+    parts = [(found.xy, found.octave, found.angle, found.descriptors)]
     for level in np.unique(octave).tolist():
         ratio = shapes[0, ::-1] / shapes[level, ::-1]
         pixel = np.rint((xy[octave == level] + 0.5) / ratio - 0.5)
         inside = (pixel >= MARGIN) & (pixel < shapes[level, ::-1] - MARGIN)
         pixel = pixel[inside.all(axis=1)]
         near = np.abs(found.octave.astype(np.int64) - level) <= 1
-        there = (found.xy[near] + 0.5) / ratio - 0.5
-        corners = pixel[_is_free(pixel, there)].astype(np.float32)
+        existing = (found.xy[near] + 0.5) / ratio - 0.5
+        corners = pixel[_is_free(pixel, existing)].astype(np.float32)
         if not len(corners):
             continue
         image = found.pyramid.level(level)
         angles = orientations(image, corners, DISC)
-        columns[0].append(((corners + 0.5) * ratio - 0.5).astype(np.float32))
-        columns[1].append(np.full(len(corners), level, np.uint8))
-        columns[2].append(angles)
-        columns[3].append(describe(smoothed(image), corners, angles, PATTERN))
-    whole = [np.concatenate(column) for column in columns]
-    order = np.argsort(whole[1], kind="stable")
-    xy, octave, angle, descriptors = (column[order] for column in whole)
+        position = ((corners + 0.5) * ratio - 0.5).astype(np.float32)
+        descriptors = describe(smoothed(image), corners, angles, PATTERN)
+        parts.append((position, np.full(len(corners), level, np.uint8), angles, descriptors))
+    joined = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
+    order = np.argsort(joined[1], kind="stable")
+    xy, octave, angle, descriptors = (array[order] for array in joined)
     return Extraction(xy, octave, angle, descriptors, found.pyramid)
 
 
 @kernel
-def _is_free(pixel, there):
-    """``(N,)`` bool: whether none of the ``(M, 2)`` positions ``there`` is near a pixel."""
+def _is_free(pixel, existing):
+    """``(N,)`` bool, whether each ``(N, 2)`` pixel is far from all ``(M, 2)`` existing features."""
     free = np.ones(len(pixel), np.bool_)
     for i in range(len(pixel)):
         x, y = pixel[i, 0], pixel[i, 1]
-        for k in range(len(there)):
-            if abs(there[k, 0] - x) <= KEYPOINT_REACH and abs(there[k, 1] - y) <= KEYPOINT_REACH:
+        for k in range(len(existing)):
+            dx, dy = abs(existing[k, 0] - x), abs(existing[k, 1] - y)
+            if dx <= KEYPOINT_REACH and dy <= KEYPOINT_REACH:
                 free[i] = False
                 break
     return free
 
 
 def scale_factors(config: OrbConfig) -> NDArray[np.float64]:
-    """``(L,)`` float64, scale of each level: full-resolution pixels per pixel; level 0 has 1."""
-    return _scales(config.n_levels, config.scale_factor)
-
-
-def _scales(n_levels: int, scale_factor: float) -> NDArray[np.float64]:
-    return scale_factor ** np.arange(n_levels, dtype=np.float64)
-
-
-def features_per_level(config: OrbConfig) -> NDArray[np.int64]:
-    """``(L,)`` int64, ``n_features`` divided among the levels in proportion to 1 / scale (ORB-SLAM,
-    V-A)."""
-    return _quota(config.n_features, config.n_levels, config.scale_factor).copy()
+    """``(L,)`` float64, scale of each level: full-resolution pixels per pixel; 1 for level 0."""
+    return config.scale_factor ** np.arange(config.n_levels, dtype=np.float64)
 
 
 @cache
-def _quota(n_features: int, n_levels: int, scale_factor: float) -> NDArray[np.int64]:
-    weights = 1.0 / _scales(n_levels, scale_factor)
-    share = n_features * weights / weights.sum()
+def features_per_level(config: OrbConfig) -> NDArray[np.int64]:
+    """``(L,)`` int64, ``n_features`` divided among the levels in proportion to 1 / scale (ORB-SLAM,
+    V-A)."""
+    weights = 1.0 / scale_factors(config)
+    share = config.n_features * weights / weights.sum()
     quota = np.floor(share).astype(np.int64)
-    # Give the features lost by rounding down to the levels that lost the largest fractions.
-    left = n_features - quota.sum()
-    quota[np.argsort(quota - share, kind="stable")[:left]] += 1
+    # The features lost by rounding down go to the levels that lost the largest fractions.
+    missing = config.n_features - quota.sum()
+    quota[np.argsort(quota - share, kind="stable")[:missing]] += 1
     return quota
 
 
 @cache
 def _layout(
-    height: int, width: int, n_levels: int, scale_factor: float
+    height: int, width: int, config: OrbConfig
 ) -> tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Number of bytes of a pyramid, and the offsets, shapes and scales of its levels."""
-    scales = _scales(n_levels, scale_factor)
+    scales = scale_factors(config)
     shapes = np.round(np.array([height, width]) / scales[:, None]).astype(np.int64).clip(min=1)
     sizes = shapes.prod(axis=1)
     offsets = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
@@ -161,14 +149,15 @@ def _layout(
 
 
 def level_shapes(size: tuple[int, int], config: OrbConfig) -> NDArray[np.int64]:
-    """``(L, 2)`` heights and widths of the pyramid's levels, from those of the image."""
-    return _layout(*size, config.n_levels, config.scale_factor)[2]
+    """``(L, 2)`` heights and widths of the pyramid levels of an image with the given height and
+    width."""
+    return _layout(*size, config)[2]
 
 
 def build_pyramid(image: NDArray[np.uint8], config: OrbConfig) -> Pyramid:
     """Build the pyramid of an ``(H, W)`` uint8 image: each level is resized bilinearly from the
-    one before."""
-    size, offsets, shapes, scales = _layout(*image.shape, config.n_levels, config.scale_factor)
+    previous one."""
+    size, offsets, shapes, scales = _layout(*image.shape, config)
     pixels = np.empty(size + SPARE, np.uint8)
     pixels[-SPARE:] = 0
     pyramid = Pyramid(pixels, offsets, shapes, scales)
@@ -187,11 +176,11 @@ def extract_levels(
 ):
     """Extract the features of all levels.
 
-    A single kernel, so that an image takes the global interpreter lock only once.
+    This is a single kernel, so that the global interpreter lock is acquired only once per image.
 
     Args:
-        pixels, offsets, shapes: of the ``Pyramid``.
-        allowed: for each of the pixels 1 where a corner may lie, else 0; empty allows all.
+        pixels, offsets, shapes: those of the ``Pyramid``.
+        allowed: 1 for pixels where a corner may lie, 0 for the others; empty allows all pixels.
         quota: ``(L,)`` int64, greatest number of features per level.
         threshold, threshold_min, cell: see ``local_maxima``.
         inside: ``DISC``.
@@ -212,24 +201,24 @@ def extract_levels(
         corners = detect_corners(image, here, quota[level], threshold, threshold_min, cell)
         if len(corners) == 0:
             continue
-        turned = orientations(image, corners, inside)
-        described = describe(smoothed(image), corners, turned, pattern)
+        level_angles = orientations(image, corners, inside)
+        level_descriptors = describe(smoothed(image), corners, level_angles, pattern)
         # The sizes of levels are rounded to whole pixels, so their ratios differ from the scales.
-        wide, high = shapes[0, 1] / width, shapes[0, 0] / height
+        ratio_x, ratio_y = shapes[0, 1] / width, shapes[0, 0] / height
         for i in range(len(corners)):
             x, y = corners[i, 0] + 0.5, corners[i, 1] + 0.5
-            xy[n, 0], xy[n, 1] = x * wide - 0.5, y * high - 0.5
-            octave[n], angle[n] = level, turned[i]
+            xy[n, 0], xy[n, 1] = x * ratio_x - 0.5, y * ratio_y - 0.5
+            octave[n], angle[n] = level, level_angles[i]
             for k in range(32):
-                descriptors[n, k] = described[i, k]
+                descriptors[n, k] = level_descriptors[i, k]
             n += 1
     return xy[:n], octave[:n], angle[:n], descriptors[:n]
 
 
 @kernel
 def detect_corners(pixels, allowed, quota, threshold, threshold_min, cell):
-    """Up to ``quota`` FAST-9 corners of one level, spread evenly over the pixels that are
-    ``allowed``: ``(n, 2)`` float32 x, y in pixels of the level."""
+    """Up to ``quota`` FAST-9 corners of one level, evenly spread over the ``allowed`` pixels:
+    ``(n, 2)`` float32 x, y in pixels of the level."""
     height, width = pixels.shape
     if min(height, width) <= 2 * MARGIN or quota == 0:
         return np.empty((0, 2), np.float32)
@@ -266,8 +255,8 @@ def orientations(pixels, corners, inside):
     rows = len(inside)
     radius = rows // 2
     flat, weight = pixels.reshape(height * width), inside.reshape(rows * LANES)
-    # Sum and first moment of each column. At most 255 (1 + 2 + ... + 15), they fit 16 bits, so a
-    # vector register holds many columns.
+    # Sum and first moment of each column. They are at most 255 (1 + 2 + ... + 15) and fit into 16
+    # bits, so that a vector register holds many columns.
     total, moment = np.empty(LANES, np.int16), np.empty(LANES, np.int16)
     for i in range(n):
         corner = (int(corners[i, 1]) - radius) * width + int(corners[i, 0]) - radius
@@ -291,8 +280,8 @@ def orientations(pixels, corners, inside):
 
 @kernel
 def describe(smooth, corners, angles, pattern):
-    """``(n, 32)`` uint8, rotated BRIEF descriptor of each corner (Rublee et al., section 4); the
-    first test is bit 0 of byte 0."""
+    """``(n, 32)`` uint8, rotated BRIEF descriptor of each corner (Rublee et al., section 4). Bit 0
+    of byte 0 is the result of the first test."""
     n = len(corners)
     height, width = smooth.shape
     flat = smooth.reshape(height * width)
@@ -324,19 +313,19 @@ def describe(smooth, corners, angles, pattern):
 
 @kernel
 def smoothed(pixels):
-    """Blur an ``(H, W)`` uint8 image of at least 4x4 pixels, with mirrored borders: the Gaussian
-    before BRIEF, with the same result as OpenCV's fixed-point version.
+    """Blur an ``(H, W)`` uint8 image of at least 4x4 pixels before BRIEF, with mirrored borders.
+    The result is the same as that of ``cv2.GaussianBlur`` with a 7x7 kernel and a sigma of 2.
 
-    ``cv2.GaussianBlur`` with a 7x7 kernel and a sigma of 2 weights bytes in multiples of 1/256,
-    first along rows, then along columns, and rounds once at the end. Here every intermediate sum
-    fits 16 bits, so that a vector register holds twice as many pixels as with 32 bits: row sums are
-    split into whole grey levels and 256ths, and both parts are summed along the columns.
+    OpenCV uses fixed-point weights in multiples of 1/256, first along rows, then along columns, and
+    rounds once at the end. Here row sums are split into whole grey levels and 256ths, and both
+    parts are summed along the columns. So every intermediate sum fits into 16 bits, and a vector
+    register holds twice as many pixels as with 32 bits.
     """
     height, width = pixels.shape
     taps = 2 * BLUR_REACH + 1
     out = np.empty((height, width), np.uint8)
     row = np.empty(width + 2 * BLUR_REACH, np.uint16)
-    rows = np.empty((taps, 2 * width), np.uint16)  # the last row sums: whole levels, then 256ths
+    rows = np.empty((taps, 2 * width), np.uint16)  # newest row sums: grey levels, then 256ths
     total = np.empty(2 * width, np.uint16)
     n = np.uintp(width)
     for y in range(-BLUR_REACH, height + BLUR_REACH):
@@ -373,7 +362,7 @@ def smoothed(pixels):
 
 @inner_kernel
 def weigh(a, b, c, d, e, f, g, out):
-    """Weighted sum of seven rows or shifted copies of one. The weights are those of a Gaussian of
-    sigma 2 in 256ths, rounded as OpenCV does so that they sum to 256."""
+    """Weighted sum of seven rows, or of seven shifted copies of a row. The weights are those of a
+    Gaussian with a sigma of 2, in 256ths, rounded to a sum of 256 as in OpenCV."""
     for x in range(np.uintp(len(out))):
         out[x] = 18 * (a[x] + g[x]) + 34 * (b[x] + f[x]) + 48 * (c[x] + e[x]) + 56 * d[x]

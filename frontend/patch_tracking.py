@@ -1,8 +1,8 @@
-"""Tracking without features: the patches of the newest keyframes are found in the image itself.
+"""Tracking without features: the patches of the newest keyframes are searched for in the image.
 
-After SVO (Forster et al., ICRA 2014, III, and T-RO 2017): the pose first, by sparse image alignment
-to the last frame; then each landmark by itself, where its patch agrees with the image; at last the
-pose once more, from where the landmarks were found.
+As in SVO (Forster et al., ICRA 2014, III, and T-RO 2017), sparse image alignment to the last frame
+first estimates the pose (``pose_alignment``). Then the patch of each landmark is aligned with the
+image separately, and the pose is optimised from the positions that were found.
 """
 
 from __future__ import annotations
@@ -15,21 +15,24 @@ from numpy.typing import NDArray
 from vslam.features import PATCH_RADIUS, Features, Pyramid
 from vslam.frontend.alignment import find_patches
 from vslam.frontend.masks import Mask
-from vslam.frontend.matching import predict_view
 from vslam.frontend.pose import optimise_pose
-from vslam.frontend.tracking import TrackingContext
+from vslam.frontend.tracking import TrackingContext, predict_landmarks
 from vslam.geometry import Matrix, orthonormalised
-from vslam.map_view import MapView
+from vslam.map_view import LocalMap, MapView
 
-_MARGIN = PATCH_RADIUS + 2  # of a patch from the border of its level, pixels
+_MARGIN = PATCH_RADIUS + 2  # least distance of a patch centre from the border of its level, pixels
 
 
 class PatchTrack(NamedTuple):
-    """Landmarks that were found by their patches, and the pose that follows.
+    """The pose of a frame, and the N inliers among the landmarks that were found by their patches.
 
-    ``T_cw`` (4, 4); ``ids`` (N,) i4 and ``xyz`` (N, 3) of the inliers; ``features`` of these, where
-    they were found, with the descriptors of the landmarks and without columns in a right image;
-    ``n_matches`` before outliers were removed; ``visible`` (M,) i4 landmarks that were looked for.
+    Attributes:
+        T_cw: ``(4, 4)`` pose.
+        ids, xyz: ``(N,)`` ids and ``(N, 3)`` positions of the landmarks.
+        features: a feature for each landmark at the position where it was found, with the
+            descriptor of the landmark and without a column in a right image.
+        n_matches: number of landmarks that were found, outliers included.
+        visible: ``(M,)`` ids of the landmarks that the frame should see.
     """
 
     T_cw: Matrix
@@ -47,30 +50,18 @@ def track_patches(
     context: TrackingContext,
     mask: Mask | None = None,
 ) -> PatchTrack:
-    """Find the landmarks of the local map that have patches, and the pose of the camera.
+    """Find the landmarks of the local map that have patches, and optimise the pose.
 
     Args:
-        pyramid: of the image.
-        T_cw: ``(4, 4)`` pose, right to about two pixels.
-        mask: of the image; None if all of it is used.
+        pyramid: the pyramid of the image.
+        T_cw: ``(4, 4)`` initial pose; its projections may be off by about two pixels.
+        mask: the mask of the image; None if all pixels are used.
     """
-    known, local = view.patches, view.local_landmarks
-    camera, config, scales = context.camera, context.config.alignment, context.scales
-    at = np.searchsorted(local.ids, known.ids)
-    xyz = local.xyz[at]
-    uvr, radius, octave = predict_view(
-        T_cw,
-        xyz,
-        local.normal[at],
-        local.distance_range[at],
-        camera.intrinsics,
-        camera.width,
-        camera.height,
-        scales,
-        1.0,
-    )
-    if mask is not None:
-        radius[~mask.shows(uvr[:, :2], octave)] = 0.0
+    known, camera, scales = view.patches, context.camera, context.scales
+    config = context.config.alignment
+    at = np.searchsorted(view.local_landmarks.ids, known.ids)
+    local = LocalMap._make(values[at] for values in view.local_landmarks)
+    uvr, radius, octave = predict_landmarks(T_cw, local, 1.0, mask, context)
     margin = _MARGIN * scales[octave]
     size = np.array([camera.width, camera.height])
     inside = (uvr[:, :2] > margin[:, None]) & (uvr[:, :2] < size - 1 - margin[:, None])
@@ -78,7 +69,7 @@ def track_patches(
     level = octave[tried].astype(np.uint8)
     xy = _whole_pixels(uvr[tried, :2], pyramid, level)
     shift = find_patches(
-        pyramid, xy, level, T_cw, xyz[tried], known, tried, scales, camera.intrinsics, config
+        pyramid, xy, level, T_cw, local.xyz[tried], known, tried, scales, camera.intrinsics, config
     )
     found = np.isfinite(shift[:, 0])
     seen, level = tried[found], level[found]
@@ -86,30 +77,30 @@ def track_patches(
     xy = xy[found] + shift[found] * scale[:, None].astype(np.float32)
     uvr = np.full((len(seen), 3), np.nan)
     uvr[:, :2] = xy
-    certain = config.certainty * scale**-2.0
-    T_found, inlier = optimise_pose(T_cw, xyz[seen], uvr, certain, camera.intrinsics)
+    weight = config.certainty * scale**-2.0
+    T_found, inlier = optimise_pose(T_cw, local.xyz[seen], uvr, weight, camera.intrinsics)
     seen, xy, level = seen[inlier], xy[inlier], level[inlier]
     features = Features(
         xy=xy,
         octave=level,
         angle=known.angle[seen],
-        descriptors=local.descriptor[at[seen]].view(np.uint8).reshape(-1, 32),
+        descriptors=local.descriptor[seen].view(np.uint8).reshape(-1, 32),
         u_right=np.full(len(seen), np.nan, np.float32),
     )
     return PatchTrack(
         orthonormalised(T_found),
-        known.ids[seen],
-        xyz[seen],
+        local.ids[seen],
+        local.xyz[seen],
         features,
         len(inlier),
-        known.ids[radius > 0],
+        local.ids[radius > 0],
     )
 
 
 def _whole_pixels(
     uv: NDArray[np.float64], pyramid: Pyramid, level: NDArray[np.uint8]
 ) -> NDArray[np.float32]:
-    """``(N, 2)`` full-resolution positions of the pixels of a level that are nearest to ``uv``."""
+    """Round ``(N, 2)`` full-resolution positions to the nearest pixels of their levels."""
     ratio = pyramid.shapes[0, ::-1] / pyramid.shapes[level][:, ::-1]
     pixel = np.rint((uv + 0.5) / ratio - 0.5)
     return ((pixel + 0.5) * ratio - 0.5).astype(np.float32)

@@ -1,8 +1,7 @@
-"""Image patches around keypoints, to which matches are aligned, and a store of those of the newest
-keyframes.
+"""Image patches around keypoints, to which matches are aligned, and a store of recent patches.
 
-Only the newest keyframes keep their patches: they observe nearly all landmarks that tracking
-follows, and a patch takes more memory than the rest of an observation.
+Only the patches of the newest keyframes are kept: these keyframes observe nearly all landmarks that
+are being tracked, and a patch takes more memory than the rest of an observation.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from vslam.map import Map
 def patches_around(
     pyramid: Pyramid, xy: NDArray[np.float32], octave: NDArray[np.uint8]
 ) -> NDArray[np.uint8]:
-    """Cut a square patch around each keypoint out of the level of its octave.
+    """Cut a square patch around each keypoint out of the pyramid level of its octave.
 
     Args:
         xy: ``(N, 2)`` full-resolution pixels; the patches must lie inside their levels.
@@ -62,7 +61,7 @@ class RecentPatches:
     """
 
     def __init__(self, capacity: int) -> None:
-        """``capacity`` is the number of keyframes whose patches are remembered."""
+        """``capacity`` is the number of keyframes whose patches are kept."""
         self._keyframes = np.full(capacity, -1, np.int64)  # id of the keyframe in each slot, or -1
         self._n_features = np.zeros(capacity, np.int64)
         self._pixels = np.empty((capacity, 0, PATCH_PIXELS), np.uint8)
@@ -70,7 +69,7 @@ class RecentPatches:
         self._next = 0
 
     def remember(self, frame: Frame, keyframe: int, scales: NDArray[np.float64]) -> None:
-        """Remember the patches around the features of a frame that became a keyframe.
+        """Store the patches around the features of a frame that became a keyframe.
 
         Args:
             keyframe: id of the new keyframe.
@@ -86,19 +85,19 @@ class RecentPatches:
         pixels = patches_around(frame.pyramid, features.xy, features.octave)
         self.add(KeyframePatches(keyframe, pixels, shift))
 
-    def add(self, one: KeyframePatches) -> None:
-        """Remember the patches of another keyframe and, if all slots are full, forget those of the
-        oldest one."""
-        slot, n = self._next, len(one.pixels)
+    def add(self, patches: KeyframePatches) -> None:
+        """Store the patches of another keyframe; if all slots are full, they replace those of the
+        oldest keyframe."""
+        slot, n = self._next, len(patches.pixels)
         if n > self._shift.shape[1]:
             self._pixels = _widened(self._pixels, n)
             self._shift = _widened(self._shift, n)
-        self._pixels[slot, :n], self._shift[slot, :n] = one.pixels, one.shift
-        self._keyframes[slot], self._n_features[slot] = one.keyframe, n
+        self._pixels[slot, :n], self._shift[slot, :n] = patches.pixels, patches.shift
+        self._keyframes[slot], self._n_features[slot] = patches.keyframe, n
         self._next = (slot + 1) % len(self._keyframes)
 
     def all(self) -> tuple[KeyframePatches, ...]:
-        """The patches of all remembered keyframes, oldest first, for a checkpoint."""
+        """The stored patches of all keyframes, oldest first, for a checkpoint."""
         slots = np.roll(np.arange(len(self._keyframes)), -self._next)
         return tuple(
             KeyframePatches(
@@ -111,9 +110,9 @@ class RecentPatches:
         )
 
     def of(self, map_: Map, ids: NDArray[np.int32]) -> LandmarkPatches:
-        """The patches of ``(L,)`` landmarks with sorted ids, each from the newest remembered
-        keyframe that observes it; landmarks without one are left out. The result is valid until
-        ``add`` is called."""
+        """The patches of ``(L,)`` landmarks with sorted ids. Each patch is from the newest stored
+        keyframe that observes the landmark; landmarks that no stored keyframe observes are omitted.
+        The result is valid until ``add`` is called."""
         width, arrays = self._shift.shape[1], map_.arrays
         row, view = newest_rows(arrays, self._keyframes, ids)
         seen = np.flatnonzero(row >= 0)
@@ -141,8 +140,9 @@ def certainty_of(frame: Frame, config: AlignmentConfig) -> NDArray[np.uint8] | i
     """``(N,)`` uint8, the factor by which the variance of each feature's position is smaller than
     that of a keypoint (``Arrays.certainty``); 1 for all features of a frame without a pyramid.
 
-    An aligned match is certain. So is a feature without a match: the landmark that it creates is
-    defined by this very position. A match that was not aligned is about half a pixel off.
+    The position of an aligned match is accurate. So is that of a feature without a match, because
+    the position itself defines the landmark that is created from the feature. A match that was not
+    aligned is off by about half a pixel.
     """
     if frame.pyramid is None:
         return 1
@@ -155,7 +155,7 @@ def newest_rows(a, keyframes, ids):
     """For each of ``(L,)`` landmarks, the row of its observation by the newest of ``keyframes``.
 
     The observations of a landmark are linked roughly from the newest to the oldest keyframe, so the
-    search ends at the first one that is older than all ``keyframes``.
+    search ends at the first observation that is older than all ``keyframes``.
 
     Returns:
         ``(L,)`` int64 row in the map's arrays and ``(L,)`` int64 index into ``keyframes``; -1 where
@@ -174,10 +174,10 @@ def newest_rows(a, keyframes, ids):
         if keyframes[k] >= 0:
             place[keyframes[k] - oldest] = k
     for i in range(len(ids)):
-        row, of = a.head[ids[i]], -1
+        row, best = a.head[ids[i]], -1
         while row >= 0 and a.keyframe[row] >= oldest:
             keyframe = a.keyframe[row]
-            if of < keyframe <= newest and place[keyframe - oldest] >= 0:
-                found[i], view[i], of = row, place[keyframe - oldest], keyframe
+            if best < keyframe <= newest and place[keyframe - oldest] >= 0:
+                found[i], view[i], best = row, place[keyframe - oldest], keyframe
             row = a.next_row[row]
     return found, view

@@ -16,7 +16,7 @@ from vslam.reprojection import chi_square_ratio, unpacked
 
 @kernel
 def solve_p3p(points, rays, T_cw):
-    """Poses from which three points are seen along three rays.
+    """Poses of a camera that sees three points along three rays.
 
     Args:
         points: ``(3, 3)`` float64, one point in the world per row.
@@ -34,8 +34,8 @@ def solve_p3p(points, rays, T_cw):
     area = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
     if area <= 1e-12 * longest * longest:
         return 0
-    # The depths l solve l' M_ij l = a_ij (paper, eq. 4-6). Two homogeneous combinations:
-    # l' D1 l = 0 and l' D2 l = 0 (eq. 8).
+    # The depths l solve l' M_ij l = a_ij (paper, eq. 4-6). Two combinations of these equations are
+    # homogeneous: l' D1 l = 0 and l' D2 l = 0 (eq. 8).
     D1, D2 = np.zeros((3, 3)), np.zeros((3, 3))
     D1[0, 0], D1[0, 1], D1[1, 1] = a23, -b12 * a23, a23 - a12
     D1[1, 2], D1[2, 2] = b23 * a12, -a12
@@ -44,7 +44,7 @@ def solve_p3p(points, rays, T_cw):
     for i in range(3):
         for j in range(i):
             D1[i, j], D2[i, j] = D1[j, i], D2[j, i]
-    # A combination D1 + g D2 of determinant zero is a pair of planes (eq. 9-11).
+    # A combination D1 + g D2 whose determinant is zero describes a pair of planes (eq. 9-11).
     g = _real_root(
         _determinant(D2),
         _mixed(D2, D1),
@@ -75,8 +75,8 @@ def solve_p3p(points, rays, T_cw):
         if abs(n0) < 1e-14 * (abs(n1) + abs(n2)):
             continue
         w1, w2 = -n1 / n0, -n2 / n0  # l1 = w1 l2 + w2 l3
-        # Substituting l3 = t l2 into l' D l = 0, with D1 or D2 as D, gives a quadratic in t. The
-        # one that is less parallel to D0 is better conditioned.
+        # Substituting l3 = t l2 into l' D l = 0, where D is D1 or D2, gives a quadratic in t. It
+        # is better conditioned for the matrix that contributes less to D0.
         D = D1 if abs(g) > 1.0 else D2
         A = D[0, 0] * w2 * w2 + 2.0 * D[0, 2] * w2 + D[2, 2]
         B = 2.0 * (D[0, 0] * w1 * w2 + D[0, 1] * w2 + D[0, 2] * w1 + D[1, 2])
@@ -126,8 +126,8 @@ def _dot(rays, i, j):
 
 @inner_kernel
 def _cross(points, out):
-    """Write the normal of the triangle of three points into ``out``; its length is twice the
-    area."""
+    """Write the normal of the triangle of three points into ``out``. Its length is twice the area
+    of the triangle."""
     for k in range(3):
         m, n = (k + 1) % 3, (k + 2) % 3
         out[k] = (points[1, m] - points[0, m]) * (points[2, n] - points[0, n])
@@ -145,7 +145,7 @@ def _determinant(A):
 
 @inner_kernel
 def _mixed(A, B):
-    """Coefficient of g in det(B g + A): the sum over the cofactors of A times the entries of B."""
+    """Coefficient of g in det(A + g B): the sum of the cofactors of A times the entries of B."""
     total = 0.0
     for i in range(3):
         for j in range(3):
@@ -164,13 +164,13 @@ def _real_root(c3, c2, c1, c0):
     discriminant = 0.25 * q * q + p * p * p / 27.0
     if discriminant >= 0.0:
         s = np.sqrt(discriminant)
-        # The larger of the two cube roots is free of cancellation; the other follows from p.
+        # The larger of the two cube roots has no cancellation; the other follows from p.
         u = np.cbrt(-0.5 * q - s) if q >= 0.0 else np.cbrt(-0.5 * q + s)
         x = u - (p / (3.0 * u) if u != 0.0 else 0.0)
     else:
         r = np.sqrt(-p / 3.0)
         cos = min(1.0, max(-1.0, -0.5 * q / (r * r * r)))
-        # Of three real roots, the outermost one is separated best.
+        # Of three real roots, take the one that is farthest from the others.
         angle = np.arccos(cos) / 3.0
         x = 2.0 * r * np.cos(angle) if q <= 0.0 else 2.0 * r * np.cos(angle + 2.0 * np.pi / 3.0)
     x -= shift
@@ -235,8 +235,8 @@ def _pose_of_triangle(points, rays, depth, T):
 
 @inner_kernel
 def _triad(points, axes):
-    """Write an orthonormal frame of a triangle into the rows of ``axes``: the first side, the
-    normal and their cross product."""
+    """Write an orthonormal frame of a triangle into the rows of ``axes``: the direction of the
+    first side, the normal, and their cross product."""
     _cross(points, axes[1])
     for k in range(3):
         axes[0, k] = points[1, k] - points[0, k]
@@ -251,10 +251,8 @@ def _triad(points, axes):
 
 @inner_kernel
 def _score_pose(T, points, uvr, inverse_sigma2, intrinsics, to_beat, inlier):
-    """MSAC score of a pose and its number of inliers (Torr and Zisserman, CVIU 2000).
-
-    Sets ``inlier``. Returns -1, 0 as soon as the score can no longer exceed ``to_beat``.
-    """
+    """MSAC score of a pose (Torr and Zisserman, CVIU 2000) and its number of inliers, which are
+    written into ``inlier``. Returns -1, 0 as soon as the score can no longer exceed ``to_beat``."""
     pinhole = unpacked(intrinsics)
     n = len(points)
     score, count = 0.0, 0
@@ -280,10 +278,10 @@ def _score_pose(T, points, uvr, inverse_sigma2, intrinsics, to_beat, inlier):
 
 @kernel
 def ransac_pose(points, uvr, inverse_sigma2, intrinsics, seed, min_inliers, max_draws, confidence):
-    """Pose with the highest consensus among N matches.
+    """Pose with the highest MSAC score among N matches.
 
-    P3P uses the left image alone, so monocular features serve as well as stereo ones; the score of
-    a pose includes u_right where it is known.
+    P3P uses only the left image, so samples may contain monocular features; the score of a pose
+    includes u_right where it is known.
 
     Args:
         points: ``(N, 3)`` float64 landmarks in the world frame.
@@ -291,13 +289,14 @@ def ransac_pose(points, uvr, inverse_sigma2, intrinsics, seed, min_inliers, max_
         inverse_sigma2: ``(N,)`` float64, inverse variance of a pixel coordinate.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         seed: uint64; the same seed gives the same result.
-        min_inliers: number of inliers of a pose that is worth finding.
+        min_inliers: least number of inliers of an acceptable pose.
         max_draws: maximum number of samples.
-        confidence: sampling ends when a better pose with at least ``min_inliers`` inliers would
-            have been found with this probability.
+        confidence: sampling ends when, with this probability, no better pose with at least
+            ``min_inliers`` inliers has been missed.
 
     Returns:
-        ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers of the best pose, however few.
+        ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers of the best pose, which may be fewer than
+        ``min_inliers``.
     """
     fx, fy, cx, cy, _, _ = intrinsics
     n = len(points)

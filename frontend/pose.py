@@ -24,7 +24,7 @@ def optimise_pose(
     """Pose that minimises the robust reprojection error of fixed landmarks.
 
     Runs four rounds of Gauss-Newton. After each round, the chi-square test classifies all
-    observations again, and only inliers take part in the next. The first two rounds use the Huber
+    observations again, and the next round uses only inliers. The first two rounds use the Huber
     loss.
 
     Args:
@@ -34,7 +34,7 @@ def optimise_pose(
         inverse_sigma2: ``(N,)`` float64, inverse variance of a pixel coordinate.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         disparity_weight: ``(N,)`` float64, standard deviation of u and v over that of the
-            disparity; None takes the weight in ``intrinsics``.
+            disparity; None uses the weight in ``intrinsics``.
 
     Returns:
         ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers; no inliers if fewer than three observations
@@ -53,14 +53,15 @@ def pose_covariance(
     intrinsics: NDArray[np.float64],
     disparity_weight: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """Covariance of an optimised pose relative to the landmarks: the inverse of the normal matrix,
-    scaled by the mean squared residual (Hartley and Zisserman, Multiple View Geometry, 5.2 and
-    A6.3.2: the variance of the observations is estimated from their residuals).
+    """Covariance of an optimised pose relative to the landmarks.
+
+    It is the inverse of the normal matrix times the variance factor of the observations, which is
+    estimated from their residuals (Hartley and Zisserman, Multiple View Geometry, 5.2 and A6.3.2).
 
     Args:
         T_cw: ``(4, 4)`` optimised pose.
-        points, uvr, inverse_sigma2, intrinsics, disparity_weight: of the inliers, as for
-            ``optimise_pose``.
+        points, uvr, inverse_sigma2, intrinsics, disparity_weight: see ``optimise_pose``; inliers
+            only.
 
     Returns:
         ``(6, 6)`` covariance of ``xi = [v, w]``, metres and radians, where ``exp(xi) T_cw`` is the
@@ -80,10 +81,10 @@ def pose_covariance(
 
 @kernel
 def _information(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics):
-    """Normal matrix, sum of the squared residuals in variances, and number of coordinates."""
-    every = np.ones(len(points), np.bool_)
+    """Normal matrix, sum of the chi-squares of all observations, and number of coordinates."""
+    inlier = np.ones(len(points), np.bool_)
     H, _, chi2, _, n = normal_equations(
-        T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics, every, False
+        T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics, inlier, False
     )
     for row in range(6):
         for column in range(row):
@@ -122,8 +123,8 @@ def normal_equations(T, points, uvr, inverse_sigma2, disparity_weight, intrinsic
     ``robust``.
 
     Returns:
-        Lower triangle of the normal matrix, right side, sum of the squared errors in variances,
-        number of observations, and number of their coordinates.
+        Lower triangle of the normal matrix, right-hand side, sum of the chi-squares of the
+        observations, number of observations, and number of their coordinates.
     """
     fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
     H = np.zeros((6, 6))
@@ -170,7 +171,7 @@ def normal_equations(T, points, uvr, inverse_sigma2, disparity_weight, intrinsic
 
 @inner_kernel
 def classify(T, points, uvr, inverse_sigma2, disparity_weight, intrinsics, inlier):
-    """Set ``inlier`` to the observations that pass the chi-square test at pose ``T``."""
+    """Write into ``inlier`` whether each observation passes the chi-square test at pose ``T``."""
     fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
     for i in range(len(points)):
         p = points[i]

@@ -1,10 +1,10 @@
 """Sparse image alignment: the motion between two frames from the grey values around landmarks.
 
-Small windows around the landmarks of the last frame are moved over the new image until they agree
-with it, all at once, by a common motion of the camera (SVO: Forster et al., ICRA 2014, III-A, and
-T-RO 2017, IV-A). The images are small, coarsest first, so that a prediction may be wrong by some
-twenty pixels, as in a turn that has just begun. The mean of every window and the contrast of the
-image are removed, because the light may change between two frames.
+The motion of the camera is optimised until small windows around all landmarks of the last frame
+agree with the new image (SVO: Forster et al., ICRA 2014, III-A, and T-RO 2017, IV-A). Small images
+are used, the coarsest first, so that the prediction may be off by about twenty pixels, for example
+at the beginning of a turn. The light may change between two frames, so the mean of each window is
+subtracted, and a common factor of contrast is estimated.
 """
 
 from __future__ import annotations
@@ -14,22 +14,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.features import Pyramid
-from vslam.geometry import Matrix, compose, inverse, orthonormalised, se3_exp, solve_positive
+from vslam.geometry import (
+    Matrix,
+    compose,
+    inverse,
+    orthonormalised,
+    se3_exp,
+    solve_positive,
+    transform,
+)
 from vslam.kernels import inner_kernel, kernel
 
 WINDOW = 4  # pixels along each side
 PIXELS = WINDOW * WINDOW
 ITERATIONS = 10
 MIN_WINDOWS, MAX_WINDOWS = 20, 256
-MIN_CORRELATION = 0.6  # of all windows with the image; lower where the motion was not found
-STILL = 0.02  # pixels of the level; a smaller turn ends the iteration
-STILL_M = 0.005  # and a smaller shift, in the unit of the map
-ROBUST = 1.5  # windows that differ by more than this multiple of the median count less (Huber)
+MIN_CORRELATION = 0.6  # between all windows and the image; below it, the alignment has failed
+# The iteration ends when a step rotates the image by less than STILL pixels of the level and moves
+# the camera by less than STILL_M units of the map.
+STILL, STILL_M = 0.02, 0.005
+ROBUST = 1.5  # Huber threshold of a window's error, as a multiple of the median error
 
 
 def coarse_levels(pyramid: Pyramid) -> Pyramid:
-    """The images that frames are aligned by: half of the smallest level of a pyramid, that level,
-    and the one in the middle."""
+    """The images for the alignment of frames, coarsest first: the smallest level of a pyramid at
+    half size, this level, and the middle level."""
     height, width = pyramid.shapes[0]
     last, middle = len(pyramid.shapes) - 1, len(pyramid.shapes) // 2
     smallest = pyramid.level(last)
@@ -41,7 +50,7 @@ def coarse_levels(pyramid: Pyramid) -> Pyramid:
 
 
 def coarse_shapes(shapes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The ``(3, 2)`` heights and widths of ``coarse_levels``.
+    """``(3, 2)`` heights and widths of ``coarse_levels``.
 
     Args:
         shapes: ``(L, 2)`` heights and widths of the levels of the whole pyramid.
@@ -53,10 +62,13 @@ def coarse_shapes(shapes: NDArray[np.int64]) -> NDArray[np.int64]:
 def coarse_pyramid(
     pixels: NDArray[np.uint8], shapes: NDArray[np.int64], size: tuple[int, int]
 ) -> Pyramid:
-    """``coarse_levels`` from the pixels of all levels, and the height and width of the image.
+    """``coarse_levels`` from the pixels and shapes of its levels.
+
+    Args:
+        size: height and width of the whole image, pixels.
 
     Raises:
-        ValueError: the number of pixels is not that of the shapes.
+        ValueError: the number of pixels does not match the shapes.
     """
     counts = shapes.prod(axis=1)
     if len(pixels) != counts.sum():
@@ -77,18 +89,18 @@ def align_pose(
     """Pose of a frame by sparse image alignment to another one.
 
     Args:
-        now, before: ``coarse_levels`` of the frame and of the other one.
+        now, before: ``coarse_levels`` of the frame and of the other frame.
         xyz: ``(N, 3)`` landmarks that the other frame tracks, in the world.
-        T_before: ``(4, 4)`` pose of the other frame.
+        T_before: ``(4, 4)`` pose of the other frame (world to camera).
         T_cw: ``(4, 4)`` predicted pose of the frame.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         size: height and width of the whole images, pixels.
 
     Returns:
-        ``(4, 4)`` pose ``T_cw``: the predicted one if the windows do not agree with the image.
+        ``(4, 4)`` pose ``T_cw``; the predicted pose if the alignment fails.
     """
-    every = -(-len(xyz) // MAX_WINDOWS) or 1
-    points = np.ascontiguousarray(xyz[::every] @ T_before[:3, :3].T + T_before[:3, 3])
+    stride = -(-len(xyz) // MAX_WINDOWS) or 1
+    points = np.ascontiguousarray(transform(T_before, xyz[::stride]))
     T, correlation = T_cw @ inverse(T_before), 0.0
     for level, (height, width) in enumerate(now.shapes.tolist()):
         T, correlation = _align(
@@ -104,18 +116,20 @@ def align_pose(
 
 
 @kernel
-def _align(image, before, points, T_start, intrinsics, wide, high):
-    """Gauss-Newton, inverse compositional: slopes and Jacobians are those of the image before.
+def _align(image, before, points, T_start, intrinsics, ratio_x, ratio_y):
+    """Align one level by inverse compositional Gauss-Newton: gradients and Jacobians are computed
+    once, in the image ``before``.
 
     Args:
         image, before: ``(h, w)`` uint8.
-        points: ``(N, 3)`` in the camera of ``before``.
-        T_start: ``(4, 4)`` maps them to the camera of ``image``.
-        wide, high: full-resolution pixels for a pixel of the level.
+        points: ``(N, 3)`` landmarks in the camera frame of ``before``.
+        T_start: ``(4, 4)`` initial motion, from the camera frame of ``before`` to that of
+            ``image``.
+        ratio_x, ratio_y: full-resolution pixels per pixel of the level.
 
     Returns:
-        That motion, and the correlation of the windows with the image; the start and 0 if they do
-        not agree.
+        The ``(4, 4)`` motion, and the correlation between all windows and the image; ``T_start``
+        and 0 if the alignment fails.
     """
     n = len(points)
     template = np.empty((n, PIXELS), np.float32)
@@ -124,7 +138,9 @@ def _align(image, before, points, T_start, intrinsics, wide, high):
     used = np.empty(n, np.int64)
     m = 0
     for i in range(n):
-        if _draw_template(before, points[i], intrinsics, wide, high, template[m], jacobian[m]):
+        if _draw_template(
+            before, points[i], intrinsics, ratio_x, ratio_y, template[m], jacobian[m]
+        ):
             _square(jacobian[m], hessian[m])
             used[m] = i
             m += 1
@@ -136,7 +152,7 @@ def _align(image, before, points, T_start, intrinsics, wide, high):
         count = 0
         for i in range(m):
             error[i] = -1.0
-            if not _read_window(image, T, points[used[i]], intrinsics, wide, high, seen[i]):
+            if not _read_window(image, T, points[used[i]], intrinsics, ratio_x, ratio_y, seen[i]):
                 continue
             error[i] = 0.0
             count += 1
@@ -150,36 +166,37 @@ def _align(image, before, points, T_start, intrinsics, wide, high):
         correlation = product / np.sqrt(energy * square)
         step = _step(seen, template, jacobian, hessian, error, m, contrast)
         T = compose(T, se3_exp(-step))
-        turn = max(abs(step[3]), abs(step[4]), abs(step[5])) * intrinsics[0] / wide
+        turn = max(abs(step[3]), abs(step[4]), abs(step[5])) * intrinsics[0] / ratio_x
         if turn < STILL and max(abs(step[0]), abs(step[1]), abs(step[2])) < STILL_M:
             break
     return T, correlation
 
 
 @inner_kernel
-def _corner(point, intrinsics, wide, high):
+def _corner(point, intrinsics, ratio_x, ratio_y):
     """Column and row, in the level, of the first pixel of the window around a projected point."""
     u = intrinsics[0] * point[0] / point[2] + intrinsics[2]
     v = intrinsics[1] * point[1] / point[2] + intrinsics[3]
     middle = 0.5 + 0.5 * (WINDOW - 1)
-    return (u + 0.5) / wide - middle, (v + 0.5) / high - middle
+    return (u + 0.5) / ratio_x - middle, (v + 0.5) / ratio_y - middle
 
 
 @inner_kernel
-def _draw_template(before, point, intrinsics, wide, high, template, jacobian):
-    """Grey values of the window around a point, and their derivatives by the motion, both without
-    their mean; returns whether the window lies in the image."""
+def _draw_template(before, point, intrinsics, ratio_x, ratio_y, template, jacobian):
+    """Write the grey values of the window around a point into ``template``, and their derivatives
+    with respect to the motion into ``jacobian``, each minus its mean over the window. Returns
+    whether the window lies inside the image."""
     height, width = before.shape
     x, y, z = point[0], point[1], point[2]
     if not z > 0.1:
         return False
-    u, v = _corner(point, intrinsics, wide, high)
+    u, v = _corner(point, intrinsics, ratio_x, ratio_y)
     if not (1.0 <= u < width - WINDOW - 2 and 1.0 <= v < height - WINDOW - 2):
         return False
     left, top = int(u), int(v)
     a, b = u - left, v - top
     w00, w01, w10, w11 = (1.0 - b) * (1.0 - a), (1.0 - b) * a, b * (1.0 - a), b * a
-    fx, fy = intrinsics[0] / (wide * z), intrinsics[1] / (high * z)
+    fx, fy = intrinsics[0] / (ratio_x * z), intrinsics[1] / (ratio_y * z)
     mean = np.float32(0.0)
     means = np.zeros(6, np.float32)
     for r in range(WINDOW):
@@ -212,16 +229,16 @@ def _draw_template(before, point, intrinsics, wide, high, template, jacobian):
 
 
 @inner_kernel
-def _read_window(image, T, p, intrinsics, wide, high, seen):
-    """Grey values where a moved point should be seen, without their mean; returns whether that lies
-    in the image."""
+def _read_window(image, T, p, intrinsics, ratio_x, ratio_y, seen):
+    """Write the grey values of the window around a point that was moved by ``T``, minus their mean,
+    into ``seen``. Returns whether the window lies inside the image."""
     height, width = image.shape
     x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
     y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
     z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
     if not z > 0.1:
         return False
-    u, v = _corner((x, y, z), intrinsics, wide, high)
+    u, v = _corner((x, y, z), intrinsics, ratio_x, ratio_y)
     if not (0.0 <= u < width - WINDOW and 0.0 <= v < height - WINDOW):
         return False
     left, top = int(u), int(v)
@@ -243,7 +260,7 @@ def _read_window(image, T, p, intrinsics, wide, high, seen):
 
 @inner_kernel
 def _square(jacobian, hessian):
-    """Normal matrix of one window, its lower half."""
+    """Write the lower triangle of the normal matrix of one window into ``hessian``."""
     for j in range(6):
         for t in range(j + 1):
             total = np.float32(0.0)
@@ -254,11 +271,11 @@ def _square(jacobian, hessian):
 
 @inner_kernel
 def _step(seen, template, jacobian, hessian, error, m, contrast):
-    """``(6,)`` motion of the windows that explains what is seen; ``error`` is negative for windows
-    outside the image."""
+    """``(6,)`` Gauss-Newton step that reduces the differences between ``seen`` and the templates;
+    ``error`` is negative for windows outside the image."""
     inside = 0
     scale = np.float32(1.0 / contrast)
-    sizes = np.empty(m)
+    valid_errors = np.empty(m)
     for i in range(m):
         if error[i] < 0.0:
             continue
@@ -267,9 +284,9 @@ def _step(seen, template, jacobian, hessian, error, m, contrast):
             difference = scale * seen[i, k] - template[i, k]
             total += difference * difference
         error[i] = np.sqrt(total)
-        sizes[inside] = error[i]
+        valid_errors[inside] = error[i]
         inside += 1
-    limit = ROBUST * np.median(sizes[:inside]) + 1e-6
+    limit = ROBUST * np.median(valid_errors[:inside]) + 1e-6
     H, b = np.zeros((6, 6)), np.zeros(6)
     for i in range(m):
         if error[i] < 0.0:

@@ -1,5 +1,5 @@
-"""Relocalisation (ORB-SLAM, T-RO 2015, V-C): when a lost or doubtful frame is searched in the whole
-map, at which places, and how its pose is found there."""
+"""Relocalisation: finds the pose of a lost or doubtful frame anywhere in the map (ORB-SLAM, T-RO
+2015, V-C)."""
 
 from __future__ import annotations
 
@@ -11,10 +11,16 @@ import numpy as np
 from vslam.camera import Image
 from vslam.features import Features, TrackingState
 from vslam.frontend.frame import Frame
-from vslam.frontend.matching import count_elsewhere, search_all
+from vslam.frontend.matching import count_elsewhere
 from vslam.frontend.pnp import ransac_pose
 from vslam.frontend.tracker import Found, judge
-from vslam.frontend.tracking import TrackingContext, observations, refine, track_local_map
+from vslam.frontend.tracking import (
+    TrackingContext,
+    match_descriptors,
+    observations,
+    refine,
+    track_local_map,
+)
 from vslam.loops import LoopCandidate, Sighting
 from vslam.map import Map
 from vslam.map_view import LocalMap, local_map
@@ -23,7 +29,7 @@ Locate = Callable[[Image | None, Features, Map], list[LoopCandidate]]
 
 
 class Recognise(Protocol):
-    """Finds a frame at one of the candidates after matching by ORB descriptors has failed."""
+    """Finds the pose of a frame at one of the candidates if ORB descriptors do not match there."""
 
     def __call__(
         self, map_: Map, image: Image | None, features: Features, candidates: list[LoopCandidate]
@@ -31,55 +37,59 @@ class Recognise(Protocol):
 
 
 class MapAccess(Protocol):
-    """Access to the map when it may be read."""
+    """Access to the map while local mapping does not write to it."""
 
     @property
     def is_merged(self) -> bool:
-        """Whether tracking sees everything that has been mapped, i.e. no keyframe is being
-        mapped."""
+        """Whether no keyframe is being mapped, so that tracking sees the whole map."""
         ...
 
     def merge(self) -> Map:
-        """Wait for the keyframe that is being mapped, make it visible to tracking, and return the
-        map."""
+        """Wait until no keyframe is being mapped, make the last one visible to tracking, and return
+        the map."""
         ...
 
 
 class Relocaliser:
-    """Searches for a frame at the keyframes that it resembles."""
+    """Relocalises frames at the keyframes that they resemble."""
 
     def __init__(self, context: TrackingContext, locate: Locate, recognise: Recognise) -> None:
         """
         Args:
             locate: returns the keyframes that a frame resembles, best first.
-            recognise: called if matching by ORB descriptors fails at all of them.
+            recognise: called if ORB descriptors match at none of these keyframes.
         """
         self._context = context
         self._locate = locate
         self._recognise = recognise
 
     def relocalise_if_needed(self, frame: Frame, found: Found, owner: MapAccess) -> Found:
-        """Search the whole map for a frame that is lost or doubtful; returns ``found`` if it is
-        neither, or if relocalisation fails.
+        """Relocalise a frame that is lost or doubtful.
 
-        A lost frame is searched only while no keyframe is being mapped. A doubtful frame waits for
-        the mapping, and keeps its tracked pose unless relocalisation finds
-        ``relocalization.better`` times as many inliers.
+        A lost frame is relocalised only while no keyframe is being mapped. For a doubtful frame,
+        wait until the keyframe is mapped; the frame keeps its tracked pose unless relocalisation
+        finds more than ``relocalization.better`` times as many inliers.
+
+        Args:
+            found: the result of tracking the frame.
+
+        Returns:
+            The new result, or ``found`` if the frame keeps its tracked pose.
         """
         if found.is_lost:
             return self._find(frame, owner.merge()) if owner.is_merged else found
         if not found.is_doubtful:
             return found
-        map_ = owner.merge()  # worth the wait, because a doubtful frame will ask for a keyframe
+        map_ = owner.merge()  # worth the wait, because a doubtful frame soon becomes a keyframe
         before = frame.snapshot()
-        elsewhere = self._find(frame, map_)
-        if elsewhere.n_inliers > self._context.config.relocalization.better * found.n_inliers:
-            return elsewhere
+        relocalised = self._find(frame, map_)
+        if relocalised.n_inliers > self._context.config.relocalization.better * found.n_inliers:
+            return relocalised
         frame.restore(before)
         return found
 
     def _find(self, frame: Frame, map_: Map) -> Found:
-        """Search for a frame at the candidates, first by ORB descriptors, then by ``recognise``."""
+        """Relocalise a frame at the candidates, first by ORB descriptors, then by ``recognise``."""
         config = self._context.config.relocalization
         candidates = self._locate(frame.image, frame.features, map_)
         for candidate in candidates[: config.max_candidates]:
@@ -87,17 +97,17 @@ class Relocaliser:
             around = local_map(map_, candidate.match, config.neighbours)
             n_inliers = relocalise(frame, place, around, self._context, seed=candidate.match)
             if n_inliers:
-                return self._found(n_inliers, candidate.match)
+                return self._result(n_inliers, candidate.match)
         sighting = self._recognise(map_, frame.image, frame.features, candidates)
         if sighting is None:
             return Found(TrackingState.LOST)
         frame.set_camera_pose(sighting.T_cw)
-        frame.landmark[sighting.feature] = sighting.landmark
         frame.shift = None
-        frame.xyz[sighting.feature] = map_.arrays.xyz[sighting.landmark]
-        return self._found(len(sighting.feature), sighting.keyframe)
+        xyz = map_.arrays.xyz[sighting.landmark]
+        frame.match(sighting.feature, sighting.landmark, xyz)
+        return self._result(len(sighting.feature), sighting.keyframe)
 
-    def _found(self, n_inliers: int, keyframe: int) -> Found:
+    def _result(self, n_inliers: int, keyframe: int) -> Found:
         state = judge(n_inliers, n_inliers, self._context)
         lost = state == TrackingState.LOST
         return Found(state, n_inliers, n_inliers, keyframe=-1 if lost else keyframe)
@@ -108,12 +118,12 @@ def relocalise(
 ) -> int:
     """Find the pose of a frame, without any prediction, at a place that it resembles.
 
-    Its descriptors are matched with the landmarks of the place, and P3P inside RANSAC, which needs
-    no stereo, estimates a pose. Then all landmarks of the surroundings are searched for near their
-    projections, first in a wide window, then in the usual one.
+    The descriptors of the frame are matched with the landmarks of the place, and a pose is
+    estimated by P3P inside RANSAC, which needs no stereo. Then all landmarks of the surroundings
+    are searched for near their projections, first in a wide window, then in the usual one.
 
     Args:
-        frame: receives its pose and its landmarks on success; otherwise both are reset.
+        frame: receives the pose and the matches on success; otherwise both are reset.
         place: the landmarks of a candidate keyframe.
         surroundings: the landmarks of the candidate and its covisible keyframes.
         seed: seed of the random samples; the same seed gives the same result.
@@ -128,8 +138,7 @@ def relocalise(
     if inliers >= config.min_inliers and elsewhere >= config.min_elsewhere:
         return inliers
     frame.T_cw = np.eye(4)
-    frame.landmark[:] = -1
-    frame.xyz[:] = np.nan
+    frame.drop_matches()
     return 0
 
 
@@ -137,18 +146,11 @@ def _locate(
     frame: Frame, place: LocalMap, surroundings: LocalMap, context: TrackingContext, seed: int
 ) -> int:
     config = context.config.relocalization
-    found = search_all(
-        place.descriptor,
-        frame.features.descriptors.view(np.uint64),
-        config.match_distance,
-        config.match_ratio,
-    )
-    hit = np.flatnonzero(found >= 0)
-    if len(hit) < config.min_matches:
+    feature, landmark = match_descriptors(frame, place, config.match_distance, config.match_ratio)
+    if len(feature) < config.min_matches:
         return 0
-    feature = found[hit]
     T_camera_w, inlier = ransac_pose(
-        place.xyz[hit],
+        place.xyz[landmark],
         *observations(frame, feature, context),
         context.camera.intrinsics,
         np.uint64(seed),
@@ -158,10 +160,9 @@ def _locate(
     )
     if np.count_nonzero(inlier) < config.min_consensus:
         return 0
-    frame.landmark[:] = -1
-    frame.xyz[:] = np.nan
-    frame.landmark[feature[inlier]] = place.ids[hit[inlier]]
-    frame.xyz[feature[inlier]] = place.xyz[hit[inlier]]
+    feature, landmark = feature[inlier], landmark[inlier]
+    frame.drop_matches()
+    frame.match(feature, place.ids[landmark], place.xyz[landmark])
     frame.set_camera_pose(T_camera_w)
     inliers = refine(frame, frame.T_cw, context)
     for window in (config.first_window, context.config.tracking.local_window):

@@ -1,4 +1,4 @@
-"""Corrects frames for errors of a stereo rig that rectification leaves.
+"""Corrects frames for errors of a stereo rig that remain after rectification.
 
 Two errors are corrected: a common offset of all disparities, which is estimated while the map grows
 (``backend/disparity_offset.py``), and the delay of the right image given in the calibration file
@@ -24,14 +24,14 @@ from vslam.states import RigState
 
 
 class RigCalibration:
-    """The corrections of a stereo pair. After stereo matching, nothing else writes the ``u_right``
-    of a frame.
+    """The corrections of a stereo pair. After stereo matching, only this class changes the
+    ``u_right`` of a frame.
 
     Attributes:
         disparity_offset: pixels to be added to every measured disparity. The owner of the map sets
             it to the map's disparity offset at each merge.
         delay: the measured delay of the right image.
-        sides: what the comparisons of both images showed.
+        sides: a summary of the comparisons of left and right images.
         problems: a sentence for each frame whose right image could not be read.
     """
 
@@ -48,8 +48,8 @@ class RigCalibration:
         self._scales = scales
 
     def extract(self, frame: Frame, twist: Matrix | None) -> None:
-        """Extract the features of a frame, if that has not been done, note what its sides show and
-        ``prepare`` it."""
+        """Extract the features of a frame if that has not been done, record the comparison of its
+        two images, and ``prepare`` the frame."""
         source = frame.source
         frame.extract(self._camera)
         if source is not None and source.sides is not None:
@@ -69,16 +69,16 @@ class RigCalibration:
                 unknown.
         """
         self.correct_offset(frame)
-        late = self._camera.right_delay
-        if frame.delay_removed or twist is None or late == 0.0:
+        delay = self._camera.right_delay
+        if frame.delay_removed or twist is None or delay == 0.0:
             return
         xy, u_right = frame.features.xy, frame.features.u_right
-        u_right = columns_without_delay(xy, u_right, twist, late, self._camera)
+        u_right = columns_without_delay(xy, u_right, twist, delay, self._camera)
         frame.features = replace(frame.features, u_right=u_right)
         frame.delay_removed = True
 
     def correct_offset(self, frame: Frame) -> None:
-        """Replace the offset by which the disparities of a frame were corrected by the current
+        """Update the disparities of a frame from the offset that they contain to the current
         one."""
         change = self.disparity_offset - frame.disparity_offset
         if change == 0.0:
@@ -102,14 +102,15 @@ class RigCalibration:
         self.delay.add(frame.features, frame.row_offset, twist, self._scales)
 
     def state(self) -> RigState:
-        """What was measured so far; the disparity offset is part of the map."""
+        """The measurements so far, for a saved map or a checkpoint. They do not include the
+        disparity offset, which is part of the map."""
         return RigState(self.delay.state().numbers(), self.sides.numbers())
 
     def restore(self, state: RigState) -> None:
         """Continue from a state that ``state`` returned.
 
         Raises:
-            ValueError: the state is damaged.
+            ValueError: the stored state is damaged.
         """
         self.delay.restore(DelayState.of_numbers(state.delay))
         self.sides = ComparedSides.of_numbers(state.sides)

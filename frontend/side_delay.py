@@ -1,15 +1,15 @@
 """Measures the delay of the right image of a stereo pair from the rows of stereo matches.
 
-In a rectified pair a point lies in the same row of both images. If the right image is taken later,
-the point's row in it is shifted by its image velocity times the delay. Its column is shifted as
-well, which distorts the map: bundle adjustment explains much of a column shift by depth and motion.
-A row shift does not depend on depth, so bundle adjustment cannot absorb it, and no map is needed to
-measure it. If a wrong calibration misaligns the rows, they are shifted by the same amount at every
-speed; a polynomial of the position in the image models that part.
+In a rectified pair, a point lies in the same row of both images. If the right image is taken later,
+the point's row in the right image is shifted by its image velocity times the delay. Its column is
+shifted as well, which distorts the map, because bundle adjustment explains much of a column shift
+by depth and motion. A row shift does not depend on depth, so bundle adjustment cannot absorb it,
+and no map is needed to measure it. A wrong calibration also shifts the rows, but by the same amount
+at every speed; a polynomial of the position in the image models this part.
 
 The delay is measured and reported, but not corrected during the run: it is known only after some
-seconds, when the map is already distorted. Set ``Camera.right_delay`` in the calibration to correct
-it in every frame whose motion is known.
+seconds, when the map is already distorted. To correct it in every frame whose motion is known, set
+``Camera.right_delay`` in the calibration.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from vslam.geometry import Matrix
 from vslam.image_motion import rays, row_speeds
 from vslam.kernels import inner_kernel, kernel
 
-EVERY = 8  # one in this many features is measured, about a hundred per image
+EVERY = 8  # every 8th feature is measured, about a hundred per image
 ROUNDS = 3  # maximum number of Gauss-Newton steps
-STILL = 0.05  # pixels; a smaller step ends the iteration
-LARGEST = 3.0  # pixels of the feature's level; a larger shift is a wrong match
+STILL = 0.05  # pixels; the iteration ends with a smaller step
+LARGEST = 3.0  # pixels of the feature's level; a match with a larger shift is wrong
 HUBER_PX = 0.3
 FRAMES_OF_A_GROUP, FEWEST_GROUPS, MOST_GROUPS = 5, 5, 16
 _DEGREE = 3  # degree of the polynomial in the image coordinates
-_NUISANCES = (_DEGREE + 1) * (_DEGREE + 2) // 2
-_SOLUTION, _TWIST = (1 + _NUISANCES,), (6,)
-_WAITING, _GROUP = (7 + _NUISANCES, 7 + _NUISANCES), (2 + _NUISANCES, 2 + _NUISANCES)
+_P = (_DEGREE + 1) * (_DEGREE + 2) // 2  # number of its coefficients
+# Shapes of the arrays of ``DelayState``.
+_SOLUTION, _TWIST, _WAITING, _GROUP = (1 + _P,), (6,), (7 + _P, 7 + _P), (2 + _P, 2 + _P)
 
 
 def row_offsets(
     left: Extraction, right: Extraction, u_right: NDArray[np.float32], config: StereoConfig
 ) -> NDArray[np.float32]:
-    """``(N,)`` float32, by how many full-resolution pixels the match of a feature is lower in the
-    right image than in the left one, measured for a subset of the features; NaN for the others.
+    """``(N,)`` float32, row of each feature in the right image minus row in the left image, in
+    full-resolution pixels. Only a subset of the features is measured; NaN for the others.
 
     Args:
         u_right: ``(N,)`` columns of the left features in the right image, NaN without a match.
@@ -72,21 +72,21 @@ def _row_offsets(xy, octave, u_right, pixels_l, pixels_r, offsets, shapes, half)
         height, width = shapes[level]
         image_l = pixels_l[offsets[level] : offsets[level] + height * width].reshape(height, width)
         image_r = pixels_r[offsets[level] : offsets[level] + height * width].reshape(height, width)
-        wide, high = shapes[0, 1] / width, shapes[0, 0] / height
-        x, y = level_pixel(xy[i, 0], wide), level_pixel(xy[i, 1], high)
-        moved = (u_right[i] - xy[i, 0]) / wide
-        found[i] = _row_shift(image_l, image_r, x, y, moved, half) * high
+        ratio_x, ratio_y = shapes[0, 1] / width, shapes[0, 0] / height
+        x, y = level_pixel(xy[i, 0], ratio_x), level_pixel(xy[i, 1], ratio_y)
+        dx = (u_right[i] - xy[i, 0]) / ratio_x
+        found[i] = _row_shift(image_l, image_r, x, y, dx, half) * ratio_y
     return found
 
 
 @inner_kernel
 def _row_shift(image_l, image_r, x, y, dx, half):
-    """Rows by which the patch around ``(x, y)`` of the left image is lower in the right one, in
-    pixels of the level; NaN if it has too little texture or cannot be found. The search starts at
-    the horizontal shift ``dx``.
+    """Vertical shift of the patch around ``(x, y)`` from the left to the right image, in pixels of
+    the level; NaN if the patch has too little texture or is not found. The search starts at the
+    horizontal shift ``dx``.
 
     Uses inverse compositional Lucas-Kanade (Baker and Matthews, IJCV 2004), so the gradients are
-    taken from the left patch.
+    those of the left patch.
     """
     height, width = image_l.shape
     edge = half + 1
@@ -115,9 +115,9 @@ def _row_shift(image_l, image_r, x, y, dx, half):
             for k in range(-half, half + 1):
                 gx = 0.5 * (float(image_l[y + j, x + k + 1]) - float(image_l[y + j, x + k - 1]))
                 gy = 0.5 * (float(image_l[y + j + 1, x + k]) - float(image_l[y + j - 1, x + k]))
-                here = _between(image_r, x0 + k, y0 + j, a, b) - float(image_l[y + j, x + k])
-                rx, ry, total = rx + gx * here, ry + gy * here, total + here
-        # Subtracting the mean difference allows for a difference in brightness.
+                r = _interpolated(image_r, x0 + k, y0 + j, a, b) - float(image_l[y + j, x + k])
+                rx, ry, total = rx + gx * r, ry + gy * r, total + r
+        # The mean difference is subtracted, because the images may differ in brightness.
         mean = total / (2 * half + 1) ** 2
         rx, ry = rx - mean * sum_x, ry - mean * sum_y
         step_x, step_y = (yy * rx - xy * ry) / determinant, (xx * ry - xy * rx) / determinant
@@ -130,7 +130,7 @@ def _row_shift(image_l, image_r, x, y, dx, half):
 
 
 @inner_kernel
-def _between(image, x, y, a, b):
+def _interpolated(image, x, y, a, b):
     """Grey value at ``(x + a, y + b)``, interpolated bilinearly."""
     upper = (1.0 - a) * float(image[y, x]) + a * float(image[y, x + 1])
     lower = (1.0 - a) * float(image[y + 1, x]) + a * float(image[y + 1, x + 1])
@@ -144,10 +144,10 @@ class DelayState:
     Attributes:
         n_group: number of frames in the group that is being filled.
         length: number of frames in a full group.
-        solution: ``(1 + P,)`` the delay in seconds and the P coefficients of the polynomial, as of
-            the last full group.
+        solution: ``(1 + P,)`` the delay in seconds and the P coefficients of the polynomial,
+            estimated when the last group became full.
         twist: ``(6,)`` velocity before the last frame, per second.
-        waiting: ``(7 + P, 7 + P)`` moments of the last frame.
+        waiting: ``(7 + P, 7 + P)`` moments of the last frame, which is not in a group yet.
         group: ``(2 + P, 2 + P)`` moments of the group that is being filled.
         groups: ``(G, 2 + P, 2 + P)`` moments of the full groups.
     """
@@ -208,15 +208,15 @@ class DelayState:
 class SideDelay:
     """Least-squares estimate of the delay of the right image from all frames so far.
 
-    The velocity at a frame is the mean of the velocities before and after it, so the moments of a
-    frame are kept until the next frame is tracked. This is possible because image velocities are
-    linear in the twist.
+    The velocity at a frame is the mean of the velocities before and after it, so a frame is added
+    only when the next one is tracked. Until then its moments are kept; the velocity can be applied
+    to them later, because image velocities are linear in the twist.
 
     Attributes:
-        seconds: by how much the right image is later than the left one.
-        sigma: standard deviation of ``seconds``, from the disagreement between groups of frames
-            (cluster-robust: Liang and Zeger, Biometrika 1986); infinite until there are enough
-            groups.
+        seconds: time by which the right image is later than the left one.
+        sigma: standard deviation of ``seconds``, estimated from the disagreement between groups of
+            frames (cluster-robust: Liang and Zeger, Biometrika 1986); infinite until there are
+            enough groups.
     """
 
     def __init__(self, camera: Camera, config: StereoConfig) -> None:
@@ -241,16 +241,17 @@ class SideDelay:
 
         Args:
             features: the N features of the frame.
-            row_offset: ``Extracted.row_offset``; without it the frame is skipped.
-            twist: ``(6,)`` per second; its exponential over the elapsed time maps points from the
-                previous camera frame to this one. None if unknown; then the frame is skipped.
+            row_offset: ``Extracted.row_offset``; if None, the frame is skipped.
+            twist: ``(6,)`` velocity per second: ``exp(twist dt)``, with the elapsed time dt, maps
+                points from the previous camera frame to this one. If None (unknown), the frame is
+                skipped.
             scales: ``(levels,)`` pyramid scale factors.
         """
         state = self._state
         if row_offset is None or twist is None:
             state.waiting[:] = 0.0
             return
-        self._take_in(0.5 * (state.twist + twist))
+        self._add_waiting(0.5 * (state.twist + twist))
         state.twist = twist
         state.waiting = self._moments(features, row_offset, twist, scales)
 
@@ -262,7 +263,7 @@ class SideDelay:
         """Continue from a state that ``state`` returned."""
         self.seconds, self.sigma = 0.0, np.inf
         self._state = deepcopy(state)
-        self._conclude()
+        self._solve()
 
     def _moments(
         self,
@@ -271,32 +272,32 @@ class SideDelay:
         twist: Matrix,
         scales: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Weighted second moments ``(7 + P, 7 + P)`` of the regression of a frame: six derivatives
-        of the row velocity by the twist, the P terms of the polynomial, and the row offset.
-        Outliers are down-weighted (Huber)."""
+        """``(7 + P, 7 + P)`` weighted second moments of the variables of the regression in a frame:
+        the six derivatives of the row velocity with respect to the twist, the P terms of the
+        polynomial, and the row offset. Outliers are down-weighted (Huber)."""
         chosen = np.flatnonzero(np.isfinite(row_offset) & np.isfinite(features.u_right))
         xy = features.xy[chosen]
         x, y = rays(xy, self._camera)
         inverse_depth = (xy[:, 0].astype(np.float64) - features.u_right[chosen]) / self._camera.bf
         speeds = self._camera.fy * row_speeds(x, y, inverse_depth)
         powers = [x**i * y**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
-        found = row_offset[chosen].astype(np.float64)
-        A = np.column_stack([speeds, *powers, found])
+        offset = row_offset[chosen].astype(np.float64)
+        A = np.column_stack([speeds, *powers, offset])
         solution = self._state.solution
-        residual = found - (speeds @ twist) * solution[0] - A[:, 6:-1] @ solution[1:]
+        residual = offset - (speeds @ twist) * solution[0] - A[:, 6:-1] @ solution[1:]
         robust = np.minimum(1.0, HUBER_PX / np.maximum(np.abs(residual), 1e-9))
         weight = robust * scales[features.octave[chosen]] ** -2.0
         moments: NDArray[np.float64] = (A * weight[:, None]).T @ A
         return moments
 
-    def _take_in(self, twist: Matrix) -> None:
-        """Add the moments of the waiting frame to its group, with ``twist`` as its velocity."""
+    def _add_waiting(self, twist: Matrix) -> None:
+        """Add the moments of the waiting frame, whose velocity is ``twist``, to the group."""
         state = self._state
         if not state.waiting.any():
             return
         project = np.zeros((len(state.group), len(state.waiting)))
         project[0, :6] = twist
-        project[1:, 6:] = np.eye(1 + _NUISANCES)
+        project[1:, 6:] = np.eye(1 + _P)
         state.group += project @ state.waiting @ project.T
         state.n_group += 1
         if state.n_group == state.length:
@@ -305,9 +306,10 @@ class SideDelay:
             if len(state.groups) == MOST_GROUPS:  # merge them in pairs
                 state.groups = state.groups[::2] + state.groups[1::2]
                 state.length *= 2
-            self._conclude()
+            self._solve()
 
-    def _conclude(self) -> None:
+    def _solve(self) -> None:
+        """Estimate the delay and its standard deviation from all full groups."""
         groups = self._state.groups
         if len(groups) < FEWEST_GROUPS:
             return
@@ -315,6 +317,6 @@ class SideDelay:
         inverse = np.linalg.pinv(total[:-1, :-1], rcond=1e-12, hermitian=True)
         self._state.solution = solution = inverse @ total[:-1, -1]
         self.seconds = float(solution[0])
-        pulls = (groups[:, :-1, -1] - groups[:, :-1, :-1] @ solution) @ inverse[0]
-        n = len(pulls)
-        self.sigma = float(np.sqrt(n / (n - 1) * pulls @ pulls))
+        influence = (groups[:, :-1, -1] - groups[:, :-1, :-1] @ solution) @ inverse[0]
+        n = len(influence)
+        self.sigma = float(np.sqrt(n / (n - 1) * influence @ influence))

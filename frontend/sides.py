@@ -1,9 +1,9 @@
-"""Compares the exposure of both images of a stereo pair, and balances them where they differ.
+"""Compares the exposure of the two images of a stereo pair, and brightens the darker one.
 
 Stereo matching compares patches by the sum of absolute differences of their grey values. If one
-image is darker by one stop, disparities are biased; at two stops they are useless, although no
-frame is lost. Both cameras look at the same scene, so the gain between them follows from the
-quantiles of all grey values.
+image is darker by one stop, disparities are biased; if it is darker by two stops, they are useless,
+although no frame is lost. Both cameras look at the same scene, so the gain between them can be
+estimated from the quantiles of all grey values.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ from vslam.config import StereoConfig
 
 Grey = NDArray[np.uint8]
 
-_STRIDE = 8  # a few thousand pixels suffice to know quantiles to a grey level
-_LOW, _HIGH = 0.05, 0.95
-_WITHIN = 0.98  # upper quantile as a fraction of the share of pixels that are not overexposed
-_LEAST_SHARE = 0.25  # least share of the pixels from which a gain is estimated
-_LEAST_RANGE = 4.0  # grey levels; over a smaller range, rounding dominates the gain
-_QUANTILES = 11  # compared between the two images
-# The largest distance between the quantiles of the two images, as a fraction of their range: under
-# a gain at most 0.07 for 95 % of the images of KITTI, at least 0.22 if only one image shows a sky.
-_MOST_BENT = 0.12
-_SEES = 16.0  # least range of the grey values of an image that is not black
+_STRIDE = 8  # a few thousand pixels determine the quantiles to within a grey level
+_LOW, _HIGH = 0.05, 0.95  # quantiles between which the images are compared
+_BELOW_CLIPPED = 0.98  # upper quantile, as a fraction of the share of pixels not overexposed
+_MIN_SHARE = 0.25  # least share of the pixels from which a gain is estimated
+_MIN_RANGE = 4.0  # grey levels; over a smaller range, rounding dominates the gain
+_N_QUANTILES = 11  # number of quantiles that are compared between the two images
+# Largest difference between the quantiles of the two images, each scaled to a range of 1. If the
+# images differ by a gain, it is at most 0.07 for 95 % of the images of KITTI; if only one image
+# shows the sky, it is at least 0.22.
+_MAX_DEVIATION = 0.12
+_MIN_VISIBLE_RANGE = 16.0  # least range of the grey values of an image that is not black
 
 
 @dataclass(frozen=True)
@@ -36,9 +37,9 @@ class Sides:
     """The difference in exposure between the two images of a pair.
 
     Attributes:
-        darker_stops: by how many stops the right image is darker than the left one; 0 if they
-            differ by less than the threshold, or if no gain explains the difference.
-        black: the side that is black while the other is not; empty if there is none.
+        darker_stops: by how many stops the right image is darker than the left one, negative if it
+            is brighter; 0 if they differ by less than the threshold, or not by a gain.
+        black: the side whose image is black while the other one is not; empty if there is none.
     """
 
     darker_stops: float = 0.0
@@ -47,12 +48,12 @@ class Sides:
 
 @dataclass
 class ComparedSides:
-    """What the comparisons of a drive showed.
+    """A summary of the comparisons of a drive.
 
     Attributes:
         n: number of comparisons.
-        n_black_left, n_black_right: in how many of them one side was black.
-        darker_stops: ``Sides.darker_stops`` where it was not 0.
+        n_black_left, n_black_right: number of comparisons in which that side was black.
+        darker_stops: all values of ``Sides.darker_stops`` that are not 0.
     """
 
     n: int = 0
@@ -84,18 +85,18 @@ class ComparedSides:
 
 
 def compare_sides(left: Grey, right: Grey, config: StereoConfig) -> Sides:
-    """Compare the exposure of both ``(H, W)`` uint8 images of a rectified pair."""
-    ours, theirs = _shares(left), _shares(right)
-    if _is_black(ours, theirs, config):
+    """Compare the exposure of the two ``(H, W)`` uint8 images of a rectified pair."""
+    shares_l, shares_r = _shares(left), _shares(right)
+    if _is_black(shares_l, shares_r, config):
         return Sides(black="left")
-    if _is_black(theirs, ours, config):
+    if _is_black(shares_r, shares_l, config):
         return Sides(black="right")
-    return Sides(_stops(ours, theirs, config))
+    return Sides(_stops(shares_l, shares_r, config))
 
 
 def balanced(left: Grey, right: Grey, sides: Sides) -> tuple[Grey, Grey]:
-    """Both images; if they differ by a gain, according to ``compare_sides``, the darker one is
-    brightened."""
+    """The left and the right image, the darker one brightened by the gain that ``compare_sides``
+    found."""
     stops = sides.darker_stops
     if stops > 0:
         return left, _brightened(right, left, stops)
@@ -105,14 +106,15 @@ def balanced(left: Grey, right: Grey, sides: Sides) -> tuple[Grey, Grey]:
 
 
 def _shares(image: Grey) -> NDArray[np.float64]:
-    """``(256,)`` cumulative histogram: share of the pixels that are at most as bright."""
+    """``(256,)`` cumulative histogram: share of the pixels that are at most as bright as each grey
+    value."""
     counts = np.bincount(image[::_STRIDE, ::_STRIDE].ravel(), minlength=256)
     return np.cumsum(counts) / counts.sum()
 
 
 def _quantiles(shares: NDArray[np.float64], *at: float) -> list[float]:
-    # Pixels of one grey value are taken to be spread evenly over it, so that quantiles vary
-    # smoothly even if only few grey values occur.
+    # Pixels with the same grey value are assumed to be spread evenly between it and the next one,
+    # so that quantiles vary smoothly even if only few grey values occur.
     values: list[float] = np.interp(at, shares, np.arange(256) + 0.5).tolist()
     return values
 
@@ -122,46 +124,46 @@ def _is_black(side: NDArray[np.float64], other: NDArray[np.float64], config: Ste
     other_low, other_high = _quantiles(other, _LOW, _HIGH)
     if high >= config.black_below:
         return False
-    return other_high - other_low > max(_SEES, 10.0 * (high - low))
+    return other_high - other_low > max(_MIN_VISIBLE_RANGE, 10.0 * (high - low))
 
 
-def _stops(ours: NDArray[np.float64], theirs: NDArray[np.float64], config: StereoConfig) -> float:
-    """Binary logarithm of the gain from ``theirs`` to ``ours``; 0 if it is below the threshold, or
-    if dark and bright pixels do not agree on a gain. Both images are compared below an upper
-    quantile that excludes the pixels that are overexposed in either of them."""
+def _stops(left: NDArray[np.float64], right: NDArray[np.float64], config: StereoConfig) -> float:
+    """Binary logarithm of the gain from the right to the left image, given their ``_shares``; 0 if
+    it is below the threshold, or if dark and bright pixels differ by different gains. The images
+    are compared below an upper quantile that excludes pixels that are overexposed in either one."""
     below = config.clipped_from - 1
-    top, dull = _HIGH, float(min(ours[below], theirs[below]))
-    if dull <= top:
-        top = _WITHIN * dull
-    if top < _LOW + _LEAST_SHARE:
+    top, unclipped = _HIGH, float(min(left[below], right[below]))
+    if unclipped <= top:
+        top = _BELOW_CLIPPED * unclipped
+    if top < _LOW + _MIN_SHARE:
         return 0.0
-    (a_low, a_high), (b_low, b_high) = (
+    (l_low, l_high), (r_low, r_high) = (
         np.diff(_quantiles(shares, _LOW, (_LOW + top) / 2, top)).tolist()
-        for shares in (ours, theirs)
+        for shares in (left, right)
     )
-    least = min(a_low, b_low, a_high, b_high)
-    if min(a_low + a_high, b_low + b_high) < _LEAST_RANGE or least <= 0:
+    least = min(l_low, r_low, l_high, r_high)
+    if min(l_low + l_high, r_low + r_high) < _MIN_RANGE or least <= 0:
         return 0.0
-    gain = log2((a_low + a_high) / (b_low + b_high))
+    gain = log2((l_low + l_high) / (r_low + r_high))
     if abs(gain) <= config.balance_from:
         return 0.0
-    if least >= _LEAST_RANGE:  # over a smaller range, the halves differ by rounding
-        low, high = log2(a_low / b_low), log2(a_high / b_high)
-        # A few more bright pixels in one image stretch only its upper half, which is no gain.
+    if least >= _MIN_RANGE:  # over a smaller range, the gains of both halves differ by rounding
+        low, high = log2(l_low / r_low), log2(l_high / r_high)
+        # More bright pixels in one image stretch only its upper half, which is not a gain.
         if min(low * np.sign(gain), high * np.sign(gain)) <= config.balance_from:
             return 0.0
         if abs(low - high) > config.max_gain_disagreement:
             return 0.0
-    return gain if _proportional(ours, theirs, top) else 0.0
+    return gain if _proportional(left, right, top) else 0.0
 
 
-def _proportional(ours: NDArray[np.float64], theirs: NDArray[np.float64], top: float) -> bool:
-    """Whether the quantiles up to ``top`` are proportional, as a gain makes them. If one image
-    shows what the other does not, such as the sky beside a bridge, they are not."""
-    at = np.linspace(_LOW, top, _QUANTILES)
-    a, b = (np.array(_quantiles(shares, *at)) for shares in (ours, theirs))
+def _proportional(left: NDArray[np.float64], right: NDArray[np.float64], top: float) -> bool:
+    """Whether the quantiles up to ``top`` are proportional, as they are if the images differ by a
+    gain. They are not if only one image shows, for example, the sky beside a bridge."""
+    at = np.linspace(_LOW, top, _N_QUANTILES)
+    a, b = (np.array(_quantiles(shares, *at)) for shares in (left, right))
     a, b = a - a[0], b - b[0]
-    return bool(np.abs(a / a[-1] - b / b[-1]).max() <= _MOST_BENT)
+    return bool(np.abs(a / a[-1] - b / b[-1]).max() <= _MAX_DEVIATION)
 
 
 def _brightened(dark: Grey, bright: Grey, stops: float) -> Grey:

@@ -14,10 +14,10 @@ from vslam.frontend.orb import Extraction
 from vslam.kernels import hamming, inline, inner_kernel, kernel
 
 LANES = 16  # shifts of the SAD window that are evaluated at once
-# Half width of the patch used for sub-pixel refinement, pixels; a larger patch would more often
-# include a nearer object.
+# Half width of the patch for sub-pixel refinement, pixels; a larger patch would more often include
+# a nearer object.
 REFINE_HALF = 4
-MEDIAN_FACTOR = 1.5 * 1.4826  # 1.5 standard deviations, estimated from the median
+MEDIAN_FACTOR = 1.5 * 1.4826  # 1.5 standard deviations, as estimated from the median
 
 
 def match_stereo(
@@ -25,10 +25,10 @@ def match_stereo(
 ) -> NDArray[np.float32]:
     """``(N,)`` float32, column of each left feature in the right image, NaN without a match.
 
-    Candidates lie in the same row (within 2 px at the scale of the right feature) and at most one
-    octave apart, at a disparity between 0 and that of a point one baseline away. The candidate with
-    the closest descriptor is chosen; sliding a SAD window at the level of the left feature then
-    locates the match to a fraction of a pixel.
+    Candidates lie in the same row (within 2 px at the scale of the right feature), at most one
+    octave apart, and at a disparity between 0 and that of a point one baseline away. The candidate
+    with the closest descriptor is chosen. Then a SAD window at the level of the left feature is
+    shifted along the row to locate the match to a fraction of a pixel.
     """
     u_right, sad = _match(
         _Side.of_extraction(left),
@@ -62,7 +62,7 @@ class _Side(NamedTuple):
 
 @kernel
 def rows_to_features(xy, octave, scales, height):
-    """Index the features by the rows in which they may match: those of row r are
+    """Index features by the rows in which they may match. Those of row r are
     ``items[start[r]:start[r + 1]]``, with ``start`` ``(height + 1,)`` int64."""
     start = np.zeros(height + 1, np.int64)
     n = len(xy)
@@ -87,8 +87,8 @@ def rows_to_features(xy, octave, scales, height):
 
 @kernel
 def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, half, reach):
-    """Returns ``(N,)`` float32 ``u_right``, NaN without a match, and ``(N,)`` float32 SAD of each
-    match, -1 without one."""
+    """``u_right`` ``(N,)`` float32, NaN without a match, and ``(N,)`` float32 SAD of each match, -1
+    without one."""
     xy_l, octave_l, descriptors_l, pixels_l = left
     xy_r, octave_r, descriptors_r, pixels_r = right
     n = len(xy_l)
@@ -99,8 +99,8 @@ def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, ha
     for i in range(n):
         u, v = xy_l[i, 0], xy_l[i, 1]
         row = int(v)
-        # Only few features of a row are candidates, and no branch predictor could tell which, so
-        # they are listed without a branch.
+        # Few features of a row are candidates, and a branch would often be mispredicted, so they
+        # are listed without one.
         n_candidates = 0
         for k in range(start[row], start[row + 1]):
             j = items[k]
@@ -122,14 +122,14 @@ def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, ha
         height, width = shapes[level]
         image_l = pixels_l[offsets[level] : offsets[level] + height * width].reshape(height, width)
         image_r = pixels_r[offsets[level] : offsets[level] + height * width].reshape(height, width)
-        wide, high = shapes[0, 1] / width, shapes[0, 0] / height
-        x_l, y_l = level_pixel(u, wide), level_pixel(v, high)
-        x_r = level_pixel(xy_r[best, 0], wide)
+        ratio_x, ratio_y = shapes[0, 1] / width, shapes[0, 0] / height
+        x_l, y_l = level_pixel(u, ratio_x), level_pixel(v, ratio_y)
+        x_r = level_pixel(xy_r[best, 0], ratio_x)
         shift, score = slide(image_l, image_r, x_l, y_l, x_r, half, reach)
         if np.isnan(shift):
             continue
-        # The left feature keeps its sub-pixel offset within the level's pixel.
-        disparity = (x_l - x_r - shift) * wide
+        # The disparity is applied to the left feature's own column, not to the rounded ``x_l``.
+        disparity = (x_l - x_r - shift) * ratio_x
         if disparity < max_disparity and disparity > -1.0:
             u_right[i] = u - max(disparity, MIN_DISPARITY)
             sad[i] = score
@@ -164,9 +164,9 @@ def drop_outliers(u_right, sad, octave):
 
 @kernel
 def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
-    """Offset from ``x_r`` in pixels of the level at which the patches agree best, and their SAD.
-    The offset is NaN if a patch would leave the image or the minimum lies at the end of the
-    search range."""
+    """Offset from ``x_r`` at which the patches agree best, in pixels of the level, and their SAD.
+    The offset is NaN if a patch would leave the image or the minimum is at an end of the search
+    range."""
     height, width = image_l.shape
     if (
         y_l < half
@@ -195,8 +195,9 @@ def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
 def add_differences(image_l, image_r, x_l, y_l, x_r, half, reach, costs):
     """Add the sum of absolute differences at each shift to ``costs``.
 
-    A vector register holds ``LANES`` shifts, and four columns of the patch are summed before it is
-    stored. Lanes beyond the last shift are ignored by the caller and may read from the next row.
+    A vector register holds ``LANES`` shifts, and four columns of the patch are summed before the
+    register is stored. Lanes beyond the last shift may read from the next row; the caller ignores
+    them.
     """
     width = image_l.shape[1]
     flat_l, flat_r = image_l.reshape(image_l.size), image_r.reshape(image_r.size)
@@ -234,7 +235,7 @@ def add_differences(image_l, image_r, x_l, y_l, x_r, half, reach, costs):
 
 @inline
 def difference(a, b):
-    """Absolute difference of two bytes, computed in bytes so that a register holds many."""
+    """Absolute difference of two bytes, computed in bytes so that a register holds many of them."""
     return np.uint16(np.uint8(max(a, b) - min(a, b)))
 
 
@@ -244,8 +245,8 @@ def refine_shift(image_l, image_r, x_l, y_l, x_r, shift, half):
     ``shift`` in (-1, 1).
 
     The minimum of a parabola through three sums of absolute differences is biased towards whole
-    pixels; two Gauss-Newton steps on the interpolated patch remove that bias (Lucas and Kanade,
-    IJCAI 1981).
+    pixels. Two Gauss-Newton steps on the interpolated patch remove this bias (Lucas and Kanade,
+    IJCAI 1981). If they fail, ``shift`` is returned.
     """
     start = shift
     width = image_r.shape[1]

@@ -32,11 +32,11 @@ class TrackerStatus(Enum):
     UNKNOWN = "unknown"
     """No frame has been tracked in this map, and the camera may be anywhere in it."""
     RESUMED = "resumed"
-    """No frame has been tracked yet, but a drive is continued, so the camera is where it ended."""
+    """No frame has been tracked yet, but the camera continues from the end of an earlier drive."""
     TRACKING = "tracking"
-    """The last frame was tracked or relocalised, or it started a map."""
+    """The last frame was tracked, was relocalised, or started a map."""
     LOST = "lost"
-    """The last frame was not tracked; an earlier one may have been."""
+    """The last frame was not tracked."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Found:
         n_matches, n_inliers: number of matched landmarks before and after the last pose
             optimisation.
         visible: ``(N,)`` int32 ids of the landmarks that the frame should see.
-        keyframe: id of the keyframe at which the frame was relocalised; -1 if it was tracked.
+        keyframe: id of the keyframe at which the frame was relocalised; -1 if it was not.
         is_doubtful: whether the frame has so few inliers that its matches may be wrong.
     """
 
@@ -61,8 +61,8 @@ class Found:
 
     @classmethod
     def at_start(cls, frame: Frame, *, begun: bool) -> Found:
-        """The result for a frame before tracking starts: OK with all landmarks that it created if
-        it has started a map (``begun``), otherwise LOST."""
+        """The result for a frame before tracking starts: OK with all landmarks that the frame
+        created if it has started a map (``begun``), otherwise LOST."""
         n_landmarks = int(np.count_nonzero(frame.landmark >= 0))
         state = TrackingState.OK if begun else TrackingState.LOST
         return cls(state, n_landmarks, n_landmarks)
@@ -79,7 +79,7 @@ class Found:
 
 
 def judge(n_matches: int, n_inliers: int, context: TrackingContext) -> TrackingState:
-    """The tracking state, from the numbers of matches and of inliers of the pose optimisation."""
+    """The tracking state for a number of matches and a number of inliers among them."""
     config = context.config.tracking
     # In the wide search windows of an RGB-D camera, even a wrong pose finds some inliers.
     share = config.depth_min_inlier_ratio if context.camera.depth else 0.0
@@ -89,11 +89,11 @@ def judge(n_matches: int, n_inliers: int, context: TrackingContext) -> TrackingS
 
 
 class Tracker:
-    """Tracks one frame after the other. It has no access to the map, only to a view of it.
+    """Tracks one frame after the other. It accesses only a view of the map, not the map itself.
 
     Attributes:
         status: what is known about the position of the camera.
-        last: the frame that was tracked last, None before the first.
+        last: the last frame that was tracked; None before the first.
         lost_frames: number of frames lost since then.
     """
 
@@ -113,8 +113,8 @@ class Tracker:
 
     def predict(self, timestamp: float, frames: FramePoses, view: MapView) -> Matrix:
         """Predict the ``(4, 4)`` pose ``T_cw`` at a time in seconds. The velocity is constant per
-        second, not per frame, so that dropped frames do not disturb it. In a loaded map, the camera
-        is predicted to be at the reference keyframe until it is found.
+        second, not per frame, so that dropped frames do not distort the prediction. Before the
+        first frame of a loaded map, the pose of the reference keyframe is predicted.
 
         Args:
             frames: poses of all earlier frames, including lost ones.
@@ -129,8 +129,8 @@ class Tracker:
 
     def track_patches(self, frame: Frame, T_cw: Matrix, view: MapView) -> Found:
         """Track a frame that is expected at ``T_cw`` by the image patches of landmarks, without
-        features of its own. It is LOST if that fails, or is not possible: there must be a frame
-        before that was tracked."""
+        extracting features. The result is LOST if too few patches are found, and also if the frame
+        cannot be tracked in this way, for example because the previous frame was not tracked."""
         last, config = self.last, self._config.tracking
         if frame.pyramid is None or frame.source is None or not len(view.patches.ids):
             return Found(TrackingState.LOST)
@@ -139,13 +139,13 @@ class Tracker:
         camera = self._context.camera
         if frame.coarse is not None and last.coarse is not None:
             size = camera.height, camera.width
-            seen = last.xyz[last.landmark >= 0]
+            xyz = last.xyz[last.landmark >= 0]
             if frame.mask is not None:
-                uv = camera.project(transform(T_cw, seen))[:, :2]
-                coarsest = np.full(len(seen), self._config.orb.n_levels - 1)
-                seen = seen[frame.mask.shows(uv, coarsest)]
+                uv = camera.project(transform(T_cw, xyz))[:, :2]
+                coarsest = np.full(len(xyz), self._config.orb.n_levels - 1)
+                xyz = xyz[frame.mask.shows(uv, coarsest)]
             T_cw = align_pose(
-                frame.coarse, last.coarse, seen, last.T_cw, T_cw, camera.intrinsics, size
+                frame.coarse, last.coarse, xyz, last.T_cw, T_cw, camera.intrinsics, size
             )
         track = track_patches(frame.pyramid, T_cw, view, self._context, frame.mask)
         n_inliers = len(track.ids)
@@ -183,9 +183,9 @@ class Tracker:
         return Found(state, n_matches, n_inliers, visible, is_doubtful=doubtful)
 
     def accept(self, frame: Frame, found: Found, frames: FramePoses) -> None:
-        """Continue from a frame that was found, and measure its twist from the motion since the
-        last tracked frame. A relocalised frame gets no twist, because the jump to its pose is not a
-        motion of the camera.
+        """Continue from a frame that was tracked or relocalised, and compute its twist from the
+        motion since the last tracked frame. A relocalised frame gets no twist, because the jump to
+        its pose is not a motion of the camera.
 
         Args:
             frames: poses of all earlier frames.
@@ -210,7 +210,8 @@ class Tracker:
         """Continue a drive whose last frame is not available.
 
         Args:
-            twist: ``(6,)`` velocity of the camera at its end, per second; None if unknown.
+            twist: ``(6,)`` velocity of the camera at the end of the drive, per second; None if
+                unknown.
         """
         self.status, self._resumed_twist = TrackerStatus.RESUMED, twist
 
@@ -233,7 +234,7 @@ class Tracker:
         )
 
     def restore(self, state: TrackerState, xyz: Matrix) -> Frame:
-        """Continue from a state that ``state`` returned, and return the last frame.
+        """Continue from a state that ``state`` returned; returns the last tracked frame.
 
         Args:
             xyz: ``(N, 3)`` positions in the world of the landmarks that the last frame tracks, NaN
@@ -255,8 +256,8 @@ class Tracker:
         return last
 
     def _track_previous_frame(self, frame: Frame, T_cw: Matrix, view: MapView) -> int:
-        """Track against the last frame with the predicted pose; if the motion is unknown or this
-        fails, against the reference keyframe. Returns the number of inliers."""
+        """Track against the last frame with the predicted pose. If the motion is unknown or this
+        fails, track against the reference keyframe. Returns the number of inliers."""
         if self.last is None and self.status is not TrackerStatus.RESUMED:
             return 0
         if self.last is not None and self.last.twist is not None:
@@ -270,17 +271,17 @@ class Tracker:
 
     def _track_predicted(self, frame: Frame, T_cw: Matrix, view: MapView) -> int:
         """Match all landmarks of the local map near their predicted positions. After a sudden
-        change of brightness, landmarks that older frames saw may still match where those of the
+        change of brightness, landmarks that older frames saw may still match when those of the
         previous frame do not. Returns the number of inliers, 0 if the prediction was wrong."""
         frame.T_cw = T_cw
-        frame.landmark[:], frame.xyz[:] = -1, np.nan
+        frame.drop_matches()
         window = self._config.tracking.predicted_window
         n_matches, n_inliers, _ = track_local_map(
             frame, view.local_landmarks, self._context, window, view.patches
         )
         if self._moves_as_predicted(n_matches, n_inliers):
             return n_inliers
-        frame.landmark[:], frame.xyz[:] = -1, np.nan
+        frame.drop_matches()
         return 0
 
     def _moves_as_predicted(self, n_matches: int, n_inliers: int) -> bool:
@@ -288,14 +289,14 @@ class Tracker:
         return n_inliers >= max(config.min_inliers_motion, config.min_inlier_ratio * n_matches)
 
     def _is_doubtful(self, frame: Frame, n_inliers: int, view: MapView, frames: FramePoses) -> bool:
-        """Whether a frame has so few inliers that its matches may be wrong, and something else
-        casts doubt on them: a gap in time, no known motion to predict the pose with, or a sudden
-        drop in the number of inliers, for example after the camera was picked up and carried."""
+        """Whether a frame has so few inliers that its matches may be wrong, and there is another
+        reason for doubt: a gap in time, an unknown motion (so that the pose was not predicted), or
+        a sudden drop in the number of inliers (for example after the camera was carried away)."""
         if self.last is None:
             return False
         config = self._config.relocalization
-        usual = frames.timestamp(-1) - frames.timestamp(-2) if len(frames) > 1 else 0
-        gap = frame.timestamp - self.last.timestamp > config.doubtful_gap * usual > 0.0
+        interval = frames.timestamp(-1) - frames.timestamp(-2) if len(frames) > 1 else 0
+        gap = frame.timestamp - self.last.timestamp > config.doubtful_gap * interval > 0.0
         old = view.n_keyframes > self._config.tracking.young_keyframes
         unpredicted = self.last.twist is None and old
         few = n_inliers < config.doubtful_share * view.n_reference
@@ -310,8 +311,8 @@ def result_of(
     stage_ms: dict[str, float],
     odometry: Odometry,
 ) -> TrackResult:
-    """The result that a caller of the library gets for a frame; ``stage_ms`` holds the
-    milliseconds of each stage."""
+    """The result for a frame that the library returns to its caller; ``stage_ms`` holds the time of
+    each stage in milliseconds."""
     return TrackResult(
         index=frame.index,
         timestamp=frame.timestamp,

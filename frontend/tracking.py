@@ -16,6 +16,7 @@ from vslam.config import Config
 from vslam.features import NO_PATCHES, Features, LandmarkPatches, Side
 from vslam.frontend.alignment import align_frame
 from vslam.frontend.frame import Frame
+from vslam.frontend.masks import Mask
 from vslam.frontend.matching import (
     Projections,
     Searchable,
@@ -31,13 +32,14 @@ from vslam.map_view import LocalMap
 from vslam.odometry import adjoint
 from vslam.reprojection import stack_uvr
 
-NEVER = np.iinfo(np.int64).max
-
 
 @dataclass(frozen=True)
 class TrackingContext:
-    """The camera, the configuration, and quantities derived from them; ``scales`` ``(levels,)`` are
-    the pyramid scale factors."""
+    """The camera, the configuration, and quantities that are derived from them.
+
+    Attributes:
+        scales: ``(levels,)`` pyramid scale factors.
+    """
 
     camera: Camera
     config: Config
@@ -49,8 +51,8 @@ class TrackingContext:
 
     @property
     def tracks_patches(self) -> bool:
-        """Whether frames are tracked by patches where that is possible. With RGB-D cameras patches
-        are less accurate and no faster (docs/research/performance.md)."""
+        """Whether frames are tracked by patches if possible. For RGB-D cameras, tracking by patches
+        is less accurate and no faster (docs/research/performance.md)."""
         method, camera = self.config.tracking.method, self.camera
         if method == "auto":
             return camera.sensor == "stereo"
@@ -85,8 +87,8 @@ def track_motion(
     """Project the points that the previous frame saw with the predicted pose, match them near
     their projections, and optimise the pose.
 
-    In addition to landmarks, close stereo points of the previous frame that are not in the map take
-    part (the visual-odometry points of ORB-SLAM2). They stabilise the pose and are then discarded.
+    In addition to landmarks, close stereo points of the previous frame that are not in the map are
+    used (the visual-odometry points of ORB-SLAM2). They stabilise the pose and are then discarded.
 
     Args:
         frame: receives the pose and the matches.
@@ -107,30 +109,26 @@ def track_motion(
     # only rise (or fall). A monocular camera has no baseline to compare the motion with.
     low, high = octave - 1, octave + 1
     if advance > camera.baseline > 0.0:
-        low, high = octave, np.full_like(octave, NEVER)
+        low, high = octave, np.full_like(octave, len(context.scales))
     elif advance < -camera.baseline < 0.0:
         low, high = np.zeros_like(octave), octave
     matches, inliers = 0, 0
     for widening in (1.0, 2.0, 4.0):
         radius = np.where(ahead, context.motion_window * widening * context.scales[octave], 0.0)
-        found = _search(
+        feature, point = _search(
             frame,
             Projections(uvr, radius, low, high, before.descriptors[source].view(np.uint64)),
             np.ones(len(frame.features), np.bool_),
             context,
             1.0,
         )
-        hit = np.flatnonzero(found >= 0)
-        hit = hit[
-            consistent_orientation(before.angle[source[hit]], frame.features.angle[found[hit]])
-        ]
-        matches = len(hit)
+        keep = consistent_orientation(before.angle[source[point]], frame.features.angle[feature])
+        feature, point = feature[keep], point[keep]
+        matches = len(feature)
         if matches < config.min_inliers_motion:
             continue
-        frame.landmark[:] = -1
-        frame.xyz[:] = np.nan
-        frame.landmark[found[hit]] = previous.landmark[source[hit]]
-        frame.xyz[found[hit]] = points[hit]
+        frame.drop_matches()
+        frame.match(feature, previous.landmark[source[point]], points[point])
         inliers = refine(frame, T_cw, context)
         if inliers >= config.min_inliers_motion:
             break
@@ -155,13 +153,28 @@ def trackable_points(
     return points[source], source
 
 
+def match_descriptors(
+    frame: Frame, local: LocalMap, max_distance: int, ratio: float
+) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Match the features of a frame with landmarks by their descriptors alone (``search_all``).
+
+    Returns:
+        ``(M,)`` indices of the matched features, and ``(M,)`` indices of their landmarks in
+        ``local``.
+    """
+    descriptors = frame.features.descriptors.view(np.uint64)
+    feature = search_all(local.descriptor, descriptors, max_distance, ratio)
+    landmark = np.flatnonzero(feature >= 0)
+    return feature[landmark], landmark
+
+
 def track_descriptors(
     frame: Frame,
     reference: LocalMap,
     T_cw: NDArray[np.float64],
     context: TrackingContext,
 ) -> int:
-    """Match landmarks by their descriptors alone, which needs no prediction, and optimise the pose.
+    """Match landmarks by their descriptors alone, without a prediction, and optimise the pose.
 
     Args:
         frame: receives the pose and the matches.
@@ -172,19 +185,13 @@ def track_descriptors(
         Number of inliers of the pose optimisation.
     """
     config = context.config.tracking
-    found = search_all(
-        reference.descriptor,
-        frame.features.descriptors.view(np.uint64),
-        config.reference_distance,
-        config.reference_ratio,
+    feature, landmark = match_descriptors(
+        frame, reference, config.reference_distance, config.reference_ratio
     )
-    hit = np.flatnonzero(found >= 0)
-    frame.landmark[:] = -1
-    frame.xyz[:] = np.nan
-    if len(hit) < config.min_inliers_lost:
+    frame.drop_matches()
+    if len(feature) < config.min_inliers_lost:
         return 0
-    frame.landmark[found[hit]] = reference.ids[hit]
-    frame.xyz[found[hit]] = reference.xyz[hit]
+    frame.match(feature, reference.ids[landmark], reference.xyz[landmark])
     return refine(frame, T_cw, context)
 
 
@@ -195,24 +202,52 @@ def track_local_map(
     window: float | None = None,
     patches: LandmarkPatches = NO_PATCHES,
 ) -> tuple[int, int, NDArray[np.int32]]:
-    """Match every landmark of the local map that should be visible, align the matches to a
-    fraction of a pixel, and optimise the pose.
+    """Match all landmarks of the local map that should be visible, align the matches to a fraction
+    of a pixel, and optimise the pose.
 
     Args:
         frame: receives the pose and the matches.
-        window: search radius at octave 0, pixels; None takes ``context.local_window``.
+        window: search radius at octave 0, pixels; None uses ``context.local_window``.
         patches: patches of the landmarks that can be aligned.
 
     Returns:
         Number of matches, number of inliers, and ``(V,)`` int32 ids of the landmarks that should be
         visible.
     """
-    config, camera = context.config.tracking, context.camera
-    points = np.flatnonzero(frame.landmark < 0)
-    frame.xyz[points] = np.nan  # discard the points that are not in the map
+    config, intrinsics = context.config, context.camera.intrinsics
+    frame.xyz[frame.landmark < 0] = np.nan  # discard the points that are not in the map
     tracked = np.isin(local.ids, frame.landmark[frame.landmark >= 0])
+    if window is None:
+        window = context.local_window
+    uvr, radius, octave = predict_landmarks(frame.T_camera_w, local, window, frame.mask, context)
+    visible = radius > 0
+    radius[tracked] = 0.0
+    feature, landmark = _search(
+        frame,
+        Projections(uvr, radius, octave - 1, octave, local.descriptor),
+        frame.landmark < 0,
+        context,
+        config.tracking.match_ratio,
+    )
+    frame.match(feature, local.ids[landmark], local.xyz[landmark])
+    matches = int(np.count_nonzero(frame.landmark >= 0))
+    shift = align_frame(frame, patches, context.scales, intrinsics, config.alignment)
+    inliers = refine(frame, frame.T_cw, context, shift)
+    return matches, inliers, local.ids[visible | tracked]
+
+
+def predict_landmarks(
+    T_camera_w: Matrix,
+    local: LocalMap,
+    window: float,
+    mask: Mask | None,
+    context: TrackingContext,
+) -> tuple[Matrix, Matrix, NDArray[np.int64]]:
+    """``predict_view`` for the landmarks of a local map. Landmarks on masked pixels are not
+    visible."""
+    camera = context.camera
     uvr, radius, octave = predict_view(
-        frame.T_camera_w,
+        T_camera_w,
         local.xyz,
         local.normal,
         local.distance_range,
@@ -220,26 +255,11 @@ def track_local_map(
         camera.width,
         camera.height,
         context.scales,
-        context.local_window if window is None else window,
+        window,
     )
-    if frame.mask is not None:
-        radius[~frame.mask.shows(uvr[:, :2], octave)] = 0.0
-    visible = radius > 0
-    radius[tracked] = 0.0
-    found = _search(
-        frame,
-        Projections(uvr, radius, octave - 1, octave, local.descriptor),
-        frame.landmark < 0,
-        context,
-        config.match_ratio,
-    )
-    hit = np.flatnonzero(found >= 0)
-    frame.landmark[found[hit]] = local.ids[hit]
-    frame.xyz[found[hit]] = local.xyz[hit]
-    matches = int(np.count_nonzero(frame.landmark >= 0))
-    shift = align_frame(frame, patches, context.scales, camera.intrinsics, context.config.alignment)
-    inliers = refine(frame, frame.T_cw, context, shift)
-    return matches, inliers, local.ids[visible | tracked]
+    if mask is not None:
+        radius[~mask.shows(uvr[:, :2], octave)] = 0.0
+    return uvr, radius, octave
 
 
 def _search(
@@ -248,10 +268,14 @@ def _search(
     free: NDArray[np.bool_],
     context: TrackingContext,
     ratio: float,
-) -> NDArray[np.int32]:
+) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """``search_windows`` in a frame; returns the ``(M,)`` indices of the matched features, and the
+    ``(M,)`` indices of their projections."""
     features = Searchable.of_features(frame.features, frame.grid)
     max_distance = context.config.tracking.match_distance
-    return search_windows(projections, features, free, max_distance, ratio)[0]
+    found, _ = search_windows(projections, features, free, max_distance, ratio)
+    matched = np.flatnonzero(found >= 0)
+    return found[matched], matched
 
 
 def refine(
@@ -272,15 +296,13 @@ def refine(
         frame.T_camera_left @ T_cw, *_observed_points(frame, matched, context)
     )
     frame.set_camera_pose(T_camera_w)
-    outliers = matched[~inlier]
-    frame.landmark[outliers] = -1
-    frame.xyz[outliers] = np.nan
+    frame.drop_matches(matched[~inlier])
     return int(np.count_nonzero(inlier))
 
 
 def covariance_of(frame: Frame, context: TrackingContext) -> Matrix:
-    """``(6, 6)`` covariance of the ``T_cw`` of a tracked frame relative to the points that it
-    tracks, as ``pose_covariance``."""
+    """``(6, 6)`` covariance of the pose ``T_cw`` of a tracked frame relative to the points that it
+    tracks; see ``pose_covariance``."""
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
     covariance = pose_covariance(frame.T_camera_w, *_observed_points(frame, matched, context))
     if frame.side == Side.LEFT:
@@ -293,13 +315,13 @@ def _observed_points(
     frame: Frame, matched: NDArray[np.integer], context: TrackingContext
 ) -> tuple[NDArray[np.float64], ...]:
     """The arguments of ``optimise_pose`` after the pose, for the points that the ``matched``
-    features track, with aligned positions where there are any."""
+    features track. Aligned matches have their aligned positions."""
     uvr, weight = observations(frame, matched, context)
     certainty = np.ones(len(matched))
     if frame.shift is not None:
-        moved = frame.shift[matched]
-        aligned = np.isfinite(moved[:, 0])
-        uvr[aligned] += moved[aligned][:, [0, 1, 0]]
+        shift = frame.shift[matched]
+        aligned = np.isfinite(shift[:, 0])
+        uvr[aligned] += shift[aligned][:, [0, 1, 0]]
         certainty[aligned] = context.config.alignment.certainty
     disparity_weight = DISPARITY_WEIGHT / np.sqrt(certainty)
     intrinsics = context.camera.intrinsics
@@ -309,8 +331,8 @@ def _observed_points(
 def observations(
     frame: Frame, feature: NDArray[np.integer], context: TrackingContext
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """``(N, 3)`` float64 u, v, u_right of ``(N,)`` features of a frame, and the ``(N,)`` inverse
-    variances of their coordinates."""
+    """``(N, 3)`` float64 u, v, u_right of ``(N,)`` features of a frame, and ``(N,)`` float64
+    inverse variances of these coordinates."""
     features = frame.features
     uvr = stack_uvr(features.xy[feature], features.u_right[feature])
     return uvr, context.scales[features.octave[feature]] ** -2.0

@@ -1,10 +1,10 @@
-"""Features of noisy or faint images: noise is filtered and low contrast is raised first.
+"""Features of noisy or faint images: noise is filtered and contrast is raised before extraction.
 
 The thresholds of FAST are grey levels, chosen for images of normal contrast. At night, in fog or
-with a wrong exposure, a corner stands out by only one or two levels; under heavy noise every pixel
-is a corner. Averaging neighbouring pixels recovers fractions of a grey level that rounding has
-spread over them, so that a scene can be recognised in as few as five levels. Images of normal
-contrast and noise are left unchanged.
+with a wrong exposure, a corner differs from its surroundings by only one or two grey levels; in
+heavy noise, every pixel is a corner. Averaging neighbouring pixels recovers differences of less
+than a grey level, so that a scene can be recognised in an image of only five grey levels. Images
+with normal contrast and noise are left unchanged.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from vslam.kernels import kernel
 
 Grey = NDArray[np.uint8]
 
-ROW_STRIDE = 32  # noise is measured in every 32nd row, in 15,000 pixels of a KITTI image
+ROW_STRIDE = 32  # noise is measured in every 32nd row: 15,000 pixels of a KITTI image
 # For Gaussian noise, median abs(I[x-1] - 2 I[x] + I[x+1]) = 0.6745 sqrt(6) sigma.
 _SECOND_DIFFERENCE = 0.6745 * 6.0**0.5
 _SPIKE_DEVIATIONS, LEAST_SPIKE = 4.0, 32.0  # least height of a spike: in sigma, in grey levels
-_MEDIAN = 5  # side of the median filter against spikes, pixels
-_GAUSSIAN = 2.0 * np.pi**0.5  # a Gaussian blur of s pixels divides noise by 2 sqrt(pi) s
+_MEDIAN = 5  # side of the median filter that removes spikes, pixels
+_GAUSSIAN = 2.0 * np.pi**0.5  # a Gaussian blur of s pixels divides the noise by 2 sqrt(pi) s
 _BLOCK = 16  # side of the blocks in which contrast is measured, pixels
-_SHOWS_NOTHING = 2  # grey levels between the darkest and the brightest pixel of an empty image
+_EMPTY_RANGE = 2  # largest range of the grey values of an image that shows nothing
 
 
 def extract_in_any_light(
@@ -39,14 +39,13 @@ def extract_in_any_light(
     image_map: ImageMap = map,
     allowed: Pyramid | None = None,
 ) -> list[Extraction]:
-    """ORB features of ``(H, W)`` uint8 images that were taken at the same time: as from
-    ``extract``, but noisy images are filtered first, and the contrast of faint ones is raised. All
-    images are processed in the same way, because stereo matching compares their patches.
-
-    A pure function: the result does not depend on ``image_map``.
+    """Extract the ORB features of ``(H, W)`` uint8 images that were taken at the same time. Noisy
+    images are filtered first, and the contrast of faint ones is raised. All images are processed in
+    the same way, because stereo matching compares their patches.
 
     Args:
-        image_map: applies a function to all images, in turn or in parallel.
+        image_map: applies a function to all images, one after the other or in parallel; the result
+            is the same.
         allowed: where the first image may have corners, see ``extract``.
     """
     weak = config.weak_images
@@ -63,8 +62,8 @@ def extract_in_any_light(
 
 
 def without_noise(images: Sequence[Grey], config: WeakImageConfig) -> Sequence[Grey]:
-    """Filter the noise of ``(H, W)`` uint8 images: a median filter replaces spikes (single pixels
-    that stand out), and a Gaussian blur reduces the rest to ``noise_left``. Images with normal
+    """Filter the noise of ``(H, W)`` uint8 images: a median filter removes spikes (single bright or
+    dark pixels), and a Gaussian blur reduces the other noise to ``noise_left``. Images with normal
     noise are returned unchanged."""
     measured = [grain(image, ROW_STRIDE, LEAST_SPIKE) for image in images]
     if max(spikes for _, spikes in measured) > config.spikes_from:
@@ -118,15 +117,15 @@ def grain(image, stride, least):
 
 def is_faint(images: Sequence[Grey], counts: Sequence[int], config: Config) -> bool:
     """Whether any of the images has few corners because of low contrast. An image that is out of
-    focus has few corners as well, but raising its contrast would only amplify rounding. An image
-    that shows nothing at all is ignored.
+    focus also has few corners, but raising its contrast would only amplify rounding errors. An
+    image that shows nothing at all is ignored.
 
     Args:
         counts: number of features of each image.
     """
     few = config.weak_images.few_features * config.orb.n_features
     return any(
-        count < few and int(np.ptp(image)) > _SHOWS_NOTHING and _is_faint(image, config.weak_images)
+        count < few and int(np.ptp(image)) > _EMPTY_RANGE and _is_faint(image, config.weak_images)
         for image, count in zip(images, counts, strict=True)
     )
 
@@ -152,8 +151,9 @@ def contrast(image: Grey) -> float:
 
 def with_contrast(image: Grey, config: WeakImageConfig) -> Grey:
     """Normalise the local contrast of an ``(H, W)`` uint8 image: after a blur of one pixel, grey
-    values are scaled so that their standard deviation in a window (``contrast_window``) around
-    every pixel is the same. Flat regions, which contain only noise, are raised less."""
+    values are scaled so that their standard deviation is the same in a window
+    (``contrast_window``) around every pixel. Flat regions, which contain only noise, are amplified
+    less."""
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.0)
     window = (config.contrast_window, config.contrast_window)
     mean = cv2.boxFilter(smooth, -1, window)

@@ -1,8 +1,9 @@
 """Loop detection by bag of words.
 
-Candidates are chosen as in ORB-SLAM (Mur-Artal et al., T-RO 2015, sections III-E and VII-A): by the
-number of shared words, by a score that exceeds that of the query's covisible keyframes, and by
-groups of covisible keyframes. One pass over the index gives the scores of all keyframes.
+Candidates are chosen as in ORB-SLAM (Mur-Artal et al., T-RO 2015, sections III-E and VII-A). They
+share many words with the query, score no lower than the query's covisible keyframes, and represent
+the groups of covisible keyframes with the highest total scores. One pass over the inverted index
+gives the scores of all keyframes.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from vslam.map_kernels import count_shared
 
 
 class BowDetector:
-    """Implements ``LoopDetector`` by visual words. Keyframes must be added in ascending order."""
+    """A ``LoopDetector`` by visual words. Keyframes must be added in ascending order."""
 
     name = "bow"
 
@@ -33,28 +34,32 @@ class BowDetector:
         self.vocabulary = vocabulary
         self.config = config or BowConfig()
         self._index = InvertedIndex(vocabulary.n_words)
-        # The words of keyframe k are word[start[k]:start[k + 1]]; a keyframe that was never added
-        # has none.
+        # CSR layout: the words of keyframe k are word[start[k]:start[k + 1]]. Ids that were never
+        # added have no words.
         self._start = np.zeros(65, np.int64)
         self._word = np.empty(65536, np.int32)
-        self._n_keyframes = 0  # one more than the newest id
+        self._n_keyframes = 0  # newest id + 1
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
-        """Remember the words of a keyframe; the image is ignored.
+        """Store the words of a keyframe; the image is ignored.
 
         Raises:
-            ValueError: the id is not greater than those of all earlier keyframes.
+            ValueError: the id is not greater than that of every earlier keyframe.
         """
         if keyframe < self._n_keyframes:
-            raise ValueError(f"keyframe {keyframe} comes after {self._n_keyframes - 1}")
+            raise ValueError(
+                f"keyframe {keyframe} was added after {self._n_keyframes - 1}; ids must ascend"
+            )
         words = self.vocabulary.words(features.descriptors)
         self._store(keyframe, words)
         self._index.add(keyframe, bow_vector(self.vocabulary, words))
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
-        """Candidates for a keyframe that was added: living keyframes that are neither recent nor
-        covisible with it, and whose score is at least the lowest one of its covisible keyframes. If
-        it has none, any score suffices.
+        """Candidates for a keyframe that was added.
+
+        They are keyframes in the map that are neither recent nor covisible with it, and they score
+        at least as high as its lowest-scoring covisible keyframe. Without covisible keyframes, any
+        score suffices.
         """
         config = self.config
         entries = self._entries(keyframe)
@@ -65,14 +70,14 @@ class BowDetector:
         covisible, _ = map_.covisible(keyframe, config.min_shared)
         covisible = covisible[(covisible < n) & (covisible != keyframe)]
         eligible[covisible] = False
-        known = covisible[np.diff(self._start[: n + 1])[covisible] > 0]
-        least = float(likeness.score[known].min()) if len(known) else 0.0
-        return self._candidates(keyframe, likeness, eligible, least, map_)
+        with_words = covisible[np.diff(self._start[: n + 1])[covisible] > 0]
+        least_score = float(likeness.score[with_words].min()) if len(with_words) else 0.0
+        return self._candidates(keyframe, likeness, eligible, least_score, map_)
 
     def locate(
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
-        """Living keyframes that look similar to a frame outside the map, best first."""
+        """Keyframes in the map that look similar to a frame outside the map, best first."""
         words = self.vocabulary.words(features.descriptors)
         likeness = self._index.compare(bow_vector(self.vocabulary, words))
         eligible = map_.arrays.keyframe_alive[: len(likeness.score)].copy()
@@ -87,9 +92,9 @@ class BowDetector:
     def restore(self, memory: DetectorMemory) -> None:
         require_same(self.memory(), memory)
         words = memory.tables["words"]
-        known = words.values.dtype == np.int32 and words.values.ndim == 1
-        if not known or ((words.values < 0) | (words.values >= self.vocabulary.n_words)).any():
-            raise ValueError("the words of the keyframes are not those of the vocabulary")
+        valid = words.values.dtype == np.int32 and words.values.ndim == 1
+        if not valid or ((words.values < 0) | (words.values >= self.vocabulary.n_words)).any():
+            raise ValueError("the words of the keyframes do not belong to the vocabulary")
         for keyframe in range(len(words)):
             self._store(keyframe, words.of(keyframe))
             self._index.add(keyframe, bow_vector(self.vocabulary, words.of(keyframe)))
@@ -145,11 +150,10 @@ class BowDetector:
 
 @inner_kernel
 def most_covisible(counts, minimum, keyframes, strength):
-    """Write the keyframes with the greatest counts into ``keyframes``, and their counts into
-    ``strength``, both ``(G,)`` int64.
+    """Select up to G keyframes with the highest counts, which must be at least ``minimum``.
 
-    They are sorted by descending count, then by ascending id; counts below ``minimum`` are left
-    out. Returns the number of keyframes.
+    Writes their ids into ``keyframes`` and their counts into ``strength``, both ``(G,)`` int64,
+    sorted by descending count and then by ascending id. Returns the number of keyframes.
     """
     n = 0
     for k in range(len(counts)):
@@ -179,15 +183,16 @@ def choose_candidates(
     group_score_ratio,
     max_groups,
 ):
-    """Choose candidates by shared words, score and groups, without repetitions, best group first.
+    """Choose candidates by shared words, scores and groups of covisible keyframes.
 
-    1. A keyframe passes if it shares at least ``common_words_ratio`` times the greatest number of
-       words that any keyframe shares. Of those with a score of at least ``least_score``, the
-       ``max_groups`` best are kept.
-    2. Each of these forms a group with those of its ``group_size`` best covisible keyframes that
-       pass as well. The score of the group is the sum of its members' scores; its best member
-       represents it.
-    3. Groups with at least ``group_score_ratio`` times the best group score are returned.
+    1. A keyframe passes if it shares at least ``common_words_ratio`` times as many words as the
+       keyframe that shares most. The ``max_groups`` keyframes with the highest scores, which must
+       be at least ``least_score``, are selected among those that pass.
+    2. Each selected keyframe forms a group with those of its ``group_size`` most covisible
+       keyframes that pass. The score of a group is the sum of its members' scores, and its
+       representative is the member with the highest score.
+    3. The representatives of the groups with at least ``group_score_ratio`` times the highest group
+       score are returned.
 
     Args:
         a, n_keyframes: arrays and number of keyframes of the map.
@@ -196,7 +201,7 @@ def choose_candidates(
         eligible: ``(K,)`` bool, keyframes that may be candidates.
 
     Returns:
-        ``(n,)`` int64 ids of the keyframes.
+        ``(n,)`` int64 ids of the keyframes without duplicates, best group first.
     """
     n = len(shared)
     most = 0

@@ -1,8 +1,9 @@
 """The inverted index from words to keyframes of Galvez-Lopez and Tardos (T-RO 2012, IV).
 
 The L1 score of two bags of words is the sum, over their shared words, of the smaller of the two
-weights (vocabulary.py). So one pass over the postings of a query's words gives the number of shared
-words and the score of every keyframe. For this, each posting also stores a weight.
+weights (vocabulary.py). Each posting therefore stores the weight of its word in the keyframe, and
+one pass over the postings of a query's words gives the number of shared words and the score of
+every keyframe.
 """
 
 from __future__ import annotations
@@ -16,13 +17,13 @@ from vslam.kernels import kernel
 from vslam.loopclosure.vocabulary import BowVector
 
 FIRST_BLOCK = 8  # postings in the smallest block: one cache line
-UNIT = 2**31 - 1  # weights are multiples of 1 / UNIT, so that sums are exact in any order
-SHARED = 1 << 40  # one shared word, counted above the bits of a sum of weights
+UNIT = 2**31 - 1  # weights are integer multiples of 1 / UNIT, so sums do not depend on the order
+SHARED = 1 << 40  # added for each shared word; it lies above all bits of a sum of weights
 
 
 def grown(array: NDArray, needed: int) -> NDArray:
-    """The array itself if it has room for ``needed`` items, else a copy that is larger by at least
-    half."""
+    """The array itself if it has room for ``needed`` items, else a copy of at least 1.5 times its
+    length."""
     if needed <= len(array):
         return array
     bigger = np.empty((max(needed, len(array) * 3 // 2), *array.shape[1:]), array.dtype)
@@ -45,14 +46,14 @@ class Likeness(NamedTuple):
 class Postings(NamedTuple):
     """Inverted index of W words. The postings of a word are contiguous, in one block.
 
-    A block has room for 8, 16, 32 ... postings. If the block of a word is full, its postings move
-    to a block of twice the size, and the old block becomes free for other words.
+    The size of a block is 8, 16, 32 or another power of two. When the block of a word is full, its
+    postings move to a block of twice the size, and the old block becomes free for other words.
 
     Attributes:
         start: ``(W,)`` index of the first posting of each word.
         size: ``(W,)`` number of postings of each word.
-        free: ``(40,)`` first free block of each size, -1 for none; the first entry of a free block
-            is the index of the next one.
+        free: ``(40,)`` head of a linked list of the free blocks of each size, -1 if it is empty;
+            the first entry of a free block is the index of the next free block.
         pool: ``(P,)`` postings, ``keyframe << 32 | weight``.
     """
 
@@ -66,7 +67,7 @@ class InvertedIndex:
     """The keyframes that contain each word, and the weight of the word in each of them."""
 
     def __init__(self, n_words: int) -> None:
-        self.n_keyframes = 0  # one more than the newest id
+        self.n_keyframes = 0  # newest id + 1
         self._postings = Postings(
             start=np.zeros(n_words, np.int64),
             size=np.zeros(n_words, np.int32),
@@ -85,7 +86,7 @@ class InvertedIndex:
         self.n_keyframes = max(self.n_keyframes, keyframe + 1)
 
     def compare(self, bag: BowVector) -> Likeness:
-        """Compare an image with all keyframes, from id 0 to the newest one."""
+        """Compare the bag of words of an image with all keyframes, from id 0 to the newest."""
         sums = compare_with_all(self._postings, self.n_keyframes, bag.words, fixed(bag.weights))
         return Likeness((sums // SHARED).astype(np.int32), sums % SHARED / UNIT)
 
@@ -96,8 +97,8 @@ def fixed(weights: NDArray[np.float32]) -> NDArray[np.int64]:
 
 
 def is_full(size):
-    """Whether the block of a word with ``size`` postings is full; ``size`` may be an array. The
-    condition is the same as in ``post``."""
+    """Whether the block of a word with ``size`` postings is full, by the same condition as in
+    ``post``; ``size`` may be an array."""
     return (size & (size - 1) == 0) & ((size == 0) | (size >= FIRST_BLOCK))
 
 
@@ -117,22 +118,22 @@ def post(postings, used, keyframe, words, weights):
     for i in range(len(words)):
         word = words[i]
         n = np.int64(sizes[word])
-        if n == 0 or (n >= FIRST_BLOCK and n & (n - 1) == 0):  # full
-            kind, room = 0, FIRST_BLOCK  # room = FIRST_BLOCK * 2^kind
-            while room <= n:
-                kind += 1
-                room *= 2
-            block = free[kind]
+        if n == 0 or (n >= FIRST_BLOCK and n & (n - 1) == 0):  # the block is full
+            exponent, capacity = 0, FIRST_BLOCK  # capacity = FIRST_BLOCK * 2^exponent
+            while capacity <= n:
+                exponent += 1
+                capacity *= 2
+            block = free[exponent]
             if block >= 0:
-                free[kind] = pool[block]
+                free[exponent] = pool[block]
             else:
                 block = used
-                used += room
+                used += capacity
             for j in range(n):
                 pool[block + j] = pool[start[word] + j]
             if n > 0:
-                pool[start[word]] = free[kind - 1]
-                free[kind - 1] = start[word]
+                pool[start[word]] = free[exponent - 1]
+                free[exponent - 1] = start[word]
             start[word] = block
         pool[start[word] + n] = keyframe << 32 | weights[i]
         sizes[word] = n + 1
@@ -141,8 +142,8 @@ def post(postings, used, keyframe, words, weights):
 
 @kernel
 def compare_with_all(postings, n_keyframes, words, weights):
-    """``(K,)`` int64, for each keyframe ``SHARED`` times the number of shared words plus the sum of
-    the smaller weights. Both are accumulated in one integer, so a posting costs one addition."""
+    """``(K,)`` int64: for each keyframe, ``SHARED`` times the number of shared words plus the sum
+    of the smaller weights. With both in one integer, a posting costs one addition."""
     start, sizes, _, pool = postings
     sums = np.zeros(n_keyframes, np.int64)
     for i in range(len(words)):

@@ -18,27 +18,26 @@ class CombinedDetector:
     """Implements :class:`vslam.loopclosure.detector.LoopDetector`.
 
     The scores of different detectors are not comparable, so the candidates of all detectors are
-    interleaved: first the best one of each, then the second best, and so on. Candidates at the same
-    place are merged into the first of them.
+    interleaved: first the best one of each, then the second best, and so on. Candidates for the
+    same keyframe are joined. Different keyframes of one place all stay candidates, because a change
+    of the light may leave only one of them recognisable.
     """
 
-    def __init__(self, name: str, detectors: list[LoopDetector], min_shared: int) -> None:
-        """``min_shared`` is the number of shared landmarks from which on two keyframes count as the
-        same place."""
+    def __init__(self, name: str, detectors: list[LoopDetector]) -> None:
         self.name = name
-        self._detectors, self._min_shared = detectors, min_shared
+        self._detectors = detectors
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
         for one in self._detectors:
             one.add(keyframe, image, features)
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
-        return self._merged([one.query(keyframe, map_) for one in self._detectors], map_)
+        return _interleaved([one.query(keyframe, map_) for one in self._detectors])
 
     def locate(
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
-        return self._merged([one.locate(image, features, map_) for one in self._detectors], map_)
+        return _interleaved([one.locate(image, features, map_) for one in self._detectors])
 
     def memory(self) -> DetectorMemory:
         """See :class:`LoopDetector`; contains the memory of each detector under its name."""
@@ -58,28 +57,20 @@ class CombinedDetector:
             tables = {name: memory.tables[f"{own.name}/{name}"] for name in own.tables}
             one.restore(replace(own, tables=tables))
 
-    def _merged(self, found: list[list[LoopCandidate]], map_: Map) -> list[LoopCandidate]:
-        merged: list[LoopCandidate] = []
-        place: dict[int, int] = {}  # keyframe -> index of the merged candidate at the same place
-        for candidate in chain.from_iterable(zip_longest(*found)):
-            if candidate is None:
-                continue
-            known = place.get(candidate.match)
-            if known is not None:
-                merged[known] = _joined(merged[known], candidate)
-                continue
-            around, _ = map_.covisible(candidate.match, self._min_shared)
-            for keyframe in (candidate.match, *around.tolist()):
-                place.setdefault(keyframe, len(merged))
-            merged.append(candidate)
-        return merged
+
+def _interleaved(found: list[list[LoopCandidate]]) -> list[LoopCandidate]:
+    """The first candidate of each detector, then the second one of each, and so on, with the
+    candidates for the same keyframe joined into one."""
+    by_match: dict[int, LoopCandidate] = {}
+    for candidate in chain.from_iterable(zip_longest(*found)):
+        if candidate is not None:
+            known = by_match.get(candidate.match)
+            by_match[candidate.match] = _joined(known, candidate) if known else candidate
+    return list(by_match.values())
 
 
 def _joined(first: LoopCandidate, second: LoopCandidate) -> LoopCandidate:
-    """Join two candidates at the same place: the first one, with the names of both detectors and,
-    if it has no ``alike``, that of the second one."""
-    names = first.proposed_by.split("+")
-    if second.proposed_by not in names:
-        names.append(second.proposed_by)
+    """Join the candidates of two detectors for the same keyframe: the first one, with the names of
+    both detectors and, if it has no ``alike``, that of the second one."""
     alike = second.alike if first.alike is None else first.alike
-    return replace(first, alike=alike, proposed_by="+".join(names))
+    return replace(first, alike=alike, proposed_by=f"{first.proposed_by}+{second.proposed_by}")

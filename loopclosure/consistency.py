@@ -1,11 +1,11 @@
-"""Consistency over time: a loop needs candidates of several keyframes, and verified loops that
-agree.
+"""Temporal consistency of loops: several keyframes must propose the place, and their verified loops
+must agree.
 
 ORB-SLAM (T-RO 2015, VII-A) requires that consecutive keyframes resemble overlapping places, which
 is evidence from appearance. Geometry gives stronger evidence: each verified loop implies by how
 much the map has drifted, and the loops of neighbouring keyframes must imply the same drift.
-ORB-SLAM3 (T-RO 2021, section VI) does likewise: it verifies first and then looks for confirmation
-by other keyframes.
+ORB-SLAM3 (T-RO 2021, section VI) also verifies a loop first and then confirms it with other
+keyframes.
 """
 
 from __future__ import annotations
@@ -29,36 +29,41 @@ class LoopConsistency:
     """Remembers which places recent keyframes resembled, and which loops were verified for them.
 
     Call ``update`` once for every keyframe, with or without candidates, ``confirm`` for every
-    verified edge, and ``reset`` after a loop was closed.
+    verified edge, and ``reset`` after a loop has been closed.
     """
 
     def __init__(self, config: ConsistencyConfig) -> None:
         self.config = config
-        self._groups: list[ResembledPlace] = []
-        self._verified: list[tuple[int, LoopEdge]] = []  # turn, edge
-        self._turn = 0
+        self._series: list[ResembledPlace] = []
+        self._verified: list[tuple[int, LoopEdge]] = []  # verified edges, each with its turn
+        self._turn = 0  # number of updates so far
 
     def update(
         self, keyframe: int, candidates: list[LoopCandidate], map_: Map
     ) -> tuple[list[LoopCandidate], list[LoopEdge]]:
-        """Split the candidates of a keyframe into those whose place enough consecutive keyframes
-        resembled, and rejected edges for the others.
+        """Check whether enough consecutive keyframes resembled the place of each candidate.
 
-        Each candidate extends the longest group that its place overlaps, and results in exactly one
-        group, so the number of groups does not exceed the number of candidates. Candidates with
-        identical groups share one.
+        The place of a candidate is the set of its match and the keyframes covisible with the match.
+        The candidate continues the longest series of keyframes that resembled an overlapping place.
+        Candidates at the same place share one series, so there are never more new series than
+        candidates.
+
+        Returns:
+            The candidates with enough keyframes, and a rejected edge for each of the others.
         """
         self._turn += 1
-        groups: dict[frozenset[int], ResembledPlace] = {}
+        series: dict[frozenset[int], ResembledPlace] = {}
         consistent, rejected = [], []
         continued: set[int] = set()
         for candidate in candidates:
             around = map_.covisible(candidate.match, self.config.min_shared)[0].tolist()
             place = frozenset({candidate.match, *around})
-            before = [i for i, g in enumerate(self._groups) if not place.isdisjoint(g.keyframes)]
-            continued.update(before)
-            length = 1 + max((self._groups[i].length for i in before), default=0)
-            groups[place] = ResembledPlace(place, length)
+            overlapping = [
+                i for i, one in enumerate(self._series) if not place.isdisjoint(one.keyframes)
+            ]
+            continued.update(overlapping)
+            length = 1 + max((self._series[i].length for i in overlapping), default=0)
+            series[place] = ResembledPlace(place, length)
             if length >= self.config.min_keyframes:
                 consistent.append(candidate)
             else:
@@ -66,23 +71,23 @@ class LoopConsistency:
                 reason = f"proposed for only {length} of {needed}"
                 rejected.append(LoopEdge.of(candidate, reason))
         waiting = [
-            replace(g, age=g.age + 1)
-            for i, g in enumerate(self._groups)
-            if i not in continued and g.age < self.config.max_gap
+            replace(one, age=one.age + 1)
+            for i, one in enumerate(self._series)
+            if i not in continued and one.age < self.config.max_gap
         ]
-        self._groups = [*groups.values(), *waiting]
+        self._series = [*series.values(), *waiting]
         return consistent, rejected
 
     def confirm(self, edge: LoopEdge, map_: Map) -> LoopEdge:
         """Accept a verified edge only if the loops of enough recent keyframes imply the same drift.
 
-        The drift that an edge implies is the motion of the world that would move the query to where
+        The drift implied by an edge is the motion of the world that would move the query to where
         the edge places it. Odometry between neighbouring keyframes is accurate compared with the
         tolerances, so true loops imply the same drift and false ones do not.
 
         Returns:
-            The edge unchanged, or not accepted until more keyframes agree. Each keyframe counts
-            once, however many of its edges agree.
+            The edge; it is marked as not accepted if too few keyframes agree so far. A keyframe
+            counts once, even if several of its edges agree.
         """
         if not edge.accepted:
             return edge
@@ -103,11 +108,12 @@ class LoopConsistency:
     def confirmed_by_earlier(
         self, map_: Map, camera: Camera, config: VerificationConfig
     ) -> Iterator[LoopEdge]:
-        """Loops that were verified but wait for more keyframes to agree, and that an earlier
-        keyframe now confirms: it is verified at the same place with the same drift. The newest loop
-        comes first.
+        """Yield the verified loops that still wait for agreement and that an earlier keyframe
+        confirms, newest first.
 
-        ORB-SLAM3 (section VI) also tries covisible keyframes first, and later keyframes after them.
+        An earlier keyframe confirms a loop if it is covisible with the query, can be verified at
+        the same place, and implies the same drift. ORB-SLAM3 (section VI) also tries covisible
+        keyframes before it waits for later ones.
         """
         oldest = self._turn + 1 - self.config.verified_memory
         for waiting in [edge for turn, edge in reversed(self._verified) if turn >= oldest]:
@@ -120,8 +126,8 @@ class LoopConsistency:
     def _is_confirmed(
         self, edge: LoopEdge, map_: Map, camera: Camera, config: VerificationConfig
     ) -> bool:
-        """Whether a keyframe that is covisible with the query of an edge, but at least
-        ``min_moved`` away from it, is verified with the same drift."""
+        """Whether verification succeeds with the same drift for a keyframe that is covisible with
+        the query of an edge and at least ``min_moved`` away from it."""
         assert edge.T_query_match is not None
         T_w_query = inverse(map_.keyframe_pose(edge.query))
         for keyframe in map_.covisible(edge.query)[0].tolist():
@@ -139,27 +145,27 @@ class LoopConsistency:
 
     def agree(self, edge: LoopEdge, other: LoopEdge, map_: Map) -> bool:
         """Whether two edges imply the same drift at the query of the first."""
-        where = inverse(map_.keyframe_pose(edge.query))[:3, 3]
+        position = inverse(map_.keyframe_pose(edge.query))[:3, 3]
         a, b = implied_drift(edge, map_), implied_drift(other, map_)
         twist = se3_log(inverse(_rigid(a)) @ _rigid(b))
-        apart = (a[:3, :3] - b[:3, :3]) @ where + a[:3, 3] - b[:3, 3]
+        difference = (a[:3, :3] - b[:3, :3]) @ position + a[:3, 3] - b[:3, 3]
         return bool(
-            np.linalg.norm(apart) <= self.config.max_apart
+            np.linalg.norm(difference) <= self.config.max_apart
             and np.degrees(np.linalg.norm(twist[3:])) <= self.config.max_turn
         )
 
     def state(self) -> ConsistencyState:
         """The state, for a saved map or a checkpoint."""
-        return ConsistencyState(tuple(self._groups), tuple(self._verified), self._turn)
+        return ConsistencyState(tuple(self._series), tuple(self._verified), self._turn)
 
     def restore(self, state: ConsistencyState) -> None:
         """Continue from a state that ``state`` returned."""
-        self._groups, self._verified = list(state.places), list(state.verified)
+        self._series, self._verified = list(state.places), list(state.verified)
         self._turn = state.turn
 
     def reset(self) -> None:
-        """Forget everything, because closing a loop has moved the map."""
-        self._groups.clear()
+        """Forget all series and verified loops, because closing a loop has moved the map."""
+        self._series.clear()
         self._verified.clear()
 
 
@@ -179,7 +185,7 @@ def implied_drift(edge: LoopEdge, map_: Map) -> NDArray[np.float64]:
 
 def _rigid(S: NDArray[np.float64]) -> NDArray[np.float64]:
     """A similarity with its scale set to 1; a rigid motion is returned unchanged."""
-    T, cube = S.copy(), np.linalg.det(S[:3, :3])
-    if abs(cube - 1.0) > 1e-9:
-        T[:3, :3] /= np.cbrt(cube)
+    T, scale_cubed = S.copy(), np.linalg.det(S[:3, :3])
+    if abs(scale_cubed - 1.0) > 1e-9:
+        T[:3, :3] /= np.cbrt(scale_cubed)
     return T

@@ -17,12 +17,12 @@ class LoopDetector(Protocol):
 
     Methods are called in the order of the keyframes, by one thread at a time.
 
-    All detectors share the code that follows them: rating and verification of candidates,
+    The later stages are the same for all detectors: rating and verification of candidates,
     consistency, and correction. The setting ``verification.descriptors`` selects the descriptors
     for verification, and its default depends on the detector. For ``bow``, ``capsule-paper`` and
     plug-ins, candidates are verified by ORB descriptors alone. For ``both`` and the other networks,
     candidates that ORB rejects are verified again by learned local descriptors; these detectors
-    also use the local descriptors to rank their 20 most similar keyframes. The local descriptors
+    also use the local descriptors to rank the 20 most similar keyframes. The local descriptors
     always come from the feature extractor of the capsule network, whichever network proposed the
     candidates. To compare detectors in isolation, set ``verification.descriptors`` to ``orb`` or
     ``both`` for all of them.
@@ -31,32 +31,32 @@ class LoopDetector(Protocol):
     name: str
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
-        """Remember a keyframe. ``image`` is its ``(H, W)`` uint8 left image, None if it was not
-        kept."""
+        """Remember a keyframe. ``image`` is its ``(H, W)`` uint8 left image, or None if it was not
+        stored."""
         ...
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
-        """Candidates for a keyframe that was added, best first: similar living keyframes that are
-        neither recent nor covisible with it."""
+        """Candidates for a keyframe that was added, best first: similar keyframes in the map that
+        are neither recent nor covisible with it."""
         ...
 
     def locate(
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
-        """Living keyframes that look similar to a frame outside the map, best first; the candidates
-        have query -1."""
+        """Keyframes in the map that look similar to a frame outside the map, best first. The query
+        of these candidates is -1."""
         ...
 
     def memory(self) -> DetectorMemory:
-        """What the detector remembers of all keyframes, for a map file. Do not write to its arrays:
-        the detector still uses them."""
+        """What the detector remembers of all keyframes, for a map file. Do not write to its arrays,
+        because the detector still uses them."""
         ...
 
     def restore(self, memory: DetectorMemory) -> None:
-        """Take over the memory of an equal detector, instead of calling ``add`` for each keyframe.
+        """Load the memory of an identical detector, instead of calling ``add`` for each keyframe.
 
         Raises:
-            ValueError: the memory is that of another detector, or damaged.
+            ValueError: the memory is damaged or comes from another detector.
         """
         ...
 
@@ -69,7 +69,8 @@ def require_same(detector: DetectorMemory, memory: DetectorMemory) -> None:
         memory: the memory to be restored.
 
     Raises:
-        ValueError: the memory has another name, or another vocabulary or other weights.
+        ValueError: the memory comes from another detector, or from the same one with another
+            vocabulary or other weights.
     """
     if memory.name != detector.name:
         raise ValueError(f"made with the detector {memory.name}, not {detector.name}")

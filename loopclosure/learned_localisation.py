@@ -1,8 +1,8 @@
 """Estimates the pose of an image at a place in the map by learned local descriptors.
 
-Landmarks of the place are searched for anywhere in the image, not only at its keypoints, because by
-night or from the other lane the detector finds corners elsewhere. If one keyframe of the place does
-not give enough matches, further ones are added.
+Landmarks of the place are searched for anywhere in the image, not only at its keypoints, because at
+night or in the other lane the corner detector responds at other points. If one keyframe of the
+place does not give enough matches, the matches of further keyframes are added.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from vslam.reprojection import stack_uvr
 
 
 class View(NamedTuple):
-    """A keyframe of the place.
+    """What a keyframe of the place contributes to the search.
 
     Attributes:
         maps: local descriptors of its image.
         landmarks: ``(N,)`` ids of the landmarks that it observes.
-        xy: ``(N, 2)`` pixels at which it observes them.
+        xy: ``(N, 2)`` pixels of these landmarks in its image.
     """
 
     maps: DescriptorMaps
@@ -44,12 +44,13 @@ class View(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """The landmarks of a place that a camera should see, and those that it does see.
+    """A camera pose, the landmarks of a place that should be visible from it, and which of them are
+    found in the image.
 
     Attributes:
         landmarks: ``(M,)`` int32 ids of the landmarks that should be visible.
         uv: ``(M, 2)`` float64, their predicted pixels.
-        seen: ``(M,)`` bool, whether each was found at its prediction (inliers).
+        seen: ``(M,)`` bool, landmarks found at their predicted pixels (inliers).
         n_matches: number of matches near the predictions, including outliers.
         T_cw: ``(4, 4)`` pose of the camera in the world frame of the landmarks.
     """
@@ -78,11 +79,11 @@ def localise(
         seed: seed of the random samples; the same seed gives the same result.
 
     Returns:
-        The pose and the landmarks that it sees, or in a few words why there is none.
+        The pose with the landmarks, or a short reason why no pose was found.
     """
     views: list[View] = []
     xyz, uv = np.empty((0, 3)), np.empty((0, 2))
-    sought, reason = 0, ""
+    n_searched, reason = 0, ""
     for keyframe in keyframes[: config.views]:
         view = view_of(map_, keyframe, images)
         coarse = match_coarse(view.maps, query, config.coarse_alike)
@@ -90,8 +91,8 @@ def localise(
         if share < config.min_share:
             return reason or f"only {100 * share:.0f} % of the image matches"
         views.append(view)
-        sought += len(view.xy)
-        least = max(config.min_consensus, round(config.min_consensus_ratio * sought))
+        n_searched += len(view.xy)
+        min_inliers = max(config.min_consensus, round(config.min_consensus_ratio * n_searched))
         located = locate(view.xy, view.maps, query, coarse, config.reach, config.alike)
         found = located.found
         xyz = np.vstack([xyz, map_.arrays.xyz[view.landmarks[found]]])
@@ -101,14 +102,14 @@ def localise(
             *_observed(uv, query, config),
             camera.intrinsics,
             np.uint64(seed),
-            least,
+            min_inliers,
             config.max_draws,
             config.confidence,
         )
-        if np.count_nonzero(inlier) >= least:
+        if np.count_nonzero(inlier) >= min_inliers:
             return guided_search(map_, views, T_cw, query, camera, config)
-        reason = f"no motion has {least} inliers among {len(uv)} learned matches"
-    return reason or "no image of the place is kept"
+        reason = f"no pose has {min_inliers} inliers among {len(uv)} learned matches"
+    return reason or "no image of the place is stored"
 
 
 def view_of(map_: Map, keyframe: int, images: KeyframeImages) -> View:
@@ -154,7 +155,7 @@ def guided_search(
 
 
 def project(xyz: Matrix, T_cw: Matrix, camera: Camera) -> Matrix:
-    """``(N, 2)`` pixels of ``(N, 3)`` points in the world, NaN for points out of view."""
+    """``(N, 2)`` pixels of ``(N, 3)`` world points, NaN for points outside the image."""
     p = transform(T_cw, xyz)
     uv = np.full((len(p), 2), np.nan)
     ahead = p[:, 2] > 0.1
@@ -167,7 +168,7 @@ def project(xyz: Matrix, T_cw: Matrix, camera: Camera) -> Matrix:
 def _observed(
     uv: Matrix, query: DescriptorMaps, config: LearnedMatchingConfig
 ) -> tuple[Matrix, Matrix]:
-    """``(N, 3)`` u, v, u_right of ``(N, 2)`` pixels (u_right is NaN), and ``(N,)`` inverse
-    variances."""
+    """Monocular observations at ``(N, 2)`` pixels: ``(N, 3)`` u, v, u_right (NaN), and ``(N,)``
+    inverse variances."""
     sigma = config.sigma / query.scale
     return stack_uvr(uv, np.full(len(uv), np.nan)), np.full(len(uv), sigma**-2.0)

@@ -1,5 +1,5 @@
-"""Verification of loop candidates, and relocalisation, by learned local descriptors, for changes of
-appearance that ORB descriptors do not survive.
+"""Verifies loop candidates and relocalises by learned local descriptors, which still match when the
+appearance has changed too much for ORB descriptors.
 
 The steps are those of :mod:`vslam.loopclosure.verification`: an initial pose, guided matching with
 all landmarks of the place, refinement, and the same tests against similar-looking places.
@@ -31,19 +31,19 @@ from vslam.map import Map
 from vslam.map_kernels import collect_landmarks
 from vslam.states import VerifierState
 
-_DEPTHS_AGREE = 0.15  # largest relative difference of the depths of two landmarks of one feature
+_DEPTHS_AGREE = 0.15  # largest relative difference in depth between two landmarks of one feature
 
 
 class LearnedTrials:
     """Chooses the candidates for learned verification, which takes forty times as long as
     verification by ORB.
 
-    Candidates are chosen if the local descriptors of their images are among the most similar ones
-    and similar enough. After a failed attempt, only clearly more similar candidates are chosen for
-    the next ``learned.rest`` keyframes.
+    The chosen candidates are those with the most similar images by local descriptors, if they are
+    similar enough. After a failed attempt, only clearly more similar candidates are chosen for the
+    next ``learned.rest`` keyframes.
 
     Attributes:
-        state: what is remembered of the last attempt.
+        state: the outcome of the last attempt.
     """
 
     def __init__(self, config: LearnedMatchingConfig) -> None:
@@ -51,20 +51,20 @@ class LearnedTrials:
         self.state = VerifierState()
 
     def choose(self, keyframe: int, candidates: Collection[LoopCandidate]) -> set[int]:
-        """Ids of the matches to try; candidates without a rating are never chosen."""
+        """Matches of the candidates to try; candidates without a rating are never chosen."""
         config = self._config
-        least = config.min_alike
+        min_alike = config.min_alike
         if keyframe < self.state.resting_until:
-            least = max(least, config.more_alike * self.state.failed_alike)
-        alike = [(one.alike, one.match) for one in candidates if one.alike is not None]
-        best = sorted(alike, reverse=True)[: config.max_candidates]
-        return {match for likeness, match in best if likeness >= least}
+            min_alike = max(min_alike, config.more_alike * self.state.failed_alike)
+        rated = [(one.alike, one.match) for one in candidates if one.alike is not None]
+        best = sorted(rated, reverse=True)[: config.max_candidates]
+        return {match for alike, match in best if alike >= min_alike}
 
     def record(self, candidate: LoopCandidate, *, located: bool) -> None:
         """Remember the result of an attempt.
 
         Args:
-            located: whether the attempt found a pose, even if the loop was then rejected.
+            located: whether the attempt found a pose, even if the loop was rejected afterwards.
         """
         if located:
             self.state = replace(self.state, resting_until=0)
@@ -80,11 +80,11 @@ def rated(
     config: LearnedMatchingConfig,
     beyond: NDArray[np.float64] | None = None,
 ) -> list[LoopCandidate]:
-    """Set ``alike``, the similarity by local descriptors, of candidates that the detector has not
+    """Set ``alike``, the similarity by local descriptors, for candidates that the detector has not
     rated.
 
     Args:
-        candidates: best first; of those without a rating, the first ``config.rated`` get one.
+        candidates: best first; at most ``config.rated`` of them are rated.
         glance: returns the coarse descriptors of the query image; called only if there is a
             candidate to rate.
         beyond: result of :func:`vslam.loopclosure.reach.beyond_reach`; keyframes out of reach are
@@ -109,12 +109,12 @@ def rated(
 def is_image_redundant(
     map_: Map, keyframe: int, images: KeyframeImages, config: LearnedMatchingConfig
 ) -> bool:
-    """Whether the image of a keyframe need not be kept, because another image shows nearly the same
-    view: the previous keyframe has an image, or a keyframe with an image shares most of its
-    landmarks.
+    """Whether the image of a keyframe need not be stored, because another image shows nearly the
+    same view.
 
-    If keyframes are far apart, every second image is enough. The test by shared landmarks covers
-    slow motion, turns, and revisits of mapped places alike, whatever the keyframe policy.
+    This is the case if the previous keyframe has an image, because every second image is enough
+    even if keyframes are far apart. It is also the case if any keyframe with an image shares most
+    landmarks with it, as in slow motion, in turns, and on revisits of mapped places.
     """
     if keyframe - 1 in images:
         return True
@@ -131,25 +131,25 @@ def verify_learned(
     config: LearnedMatchingConfig,
     gates: VerificationConfig,
 ) -> LoopEdge:
-    """:func:`verification.verify` by local descriptors of the keyframes' images.
+    """Verify a candidate as :func:`verification.verify` does, but by learned local descriptors.
 
     Returns:
-        The edge, accepted or with a reason; its features and landmarks are those inliers at which
-        the query has a keypoint.
+        The edge, accepted or with the reason for its rejection. Its features and landmarks are
+        those inliers that coincide with a keypoint of the query.
     """
     query, match = candidate.query, candidate.match
     edge = LoopEdge.of(candidate, matched_by="learned")
     keyframes = [k for k in place_of(map_, match, query, gates).tolist() if k in images]
     if query not in images or not keyframes:
-        return replace(edge, reason="no image is kept")
+        return replace(edge, reason="no image is stored")
     sight = localise(
         map_, images.maps(query), keyframes, images, camera, config, seed=query << 32 | match
     )
     if isinstance(sight, str):
         return replace(edge, reason=sight)
     feature, landmark = observed_features(map_, query, sight, camera, config)
-    # Once the pose is known, ORB features may match after all, and they are located more precisely,
-    # to a tenth of a pixel.
+    # With a known pose, ORB features may match after all. Their positions are more precise, about a
+    # tenth of a pixel.
     place = collect_landmarks(map_.arrays, np.array(keyframes, np.int64), map_.n_landmarks)
     guided = guided_match(map_, query, place, sight.T_cw, camera, gates)
     if np.count_nonzero(guided.seen) >= gates.min_inliers:
@@ -168,7 +168,7 @@ def verify_learned(
     if camera.monocular:
         scale = relative_scale(map_, edge, sight.T_cw, default=np.nan)
         if not np.isfinite(scale):
-            return replace(edge, reason="too few depths on both sides to estimate the scale")
+            return replace(edge, reason="too few landmarks on both sides to estimate the scale")
         edge = replace(edge, scale=scale)
     seen = _seen_of_query(map_, edge, keyframes[0], images, camera, config)
     reason = _rejection_reason(edge, sight, seen, camera, config, gates)
@@ -192,14 +192,14 @@ def recognise(
         match: id of the keyframe.
 
     Returns:
-        None unless the frame passes the tests of a loop, and enough of its keypoints coincide with
-        landmarks to continue tracking.
+        The pose and the observed landmarks, or None if the frame fails the tests of a loop or if
+        too few of its keypoints coincide with landmarks to continue tracking.
     """
     gates = config.verification
     around = [match, *map_.covisible(match)[0].tolist()]
     keyframes = [k for k in around if k in images]
     sight = localise(map_, query, keyframes, images, camera, config.learned, seed=match)
-    if isinstance(sight, str) or _too_little(sight, camera, config.learned, gates):
+    if isinstance(sight, str) or _visibility_reason(sight, camera, config.learned, gates):
         return None
     index = np.flatnonzero(sight.seen)
     feature, near = nearest_features(
@@ -213,13 +213,13 @@ def recognise(
 def observed_features(
     map_: Map, query: int, sight: Sight, camera: Camera, config: LearnedMatchingConfig
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Pairs of features of the query and landmarks of the place that coincide in the image.
+    """Pair features of the query with landmarks of the place that coincide in the image.
 
-    If a feature already observes a landmark of its own, the depths of both landmarks must agree: a
+    If a feature already observes a landmark, the depths of both landmarks must agree, because a
     corner of a car in front of a facade is not a corner of the facade.
 
     Returns:
-        ``(N,)`` indices of features and ``(N,)`` ids of landmarks, without repetitions.
+        ``(N,)`` indices of features and ``(N,)`` ids of landmarks, without duplicates.
     """
     a, rows = map_.arrays, map_.rows(query)
     landmarks, uv = sight.landmarks[sight.seen], sight.uv[sight.seen]
@@ -228,8 +228,9 @@ def observed_features(
     depth = transform(sight.T_cw, a.xyz[landmarks[index]])[:, 2]
     ratio = np.where(own >= 0, transform(a.T_cw[query], a.xyz[own])[:, 2] / depth, np.nan)
     known = np.isfinite(ratio)
-    usual = float(np.median(ratio[known])) if camera.monocular and known.any() else 1.0
-    keep = ~known | (np.abs(np.where(known, ratio, usual) / usual - 1.0) < _DEPTHS_AGREE)
+    # Scale drift of a monocular map changes all ratios by the same factor.
+    drift = float(np.median(ratio[known])) if camera.monocular and known.any() else 1.0
+    keep = ~known | (np.abs(np.where(known, ratio, drift) / drift - 1.0) < _DEPTHS_AGREE)
     return feature[keep].astype(np.int32), landmarks[index[keep]]
 
 
@@ -237,8 +238,8 @@ def joined(
     first: tuple[NDArray[np.int32], NDArray[np.int32]],
     second: tuple[NDArray[np.int32], NDArray[np.int32]],
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """All pairs of features and landmarks of the first list, followed by those pairs of the second
-    list whose feature and landmark both do not occur in the first."""
+    """All pairs of features and landmarks of the first list, followed by the pairs of the second
+    list whose feature and landmark are both absent from the first."""
     new = ~(np.isin(second[0], first[0]) | np.isin(second[1], first[1]))
     return np.r_[first[0], second[0][new]], np.r_[first[1], second[1][new]]
 
@@ -258,13 +259,14 @@ def nearest_features(
         xy, octave: features of the image.
 
     Returns:
-        ``(K,)`` indices of features, without repetitions, and ``(K,)`` indices of the pixels; the
+        ``(K,)`` indices of features, without duplicates, and ``(K,)`` indices of the pixels; the
         nearest pairs come first.
     """
     if not len(uv) or not len(xy):
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    # This takes 3 ms. A k-d tree of SciPy is faster, but its import takes 27 MB and 0.2 s, and of
-    # several features at the same pixel it returns any; this returns the one of the finest octave.
+    # Brute force takes 3 ms. SciPy's k-d tree is faster, but its import takes 27 MB and 0.2 s, and
+    # it returns an arbitrary one of several features at the same pixel, whereas argmin returns the
+    # first one, which has the finest octave.
     x, y = xy.T.astype(np.float64)
     feature = np.array([np.argmin((x - u) ** 2 + (y - v) ** 2) for u, v in uv.tolist()])
     distance = np.sqrt((x[feature] - uv[:, 0]) ** 2 + (y[feature] - uv[:, 1]) ** 2)
@@ -278,28 +280,32 @@ def nearest_features(
 def _rejection_reason(
     edge: LoopEdge,
     sight: Sight,
-    of_query: tuple[int, int],
+    query_seen: tuple[int, int],
     camera: Camera,
     config: LearnedMatchingConfig,
     gates: VerificationConfig,
 ) -> str:
-    """Why a refined loop must be rejected, "" if it passes all tests."""
+    """The reason to reject a refined loop, or "" if it passes all tests.
+
+    Args:
+        query_seen: result of ``_seen_of_query``.
+    """
     assert edge.T_query_match is not None
     distance = float(np.linalg.norm(inverse(edge.T_query_match)[:3, 3]))
     if distance > gates.max_distance:
         return f"the pose is {distance:.0f} m from the place"
-    if reason := _too_little(sight, camera, config, gates):
+    if reason := _visibility_reason(sight, camera, config, gates):
         return reason
-    seen, total = of_query
+    seen, total = query_seen
     if seen < config.min_seen_ratio * total:
-        return f"the place saw only {seen} of {total} landmarks of the query"
+        return f"only {seen} of {total} landmarks of the query are seen from the place"
     return ""
 
 
-def _too_little(
+def _visibility_reason(
     sight: Sight, camera: Camera, config: LearnedMatchingConfig, gates: VerificationConfig
 ) -> str:
-    """Why a camera sees too little of a place, "" if it sees enough."""
+    """The reason to reject a pose because too little of the place is seen, or "" if enough is."""
     seen, total = int(np.count_nonzero(sight.seen)), len(sight.seen)
     if seen < config.min_inliers:
         return f"only {seen} learned matches fit"
@@ -320,8 +326,8 @@ def _seen_of_query(
     camera: Camera,
     config: LearnedMatchingConfig,
 ) -> tuple[int, int]:
-    """How many landmarks of the query are found at their projections in the image of a keyframe of
-    the place, and how many should be visible in it."""
+    """Number of landmarks of the query that are found at their projections in the image of a
+    keyframe of the place, and number of those that should be visible in it."""
     assert edge.T_query_match is not None
     T_match_query = inverse(edge.T_query_match)
     T_match_query[:3, 3] *= edge.scale  # in the query's unit, like its landmarks
@@ -334,13 +340,14 @@ def _seen_of_query(
     expected = project(map_.arrays.xyz[view.landmarks], T_kw, camera)
     match = images.maps(keyframe)
     found = locate_near(view.xy, expected, view.maps, match, config.guided_reach, config.alike)
-    off = np.linalg.norm(found.xy - expected, axis=1) * match.scale
-    # For a two-dimensional normal distribution, 95 % of the distances are below 2.45 sigma.
-    return int(np.count_nonzero(off < 2.45 * config.sigma)), int(np.isfinite(expected[:, 0]).sum())
+    error = np.linalg.norm(found.xy - expected, axis=1) * match.scale
+    # 95 % of the distances of a two-dimensional normal distribution are below 2.45 sigma.
+    seen = np.count_nonzero(error < 2.45 * config.sigma)
+    return int(seen), int(np.isfinite(expected[:, 0]).sum())
 
 
 class LearnedRelocalisation:
-    """Implements ``Recognise`` by the images of keyframes; finds nothing if there are no images."""
+    """Implements ``Recognise`` with the images of keyframes; without images, it finds nothing."""
 
     def __init__(self, images: KeyframeImages | None, camera: Camera, config: Config) -> None:
         self._images = images
@@ -351,18 +358,20 @@ class LearnedRelocalisation:
         self, map_: Map, image: Image | None, features: Features, candidates: list[LoopCandidate]
     ) -> Sighting | None:
         """Search for a frame at the candidates whose images are most similar to it; returns None if
-        it is found at none of them."""
+        no candidate succeeds."""
         images, config = self._images, self._config
         if images is None or image is None:
             return None
         candidates = rated(candidates, lambda: images.glance_at(image), images, config.learned)
-        alike = [one for one in candidates if one.alike is not None]
-        alike.sort(key=lambda one: -(one.alike or 0.0))
-        if not alike:
+        candidates = [one for one in candidates if one.alike is not None]
+        candidates.sort(key=lambda one: -(one.alike or 0.0))
+        if not candidates:
             return None
         maps = images.network.describe(image)
-        for candidate in alike[: config.learned.max_candidates]:
-            found = recognise(map_, maps, features, candidate.match, images, self._camera, config)
-            if found is not None:
-                return found
+        for candidate in candidates[: config.learned.max_candidates]:
+            sighting = recognise(
+                map_, maps, features, candidate.match, images, self._camera, config
+            )
+            if sighting is not None:
+                return sighting
         return None

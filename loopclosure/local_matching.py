@@ -1,9 +1,9 @@
 """Coarse-to-fine matching of learned local descriptors (after LoFTR, Sun et al., CVPR 2021).
 
-Coarse matches are cells of two images that are mutual nearest neighbours. For a fine match, a
-keypoint of one image is searched for in the other, not only at its keypoints, but in windows around
-the positions that nearby coarse matches predict. The position is interpolated to a fraction of a
-cell, and accepted only if the reverse search returns to the keypoint.
+Coarse matches are cells of two images that are mutual nearest neighbours. Fine matching searches
+for each keypoint of one image in the other image, in windows around the positions that nearby
+coarse matches predict; it does not need keypoints there. The position is refined to a fraction of a
+cell and accepted only if the reverse search returns to the keypoint.
 """
 
 from __future__ import annotations
@@ -16,15 +16,16 @@ from numpy.typing import NDArray
 from vslam.kernels import inner_kernel, kernel
 
 COARSE_STRIDE, FINE_STRIDE = 16, 4  # pixels of the network's input per cell
-_HOMOGRAPHY_PIXELS, _HOMOGRAPHY_DRAWS = 12.0, 300
+_HOMOGRAPHY_PIXELS = 12.0  # RANSAC threshold, pixels of the network's input
+_HOMOGRAPHY_DRAWS = 300  # maximum number of RANSAC samples
 
 
 class DescriptorMaps(NamedTuple):
     """Local descriptors of an image, normalised to length 1.
 
     Attributes:
-        coarse: ``(h, w, C)`` float32 (float16 if made by ``coarse_alone``); cell (i, j) lies at
-            pixel (16 j, 16 i) of the network's input.
+        coarse: ``(h, w, C)`` float32, or float16 from ``coarse_alone``; cell (i, j) lies at pixel
+            (16 j, 16 i) of the network's input.
         fine: ``(H, W, D)`` float32; cell (i, j) lies at pixel (4 j, 4 i) of the network's input.
         scale: pixels of the network's input per pixel of the camera image.
     """
@@ -34,8 +35,8 @@ class DescriptorMaps(NamedTuple):
     scale: float
 
     def coarse_alone(self) -> DescriptorMaps:
-        """The coarse descriptors only, in half precision, because those of all keyframes are kept
-        in memory."""
+        """Only the coarse descriptors, in half precision, because they stay in memory for all
+        keyframes."""
         none = np.empty((0, *self.fine.shape[1:]), np.float32)
         return self._replace(coarse=self.coarse.astype(np.float16), fine=none)
 
@@ -69,7 +70,7 @@ class Located(NamedTuple):
 
 
 def match_coarse(a: DescriptorMaps, b: DescriptorMaps, least: float) -> CoarseMatches:
-    """Mutual nearest neighbours of the coarse descriptors with a cosine of at least ``least``."""
+    """Mutual nearest neighbours of the coarse descriptors whose cosine is at least ``least``."""
     cells = [one.coarse.reshape(-1, one.coarse.shape[2]).astype(np.float32) for one in (a, b)]
     best_a, best_b, alike = _nearest(cells[0], np.ascontiguousarray(cells[1].T))
     mutual = (best_b[best_a] == np.arange(len(best_a))) & (alike >= least)
@@ -91,8 +92,8 @@ def locate(
     reach: int,
     least: float,
 ) -> Located:
-    """Search for keypoints of image a in image b, in windows around the positions that the coarse
-    matches near each keypoint predict.
+    """Search for keypoints of image a in image b, in windows around the positions that nearby
+    coarse matches predict.
 
     Args:
         xy: ``(N, 2)`` keypoints, pixels of camera image a.
@@ -100,11 +101,12 @@ def locate(
         reach: half width of a window, fine cells.
         least: least cosine of a match.
     """
-    towards = np.full(a.coarse.shape[:2], -1, np.int64).reshape(-1)
-    towards[coarse.a] = coarse.b
+    rows, columns, _ = a.coarse.shape
+    cell_in_b = np.full(rows * columns, -1, np.int64)
+    cell_in_b[coarse.a] = coarse.b
     found = _locate(
         xy.astype(np.float64) * (a.scale / FINE_STRIDE), a.fine, b.fine,
-        towards.reshape(a.coarse.shape[:2]), b.coarse.shape[1], reach, least,
+        cell_in_b.reshape(rows, columns), b.coarse.shape[1], reach, least,
     )  # fmt: skip
     return Located(found * (FINE_STRIDE / b.scale))
 
@@ -143,21 +145,26 @@ def likeness(a: DescriptorMaps, b: DescriptorMaps, least: float) -> float:
 
 
 def homography_share(coarse: CoarseMatches, a: DescriptorMaps, b: DescriptorMaps) -> float:
-    """Share of the cells of the smaller image whose coarse matches one homography explains.
+    """``homography_inliers`` as a share of the cells of the smaller image."""
+    return homography_inliers(coarse, a, b) / _fewest_cells(a, b)
 
-    A homography is not an exact model of a street. But it explains distant points, and near points
-    deviate from it by only a cell or two. In images of different places, no homography explains as
-    many matches.
+
+def homography_inliers(coarse: CoarseMatches, a: DescriptorMaps, b: DescriptorMaps) -> int:
+    """Number of coarse matches that fit a single homography.
+
+    A homography is not an exact model of a street, but distant points fit it, and near points
+    deviate from it by only a cell or two. In images of different places, far fewer matches fit any
+    homography.
     """
     import cv2
 
     if len(coarse.a) < 4:
-        return 0.0
+        return 0
     _, inlier = cv2.findHomography(
         a.scale * positions(coarse.a, a), b.scale * positions(coarse.b, b),
         cv2.RANSAC, _HOMOGRAPHY_PIXELS, maxIters=_HOMOGRAPHY_DRAWS,
     )  # fmt: skip
-    return 0.0 if inlier is None else float(inlier.sum() / _fewest_cells(a, b))
+    return 0 if inlier is None else int(inlier.sum())
 
 
 def _fewest_cells(a: DescriptorMaps, b: DescriptorMaps) -> int:
@@ -171,7 +178,7 @@ def _nearest(a, b):
 
     Returns:
         ``(N,)`` int64 nearest b of each a, ``(M,)`` int64 nearest a of each b, and ``(N,)`` float32
-        cosines of the former.
+        cosine of each a with its nearest b.
     """
     n, channels = a.shape
     m = b.shape[1]
@@ -210,15 +217,15 @@ def _interpolate(fine, x, y, out):
         squared += out[c] * out[c]
     if squared <= 0.0:
         return False
-    squared = one / np.sqrt(squared)
+    factor = one / np.sqrt(squared)
     for c in range(channels):
-        out[c] *= squared
+        out[c] *= factor
     return True
 
 
 @inner_kernel
 def _cosine(fine, i, j, descriptor):
-    # Four partial sums, because in a single one each addition would wait for the one before.
+    # Four partial sums, because each addition to a single sum would wait for the previous one.
     s0, s1, s2, s3 = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
     for c in range(0, len(descriptor), 4):
         s0 += fine[i, j, c] * descriptor[c]
@@ -230,8 +237,8 @@ def _cosine(fine, i, j, descriptor):
 
 @inner_kernel
 def _search(fine, descriptor, x, y, reach):
-    """Find the best cell within ``reach`` of (x, y); returns its column, row and cosine (-2 if the
-    window is outside the image)."""
+    """Find the most similar cell within ``reach`` of (x, y); returns its column, row and cosine (-2
+    if the window is outside the image)."""
     rows, columns, _ = fine.shape
     best_i, best_j, best = -1, -1, np.float32(-2.0)
     middle_j, middle_i = int(np.rint(x)), int(np.rint(y))
@@ -245,38 +252,40 @@ def _search(fine, descriptor, x, y, reach):
 
 @inner_kernel
 def _peak(fine, descriptor, j, i, best):
-    """Position of the best match to a fraction of a cell: the maxima of the parabolas through the
-    cosines of the best cell and of its neighbours in x and in y."""
+    """Position of the best match at sub-cell precision: in x and in y, the maximum of the parabola
+    through the cosines of the best cell and its two neighbours."""
     rows, columns, _ = fine.shape
     x, y = float(j), float(i)
     if 0 < j < columns - 1:
         before, after = _cosine(fine, i, j - 1, descriptor), _cosine(fine, i, j + 1, descriptor)
-        bend = 2.0 * best - before - after
-        if bend > 1e-6:
-            x += min(0.5, max(-0.5, 0.5 * (after - before) / bend))
+        curvature = 2.0 * best - before - after
+        if curvature > 1e-6:
+            x += min(0.5, max(-0.5, 0.5 * (after - before) / curvature))
     if 0 < i < rows - 1:
         before, after = _cosine(fine, i - 1, j, descriptor), _cosine(fine, i + 1, j, descriptor)
-        bend = 2.0 * best - before - after
-        if bend > 1e-6:
-            y += min(0.5, max(-0.5, 0.5 * (after - before) / bend))
+        curvature = 2.0 * best - before - after
+        if curvature > 1e-6:
+            y += min(0.5, max(-0.5, 0.5 * (after - before) / curvature))
     return x, y
 
 
 @inner_kernel
 def _accept_if_mutual(fine_a, fine_b, descriptor, x, y, j, i, best, reach, other, found):
-    """Set ``found`` to the peak around the best cell of b, if the reverse search from there ends
+    """Set ``found`` to the peak around the best cell of b if the reverse search from that peak ends
     within 1.5 cells of the keypoint (x, y) in a; ``other`` is a workspace."""
-    to_x, to_y = _peak(fine_b, descriptor, j, i, best)
-    if _interpolate(fine_b, to_x, to_y, other):
+    peak_x, peak_y = _peak(fine_b, descriptor, j, i, best)
+    if _interpolate(fine_b, peak_x, peak_y, other):
         back_j, back_i, _ = _search(fine_a, other, x, y, reach)
         if abs(back_j - x) <= 1.5 and abs(back_i - y) <= 1.5:
-            found[0], found[1] = to_x, to_y
+            found[0], found[1] = peak_x, peak_y
 
 
 @kernel
-def _locate(xy, fine_a, fine_b, towards, columns_b, reach, least):
+def _locate(xy, fine_a, fine_b, cell_in_b, columns_b, reach, least):
+    """``locate`` in units of fine cells; ``cell_in_b`` is the coarse match of each cell of a, or
+    -1."""
     n, channels = len(xy), fine_a.shape[2]
-    rows_a, columns_a = towards.shape
+    rows_a, columns_a = cell_in_b.shape
     found = np.full((n, 2), np.nan)
     descriptor, other = np.empty(channels, np.float32), np.empty(channels, np.float32)
     ratio = COARSE_STRIDE // FINE_STRIDE  # fine cells per coarse cell
@@ -290,21 +299,21 @@ def _locate(xy, fine_a, fine_b, towards, columns_b, reach, least):
         n_tried = 0
         for i in range(max(0, cell_i - 1), min(rows_a, cell_i + 2)):
             for j in range(max(0, cell_j - 1), min(columns_a, cell_j + 2)):
-                there = towards[i, j]
-                if there < 0:
+                match = cell_in_b[i, j]
+                if match < 0:
                     continue
-                guess_x = x + ratio * (there % columns_b - j)
-                guess_y = y + ratio * (there // columns_b - i)
-                known = False
+                guess_x = x + ratio * (match % columns_b - j)
+                guess_y = y + ratio * (match // columns_b - i)
+                repeated = False
                 for t in range(n_tried):
-                    known |= abs(tried[t, 0] - guess_x) < 2 and abs(tried[t, 1] - guess_y) < 2
-                if known:
+                    repeated |= abs(tried[t, 0] - guess_x) < 2 and abs(tried[t, 1] - guess_y) < 2
+                if repeated:
                     continue
                 tried[n_tried, 0], tried[n_tried, 1] = guess_x, guess_y
                 n_tried += 1
-                to_j, to_i, alike = _search(fine_b, descriptor, guess_x, guess_y, reach)
+                found_j, found_i, alike = _search(fine_b, descriptor, guess_x, guess_y, reach)
                 if alike > best:
-                    best_j, best_i, best = to_j, to_i, alike
+                    best_j, best_i, best = found_j, found_i, alike
         if best >= least:
             _accept_if_mutual(
                 fine_a, fine_b, descriptor, x, y, best_j, best_i, best, reach, other, found[k]
@@ -314,6 +323,7 @@ def _locate(xy, fine_a, fine_b, towards, columns_b, reach, least):
 
 @kernel
 def _locate_near(xy, expected, fine_a, fine_b, reach, least):
+    """``locate_near`` in units of fine cells."""
     n, channels = len(xy), fine_a.shape[2]
     found = np.full((n, 2), np.nan)
     descriptor, other = np.empty(channels, np.float32), np.empty(channels, np.float32)

@@ -23,11 +23,12 @@ _METHODS = ("add", "query", "locate")
 
 
 class PlugInDetector:
-    """Implements ``LoopDetector``. After its first failure, the detector is not called again.
+    """A ``LoopDetector`` that forwards all calls to the detector of a package. After its first
+    failure, that detector is not called again.
 
     Attributes:
-        problem: what failed, in one sentence; None if nothing did. A run ends at a problem and
-            keeps what it has computed.
+        problem: one sentence about the failure; None if there was none. A run ends after a failure
+            and keeps its results so far.
     """
 
     def __init__(self, plugin: PlugIn, detector: LoopDetector) -> None:
@@ -37,7 +38,7 @@ class PlugInDetector:
         self._detector = detector
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
-        self._ask(self._detector.add, keyframe, _read_only(image), features)
+        self._call(self._detector.add, keyframe, _read_only(image), features)
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
         return self._candidates(keyframe, map_, self._detector.query, keyframe, map_)
@@ -48,37 +49,39 @@ class PlugInDetector:
         return self._candidates(-1, map_, self._detector.locate, _read_only(image), features, map_)
 
     def memory(self) -> DetectorMemory:
-        """The saved state of the package's detector, or only its name if it saves no state."""
-        bare = DetectorMemory(self.name)
+        """The memory of the package's detector, or only its name if it has no method ``memory``."""
+        empty = DetectorMemory(self.name)
         if not callable(getattr(self._detector, "memory", None)):
-            return bare
-        found = self._ask(self._detector.memory)
-        if found is None and self.problem is not None:
-            return bare
-        if not isinstance(found, DetectorMemory):
+            return empty
+        memory = self._call(self._detector.memory)
+        if memory is None and self.problem is not None:
+            return empty
+        if not isinstance(memory, DetectorMemory):
             self.problem = (
-                f"{self._plugin}: memory returned {type(found).__name__}, not DetectorMemory; "
+                f"{self._plugin}: memory returned {type(memory).__name__}, not DetectorMemory; "
                 "repair the package"
             )
-            return bare
-        return replace(found, name=self.name)
+            return empty
+        return replace(memory, name=self.name)
 
     def restore(self, memory: DetectorMemory) -> None:
         """See ``LoopDetector``.
 
         Raises:
-            ValueError: the memory is that of another detector, or the package has no method
-                ``restore``, or it fails.
+            ValueError: the memory comes from another detector, or the package's detector has no
+                method ``restore`` or fails in it.
         """
         if memory.name != self.name:
             raise ValueError(f"made with the detector {memory.name}, not {self.name}")
         if not callable(getattr(self._detector, "restore", None)):
-            raise ValueError(f"{self._plugin} has no restore, so it cannot continue a saved map")
-        self._ask(self._detector.restore, memory)
+            raise ValueError(
+                f"{self._plugin} has no method restore, so it cannot continue a saved map"
+            )
+        self._call(self._detector.restore, memory)
         if self.problem is not None:
             raise ValueError(self.problem)
 
-    def _ask(self, method: Callable[..., Any], *arguments: object) -> Any:
+    def _call(self, method: Callable[..., Any], *arguments: object) -> Any:
         """Call a method; returns its result, or None if the detector fails or has failed before."""
         if self.problem is not None:
             return None
@@ -91,38 +94,39 @@ class PlugInDetector:
     def _candidates(
         self, query: int, map_: Map, method: Callable[..., Any], *arguments: object
     ) -> list[LoopCandidate]:
-        found = self._ask(method, *arguments)
-        if found is None and self.problem is not None:
+        candidates = self._call(method, *arguments)
+        if candidates is None and self.problem is not None:
             return []
-        wrong = _wrong(found, query, map_)
-        if wrong:
-            self.problem = f"{self._plugin}: {method.__name__} {wrong}; repair the package"
+        if fault := _fault(candidates, query, map_):
+            self.problem = f"{self._plugin}: {method.__name__} {fault}; repair the package"
             return []
-        return [replace(one, proposed_by=self.name) for one in found]
+        return [replace(one, proposed_by=self.name) for one in candidates]
 
 
 def open_plugin(plugin: PlugIn, config: Config, weights: Path | None) -> PlugInDetector:
     """Create the detector of a plug-in, without any keyframes.
 
     Raises:
-        InputError: the package is broken, or what it creates is not a detector.
+        InputError: the package is broken, or the object that it creates is not a detector.
     """
-    made = plugin.call(config, weights)
-    missing = [name for name in _METHODS if not callable(getattr(made, name, None))]
+    detector = plugin.call(config, weights)
+    missing = [name for name in _METHODS if not callable(getattr(detector, name, None))]
     if missing:
         raise InputError(
-            f"{plugin}: {type(made).__name__} has no method {' nor '.join(missing)}; repair or "
+            f"{plugin}: {type(detector).__name__} has no method {' nor '.join(missing)}; repair or "
             "uninstall the package."
         )
-    return PlugInDetector(plugin, made)
+    return PlugInDetector(plugin, detector)
 
 
-def _wrong(found: object, query: int, map_: Map) -> str:
-    """What is wrong with the candidates for a query, "" if they are valid. They must be checked
-    because kernels use these numbers as indices without checks."""
-    if not isinstance(found, (list, tuple)):
-        return f"returned {type(found).__name__}, not a list"
-    for candidate in found:
+def _fault(candidates: object, query: int, map_: Map) -> str:
+    """What is wrong with the candidates for a query, or "" if they are valid.
+
+    The check is needed because kernels use the ids as indices without bounds checks.
+    """
+    if not isinstance(candidates, (list, tuple)):
+        return f"returned {type(candidates).__name__}, not a list"
+    for candidate in candidates:
         if not isinstance(candidate, LoopCandidate):
             return f"returned a list with {type(candidate).__name__}, not LoopCandidate"
         numbers = candidate.query, candidate.match, candidate.score

@@ -1,7 +1,7 @@
 """Evaluates the scores of a loop detector by precision, recall and measures derived from them.
 
-The definitions are those of the field's benchmarks (for example recall at 100 % precision, Cummins
-and Newman, IJRR 2008), and the curves are identical to those of scikit-learn (checked by tests).
+The definitions are those of published benchmarks, for example recall at 100 % precision (Cummins
+and Newman, IJRR 2008). Tests check that the curves are identical to those of scikit-learn.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from vslam.errors import InputError
 
 @dataclass(frozen=True)
 class PrecisionRecall:
-    """A precision-recall curve of K + 1 points, one per threshold and the end point with precision
-    1 and recall 0.
+    """A precision-recall curve of K + 1 points: one for each threshold, and the end point with
+    precision 1 and recall 0.
 
     Attributes:
         precision, recall: ``(K + 1,)`` float64.
@@ -51,26 +51,25 @@ def precision_recall(same: NDArray, score: NDArray) -> PrecisionRecall:
 
 
 def curve_of(right: NDArray[np.bool_], score: NDArray[np.float64], total: int) -> PrecisionRecall:
-    """The curve of N decisions.
+    """The precision-recall curve of N scored items.
 
     Args:
-        right: ``(N,)`` bool, decisions that are right if they are accepted.
+        right: ``(N,)`` bool, items that are correct to accept.
         score: ``(N,)`` float64.
-        total: number of right decisions that recall is relative to.
+        total: number of correct items, the denominator of recall.
     """
     order = np.argsort(-score, kind="stable")
     ranked = score[order]
-    # The last index of each distinct score.
-    last = np.flatnonzero(np.append(np.diff(ranked) != 0, len(ranked) > 0))
-    found = np.cumsum(right[order])[last]
-    precision, recall = found / (last + 1), found / total
+    last = np.flatnonzero(np.append(np.diff(ranked) != 0, len(ranked) > 0))  # of each equal score
+    correct = np.cumsum(right[order])[last]
+    precision, recall = correct / (last + 1), correct / total
     return PrecisionRecall(
         np.append(precision[::-1], 1.0), np.append(recall[::-1], 0.0), ranked[last][::-1]
     )
 
 
 def average_precision(curve: PrecisionRecall) -> float:
-    """Average precision: precision weighted by the steps of recall, without interpolation."""
+    """Average precision: the precisions weighted by the steps in recall, without interpolation."""
     return float(-np.sum(np.diff(curve.recall) * curve.precision[:-1]))
 
 
@@ -80,7 +79,7 @@ def recall_at_full_precision(curve: PrecisionRecall) -> float:
 
 
 def precision_at_recall(curve: PrecisionRecall, recall: float = 0.7) -> float:
-    """The highest precision of any threshold with at least this recall."""
+    """The highest precision among the thresholds with at least this recall."""
     return float(curve.precision[curve.recall >= recall].max())
 
 
@@ -100,23 +99,26 @@ def max_f1(curve: PrecisionRecall) -> tuple[float, float]:
 
 def balanced_accuracy(same: NDArray, score: NDArray, threshold: float) -> float:
     """Mean of the true positive rate and the true negative rate at a threshold. It equals the
-    accuracy on a set with as many true as false pairs.
+    accuracy on a set with as many positive as negative pairs.
 
     Args:
         same: ``(N,)`` bool, whether the two images of each pair show the same place.
         score: ``(N,)`` similarity of each pair.
 
     Raises:
-        InputError: there are no true pairs, or no false pairs.
+        InputError: all pairs show the same place, or none does.
     """
     same, accepted = np.asarray(same, bool), np.asarray(score) >= threshold
     if same.all() or not same.any():
-        raise InputError("accuracy: both true and false pairs are needed; add the missing kind.")
+        raise InputError(
+            "accuracy: pairs of the same place and of different places are needed; add the missing "
+            "kind."
+        )
     return float((accepted[same].mean() + (~accepted[~same]).mean()) / 2)
 
 
 def summary(same: NDArray, score: NDArray) -> dict[str, float]:
-    """All measures that a report shows for a detector on a set of pairs."""
+    """All measures that a report shows for the scores of a detector on a set of pairs."""
     curve = precision_recall(same, score)
     f1, threshold = max_f1(curve)
     return {

@@ -1,4 +1,4 @@
-"""Creates loop detectors by name: those of vslam and of other packages (docs/howto/plugins.md)."""
+"""Creates the loop detectors of vslam and of other packages by name (docs/howto/plugins.md)."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _ABOUT = {
     "capsule-pruned": "the Siamese capsule network, pruned",
     "capsule-paper": "the Siamese capsule network as the paper describes it",
 }
-# Detectors whose candidates are also verified by learned descriptors, unless the configuration
-# selects others.
+# Detectors whose candidates are also verified by learned descriptors, unless the configuration says
+# otherwise.
 LEARNED_VERIFICATION = ("both", *(name for name in NETWORKS if name != TO_THE_LETTER))
 
 
 def about(name: str) -> str:
-    """A description of a detector in a few words."""
+    """A short description of a detector."""
     return _ABOUT.get(name, "a plug-in")
 
 
@@ -41,11 +41,12 @@ def require_detector(name: str, weights: Path | None = None, option: str = "--de
 
     Args:
         name: name of the detector.
-        weights: weights for it, or None.
-        option: the option of the command line to name in the message.
+        weights: its weights or vocabulary; None uses those that vslam ships.
+        option: the command-line option that an error message names.
 
     Raises:
-        InputError: there is no such detector or no weights for it, or it takes no weights.
+        InputError: the detector is unknown, its weights are missing, or weights are given for a
+            detector without weights.
     """
     if name not in DETECTORS:
         others = plugins.find_plugins(plugins.DETECTORS)
@@ -59,13 +60,13 @@ def require_detector(name: str, weights: Path | None = None, option: str = "--de
     elif name in (*NETWORKS, "both"):
         find_weights(_network_of(name), weights)
     elif weights is not None and name == "none":
-        raise InputError("--weights: the detector none has no weights; leave the option out.")
+        raise InputError("--weights: the detector 'none' has no weights; leave the option out.")
     elif weights is not None and not weights.is_file():
         raise InputError(f"--weights {weights}: no such file; name a vocabulary, .npz or .txt.")
 
 
 def problem_of(detector: LoopDetector) -> str | None:
-    """What failed in a plug-in detector, in one sentence; None if nothing did."""
+    """One sentence about the failure of a plug-in detector; None if there was none."""
     return detector.problem if isinstance(detector, PlugInDetector) else None
 
 
@@ -82,10 +83,11 @@ def detector_with_images(
 
     Args:
         weights, late: as in :func:`create_detector`.
-        local_weights: weights of the local descriptors; None takes those that vslam ships.
+        local_weights: weights of the local descriptors; None uses those that vslam ships.
 
     Returns:
-        The detector, and the store of images, or None if candidates are verified by ORB alone.
+        The detector, and the store of images; the store is None if candidates are verified by ORB
+        alone.
 
     Raises:
         InputError, ValueError: as in :func:`create_detector`.
@@ -105,15 +107,15 @@ def create_detector(
     """Create a detector without any keyframes. Its dependencies are imported only here.
 
     Args:
-        weights: weights of a learned detector, or the vocabulary of ``bow``; None takes those that
+        weights: weights of a learned detector, or the vocabulary of ``bow``; None uses those that
             vslam ships.
-        images: the store of keyframe images from :func:`create_images`, which ``verifier_for``
-            must be given as well.
-        late: whether to load a network that vslam ships only when it gets its first image.
+        images: the store of keyframe images from :func:`create_images`; pass the same store to
+            ``verifier_for``.
+        late: whether to postpone loading the shipped network until its first image.
 
     Raises:
-        InputError: its vocabulary or weights cannot be read, or its package is broken.
-        ValueError: no such detector.
+        InputError: the vocabulary or weights cannot be read, or the package of a plug-in is broken.
+        ValueError: there is no such detector.
     """
     if name == "none":
         return NoDetector()
@@ -130,7 +132,7 @@ def create_detector(
             create_detector("bow", config),
             create_detector(_network_of(name), config, weights, images, late=late),
         ]
-        return CombinedDetector(name, detectors, config.siamese.min_shared)
+        return CombinedDetector(name, detectors)
     if name in NETWORKS:
         from vslam.loopclosure.siamese.detector import open_detector
 
@@ -145,11 +147,11 @@ def create_detector(
 
 
 def create_images(name: str, config: Config, weights: Path | None = None) -> KeyframeImages | None:
-    """Create the store of keyframe images with which learned descriptors rate and verify
-    candidates; None if they are verified by ORB alone (``verification.descriptors``).
+    """Create the store of keyframe images that learned rating and verification of candidates need;
+    None if ``verification.descriptors`` selects ORB alone.
 
     Raises:
-        InputError: the network cannot be read.
+        InputError: the network of the local descriptors cannot be read.
     """
     descriptors = config.verification.descriptors
     if descriptors == "usual":
@@ -166,15 +168,15 @@ def create_images(name: str, config: Config, weights: Path | None = None) -> Key
 
 
 def _network_of(name: str) -> str:
-    """The network of a detector: for ``both``, ``capsule``."""
+    """The network that a learned detector uses; ``both`` uses ``capsule``."""
     return "capsule" if name == "both" else name
 
 
 def parse_weights(given: Collection[str], detectors: Collection[str]) -> dict[str, Path]:
-    """Parse items ``NAME=FILE``, the weights of some of the detectors, into files by name.
+    """Parse items ``NAME=FILE`` into the files of weights by detector name.
 
     Raises:
-        InputError: an item has another form, or names none of the detectors.
+        InputError: an item has another form or names an unknown detector.
     """
     files = {}
     for item in given:

@@ -1,8 +1,8 @@
 """Motion between two cameras from matched 3D landmarks, by RANSAC.
 
-Both sides of a loop have landmarks of the same points, so three matches determine the motion in
-closed form (Horn, JOSA A 1987; the scale as in Umeyama, PAMI 1991). RANSAC scores a motion as
-ORB-SLAM does (T-RO 2015, VII-B), by the reprojection errors in *both* keyframes.
+Both sides of a loop have triangulated the same points, so three matches determine the motion in
+closed form (Horn, JOSA A 1987; the scale as in Umeyama, PAMI 1991). As in ORB-SLAM (T-RO 2015,
+VII-B), RANSAC scores a motion by the reprojection errors in *both* keyframes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from vslam.reprojection import chi_square, chi_square_ratio, residual, unpacked
 
 REFITS = 4
 SAMPLE_ITERATIONS, REFIT_ITERATIONS = 3, 5
-# A flatter triangle (height over longest side) hardly constrains the rotation about that side.
+# Least height of a triangle over its longest side; flatter triangles hardly constrain the rotation
+# about that side.
 MIN_FLATNESS = 0.03
 
 
@@ -27,7 +28,7 @@ class Sightings(NamedTuple):
     """The landmarks of N matches on one side of a loop, and their observations there.
 
     Attributes:
-        points: ``(N, 3)`` landmarks in the camera frame, in the unit of the map.
+        points: ``(N, 3)`` landmarks in the camera frame, unit of the map.
         uvr: ``(N, 3)`` observed u, v, u_right, pixels; NaN u_right for a monocular observation.
         inverse_sigma2: ``(N,)`` inverse variance of a pixel coordinate.
     """
@@ -43,7 +44,7 @@ class Alignment(NamedTuple):
     Attributes:
         T_a_b: ``(4, 4)`` with R and t.
         scale: factor from lengths in b to lengths in a.
-        inlier: ``(N,)`` bool, matches that agree with it.
+        inlier: ``(N,)`` bool, matches that agree with the similarity.
     """
 
     T_a_b: NDArray[np.float64]
@@ -62,7 +63,7 @@ def align(
     confidence: float,
     fix_scale: bool = True,
 ) -> Alignment | None:
-    """Rigid motion or similarity with the highest consensus; None if it has fewer than
+    """Rigid motion or similarity with the highest MSAC score; None if it has fewer than
     ``min_inliers`` inliers.
 
     Args:
@@ -71,7 +72,7 @@ def align(
         seed: seed of the random samples; the same seed gives the same result.
         min_inliers: least number of inliers.
         max_draws: maximum number of samples.
-        confidence: sampling ends when a better motion would have been found with this probability.
+        confidence: sampling stops once a better motion would have been found with this probability.
         fix_scale: True for metric maps (stereo, RGB-D), False for monocular ones.
     """
     if len(a.points) < max(3, min_inliers):
@@ -91,11 +92,11 @@ def align(
 
 @kernel
 def fit_motion(p_a, p_b, weights, fix_scale):
-    """Weighted least-squares motion ``p_a = scale * R p_b + t`` of points (Horn 1987).
+    """Weighted least-squares motion ``p_a = scale * R p_b + t`` between point sets (Horn 1987).
 
     Args:
-        p_a, p_b: ``(N, 3)`` float64, at least three points that are not collinear
-            (``is_degenerate``).
+        p_a, p_b: ``(N, 3)`` float64; at least three points that are not collinear (see
+            ``is_degenerate``).
         weights: ``(N,)`` float64; a point with weight 0 is ignored.
 
     Returns:
@@ -186,11 +187,11 @@ def is_degenerate(p):
 
 @inner_kernel
 def _same_sides(p_a, p_b, bf):
-    """Whether the sides of two triangles agree within the stereo error. This cheap test rejects
-    most samples that contain a wrong match.
+    """Whether the side lengths of two triangles agree within the stereo error. This cheap test
+    rejects most samples that contain a wrong match.
 
-    An error of one pixel in the disparity moves a point by z^2 / bf. Each end of a side may be
-    off by that much in each camera.
+    A disparity error of one pixel moves a point by z^2 / bf. Each end of a side may have this error
+    in each camera.
     """
     for i in range(3):
         j = (i + 1) % 3
@@ -210,7 +211,8 @@ def _add_residual(p, motion, uvr, inverse_sigma2, intrinsics, H, b):
 
     Args:
         p: ``(3,)`` point in the camera frame.
-        motion: ``(3, 7)`` derivative of the point by the seven parameters of the similarity.
+        motion: ``(3, 7)`` derivative of the point with respect to the similarity.
+        H, b: ``(7, 7)`` and ``(7,)`` normal equations.
     """
     if p[2] <= 0.1:
         return
@@ -238,7 +240,7 @@ def refine_motion(T, scale, a, b, chosen, intrinsics, iterations, fix_scale):
     loss.
 
     This is needed because stereo points are ten times less certain along the line of sight than
-    across it, which the least-squares fit of ``fit_motion`` ignores.
+    across it, and ``fit_motion`` ignores the difference.
 
     Args:
         T, scale: initial motion.
@@ -249,29 +251,29 @@ def refine_motion(T, scale, a, b, chosen, intrinsics, iterations, fix_scale):
     """
     points_a, uvr_a, weight_a = a
     points_b, uvr_b, weight_b = b
-    p, turned = np.empty(3), np.empty((3, 7))
-    in_b = np.empty((3, 7))
+    p = np.empty(3)
+    derivative_a, derivative_b = np.empty((3, 7)), np.empty((3, 7))
     for _ in range(iterations):
         H, g = np.zeros((7, 7)), np.zeros(7)
         for i in chosen:
-            # In camera a: p = scale R p_b + t, with derivative [I, -[p]x, p] by [v, w, log scale].
+            # Camera a observes p = scale R p_b + t.
             for row in range(3):
                 p[row] = T[row, 3]
                 for k in range(3):
                     p[row] += scale * T[row, k] * points_b[i, k]
-            _derivative(p, fix_scale, turned)
-            _add_residual(p, turned, uvr_a[i], weight_a[i], intrinsics, H, g)
-            # In camera b: p' = R' (p - t) / scale, the inverse of the same motion.
-            _derivative(points_a[i], fix_scale, turned)
+            _derivative(p, fix_scale, derivative_a)
+            _add_residual(p, derivative_a, uvr_a[i], weight_a[i], intrinsics, H, g)
+            # Camera b observes R' (p_a - t) / scale, the inverse of the same motion.
+            _derivative(points_a[i], fix_scale, derivative_a)
             for row in range(3):
                 p[row] = 0.0
                 for k in range(3):
                     p[row] += T[k, row] * (points_a[i, k] - T[k, 3]) / scale
                 for column in range(7):
-                    in_b[row, column] = 0.0
+                    derivative_b[row, column] = 0.0
                     for k in range(3):
-                        in_b[row, column] -= T[k, row] * turned[k, column] / scale
-            _add_residual(p, in_b, uvr_b[i], weight_b[i], intrinsics, H, g)
+                        derivative_b[row, column] -= T[k, row] * derivative_a[k, column] / scale
+            _add_residual(p, derivative_b, uvr_b[i], weight_b[i], intrinsics, H, g)
         for k in range(7):
             H[k, k] = H[k, k] * (1.0 + 1e-9) if k < 6 or not fix_scale else 1.0
         step = solve_positive(H, g)
@@ -290,6 +292,8 @@ def refine_motion(T, scale, a, b, chosen, intrinsics, iterations, fix_scale):
 
 @inner_kernel
 def _derivative(p, fix_scale, out):
+    """Write the derivative ``[I, -[p]x, p]`` of a moved point with respect to translation, rotation
+    and log scale into ``out``, ``(3, 7)``."""
     for row in range(3):
         for column in range(3):
             out[row, column] = 1.0 if row == column else 0.0
@@ -302,7 +306,7 @@ def _derivative(p, fix_scale, out):
 
 @inner_kernel
 def _error(x, y, z, uvr, inverse_sigma2, intrinsics):
-    """``chi_square_ratio`` of an observation; 2 if the point is not in front of the camera."""
+    """``chi_square_ratio`` of an observation, or 2 if the point is not in front of the camera."""
     if z <= 0.1:
         return 2.0
     pinhole = unpacked(intrinsics)
@@ -313,7 +317,7 @@ def _error(x, y, z, uvr, inverse_sigma2, intrinsics):
 def _score_motion(T, scale, a, b, intrinsics, to_beat, inlier):
     """MSAC score of a motion and its number of inliers (Torr and Zisserman, CVIU 2000).
 
-    Sets ``inlier``. Returns -1, 0 as soon as the score can no longer exceed ``to_beat``.
+    Sets ``inlier``. Stops and returns (-1, 0) when the score can no longer exceed ``to_beat``.
     """
     points_a, uvr_a, weight_a = a
     points_b, uvr_b, weight_b = b
@@ -345,8 +349,8 @@ def _score_motion(T, scale, a, b, intrinsics, to_beat, inlier):
 
 @kernel
 def _ransac(a, b, intrinsics, seed, min_inliers, max_draws, confidence, fix_scale):
-    """RANSAC on samples of three matches; a motion that scores better than all before is refitted
-    to its inliers. Returns T, scale, inliers and their number."""
+    """RANSAC on samples of three matches. Each motion with a new best score is refitted to its
+    inliers. Returns T, scale, inliers and their number."""
     points_a, points_b = a.points, b.points
     n = len(points_a)
     state = np.empty(1, np.uint64)
@@ -355,7 +359,7 @@ def _ransac(a, b, intrinsics, seed, min_inliers, max_draws, confidence, fix_scal
     best_inlier, inlier = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
     sample = np.empty(3, np.int64)
     three_a, three_b, ones = np.empty((3, 3)), np.empty((3, 3)), np.ones(3)
-    # If at least min_inliers of the matches are right, this many samples suffice.
+    # This many samples suffice if at least min_inliers of the matches are correct.
     draws = draws_needed(min_inliers / n, confidence, max_draws)
     turn = 0
     while turn < draws:

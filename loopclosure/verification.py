@@ -2,10 +2,10 @@
 
 The steps are those of ORB-SLAM (T-RO 2015, VII-B; for stereo T-RO 2017, III-D): match the
 descriptors of two keyframes, estimate a motion by RANSAC, match all landmarks of the place near
-their projections, and refine the pose. ORB-SLAM then counts inliers. But a facade or a car that
-looks like another one has inliers, too. So we also test for evidence against the loop: inliers must
-be spread over the image, and each side must find most of the landmarks of the other side that
-should be visible.
+their projections, and refine the pose. ORB-SLAM then only counts inliers, but a facade or a car
+that looks like another one has many inliers, too. The tests here therefore also look for evidence
+against the loop: the inliers must be spread over the image, and on each side most landmarks of the
+other side that should be visible must be found.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ from vslam.map_kernels import collect_landmarks
 from vslam.reprojection import stack_uvr
 
 GRID_COLUMNS, GRID_ROWS = 8, 4
-MIN_DEPTHS = 10  # least number of landmarks with depths on both sides for a ratio of scales
+MIN_DEPTHS = 10  # least number of features with landmarks on both sides to estimate the scale
 
 
 class GuidedMatches(NamedTuple):
-    """The landmarks that a camera should see, and those that it does see.
+    """The landmarks that should be visible from a camera pose, and the features that match them.
 
     Attributes:
         landmarks: ``(M,)`` int32 ids of the landmarks that should be visible.
-        feature: ``(M,)`` int32, inlier feature of each (index within the keyframe), or -1.
-        uv: ``(M, 2)`` float64, their predicted pixels.
+        feature: ``(M,)`` int32, inlier feature of each landmark (index within the keyframe), or -1.
+        uv: ``(M, 2)`` float64, predicted pixels of the landmarks.
         n_matches: number of matches near the predictions, including outliers.
         T_cw: ``(4, 4)`` pose of the camera in the world frame of the landmarks.
     """
@@ -59,7 +59,7 @@ class GuidedMatches(NamedTuple):
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """``(M,)`` bool, landmarks with an inlier."""
+        """``(M,)`` bool, landmarks with an inlier feature."""
         return self.feature >= 0
 
 
@@ -72,9 +72,9 @@ def verify(
     """Decide whether the query keyframe shows the place of the match. The map is not changed.
 
     Returns:
-        An edge that is accepted with reason "verified", or not accepted with the reason why not.
-        Pose and matches are set as far as verification got. Features and landmarks are the inliers:
-        features of the query and living landmarks of the place, without repetitions.
+        An edge that is accepted with the reason "verified", or rejected with another reason. The
+        pose and the numbers of matches come from the last step that was completed. The inliers are
+        features of the query and landmarks of the place, without duplicates.
     """
     query, match = candidate.query, candidate.match
     edge = LoopEdge.of(candidate)
@@ -93,7 +93,8 @@ def verify(
 
 
 def verify_near(map_: Map, edge: LoopEdge, camera: Camera, config: VerificationConfig) -> LoopEdge:
-    """``verify`` starting from the pose of an edge, without matching descriptors first.
+    """Verify as ``verify`` does, but start from the pose of an edge instead of matching
+    descriptors.
 
     Raises:
         ValueError: the edge has no pose.
@@ -123,8 +124,11 @@ def verify_near(map_: Map, edge: LoopEdge, camera: Camera, config: VerificationC
 def match_keyframes(
     map_: Map, query: int, match: int, config: VerificationConfig
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Match the features of two keyframes that observe landmarks by their descriptors; returns
-    ``(N,)`` rows of each keyframe in the map's arrays."""
+    """Match the descriptors of those features of two keyframes that observe landmarks.
+
+    Returns:
+        ``(N,)`` rows of the matched features in the map's arrays, for each keyframe.
+    """
     a = map_.arrays
     rows_q, rows_m = (
         np.flatnonzero(a.landmark[map_.rows(k)] >= 0) + a.first_row[k] for k in (query, match)
@@ -149,8 +153,8 @@ def _consensus(
     camera: Camera,
     config: VerificationConfig,
 ) -> tuple[Matrix | None, float, int]:
-    """``T_query_match`` and scale with the highest consensus, and its number of inliers; the pose
-    is None if there is no consensus."""
+    """``T_query_match`` and scale from RANSAC, with the number of inliers. The pose is None if it
+    has too few inliers."""
     found = align(
         _sightings(map_, query, rows_q),
         _sightings(map_, match, rows_m),
@@ -170,8 +174,11 @@ def _consensus(
 
 def relative_scale(map_: Map, edge: LoopEdge, T_cw: Matrix, *, default: float) -> float:
     """Scale of a monocular loop: the factor from lengths around the match to lengths around the
-    query. It is the median, over features that observe a landmark on both sides, of the ratio of
-    the depths of the query's landmark and the landmark of the place.
+    query.
+
+    An inlier feature of the query may also observe a landmark of its own. The ratio of the depths
+    of that landmark and of the landmark of the place is one estimate of the scale; the median is
+    returned.
 
     Args:
         T_cw: ``(4, 4)`` pose of the query in the world frame of the place.
@@ -203,7 +210,7 @@ def _observations(map_: Map, rows: NDArray[np.int64]) -> tuple[Matrix, Matrix]:
 
 
 def place_of(map_: Map, match: int, query: int, config: VerificationConfig) -> NDArray[np.int64]:
-    """Ids of the match and its best covisible keyframes, without those that are covisible with the
+    """Ids of the match and its most covisible keyframes, without keyframes covisible with the
     query."""
     near_query = {query, *map_.covisible(query)[0].tolist()}
     around = [k for k in map_.covisible(match)[0].tolist() if k not in near_query]
@@ -218,12 +225,12 @@ def guided_match(
     camera: Camera,
     config: VerificationConfig,
 ) -> GuidedMatches:
-    """Guided matching: search for ``(N,)`` landmarks near their projections and refine the pose
-    with all matches; then repeat this in narrower windows.
+    """Search for ``(N,)`` landmarks near their projections and refine the pose with all matches;
+    then repeat both steps with narrower windows.
 
     Args:
         T_cw: ``(4, 4)`` estimated pose of the keyframe in the world frame of the landmarks. If the
-            map has drifted, this differs from its pose in the map.
+            map has drifted, it differs from the keyframe's pose in the map.
     """
     a, rows = map_.arrays, map_.rows(keyframe)
     grid = FeatureGrid.of_positions(a.xy[rows], camera.width, camera.height)
@@ -269,7 +276,7 @@ def _rejection_reason(
     camera: Camera,
     config: VerificationConfig,
 ) -> str:
-    """Why a refined loop must be rejected, "" if it passes all tests."""
+    """The reason to reject a refined loop, or "" if it passes all tests."""
     if edge.n_inliers < config.min_inliers:
         return f"only {edge.n_inliers} landmarks of the place fit"
     if edge.n_inliers < config.min_inlier_ratio * edge.n_matches:
@@ -286,7 +293,7 @@ def _rejection_reason(
         map_, edge.query, reverse_match(map_, edge, T_query_match, camera, config)
     )
     if seen < config.min_seen_ratio * total:
-        return f"the place saw only {seen} of {total} landmarks of the query"
+        return f"only {seen} of {total} landmarks of the query are seen from the place"
     return ""
 
 
@@ -297,12 +304,13 @@ def spread_reason(
     config: VerificationConfig,
     min_elsewhere: int,
 ) -> str:
-    """Why inliers are not spread widely enough over the image, "" if they are.
+    """The reason to reject inliers that are not spread over the image, or "" if they are.
 
     Args:
         uv: ``(M, 2)`` predicted pixels of the landmarks that should be visible.
         seen: ``(M,)`` bool, the inliers.
-        min_elsewhere: least number of inliers outside one third of the image.
+        min_elsewhere: least number of inliers outside the vertical strip, a third of the image
+            wide, that contains most of them.
     """
     expected, occupied = occupied_cells(uv, camera), occupied_cells(uv[seen], camera)
     if occupied < max(config.min_cells, config.min_cell_ratio * expected):
@@ -320,7 +328,7 @@ def reverse_match(
     camera: Camera,
     config: VerificationConfig,
 ) -> GuidedMatches:
-    """Guided matching of the landmarks of the query in the match."""
+    """Search for the landmarks of the query in the image of the match."""
     T_match_query = inverse(T_query_match)
     T_match_query[:3, 3] *= edge.scale  # in the query's unit, like its landmarks
     T_mw = T_match_query @ map_.keyframe_pose(edge.query)
@@ -328,13 +336,13 @@ def reverse_match(
 
 
 def seen_of(map_: Map, keyframe: int, guided: GuidedMatches) -> tuple[int, int]:
-    """How many landmarks of a keyframe the camera sees, and how many of them it should see."""
+    """Number of landmarks of a keyframe that the camera sees, and number that it should see."""
     own = np.isin(guided.landmarks, map_.landmarks_of(keyframe))
     return int(np.count_nonzero(guided.seen & own)), int(np.count_nonzero(own))
 
 
 def occupied_cells(uv: Matrix, camera: Camera) -> int:
-    """Number of cells of the image that contain any of ``(N, 2)`` pixels."""
+    """Number of grid cells of the image that contain at least one of ``(N, 2)`` pixels."""
     column = (uv[:, 0] * GRID_COLUMNS / camera.width).astype(np.int64)
     row = (uv[:, 1] * GRID_ROWS / camera.height).astype(np.int64)
     return len(np.unique(row * GRID_COLUMNS + column))

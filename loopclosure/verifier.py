@@ -1,7 +1,7 @@
-"""Verifiers of loop candidates: by ORB descriptors, by learned ones, or by ORB and, if that fails,
-by learned ones.
+"""Verifiers of loop candidates: by ORB descriptors, by learned descriptors, or by ORB first and by
+learned descriptors if ORB fails.
 
-Loop closing knows only the methods of :class:`Verifier`, so it is the same for all of them.
+Loop closing uses only the interface of :class:`Verifier` and is the same for all of them.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from vslam.states import VerifierState
 
 
 class Verifier:
-    """Decides by geometry whether a keyframe shows the place that a detector proposes, here by ORB
-    descriptors alone.
+    """Decides by geometry whether a keyframe shows the place that a detector proposes. This class
+    uses ORB descriptors alone.
 
     Methods are called in the order of the keyframes, by one thread at a time.
 
     Attributes:
-        images: the images of keyframes that verification needs; None if it needs none.
-        verified_memory: for how many keyframes a verified loop waits for other loops that agree
-            with it.
+        images: the keyframe images that verification needs; None if it needs none.
+        verified_memory: number of keyframes for which a verified loop waits for other loops that
+            agree with it.
     """
 
     images: KeyframeImages | None = None
@@ -47,22 +47,22 @@ class Verifier:
         self._camera = camera
 
     def is_image_redundant(self, map_: Map, keyframe: int) -> bool:
-        """Whether the image of a keyframe is not needed, because other images show nearly the same
+        """Whether the image of a keyframe is not needed because other images show nearly the same
         view."""
         return False
 
     def add(self, map_: Map, keyframe: int, image: NDArray[np.uint8] | None) -> None:
-        """Remember the image of a new keyframe if verification needs images.
+        """Store the image of a new keyframe if verification needs images.
 
         Args:
-            image: ``(H, W)`` uint8 left image; None if there is none or it is not needed.
+            image: ``(H, W)`` uint8 left image; None if it is missing or not needed.
         """
 
     def rate(
         self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
     ) -> list[LoopCandidate]:
-        """The candidates of a keyframe in the same order, with ``alike`` and ``promising`` set if
-        this verifier uses them."""
+        """Set ``alike`` and ``promising`` of the candidates of a keyframe if this verifier uses
+        them; the order stays the same."""
         return candidates
 
     def verify(
@@ -71,18 +71,18 @@ class Verifier:
         """Decide whether a rated candidate is a loop. The map is not changed.
 
         Args:
-            refusal: the rejected edge if the candidate has failed an earlier test, else None. ORB
-                does not try such a candidate.
+            refusal: the rejected edge if the candidate has failed an earlier test, else None.
+                Verification by ORB skips such a candidate.
 
         Returns:
-            An accepted edge with a pose, or one that is not accepted, with the reason.
+            An accepted edge with a pose, or a rejected edge with the reason.
         """
         if refusal is not None:
             return refusal
         return verification.verify(map_, candidate, self._camera, self._config.verification)
 
     def state(self) -> VerifierState:
-        """The state, for a saved map or a checkpoint, without the images."""
+        """The state without the images, for a saved map or a checkpoint."""
         return VerifierState()
 
     def restore(self, state: VerifierState) -> None:
@@ -93,8 +93,9 @@ def verifier_for(config: Config, camera: Camera, images: KeyframeImages | None =
     """Create the verifier that ``config.verification.descriptors`` selects.
 
     Args:
-        images: the store of keyframe images for learned verification; None selects ORB alone,
-            whatever the configuration says (see ``vslam.loopclosure.registry.create_images``).
+        images: the store of keyframe images for learned verification, from
+            ``vslam.loopclosure.registry.create_images``; None selects ORB alone, whatever the
+            configuration says.
     """
     if images is None:
         return Verifier(config, camera)
@@ -104,11 +105,11 @@ def verifier_for(config: Config, camera: Camera, images: KeyframeImages | None =
 
 
 class LearnedVerifier(Verifier):
-    """A verifier by learned local descriptors alone.
+    """A verifier that uses learned local descriptors alone.
 
-    This takes forty times as long as verification by ORB, so :class:`LearnedTrials` chooses
-    promising candidates. These are tried even if only one keyframe resembled the place, because a
-    camera that crosses a place by night may get only one good view of it.
+    It takes forty times as long as verification by ORB, so :class:`LearnedTrials` selects the
+    promising candidates. They are tried even if only one keyframe resembled the place, because at
+    night a camera that crosses a place may get only one good view of it.
     """
 
     images: KeyframeImages
@@ -123,7 +124,7 @@ class LearnedVerifier(Verifier):
         return is_image_redundant(map_, keyframe, self.images, self._config.learned)
 
     def add(self, map_: Map, keyframe: int, image: NDArray[np.uint8] | None) -> None:
-        """Remember the image, and forget those of keyframes that were culled."""
+        """Store the image, and drop the images of keyframes that were culled."""
         if image is not None:
             self.images.add(keyframe, image)
             self.images.keep(map_.arrays.keyframe_alive)
@@ -131,8 +132,8 @@ class LearnedVerifier(Verifier):
     def rate(
         self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
     ) -> list[LoopCandidate]:
-        """See :class:`Verifier`: rate candidates that the detector has not rated by comparing their
-        images, and mark the promising ones."""
+        """See :class:`Verifier`. Candidates that the detector has not rated are rated by comparing
+        their images, and the promising candidates are marked."""
         images, config = self.images, self._config
         if keyframe in images and any(one.alike is None for one in candidates):
             beyond = beyond_reach(map_, keyframe, config.siamese)
@@ -144,10 +145,10 @@ class LearnedVerifier(Verifier):
     def verify(
         self, map_: Map, candidate: LoopCandidate, refusal: LoopEdge | None = None
     ) -> LoopEdge:
-        """See :class:`Verifier`; only promising candidates are tried, even if they have failed an
-        earlier test."""
+        """See :class:`Verifier`. Promising candidates are tried even if they have failed an earlier
+        test, other candidates never."""
         if not candidate.promising:
-            reason = "not similar enough for learned descriptors"
+            reason = "images not similar enough for learned verification"
             return refusal or LoopEdge.of(candidate, reason, matched_by="learned")
         config = self._config
         edge = verify_learned(
@@ -167,12 +168,12 @@ class LearnedVerifier(Verifier):
 
 
 class OrbThenLearnedVerifier(LearnedVerifier):
-    """A verifier by ORB descriptors and, if these fail, by learned ones."""
+    """A verifier that uses ORB descriptors and, if they fail, learned descriptors."""
 
     def verify(
         self, map_: Map, candidate: LoopCandidate, refusal: LoopEdge | None = None
     ) -> LoopEdge:
-        """See :class:`Verifier`; a promising candidate that ORB rejects is tried again by learned
+        """See :class:`Verifier`. A promising candidate that ORB rejects is tried again by learned
         descriptors."""
         edge = Verifier.verify(self, map_, candidate, refusal)
         return edge if edge.accepted else super().verify(map_, candidate, edge)

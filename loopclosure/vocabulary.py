@@ -4,7 +4,7 @@ The tree is the hierarchical vocabulary of Nister and Stewenius (CVPR 2006) for 
 (Galvez-Lopez and Tardos, T-RO 2012, section III): each node splits its descriptors into k clusters
 by Hamming distance, the centre of a cluster is the bitwise majority of its descriptors, and the
 leaves are the words. Nodes are numbered breadth first, so that the children of a node are adjacent
-in memory and descending a level reads one block of 32 k bytes.
+in memory and each step of a descent reads one block of 32 k bytes.
 """
 
 from __future__ import annotations
@@ -39,8 +39,7 @@ class Vocabulary:
         n_children: ``(N,)`` uint8, 0 for a leaf.
         parent: ``(N,)`` int32, -1 for the root.
         level: ``(N,)`` uint8, depth of each node; 0 for the root.
-        word: ``(N,)`` int32, index of the word of a leaf, ascending with the nodes; -1 for inner
-            nodes.
+        word: ``(N,)`` int32, word of each leaf, in the order of the nodes; -1 for inner nodes.
         weight: ``(W,)`` float32, inverse document frequency ln(images / images with the word).
     """
 
@@ -69,8 +68,8 @@ class Vocabulary:
         )
 
     def ancestors(self, level: int) -> NDArray[np.int32]:
-        """``(W,)`` int32, the ancestor of each word at a level counted from the root; a word above
-        that level is its own ancestor."""
+        """``(W,)`` int32, node of the ancestor of each word at a level (0 is the root). A word
+        above that level is its own ancestor."""
         nodes = np.flatnonzero(self.word >= 0).astype(np.int32)
         while (deep := self.level[nodes] > level).any():
             nodes[deep] = self.parent[nodes[deep]]
@@ -78,8 +77,8 @@ class Vocabulary:
 
 
 class BowVector(NamedTuple):
-    """Bag of words of an image: ``(N,)`` int32 words, ascending, and ``(N,)`` float32 weights that
-    sum to 1."""
+    """Bag of words of an image: ``(N,)`` int32 words in ascending order, and ``(N,)`` float32
+    weights that sum to 1."""
 
     words: NDArray[np.int32]
     weights: NDArray[np.float32]
@@ -93,16 +92,16 @@ def bow_vector(vocabulary: Vocabulary, words: NDArray[np.int32]) -> BowVector:
     """
     unique, count = np.unique(words, return_counts=True)
     weights = count * vocabulary.weight[unique].astype(np.float64)
-    telling = weights > 0
-    weights = weights[telling]
-    return BowVector(unique[telling], (weights / max(weights.sum(), 1e-300)).astype(np.float32))
+    informative = weights > 0
+    unique, weights = unique[informative], weights[informative]
+    return BowVector(unique, (weights / max(weights.sum(), 1e-300)).astype(np.float32))
 
 
 def score(a: BowVector, b: BowVector) -> float:
     """L1 score of two images in [0, 1]: 1 - |a - b| / 2 (T-RO 2012, equation 2).
 
-    Since the weights are positive and sum to 1, this is the sum of the smaller weight of each
-    shared word (Nister and Stewenius, section 4, equation 5, rearranged).
+    Since the weights are positive and sum to 1, this equals the sum, over the shared words, of the
+    smaller weight (Nister and Stewenius, section 4, equation 5, rearranged).
     """
     _, in_a, in_b = np.intersect1d(a.words, b.words, assume_unique=True, return_indices=True)
     return float(np.minimum(a.weights[in_a], b.weights[in_b]).sum(dtype=np.float64))
@@ -110,8 +109,8 @@ def score(a: BowVector, b: BowVector) -> float:
 
 @kernel
 def descend(queries, descriptors, first_child, n_children, word):
-    """Descend from the root to a leaf, each time to the nearest child (the first of equally near
-    ones).
+    """Descend from the root to a leaf for each query, always to the nearest child; among equally
+    near children, to the first one.
 
     Args:
         queries: ``(M, 4)`` uint64 descriptors; the other arrays are those of ``Vocabulary``.
@@ -146,7 +145,7 @@ def from_children(
     arguments.
 
     Raises:
-        ValueError: the arguments are out of range or do not fit together.
+        ValueError: an argument is out of range, or the arguments do not describe a tree.
     """
     n = len(n_children)
     if not 2 <= branching <= MAX_BRANCHING:
@@ -161,11 +160,11 @@ def from_children(
     first_child = 1 + np.cumsum(children) - children
     inner = np.flatnonzero(children)
     if children.sum() != n - 1 or (first_child[inner] <= inner).any():
-        raise ValueError("the numbers of children do not make a tree")
+        raise ValueError("the numbers of children do not form a tree")
     parent = np.concatenate([[-1], np.repeat(np.arange(n), children)]).astype(np.int32)
     level = np.zeros(n, np.uint8)
     start, stop, depth = 1, 1 + int(children[0]), 1
-    while start < stop:  # the next level: the children of this one
+    while start < stop:  # nodes start to stop are those at this depth
         if depth > levels:
             raise ValueError(f"the tree is deeper than {levels} levels")
         level[start:stop] = depth
@@ -191,8 +190,8 @@ def from_children(
 
 
 def save(vocabulary: Vocabulary, path: Path) -> None:
-    """Write a vocabulary as an npz file, uncompressed: its nearly random bits do not compress, and
-    the file loads faster.
+    """Write a vocabulary as an npz file. It is uncompressed, because the nearly random bits of
+    descriptors do not compress, and because it loads faster.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -214,18 +213,22 @@ def load(path: Path = SHIPPED) -> Vocabulary:
     """Read a vocabulary that ``save`` wrote; by default, the one that vslam ships.
 
     Raises:
-        InputError: the file is missing, damaged, of another schema, or not a vocabulary.
+        InputError: the file is missing, damaged, not a vocabulary, or written by a version of vslam
+            with another schema.
     """
-    again = "make it again with vslam vocabulary train or convert"
-    parts = read_npz(path, "a vocabulary", again)
+    fix = "write it again with 'vslam vocabulary train' or 'convert'"
+    parts = read_npz(path, "a vocabulary", fix)
     try:
         if "schema" not in parts or "n_children" not in parts:
-            raise InputError(f"{path}: holds no vocabulary; {again}.")
+            raise InputError(f"{path}: not a vocabulary; {fix}.")
         if (schema := int(parts["schema"])) != SCHEMA:
-            raise InputError(f"{path}: schema {schema}, this version reads {SCHEMA}; {again}.")
-        kinds = (("descriptors", np.uint64), ("n_children", np.uint8), ("weight", np.float32))
-        for name, kind in kinds:
-            if parts[name].dtype != kind:
+            raise InputError(
+                f"{path}: has schema {schema}, but this version of vslam reads schema {SCHEMA}; "
+                f"{fix}."
+            )
+        dtypes = (("descriptors", np.uint64), ("n_children", np.uint8), ("weight", np.float32))
+        for name, dtype in dtypes:
+            if parts[name].dtype != dtype:
                 raise ValueError(f"{name} is {parts[name].dtype}")
         return from_children(
             int(parts["branching"]),
@@ -235,4 +238,4 @@ def load(path: Path = SHIPPED) -> Vocabulary:
             parts["weight"],
         )
     except (ValueError, KeyError, TypeError, OverflowError) as error:
-        raise InputError(f"{path}: damaged vocabulary ({error}); {again}.") from error
+        raise InputError(f"{path}: damaged vocabulary ({error}); {fix}.") from error

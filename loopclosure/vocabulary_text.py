@@ -3,8 +3,8 @@
 The first line is ``k L scoring weighting``. Each further line describes a node: the number of its
 parent, whether it is a leaf (0 or 1), the 32 bytes of its descriptor, and its weight (for a leaf,
 the inverse document frequency). Nodes are numbered from 1 in the order of their lines; node 0 is
-the root and has no line. Any order in which parents precede their children can be read; files are
-written breadth first.
+the root and has no line. The reader accepts any order in which parents precede their children; the
+writer uses breadth-first order.
 """
 
 from __future__ import annotations
@@ -24,21 +24,22 @@ from vslam.loopclosure.vocabulary import (
     save,
 )
 
-NUMBERS = 35  # numbers in the line of a node: parent, leaf, 32 bytes, weight
+NUMBERS = 35  # numbers per line of a node: parent, leaf, 32 bytes, weight
 L1_NORM, TF_IDF = 0, 0  # DBoW2's codes for the scoring and weighting that vslam uses
 
 
 def read_vocabulary(path: Path) -> Vocabulary:
-    """Read an npz file or, if the name ends in .txt, DBoW2's text format.
+    """Read a vocabulary from an npz file or, if the name ends in .txt, from DBoW2's text format.
 
     Raises:
-        InputError: the name has another ending, or as in ``load`` and ``read_text``.
+        InputError: the name has another ending, or the file cannot be read (see ``load`` and
+            ``read_text``).
     """
     return read_text(path) if is_text(path) else load(path)
 
 
 def write_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
-    """Write an npz file or, if the name ends in .txt, DBoW2's text format.
+    """Write a vocabulary as an npz file or, if the name ends in .txt, in DBoW2's text format.
 
     Raises:
         InputError: the name has another ending.
@@ -48,7 +49,7 @@ def write_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
 
 
 def is_text(path: Path) -> bool:
-    """Whether a file name means DBoW2's text format (.txt) rather than npz.
+    """Whether a file name selects DBoW2's text format (.txt) rather than npz.
 
     Raises:
         InputError: the name has neither ending.
@@ -67,10 +68,9 @@ def read_text(path: Path) -> Vocabulary:
         InputError: the file is missing or damaged; the message names the line and the error.
     """
     try:
-        text = path.read_bytes()
+        text = path.read_bytes().rstrip()
     except OSError as error:
         raise InputError(f"{path}: cannot read the vocabulary ({error.strerror}).") from error
-    text = text.rstrip()
     if not text:
         raise InputError(f"{path}: the file is empty; fetch or export the vocabulary again.")
     header, _, body = text.partition(b"\n")
@@ -81,12 +81,12 @@ def read_text(path: Path) -> Vocabulary:
     leaf = np.concatenate([[False], numbers[:, 1] == 1])
     descriptors, weight = np.zeros((n + 1, 32), np.uint8), np.zeros(n + 1)
     descriptors[1:], weight[1:] = numbers[:, 2:-1], numbers[:, -1]
-    _check_family(path, parent, leaf, branching)
+    _check_children(path, parent, leaf, branching)
     order, level = _breadth_first(parent)
     if level[-1] > levels:
-        deep = int(order[np.argmax(level > levels)])
+        node = int(order[np.argmax(level > levels)])
         raise InputError(
-            f"{path}: line {deep + 1} is at level {level.max()}, but line 1 says {levels} levels; "
+            f"{path}: line {node + 1} is at level {level.max()}, but line 1 says {levels} levels; "
             "fetch or export it again."
         )
     n_children = np.bincount(parent[1:], minlength=n + 1)[order]
@@ -108,7 +108,7 @@ def write_text(vocabulary: Vocabulary, path: Path) -> None:
     v = vocabulary
     weight = np.zeros(len(v.word), np.float32)
     weight[v.word >= 0] = v.weight
-    byte = [f" {value}" for value in range(256)]
+    byte_text = [f" {value}" for value in range(256)]
     # No newline at the end, because ORB-SLAM's reader expects another node after each newline.
     lines = [f"{v.branching} {v.levels} {L1_NORM} {TF_IDF}"]
     rows = zip(
@@ -119,7 +119,8 @@ def write_text(vocabulary: Vocabulary, path: Path) -> None:
         strict=True,
     )
     for parent, leaf, values, idf in rows:
-        lines.append(f"{parent} {leaf:d}{''.join([byte[value] for value in values])} {idf:.9g}")
+        descriptor = "".join([byte_text[value] for value in values])
+        lines.append(f"{parent} {leaf:d}{descriptor} {idf:.9g}")
     write_file(path, "\n".join(lines))
 
 
@@ -129,7 +130,7 @@ def _read_header(path: Path, header: bytes) -> tuple[int, int]:
     except ValueError:
         raise InputError(
             f"{path}: line 1 is not 'k L scoring weighting' in whole numbers; "
-            "is this a vocabulary in DBoW2's text format?"
+            "name a vocabulary in DBoW2's text format."
         ) from None
     if not (2 <= branching <= MAX_BRANCHING and 1 <= levels <= MAX_LEVELS):
         raise InputError(
@@ -145,9 +146,9 @@ def _read_header(path: Path, header: bytes) -> tuple[int, int]:
 
 
 def _read_nodes(path: Path, lines: list[bytes]) -> NDArray[np.float64]:
-    """``(n, 35)`` numbers of the lines of the nodes 1 to n, each in its range."""
+    """Parse the lines of nodes 1 to n as ``(n, 35)`` numbers and check their ranges."""
 
-    def refuse(node: int, fault: str) -> InputError:
+    def refused(node: int, fault: str) -> InputError:
         return InputError(f"{path}: line {node + 1} {fault}; fetch or export it again.")
 
     numbers = np.empty((len(lines), NUMBERS))
@@ -155,48 +156,48 @@ def _read_nodes(path: Path, lines: list[bytes]) -> NDArray[np.float64]:
         words = line.split()
         if len(words) != NUMBERS:
             amount = "fewer" if len(words) < NUMBERS else "more"
-            raise refuse(node, f"has {amount} than {NUMBERS} numbers")
+            raise refused(node, f"has {amount} than {NUMBERS} numbers")
         try:
             numbers[node - 1] = list(map(float, words))
         except ValueError:
-            raise refuse(node, "holds something that is not a number") from None
+            raise refused(node, "contains something that is not a number") from None
     parent, leaf, byte, weight = numbers[:, 0], numbers[:, 1], numbers[:, 2:-1], numbers[:, -1]
-    before = np.arange(1, len(lines) + 1)
-    for right, fault in (
-        (~np.isnan(numbers).any(1), "holds something that is not a number"),
-        ((parent >= 0) & (parent < before) & (parent % 1 == 0),
+    nodes = np.arange(1, len(lines) + 1)
+    for valid, fault in (
+        (~np.isnan(numbers).any(1), "contains something that is not a number"),
+        ((parent >= 0) & (parent < nodes) & (parent % 1 == 0),
          "names a parent that does not come before it"),
         ((leaf == 0) | (leaf == 1), "has a leaf flag that is neither 0 nor 1"),
         (((byte >= 0) & (byte <= 255) & (byte % 1 == 0)).all(1),
          "has a descriptor byte that is not a whole number from 0 to 255"),
         ((weight >= 0) & (weight <= 3e38), "has a weight that is negative or too large"),
     ):  # fmt: skip
-        if not right.all():
-            raise refuse(1 + int(np.argmin(right)), fault)
+        if not valid.all():
+            raise refused(1 + int(np.argmin(valid)), fault)
     return numbers
 
 
-def _check_family(
+def _check_children(
     path: Path, parent: NDArray[np.int64], leaf: NDArray[np.bool_], branching: int
 ) -> None:
     """Check that leaves have no children, and that other nodes have 1 to ``branching`` of them."""
     n_children = np.bincount(parent[1:], minlength=len(parent))
-    for wrong, what in (
+    for wrong, fault in (
         (leaf & (n_children > 0), "is a leaf but has children"),
-        (~leaf & (n_children == 0), "is not a leaf but has no children, so the file is cut off"),
-        (n_children > branching, f"has more children than the {branching} that line 1 says"),
+        (~leaf & (n_children == 0), "is not a leaf but has no children, so the file is truncated"),
+        (n_children > branching, f"has more children than the {branching} that line 1 allows"),
     ):
         if wrong.any():
             node = int(np.argmax(wrong))
-            where = f"line {node + 1}" if node else "the root"
-            raise InputError(f"{path}: {where} {what}; fetch or export it again.")
+            name = f"line {node + 1}" if node else "the root"
+            raise InputError(f"{path}: {name} {fault}; fetch or export it again.")
 
 
 def _breadth_first(parent: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Nodes in breadth-first order, siblings in the order of their lines, and the level of each."""
     by_parent = np.argsort(parent, kind="stable")
     n_children = np.bincount(parent[1:], minlength=len(parent))
-    first = 1 + np.cumsum(n_children) - n_children  # first child of each node in by_parent
+    first = 1 + np.cumsum(n_children) - n_children  # position of each first child in by_parent
     generations = [np.zeros(1, np.int64)]
     while True:
         parents = generations[-1][n_children[generations[-1]] > 0]

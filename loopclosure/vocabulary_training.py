@@ -1,10 +1,10 @@
 """Training of a vocabulary tree by k-majority clustering, level by level.
 
-Follows Galvez-Lopez and Tardos (T-RO 2012, section III) for binary descriptors, after Nister and
-Stewenius (CVPR 2006): in each node, descriptors are assigned to the nearest of k centres, and each
-centre becomes the bitwise majority of its descriptors, until nothing changes. All arithmetic is on
-integers and the random numbers are generated here, so that a seed gives the same tree on every
-machine.
+This is the method of Galvez-Lopez and Tardos (T-RO 2012, section III) for binary descriptors, after
+Nister and Stewenius (CVPR 2006). In each node, descriptors are assigned to the nearest of k
+centres, and each centre becomes the bitwise majority of its descriptors, until nothing changes. All
+arithmetic is on integers and the random numbers are generated here, so that a seed gives the same
+tree on every machine.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def train(
         descriptors_of_images: ``(n, 32)`` uint8 descriptors of each image.
         branching: maximum number of children of a node.
         levels: maximum depth of a leaf.
-        on_level: called after each level with the number of levels and of nodes so far.
+        on_level: called after each level with the numbers of levels and nodes so far.
 
     Raises:
         ValueError: branching or levels is out of range, or there are fewer than two different
@@ -51,7 +51,7 @@ def train(
     data = np.ascontiguousarray(np.concatenate(descriptors_of_images)).view(np.uint64)
     order = np.arange(len(data), dtype=np.int64)
     centres, n_children = [np.zeros((1, 4), np.uint64)], []
-    starts = np.array([0, len(data)], np.int64)  # start of each node of the level in ``order``
+    starts = np.array([0, len(data)], np.int64)  # CSR offsets of the level's nodes into ``order``
     for level in range(levels):
         stream = np.uint64((seed * MAX_LEVELS + level) % 2**64)
         new, split, starts = split_level(data, order, starts, branching, stream, ITERATIONS)
@@ -68,14 +68,14 @@ def train(
     seen_in = np.zeros(n_leaves, np.int64)
     for one in descriptors_of_images:
         seen_in[np.unique(tree.words(one))] += 1
-    # np.maximum only guards the division: each leaf is the word of some training descriptor.
+    # np.maximum only guards the division, because each leaf is the word of a training descriptor.
     weight = np.log(len(counts) / np.maximum(seen_in, 1)).astype(np.float32)
     return from_children(branching, levels, nodes, children, weight)
 
 
 @inner_kernel
 def uniform(state):
-    """Next random number in [0, 1) and the next state, by splitmix64 (Steele et al., OOPSLA
+    """The next random number in [0, 1) and the next state of splitmix64 (Steele et al., OOPSLA
     2014)."""
     state = state + np.uint64(0x9E3779B97F4A7C15)
     z = state
@@ -90,9 +90,9 @@ def seed_centres(data, members, branching, state, nearest, centres):
     """Choose up to ``branching`` different members that are far from each other as initial centres.
 
     k-means++ (Arthur and Vassilvitskii, SODA 2007) draws a member with a probability proportional
-    to its squared distance from the nearest centre so far, which for bit vectors is the Hamming
-    distance. Of ``TRIALS`` drawn members, the one that minimises the sum of these distances is
-    chosen (their section 7).
+    to its squared distance from the nearest centre so far; for bit vectors, this is the Hamming
+    distance. The greedy variant (their section 7) draws ``TRIALS`` members and chooses the one that
+    minimises the sum of these distances over all members.
 
     Args:
         members: ``(n,)`` indices into data.
@@ -100,7 +100,7 @@ def seed_centres(data, members, branching, state, nearest, centres):
         centres: ``(branching, 4)`` uint64, receives the centres.
 
     Returns:
-        Number of centres, less than ``branching`` only if there are fewer different descriptors.
+        Number of centres; it is below ``branching`` only if there are fewer different descriptors.
     """
     n = len(members)
     draw, state = uniform(state)
@@ -136,8 +136,8 @@ def seed_centres(data, members, branching, state, nearest, centres):
 
 @inner_kernel
 def assign(data, members, centres, n_centres, label):
-    """Assign each member to the nearest centre (the first of equally near ones); returns the number
-    of changed labels."""
+    """Assign each member to the nearest centre, or to the first of several equally near ones;
+    returns the number of changed labels."""
     changed = 0
     for i in range(len(members)):
         nearest, least = 0, 257
@@ -189,8 +189,8 @@ def split_level(data, order, starts, branching, stream, iterations):
     Args:
         data: ``(M, 4)`` uint64 descriptors.
         order: ``(M,)`` int64 indices into ``data``, grouped by node; overwritten.
-        starts: ``(n + 1,)`` int64, start of the group of each node in ``order``. Descriptors of
-            leaves of upper levels are not in this range.
+        starts: ``(n + 1,)`` int64, start of the group of each node in ``order``. Descriptors in
+            leaves of upper levels are outside these groups.
         stream: uint64 seed of the random numbers of this level.
 
     Returns:
@@ -214,7 +214,7 @@ def split_level(data, order, starts, branching, stream, iterations):
     for node in range(n_nodes):
         members = order[starts[node] : starts[node + 1]]
         n = len(members)
-        # The states of different nodes are far apart, so that their sequences do not overlap.
+        # The states of different nodes are far apart, so their random sequences do not overlap.
         state = stream * np.uint64(0xD1342543DE82EF95) + np.uint64(node) * np.uint64(1 << 40)
         n_centres = seed_centres(data, members, branching, state, nearest, own)
         if n_centres == 1:
@@ -223,7 +223,7 @@ def split_level(data, order, starts, branching, stream, iterations):
             label[i] = -1
         changed = assign(data, members, own, n_centres, label)
         iteration = 0
-        # The last step is an assignment, so that a descent of the tree leads to the same clusters.
+        # The last step is an assignment, so that descending the tree leads to the same clusters.
         while changed > 0 and iteration < iterations:
             vote(data, members, label, n_centres, ones, size, own)
             changed = assign(data, members, own, n_centres, label)
@@ -239,7 +239,7 @@ def split_level(data, order, starts, branching, stream, iterations):
         for i in range(n):
             sorted_members[cursor[label[i]]] = members[i]
             cursor[label[i]] += 1
-        # Members of nodes that became leaves leave gaps, so the others are moved together.
+        # Nodes that became leaves are skipped, so the groups of the others are moved to the left.
         for i in range(n):
             order[filled + i] = sorted_members[i]
         for k in range(n_centres):

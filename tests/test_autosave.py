@@ -194,7 +194,7 @@ def test_warnings_of_the_rig_cover_both_parts(kitti_tree, tmp_path):
     uninterrupted = drive(kitti_tree, None, change=change)
     (told,) = (line for line in whole.warnings if "black" in line)
     assert told in uninterrupted.warnings
-    assert "The right side was black in 5 of " in told
+    assert "The right image was black in 5 of " in told
 
 
 @pytest.mark.slow
@@ -389,7 +389,7 @@ def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
     (folder / "report.md").symlink_to(elsewhere)
     linked = vslam("run", "--resume", folder, *brief, cwd=tmp_path)
     assert linked.returncode == 2
-    assert f"{folder / 'report.md'}: this is a link" in linked.stderr
+    assert f"{folder / 'report.md'}: this is a symbolic link" in linked.stderr
     (folder / "report.md").unlink()
     shown = ("--no-record", "--no-report", "--save-map", "town.npz")
     resumed = vslam("run", "--resume", Path("runs/latest"), *shown, cwd=tmp_path)

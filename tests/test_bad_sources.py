@@ -55,12 +55,16 @@ def test_topics(folder):
     listed = "image topics are /cam0/image_raw, /cam1/image_raw"
     options = SourceOptions(topics=f"{LEFT},/cam9")
     refused(f"--topics /cam9: not in .*ros1.bag; {listed}", "bag", bag, options)
+    twice = SourceOptions(topics=f"{LEFT},{LEFT}")
+    refused(f"--topics {LEFT},{LEFT}: names one topic twice; {listed}", "bag", bag, twice)
     refused("or of the depth, or run with --sensor mono", "bag", bag, SourceOptions(topics=LEFT))
-    refused(f"choose with --topics TOPIC; {listed}", "bag", bag, SourceOptions(), sensor="mono")
+    refused(
+        f"choose topics with --topics TOPIC; {listed}", "bag", bag, SourceOptions(), sensor="mono"
+    )
 
 
 def test_bags_without_what_is_needed(folder, corridor, tmp_path):
-    refused("no calibration .nor camera_info", "bag", folder / "ros1.bag", SourceOptions())
+    refused("no calibration, and no camera_info", "bag", folder / "ros1.bag", SourceOptions())
     refused("no such file", "bag", tmp_path / "none.bag", SourceOptions())
     one = {LEFT: corridor.left[:2]}
     write_bag(tmp_path / "one.bag", "ros1", one, [0, 10**8])
@@ -74,7 +78,7 @@ def test_bags_without_what_is_needed(folder, corridor, tmp_path):
 
 @pytest.mark.parametrize(
     ("flaw", "part"),
-    [("calibrated", "no calibration .nor camera_info"), ("baseline", "camera_info.*baseline")],
+    [("calibrated", "no calibration, and no camera_info"), ("baseline", "camera_info.*baseline")],
 )
 def test_a_useless_camera_info_is_not_read_where_there_is_a_calibration(
     folder, corridor, tmp_path, flaw, part
@@ -132,7 +136,7 @@ def test_an_image_of_another_size_is_one_lost_frame(corridor, tmp_path):
     outcome = run_source(open_from("bag", tmp_path / "a.bag", options, sensor="mono"))
     assert len(outcome.tracks) == 5
     assert len(outcome.skipped) == 1
-    assert "480x80 pixels where the first image has 480x160" in outcome.skipped[0]
+    assert "480x80 pixels but the first image has 480x160" in outcome.skipped[0]
 
 
 def test_calibrations(folder):
@@ -223,9 +227,9 @@ def test_folders_of_images(folder, corridor, tmp_path):
     refused("left and right, image_0 and image_1", "images", tmp_path, options)
     refused("but only left has images, right has none", "images", tmp_path, options)
     write_images(tmp_path, {"right": corridor.right[:2]}, ["0.png", "1.png"])
-    refused("2 images but 3 in .* 2 on one side only", "images", tmp_path, options)
+    refused("2 images but 3 in .* 2 is in only one", "images", tmp_path, options)
     write_images(tmp_path, {"right": corridor.right[2:3]}, ["3.png"])
-    refused("3 images but 3 in .* 2 on one side only", "images", tmp_path, options)
+    refused("3 images but 3 in .* 2 is in only one", "images", tmp_path, options)
     (tmp_path / "right/3.png").unlink()
     write_images(tmp_path, {"right": corridor.right[2:3]}, ["2.png"])
     refused("no time stamps .* give --fps", "images", tmp_path, options)
@@ -237,7 +241,7 @@ def test_folders_of_images(folder, corridor, tmp_path):
     times.write_text("0.0\n0.2\n0.1\n")
     refused("left/2.png: its time is not later", "images", tmp_path, options)
     refused("no such folder", "images", tmp_path / "none", options)
-    refused(f"and {tmp_path} has both .name that", "images", tmp_path / "left", options)
+    refused(f"but {tmp_path} has both .name it", "images", tmp_path / "left", options)
     (tmp_path / "calib.txt").write_text("P0: 1")
     refused("sequence of KITTI; .* --seq", "images", tmp_path, SourceOptions(fps=10.0))
     options = SourceOptions(calib=(folder / "stereo.yaml",), right=tmp_path)
@@ -251,7 +255,7 @@ def test_cameras(folder, tmp_path, monkeypatch, side_by_side):
     refused("--side-by-side .* or run with --sensor mono", "camera", "77", SourceOptions())
     (tmp_path / "video77").touch()
     monkeypatch.setattr(video, "_DEVICES", tmp_path)
-    refused("the device is busy or not a camera; end other", "camera", "77", side_by_side)
+    refused("the device is busy or not a camera; close other", "camera", "77", side_by_side)
     refused("no such device; there are 77", "camera", "76", side_by_side)
 
 

@@ -90,7 +90,7 @@ def test_several_frames_count_together(make, compress):
 def test_a_library_that_cannot_be_limited_is_told(monkeypatch, caplog):
     monkeypatch.delattr(ros2, "zstd")
     bag_limits.limit_bags()
-    assert "cannot be limited" in caplog.text
+    assert "cannot limit the memory" in caplog.text
 
 
 def test_limiting_twice_is_limiting_once():

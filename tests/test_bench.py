@@ -164,7 +164,7 @@ def test_failing_cells_are_told_and_done_again(stub: Path, tmp_path: Path):
     assert "some talk" in (out / "failed" / f"{cells[1].name}.txt").read_text()
     interrupted = outcomes[cells[0]]
     assert isinstance(interrupted, execute.Failed)
-    assert "no report" in interrupted.message
+    assert "incomplete" in interrupted.message
     assert execute.finished_cells(cells, out, CONFIG) == cells[2:]
 
     (stub / "fail-00-none-bow-0").unlink()
@@ -506,13 +506,15 @@ def test_a_video_is_a_grid_of_one_sequence(corridor, tmp_path: Path, monkeypatch
     again = CliRunner().invoke(app, words)
     assert "1 run, 0 to do" in again.output
     other = CliRunner().invoke(app, [*words, "--fps", "20"])
-    assert f"holds runs on {video} --side-by-side {calib}, not on {video}" in str(other.exception)
+    assert f"contains runs on {video} --side-by-side {calib}, not on {video}" in str(
+        other.exception
+    )
 
 
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        ("--data 0", "--data 0: a live camera gives each image once; record a video"),
+        ("--data 0", "--data 0: a live camera cannot be repeated; record a video"),
         ("--dataset video --data a.mkv --seqs 00", "--seq 00: only for data sets, not video"),
     ],
 )

@@ -109,7 +109,7 @@ def test_the_inverted_index_scores_like_the_bags_one_by_one():
 def test_ids_must_ascend(tree):
     detector = BowDetector(tree)
     detector.add(4, None, image_of(tree, [1, 2]))
-    with pytest.raises(ValueError, match="keyframe 4 comes after 4"):
+    with pytest.raises(ValueError, match="keyframe 4 was added after 4; ids must ascend"):
         detector.add(4, None, image_of(tree, [1, 2]))
     with pytest.raises(ValueError, match="keyframe 5 has not been added"):
         detector.query(5, Map(np.ones(8)))

@@ -356,7 +356,7 @@ def test_images_without_the_board_are_an_error_that_says_what_was_looked_for(cal
             ("pair", *rest, "9x6", "--square", 0.03),
             "the right camera never sees the checkerboard of 9x6 inner corners, which the other",
         ),
-        (("mixed", *rest, "9x6"), "384x100 pixels where the first image has 384x288"),
+        (("mixed", *rest, "9x6"), "384x100 pixels but the first image has 384x288"),
         (("pair", *rest, "9x6"), "--square is missing"),
         (("pair", *rest, "9x6", "--square", 30), "give both in metres, such as 0.025 for 25 mm"),
         (("pair", *rest, "9"), "--size 9: give columns and rows, such as 9x6."),

@@ -143,7 +143,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
     ("words", "parts"),
     [
         ("--detector capsule --weights no.safetensors", ["no.safetensors", "no such file"]),
-        ("--detector none --weights no.npz", ["--weights", "none has no weights"]),
+        ("--detector none --weights no.npz", ["--weights", "'none' has no weights"]),
         ("--detector bow --weights no.npz", ["--weights no.npz", "vocabulary"]),
         ("--dataset synthetic --seq 77", ["synthetic route 77", "choose one of demo"]),
         ("--dataset kitti", ["data/kitti", "cvlibs.net", "--data", "$KITTI_ROOT"]),
@@ -155,8 +155,8 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--data nowhere", ["nowhere", "no such file or folder", "--data"]),
         ("--data .", ["the folder is empty", "--data"]),
         ("nowhere", ["nowhere", "no such file or folder", "--data"]),
-        ("nowhere --data .", ["nowhere: --data also names what to read"]),
-        ("--data other", ["no known data set", "sequences", "mav0", "rgb.txt"]),
+        ("nowhere --data .", ["nowhere: --data also names data"]),
+        ("--data other", ["not a known data set", "sequences", "mav0", "rgb.txt"]),
         ("--data 77 --sensor mono", ["camera 77", "no such device"]),
         ("--dataset images --data . --fps 0", ["--fps 0", "positive"]),
         ("--dataset kitti --topics /a,/b", ["--topics", "only for --dataset bag"]),
@@ -174,7 +174,7 @@ def test_run_refuses_without_data(call, words, parts, tmp_path):
 def test_a_bare_command_without_data_says_what_to_do(call, command):
     code, out, err = call(command)
     assert (code, out) == (2, "")
-    assert err.startswith("error: there is nothing to read; ")
+    assert err.startswith("error: there is no data to read; ")
     ways = [line.strip().split("  ")[0] for line in err.splitlines()[1:]]
     assert ways == ["--dataset synthetic", "DATA --calib FILE", "--data FOLDER"]
     assert not any(Path().iterdir())
@@ -311,7 +311,7 @@ def test_help_is_grouped_and_short(call, monkeypatch):
     ]  # fmt: skip
     assert len(out.splitlines()) <= 110
     assert "<" not in out + call("--help")[1] + call("map", "--help")[1]  # types
-    assert "│ --map FILE " in out
+    assert "│ --map FILE|FOLDER " in out
     assert "First frame. [default: 0]" in out
 
 
@@ -365,6 +365,22 @@ def test_misspelt_option(call):
     code, _, err = call("run", "--frames", "5")
     assert code == 2
     assert "No such option" in err
+    assert "--max-frames" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        ("eval --seq 00", ["vslam eval takes RUN|FILE: Folder of a run", "are --gt, --align,"]),
+        ("report --data runs", ["vslam report takes FOLDER...: Folders of runs", "--trajectory"]),
+        ("info --seq 00", ["No such option: --seq. Its options are --data"]),
+    ],
+)
+def test_an_option_that_only_other_commands_have(call, words, parts):
+    code, _, err = call(*words.split())
+    assert code == 2
+    text = " ".join(err.replace("│", " ").split())
+    assert all(part in text for part in parts)
 
 
 def shaken(trajectory: Trajectory) -> Trajectory:
@@ -500,7 +516,7 @@ def test_summary_counts_loops(call, root, with_detector):
 
 def test_summary_without_a_detector(call, root, pipeline):
     _, out, _ = call("run", "--data", root, "--max-frames", 10, "--detector", "none")
-    assert re.search("Loops +off +no detector; the ground truth revisits no stretch", out)
+    assert re.search("Loops +off +no detector; the drive revisits no stretch", out)
 
 
 def detectors_in(out: str) -> list[list[str]]:
@@ -591,7 +607,7 @@ def test_interrupted_run_keeps_its_results(call, root, pipeline):
     pipeline.interrupted = "Ctrl-C"
     code, out, _ = call("run", "--data", root, "--max-frames", 10)
     assert code == 1
-    assert "Interrupted: Ctrl-C. The results cover the 10 frames before it." in out
+    assert "Interrupted: Ctrl-C. The results cover the 10 frames before that." in out
     folder = Path("runs") / Path("runs/latest").readlink()
     assert (folder / "trajectory.tum").is_file()
     assert f"\ncontinue  vslam run --resume {folder}\n" in out
@@ -600,9 +616,9 @@ def test_interrupted_run_keeps_its_results(call, root, pipeline):
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        ("", "vslam doctor says what is wrong"),
-        ("--perturb night:9", "under --perturb night:9; a weaker one"),
-        ("--sensor mono", "one camera must move sideways"),
+        ("", "vslam doctor checks images"),
+        ("--perturb night:9", "under --perturb night:9; a weaker perturbation"),
+        ("--sensor mono", "a single camera must move sideways"),
     ],
 )
 def test_a_run_that_tracked_nothing_exits_with_1_and_says_why(call, root, pipeline, words, why):
@@ -626,7 +642,7 @@ def test_eval(call, tmp_path):
     code, out, _ = call("eval", "estimate.txt", "--gt", "gt.txt")
     assert code == 0
     assert "50 of 50 have a ground truth" in out
-    assert "0.100 m" in out
+    assert "0.1000 m" in out
     assert "evo_ape kitti gt.txt estimate.txt --align\n" in out
     code, out, _ = call("eval", "estimate.txt", "--gt", "gt.txt", "--json")
     assert json.loads(out)["ate_rmse_m"] == pytest.approx(0.1, rel=1e-3)

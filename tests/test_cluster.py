@@ -100,7 +100,7 @@ def test_no_scheduler_is_one_sentence(tmp_path: Path, monkeypatch):
     monkeypatch.setattr("vslam.lab.bench.cluster._CONNECT_S", 1)
     options = execute.RunOptions(None, CONFIG, 1)
     with (
-        pytest.raises(InputError, match=r"--scheduler tcp://127\.0\.0\.1:9: nothing answers"),
+        pytest.raises(InputError, match=r"--scheduler tcp://127\.0\.0\.1:9: no scheduler answers"),
         closing(run_on_cluster(CELLS, options, "tcp://127.0.0.1:9", tmp_path)) as running,
     ):
         next(running)
@@ -109,7 +109,7 @@ def test_no_scheduler_is_one_sentence(tmp_path: Path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("address", "said"),
-    [("foo://bar", "nothing answers there"), ("tls://127.0.0.1:9", "Dask has no certificates")],
+    [("foo://bar", "no scheduler answers"), ("tls://127.0.0.1:9", "Dask has no certificates")],
 )
 def test_an_address_that_cannot_be_used_leaves_no_client_behind(address: str, said: str):
     """A client that never began cannot close: that took 20 s, and ended in a traceback."""

@@ -1,4 +1,4 @@
-"""Two detectors as one: candidates in turn, one for each place."""
+"""Two detectors as one: candidates in turn, one for each keyframe."""
 
 from __future__ import annotations
 
@@ -31,14 +31,20 @@ class Told:
         return self._found[:1]
 
 
-def test_candidates_come_in_turn_and_one_for_each_place():
-    words, network = Told("bow", [1, 4, 6], alike=None), Told("net", [2, 5], alike=0.5)
-    both = CombinedDetector("both", [words, network], 15)
-    map_ = a_map(10, covisible=((1, 2), (1, 6)))  # 1, 2 and 6 are one place
+def test_candidates_come_in_turn_and_one_for_each_keyframe():
+    words, network = Told("bow", [1, 4, 6], alike=None), Told("net", [2, 4, 5], alike=0.5)
+    both = CombinedDetector("both", [words, network])
+    map_ = a_map(10, covisible=((1, 2), (1, 6)))  # 1, 2 and 6 show one place
     found = both.query(9, map_)
-    assert [(c.match, c.alike) for c in found] == [(1, 0.5), (4, None), (5, 0.5)]
-    assert [c.proposed_by for c in found] == ["bow+net", "bow", "net"]
-    assert [c.match for c in both.locate(None, Features.none(), map_)] == [1]
+    assert [(c.match, c.alike) for c in found] == [
+        (1, None),
+        (2, 0.5),
+        (4, 0.5),
+        (6, None),
+        (5, 0.5),
+    ]
+    assert [c.proposed_by for c in found] == ["bow", "net", "bow+net", "bow", "net"]
+    assert [c.match for c in both.locate(None, Features.none(), map_)] == [1, 2]
     both.add(9, None, Features.none())
     assert words.added == network.added == [9]
 

@@ -130,9 +130,9 @@ def test_topics_of_bags_with_depth(corridor, depths, calib, tmp_path):
     bag = write_bag(tmp_path / "more.bag", "ros1", two | more, STAMPS[:2])
     assert not opened(bag, calib, topics=COLOUR, sensor="mono").camera.depth
     assert opened(bag, calib, topics=f"{COLOUR},{DEPTH}").camera.depth
-    refused("choose with --topics COLOUR,DEPTH; image topics are", bag, calib, sensor="rgbd")
+    refused("choose topics with --topics COLOUR,DEPTH; image topics are", bag, calib, sensor="rgbd")
     refused(f"{DEPTH} holds depth; name the topic", bag, calib, topics=f"{DEPTH},{COLOUR}")
-    refused("encoding 'mono8' is no depth; known are 16UC1", bag, calib,
+    refused("encoding 'mono8' is not depth; known are 16UC1", bag, calib,
             topics=f"{COLOUR},/infra/image_raw", sensor="rgbd")  # fmt: skip
     other = write_bag(tmp_path / "s.bag", "ros1", {**two, DEPTH: small}, STAMPS[:2])
     refused("has 480x80 pixels but the .* have 480x160; .* registered", other, calib)
@@ -140,7 +140,7 @@ def test_topics_of_bags_with_depth(corridor, depths, calib, tmp_path):
     refused("stereo needs two image topics; image topics are /camera/aligned", alone, calib)
 
 
-def test_folders_by_option_and_by_times(corridor, depths, calib, folders, tmp_path):
+def test_folders_by_option_and_by_times(corridor, depths, calib, folders, tmp_path, caplog):
     times = [1403636579.76 + 0.1 * k for k in range(3)]
     write_images(tmp_path, {"a": corridor.left[:3]}, [f"{t:.6f}.png" for t in times])
     # The second depth image is missing: by order, each would get the next one's.
@@ -148,6 +148,7 @@ def test_folders_by_option_and_by_times(corridor, depths, calib, folders, tmp_pa
     write_images(tmp_path, {"b": [depths[0], depths[2]]}, late)
     source = opened(tmp_path / "a", calib, depth=tmp_path / "b", depth_scale=1000.0)
     np.testing.assert_allclose(source.timestamps, [times[0], times[2]])
+    assert "only 2 of 3 images have a depth image within 20 ms" in caplog.text
     assert np.array_equal(source.read(1)[1], depths[2] * np.float32(0.001))
     assert np.array_equal(source.read(1)[0], corridor.left[2])
     alone = opened(folders, calib, fps=10.0, sensor="mono")
@@ -171,9 +172,9 @@ def test_bad_folders_with_depth(corridor, depths, calib, folders, tmp_path):
     refused("--depth .*: contradicts --right", folders / "rgb", calib, **both, **options)
     write_images(tmp_path, {"rgb": corridor.left[:3]}, NAMES[:3])
     write_images(tmp_path, {"depth": depths[:2]}, NAMES[:2])
-    refused("2 images but 3 in .* 2 on one side only", tmp_path, calib, **options)
+    refused("2 images but 3 in .* 2 is in only one", tmp_path, calib, **options)
     write_images(tmp_path, {"depth": [depths[0][:80], *depths[1:3]]}, NAMES[:3])
     refused("depth has 480x80 pixels but the colour image has 480x160", tmp_path, calib, **options)
     grey = cv2.convertScaleAbs(depths[0], alpha=0.01)
     write_images(tmp_path, {"depth": [grey, *depths[1:3]]}, NAMES[:3])
-    refused("depth of 8 bits and 1 channels", tmp_path, calib, **options)
+    refused("the depth has 8 bits and 1 channels", tmp_path, calib, **options)

@@ -398,7 +398,7 @@ def test_a_wrong_focal_length_shows_when_the_camera_turns(clean, factor):
     wrong = replace(clean, camera=replace(c, fx=factor * c.fx, fy=factor * c.fy))
     (found,) = examine(wrong, FEW).faults
     assert found.check == "focal length"
-    assert found.measured.endswith(f"the calibration says {factor * c.fx:.0f}")
+    assert found.measured.endswith(f"the calibration has {factor * c.fx:.0f} px")
     said = float(re.findall(r"fit (\d+) px", found.measured)[0])
     assert said == pytest.approx(c.fx, rel=0.03)
 

@@ -220,7 +220,7 @@ def test_missing_data_and_images(root):
     with pytest.raises(UnreadableImageError, match="cannot be decoded"):
         open_euroc(root, "V9_01")
     images[3].unlink()
-    refused(root, images[3].name, "empty")
+    refused(root, images[3].name, "no such file")
 
 
 @pytest.mark.slow

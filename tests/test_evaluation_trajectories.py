@@ -244,7 +244,7 @@ def test_read_pair_mixes_formats_with_times(tmp_path):
     np.savetxt(tmp_path / "times.txt", truth.timestamps)
     pair = tmp_path / "estimate.txt", tmp_path / "truth.txt"
     assert evaluate_trajectory(*read_pair(*pair, tmp_path / "times.txt")).frames == 30
-    with pytest.raises(InputError, match="give them with --times"):
+    with pytest.raises(InputError, match="give its times with --times"):
         read_pair(*pair)
 
 

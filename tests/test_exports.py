@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import json
 import struct
 from dataclasses import dataclass, replace
@@ -341,6 +342,24 @@ def test_loops_and_gaps_of_a_run_become_edges(corridor_run, tmp_path):
     np.testing.assert_allclose(graph.T_i_j[measured], expected, atol=1e-9)
 
 
+def test_the_picture_of_a_loop_shows_its_images_and_where_it_lies_in_the_map(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "tools"))
+    tool = importlib.import_module("loop_picture")
+    loop = LoopEdge(6, 1, 0.5, True, "closed", T_query_match=np.eye(4))
+    save_map(tmp_path / "map.npz", StoredMap(small_map(), CAMERA, (loop,)))
+    (tmp_path / "figures").mkdir()
+    seen = np.full((100, 1288, 3), 200, np.uint8)
+    cv2.imwrite(str(tmp_path / "figures" / "loop-18-3.jpg"), seen)
+    picture = tool.draw(tmp_path)
+    np.testing.assert_array_equal(picture[:100], seen)
+    below = picture[100:]
+    green = np.abs(below.astype(int) - (153, 211, 52)).max(axis=2) < 10
+    orange = np.abs(below.astype(int) - (36, 191, 251)).max(axis=2) < 10
+    assert below.shape == (540, 1288, 3)
+    assert 200 < np.count_nonzero(green) < 10_000
+    assert 20 < np.count_nonzero(orange) < 10_000
+
+
 def test_evo_reads_the_csv_of_euroc(tmp_path):
     from evo.tools.file_interface import read_euroc_csv_trajectory
 
@@ -492,7 +511,7 @@ def test_refusals(corridor_run, kitti_tree, tmp_path):
     text = times.read_text()
     times.unlink()
     times.write_text("".join(f"{1.0 + float(line)}\n" for line in text.split()))
-    assert "made on with --data" in refusal(*words, "--data", other)
+    assert "use --data to name" in refusal(*words, "--data", other)
     # A report of another version, and none.
     run = tmp_path / "run"
     run.mkdir()
@@ -501,7 +520,9 @@ def test_refusals(corridor_run, kitti_tree, tmp_path):
     assert "missing or damaged" in refusal("export", "g2o", run, *out)
     report = json.loads((corridor_run / "report.json").read_text())
     (run / "report.json").write_text(json.dumps({**report, "schema_version": 3, "eyes": 2}))
-    assert "report schema 3, this version reads 5" in refusal("export", "g2o", run, *out)
+    assert "report schema 3, but this version of vslam reads 5" in refusal(
+        "export", "g2o", run, *out
+    )
     np.savez(tmp_path / "new.npz", schema=1, keyframe_first_row=np.zeros(1))
     assert "a map of schema 1" in refusal("map", "info", tmp_path / "new.npz")
     assert not (tmp_path / "out").exists()
@@ -516,7 +537,7 @@ def test_what_can_be_exported_of_a_live_camera(corridor_run, tmp_path):
     (run / "report.json").write_text(json.dumps({**report, "dataset": "camera"}))
     for kind in ("colmap", "nerfstudio", "ply"):
         message = refusal("export", kind, run)
-        assert "what a camera has shown cannot be seen again" in message
+        assert "images of a live camera are not stored" in message
         assert "export g2o, euroc or ply --no-colours" in message
     vslam("export", "ply", run, "--no-colours")
     vslam("export", "g2o", run)

@@ -82,8 +82,8 @@ def test_every_table_here_has_a_stamp_and_pages_show_its_values(figures):
 def test_tables_are_made_after_their_inputs_and_only_once(figures, project, capsys):
     assert figures.make(project, quick=False) == 0
     said = capsys.readouterr().out
-    assert "real.csv: skipped, NOWHERE_ROOT must name files" in said
-    assert "finished.csv: kept, made by tools/finished.py of commit 01abcde." in said
+    assert "real.csv: skipped; set NOWHERE_ROOT (datasets.md)" in said
+    assert "finished.csv: kept (made by tools/finished.py of commit 01abcde)." in said
     assert figures.make(project, quick=False) == 0
     assert capsys.readouterr().out.count("up to date") == 2
     assert (project / "runs.txt").read_text() == "run\n"
@@ -102,7 +102,7 @@ def test_a_stamp_tells_how_a_table_was_made(figures, project):
 
 def test_quick_figures_are_written_elsewhere(figures, project, capsys):
     assert figures.make(project, quick=True) == 0
-    assert "plot.csv: skipped, it has no quick variant" in capsys.readouterr().out
+    assert "plot.csv: skipped, because it has no quick variant" in capsys.readouterr().out
     assert not (project / "docs/research/drives.csv").exists()
     assert "a,ours,1" in (project / "build/figures/docs/research/drives.csv").read_text()
     assert list(figures.read_stamps(project / "build/figures")) == ["docs/research/drives.csv"]
@@ -143,7 +143,7 @@ def test_a_table_of_another_version_is_listed_and_marked_on_its_page(figures, ma
     figures.write_stamps(made, stamps)
     report = figures.check(made)
     assert report.faults == []
-    on_readme = [line for line in report.older if line.endswith(", on README.md")]
+    on_readme = [line for line in report.older if line.endswith(", shown on README.md")]
     assert [line.partition(":")[0] for line in on_readme] == [*stamps][:1] + [*stamps][2:3]
     marked = figures.mark_older(made / "README.md", PAGE, made)
     before_the_table, _, _ = marked.partition("| drive |")

@@ -238,7 +238,7 @@ def test_damaged_image_is_reported_when_read(root):
 
 def test_image_of_another_size_is_reported_when_read(root):
     write_image(root / "sequences/00/image_0/000003.png", size=(30, 60))
-    with pytest.raises(UnreadableImageError, match=r"000003\.png: 60x30 .* 64x32"):
+    with pytest.raises(UnreadableImageError, match=r"000003\.png: has 60x30 .* 64x32"):
         open_kitti(root, "00").read(3)
 
 
@@ -294,9 +294,7 @@ def test_missing_times(root):
 
 def test_poses_of_another_length(root):
     write_poses(root / "poses/00.txt", FRAMES - 1)
-    refused(
-        root, "poses/00.txt", "fit neither", "has 5 poses, which fit neither 6 images", "remove it"
-    )
+    refused(root, "poses/00.txt", "has 5 poses, but there are 6 images", "remove it")
 
 
 @pytest.mark.parametrize(
@@ -325,7 +323,7 @@ def test_another_calibration_than_its_own(root):
     assert not np.array_equal(sequence.read(0)[0], raw)
     alone = open_sequence("kitti", root, "00", monocular=True, calib=[root / "own.yaml"])
     assert alone.camera.monocular
-    with pytest.raises(InputError, match="--calib: a rendered town has its own cameras"):
+    with pytest.raises(InputError, match="--calib: rendered towns have their own calibration"):
         open_sequence("synthetic", root, "demo", calib=[root / "own.yaml"])
 
 

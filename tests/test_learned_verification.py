@@ -149,7 +149,7 @@ def test_without_an_image_nothing_is_verified(network):
     world = World(network, T_1_0)
     world.images = KeyframeImages(network)
     edge = world.verify()
-    assert (edge.accepted, edge.reason) == (False, "no image is kept")
+    assert (edge.accepted, edge.reason) == (False, "no image is stored")
 
 
 def test_a_lost_frame_is_recognised(network):

@@ -198,7 +198,7 @@ def test_images_in_colour_are_refused_with_the_way_to_grey():
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.uint16])
 def test_images_of_another_type_are_refused_with_their_conversion(dtype):
     image = np.zeros((CAMERA.height, CAMERA.width), dtype)
-    with pytest.raises(ValueError, match=r"not of uint8; .*of 0 to 1 with \(255 \* image\)"):
+    with pytest.raises(ValueError, match=r"instead of uint8; .*of 0 to 1 with \(255 \* image\)"):
         check_images(image, None, CAMERA.left_camera())
 
 

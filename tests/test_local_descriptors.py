@@ -76,7 +76,7 @@ def test_files_that_are_not_the_local_descriptors(tmp_path):
 
 
 def test_keyframes_are_kept_small_and_described_when_asked_for(network, monkeypatch):
-    monkeypatch.setattr(local_descriptors, "_KEPT", 2)
+    monkeypatch.setattr(local_descriptors, "_CACHED", 2)
     images = KeyframeImages(network)
     for k in range(4):
         images.add(k, picture(k))

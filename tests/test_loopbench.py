@@ -5,8 +5,11 @@ from __future__ import annotations
 import csv
 import json
 import re
+import runpy
+import sys
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -277,7 +280,7 @@ def test_report_says_who_wins_in_all_three_files(vocabulary, tmp_path):
     assert read == found
     text, page = (tmp_path / "loops.md").read_text(), (tmp_path / "loops.html").read_text()
     for shown in (text, page):
-        assert "none: liar -0." in shown
+        assert "none: AP of liar minus that of bow is -0." in shown
         assert "worse on walls" in shown
         assert "1.000" in shown
     assert page.count("<svg") == 1
@@ -334,3 +337,17 @@ def test_cost_is_measured_in_a_process_of_its_own():
     assert set(found.query_ms) == {"1000", "5000"}
     assert min(found.query_ms.values()) > 0
     assert 50 < found.memory_mb < 2000
+
+
+def test_tests_of_images_are_compared_on_photographs(tmp_path, monkeypatch, capsys):
+    for place in range(3):
+        whole = texture(place, 480, 800)
+        folder = tmp_path / "landmarks" / str(place)
+        folder.mkdir(parents=True)
+        for k in range(2):
+            cv2.imwrite(str(folder / f"{k}.png"), whole[:, 40 * k : 640 + 40 * k])
+    script = Path(__file__).parents[1] / "tools/experiments/local_descriptors/image_test.py"
+    monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path), "landmarks"])
+    runpy.run_path(str(script), run_name="__main__")
+    row = capsys.readouterr().out.splitlines()[-1]
+    assert row == "| landmarks | 6 | 100.0 %, 100.0 % | 12 | 0.0 %, 0.0 % |"

@@ -238,7 +238,7 @@ def test_descriptors_and_images_of_learned_detectors_come_back(tmp_path):
     assert len(table.values) == 2
     other = replace(table, values=np.full_like(table.values, np.nan))
     tables = {**seen.tables, "capsule/descriptors": other}
-    with pytest.raises(ValueError, match="not those of the network"):
+    with pytest.raises(ValueError, match="do not belong to the network"):
         create()[0].restore(replace(seen, tables=tables))
 
 
@@ -312,12 +312,12 @@ def test_foreign_files_are_refused(tmp_path):
 
 def test_other_schemas_are_named(file, tmp_path):
     newer = as_header(header_of(file) | {"schema": 9})
-    assert "schema 9, this version reads 8" in refusal(
+    assert "schema 9, but this version of vslam reads schema 8" in refusal(
         changed(file, tmp_path / "n.npz", header=newer)
     )
     old = tmp_path / "old.npz"
     np.savez(old, schema=1, keyframe_first_row=np.zeros(1, np.int64))
-    assert "schema 1, this version reads 8; run again" in refusal(old)
+    assert "reads schema 8; make the map again" in refusal(old)
 
 
 def damage(name: str, position: tuple[int, ...], value: float):
@@ -533,7 +533,7 @@ def test_a_full_disk_leaves_the_file_that_was_there(slam, file, tmp_path, monkey
 def test_a_map_of_something_else_is_refused(file, tmp_path):
     with pytest.raises(InputError, match="made with the detector bow, not none"):
         Slam.load(file, detector=create_detector("none", CONFIG))
-    with pytest.raises(InputError, match=r"another pyramid, of 8 levels by 1\.2"):
+    with pytest.raises(InputError, match=r"another image pyramid \(8 levels, scale factor 1\.2\)"):
         Slam.load(file, Config(orb=OrbConfig(n_levels=4)))
     header = header_of(file)
     header["detector"]["fingerprint"] = "0" * 16
@@ -544,7 +544,7 @@ def test_a_map_of_something_else_is_refused(file, tmp_path):
         words = data["detector_words_values"].copy()
     words[3] = 10**7
     other = changed(file, tmp_path / "words.npz", detector_words_values=words)
-    with pytest.raises(InputError, match=r"words.npz: the words of the keyframes are not"):
+    with pytest.raises(InputError, match=r"words.npz: the words of the keyframes do not belong"):
         Slam.load(other)
 
 

@@ -134,5 +134,5 @@ def test_images_must_be_those_of_the_camera():
         Slam(LEFT_CAMERA).step(image, image, 0.0)
     with pytest.raises(ValueError, match="right image"):
         Slam(CAMERA).step(image, None, 0.0)
-    with pytest.raises(ValueError, match="images are"):
+    with pytest.raises(ValueError, match="the images have shape"):
         Slam(LEFT_CAMERA).step(image[:-1], None, 0.0)

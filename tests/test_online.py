@@ -164,7 +164,7 @@ def test_windows_of_images_and_of_seconds():
 
 @pytest.mark.parametrize("text", ["", "s", "0", "-3", "20m", "1.5", "nans", "infs"])
 def test_windows_that_are_refused(text):
-    with pytest.raises(InputError, match=re.escape(f"--window {text}: must be above 0")):
+    with pytest.raises(InputError, match=re.escape(f"--window {text}: must be a positive")):
         parse_window(text)
 
 
@@ -234,7 +234,9 @@ def test_times_of_a_sequence_are_those_of_its_images(tmp_path):
     assert source.select(np.array([0, 2])).times.tolist() == [0.2, 0.5]
     for damaged in ("0\n1\n", "0\n0.1\n0.2\n0.1\n0.4\n0.5\n"):
         (folder / "times.txt").write_text(damaged)
-        with pytest.raises(InputError, match=r"times\.txt: times must ascend and reach image"):
+        with pytest.raises(
+            InputError, match=r"times\.txt: the times must ascend and include image"
+        ):
             open_source(f"kitti:{tmp_path}")
 
 
@@ -248,7 +250,7 @@ def test_times_of_a_sequence_are_those_of_its_images(tmp_path):
         ("photos:x", "--protocol online needs drives"),
         ("drive:nowhere", "must be drive:ROUTE with a route of demo"),
         ("drive:demo[places=3]", "must be drive:ROUTE"),
-        ("drive:demo[every=x]", "an option is not a number"),
+        ("drive:demo[every=x]", "one of the options is not a number"),
         ("drive:demo[every=0]", "every at least 1"),
         ("drive:demo[change=2]", "change from 0 to 1"),
         ("kitti:/nowhere", "no images"),
@@ -304,7 +306,10 @@ def test_a_drive_is_measured_before_and_after_verification_and_reported(tmp_path
     text, page = ((tmp_path / "out" / f"loops.{kind}").read_text() for kind in ("md", "html"))
     assert "walls &lt;a&gt;" in page
     assert page.count("<svg") == 1
-    assert "2 of 7 images with a true match, unverified: highest recall at 100 % precision" in text
+    assert (
+        "(2 of 7 images have a true match), unverified: the highest recall at 100 % precision"
+        in text
+    )
     assert "| walls <a> | 7      | 2            | 2 images | nothing     | 0.000 (0.000) |" in text
 
 
@@ -316,7 +321,7 @@ def test_a_drive_is_measured_before_and_after_verification_and_reported(tmp_path
             "--perturb, --strengths, --seed: only for",
         ),
         (["--protocol", "online", "--seed", "1"], "--perturb, --strengths, --seed: only for"),
-        (["--protocol", "online", "--window", "x"], "--window x: must be above 0"),
+        (["--protocol", "online", "--window", "x"], "--window x: must be a positive"),
         (["--protocol", "online", "--detectors", "magic"], "--detectors magic: unknown"),
         (["--protocol", "online", "--data", "town:demo"], "--protocol online needs drives"),
         (["--window", "30s"], "--window: only for --protocol online"),

@@ -158,7 +158,7 @@ def test_detectors_that_were_compared_in_a_run_are_systems_of_their_own(run_fold
 def test_what_is_left_out_is_noted(written, runs: Path):
     notes = "\n".join(written[0].notes)
     assert f"{runs / 'stopped'} was interrupted (Ctrl-C)" in notes
-    assert "old/report.json: report schema 1, this version reads 5" in notes
+    assert "old/report.json: report schema 1, but this version of vslam reads 5" in notes
     assert "damaged/report.json: missing or damaged" in notes
     assert "half" not in notes
     assert not any(row.drive.sequence == "99" for row in written[0].rows)
@@ -181,7 +181,7 @@ def test_external_trajectory_with_frames_missing(runs: Path, run_folder: Path, t
     whole = read_trajectory(run_folder / "trajectory.tum")
     write_tum(tmp_path / "other.tum", whole.select(np.arange(10, 150)))
     found = collect([runs], [f"ORB-SLAM3@05@brightness:1={tmp_path / 'other.tum'}"])
-    assert any("ORB-SLAM3 has a pose for 140 of 150 frames of 05" in note for note in found.notes)
+    assert any("ORB-SLAM3 has poses for 140 of 150 frames of 05" in note for note in found.notes)
     write_kitti(tmp_path / "short.txt", whole.T_wc[:9])
     with pytest.raises(InputError, match="9 poses but 150 timestamps"):
         collect([runs], [f"ORB-SLAM3@05={tmp_path / 'short.txt'}"])
@@ -190,8 +190,8 @@ def test_external_trajectory_with_frames_missing(runs: Path, run_folder: Path, t
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        ("ORB-SLAM3=x.txt", "of which sequence.*one of 00, 05"),
-        ("ORB-SLAM3@07=x.txt", "of which sequence"),
+        ("ORB-SLAM3=x.txt", "its sequence is not clear.*one of 00, 05"),
+        ("ORB-SLAM3@07=x.txt", "its sequence is not clear"),
         ("x.txt", "NAME=FILE"),
         ("=x.txt", "NAME=FILE"),
         ("ORB-SLAM3@00=none.txt", "none.txt: cannot read"),
@@ -300,7 +300,7 @@ def test_a_row_for_each_sequence_and_condition_and_who_wins_over_all(two_conditi
         ("RPE (mm), bow", "20.0"), ("RPE (mm), both", "20.0"), ("RPE (°), bow", "0.050"),
         ("RPE (°), both", "0.050"), ("loops, bow", "0 of 1"), ("loops, both", "1 of 1"),
     ]  # fmt: skip
-    assert "Loops: revisits found, of those in the ground truth" in table.note
+    assert "Loops: revisits found of those in the ground truth" in table.note
     lost, found, ate, rpe = points.sentences
     assert lost == "Lost frames: bow 6 in 18 runs, both 6 in 18 runs."
     assert found.endswith(": bow found 6 of 18, 0 wrong; both found 18 of 18, 0 wrong.")
@@ -373,7 +373,9 @@ def test_every_system_stands_beside_its_baseline():
     light = "brightness:1"
     assert points.sentences[1].startswith(f"ATE, {light}, none against bow: a tie")
     assert points.sentences[2].startswith(f"ATE, {light}, both against bow: a tie")
-    with pytest.raises(InputError, match="--baseline capsule: no run of it; choose from none, bow"):
+    with pytest.raises(
+        InputError, match="--baseline capsule: there is no such run; choose from none, bow"
+    ):
         summarize(Found(runs, []), "capsule")
 
 
@@ -538,7 +540,7 @@ def test_medians_of_unlike_towns_are_noted(run_folder: Path, tmp_path: Path):
         )  # fmt: skip
     notes = summarize(collect([tmp_path], [])).notes
     assert any(
-        note.endswith("none: runs in towns of different seeds (bow in 0, 1; capsule in 1)")
+        note.endswith("none: systems ran in different towns (bow in 0, 1; capsule in 1)")
         for note in notes
     )
 
@@ -649,6 +651,10 @@ page.onload = () => {
     shown: inner.documentElement.clientWidth,
     needed: inner.documentElement.scrollWidth,
     figures: boxes.map(box => [box.left, box.right, box.height]),
+    drawings: [...inner.querySelectorAll("figure svg")].map(x => x.getBoundingClientRect().right),
+    letters: Math.min(...[...inner.querySelectorAll("figure svg text")].map(x =>
+      parseFloat(page.contentWindow.getComputedStyle(x).fontSize)
+      * x.ownerSVGElement.clientWidth / x.ownerSVGElement.viewBox.baseVal.width)),
     paths: [...inner.querySelectorAll("figure svg path")].length,
     requests: page.contentWindow.performance.getEntriesByType("resource").map(x => x.name),
     font: getComputedStyle(inner.querySelector("td")).fontSize,
@@ -684,6 +690,8 @@ def test_report_in_a_browser_as_wide_as_a_phone(written, tmp_path: Path):
         0 <= left < right <= 400 and height > 100 for left, right, height in found["figures"]
     )
     assert found["paths"] > 10 * len(FIGURES)
+    assert max(found["drawings"]) <= 400
+    assert found["letters"] >= 9
     assert found["needed"] <= found["shown"] <= 400
     assert found["requests"] == []
     assert sorted(set(asked)) == ["/probe.html", "/report.html"]

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from vslam.errors import InputError, ResultsError
-from vslam.report.drawing import LOW, Drawing, draw, new_figure
+from vslam.report.drawing import LOW, Drawing, add_legend, draw, new_figure
 from vslam.report.page import (
     Alert,
     Bullets,
@@ -145,6 +145,20 @@ def test_figures_of_one_page_share_no_ids_and_are_equal_every_time():
     assert draw(drawings()) == [first, second]
 
 
+@pytest.mark.parametrize(
+    ("labels", "columns"), [(["both", "bow", "none"], 3), (["a detector with a long name"] * 3, 1)]
+)
+def test_a_legend_is_not_wider_than_its_figure(labels: list[str], columns: int):
+    figure, axes = new_figure("Long names", "x", "y", LOW)
+    for label in labels:
+        axes.plot([0, 1], [0, 1], label=label)
+    add_legend(figure, axes)
+    figure.draw_without_rendering()
+    box = figure.legends[0].get_window_extent()
+    assert 0 <= box.x0 < box.x1 <= figure.bbox.width
+    assert len({round(text.get_window_extent().x0) for text in figure.legends[0].texts}) == columns
+
+
 def test_files_that_cannot_be_written_are_named(tmp_path: Path):
     write_files(tmp_path / "new", {"a.md": "ä", "b.jpg": JPEG})
     assert (tmp_path / "new" / "a.md").read_text("utf-8") == "ä"
@@ -170,7 +184,10 @@ def test_a_document_is_read_as_it_was_written_and_by_its_version_alone(tmp_path:
     for text, says in (
         ("{", "missing or damaged"),
         ("[1]", "missing or damaged"),
-        ('{"schema_version": 1, "metres": 1.5}', "report schema 1, this version reads 2"),
+        (
+            '{"schema_version": 1, "metres": 1.5}',
+            "report schema 1, but this version of vslam reads 2",
+        ),
         ('{"schema_version": 2, "feet": 5}', "missing or damaged"),
     ):
         path.write_text(text)

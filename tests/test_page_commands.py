@@ -159,6 +159,7 @@ RULES = {
         not_run=(
             ("vslam loops bench", REAL),
             ("vslam bench", HOURS),
+            ("python tools/experiments/local_descriptors", "test_loopbench.py runs it"),
         )
     ),
     "docs/research/gps.md": Rules(

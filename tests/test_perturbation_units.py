@@ -385,18 +385,18 @@ def test_what_the_data_lack_is_said():
     assert set(LAWS) - set(fit) == {
         "fog", "stereo_gain", "desync", "baseline", "yaw", "pitch", "black_right", "black_left",
     }  # fmt: skip
-    with pytest.raises(InputError, match="--perturb fog: needs depth: stereo images"):
+    with pytest.raises(InputError, match="--perturb fog: needs stereo or depth images"):
         parse_perturbation("fog", 0).bound_to(mono)
-    with pytest.raises(InputError, match="--perturb yaw: needs the images of both sides"):
+    with pytest.raises(InputError, match="--perturb yaw: needs stereo images"):
         parse_perturbation("brightness,yaw:3", 0).bound_to(mono)
     assert laws_for(drive_of()) == (list(LAWS), {})
     assert list(unfit) == [law for law in LAWS if law not in fit]
-    assert unfit["fog"].startswith("--perturb fog: needs depth")
+    assert unfit["fog"].startswith("--perturb fog: needs stereo")
 
 
 def test_a_stream_has_no_next_frame():
     law = parse_perturbation("motion", 0).laws[0]
-    with pytest.raises(InputError, match="--perturb motion: looks at the next frame"):
+    with pytest.raises(InputError, match="--perturb motion: needs the next frame"):
         law.bound_to(Scene(CAMERA))
 
 
@@ -415,9 +415,9 @@ def test_faults_are_of_the_images_so_far():
 
 
 def test_units_are_refused_out_of_their_range():
-    with pytest.raises(InputError, match="from 1 to 100 quality, 10 is the default"):
+    with pytest.raises(InputError, match="from 1 to 100 quality; the default is 10"):
         parse_perturbation("jpeg:0", 0)
-    with pytest.raises(InputError, match=r"0\.5 to 100000 m, 60"):
+    with pytest.raises(InputError, match=r"0\.5 to 100000 m; the default is 60"):
         parse_perturbation("fog:0", 0)
 
 

@@ -32,7 +32,7 @@ from vslam.maps.storage import load_map, save_map
 from vslam.maps.stored_map import StoredMap
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
-from vslam.run.pipeline import _tell_loops, run_sequence
+from vslam.run.pipeline import _record_loops, run_sequence
 from vslam.run.preparation import prepare_frame
 from vslam.run.recorder import Recorder
 from vslam.trajectory import Trajectory, read_kitti_poses
@@ -127,10 +127,10 @@ def test_recorder_is_told_of_each_loop_once():
     recorder = SimpleNamespace(loops=lambda edges, map_: told.extend(edges))
     slam = SimpleNamespace(loops=[], map=None)
     edges = [LoopEdge(k + 10, k, 0.5, k == 1, "closed") for k in range(4)]
-    n_told = 0
+    n_recorded = 0
     for upto in (0, 2, 2, 3, 4):
         slam.loops = edges[:upto]
-        n_told = _tell_loops(recorder, slam, n_told)
+        n_recorded = _record_loops(recorder, slam, n_recorded)
     assert told == edges
 
 

@@ -22,7 +22,7 @@ from vslam.features import Features
 from vslam.loopclosure.registry import create_detector, problem_of, require_detector
 from vslam.map import Map
 from vslam.report.folder import create_run_folder, write_results
-from vslam.run.options import RunOptions
+from vslam.run.options import RunOptions, read_options
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
 
@@ -114,8 +114,9 @@ def test_the_package_of_the_page_is_found(installed):
 
 
 @pytest.mark.slow
-def test_a_run_with_reader_perturbation_and_detector(target: Path, corridor, tmp_path: Path):
-    """In a process of its own, as a user types it; the help lists all three."""
+def test_a_run_with_reader_perturbation_and_detector(target: Path, corridor, tmp_path: Path, call):
+    """In a process of its own, as a user types it; the help lists all three. Without the package,
+    the run can neither be resumed nor its map continued."""
     data = write_frames(tmp_path / "data", corridor, 12)
     environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(target), "COLUMNS": "200"}
     environment["HOME"] = str(Path.home())
@@ -132,7 +133,8 @@ def test_a_run_with_reader_perturbation_and_detector(target: Path, corridor, tmp
         return done.stdout
 
     vslam(*words)
-    report = json.loads((tmp_path / "runs" / "latest" / "report.json").read_text())
+    folder = tmp_path / "runs" / "latest"
+    report = json.loads((folder / "report.json").read_text())
     kept = {key: report[key] for key in ("dataset", "sequence", "perturb", "detector", "frames")}
     assert kept == {
         "dataset": "frames",
@@ -145,6 +147,16 @@ def test_a_run_with_reader_perturbation_and_detector(target: Path, corridor, tmp
     shown = vslam("run", "--help") + vslam("perturb", "--list")
     assert all(name in shown for name in ("thumbnail", "frames", "haze"))
     assert "vslam-example 1.0" in vslam("info", "--data", str(data))
+    assert read_options(folder).plugins == dict.fromkeys(
+        ("frames", "haze", "thumbnail"), "vslam-example 1.0"
+    )
+
+    code, _, err = call("run", "--resume", folder)
+    assert code == 2
+    assert "the run used frames of the package vslam-example 1.0, which is not installed" in err
+    code, _, err = call("run", "--dataset", "synthetic", "--map", folder)
+    assert code == 2
+    assert "made with the detector thumbnail, a plug-in that is not installed here; install" in err
 
 
 def test_the_detector_of_the_page_finds_the_same_image(installed, corridor):
@@ -171,7 +183,7 @@ def test_vslam_selects_frames_of_a_reader(installed, corridor, tmp_path: Path):
     left, second = sequence.read(1)
     assert np.array_equal(left, corridor.left[5])
     assert second is None
-    with pytest.raises(InputError, match=r"--calib: the reader frames .* leave it out"):
+    with pytest.raises(InputError, match=r"--calib: the reader frames .* leave the option out"):
         open_sequence("frames", data, calib=[Path("a.yaml")])
     with pytest.raises(InputError, match=r"elsewhere\.npz: no such file"):  # its own words
         open_sequence("frames", data, "elsewhere")
@@ -194,7 +206,7 @@ def test_haze_is_the_same_for_one_seed(installed, corridor):
         ("import nothing_there", "broken:make", "broken:make cannot be imported (ModuleNotFound"),
         ("x = (", "broken:make", "cannot be imported (SyntaxError"),
         ("", "broken:make", "cannot be imported (AttributeError"),
-        ("make = 3", "broken:make", "is no function and no class"),
+        ("make = 3", "broken:make", "is neither a function nor a class"),
         (
             "def make(*a): return 1 / 0",
             "broken:make",
@@ -246,7 +258,7 @@ def test_a_name_that_nobody_can_type_is_left_out_with_a_warning(broken, caplog):
 def test_two_packages_with_one_name_are_an_error_and_own_names_win(broken):
     for package in ("broken", "second"):
         broken("make = None", f"[vslam.detectors]\nmine = {package}:make\nbow = x:y\n", package)
-    with pytest.raises(InputError, match=r"second 2.0 and of broken 2.0: two packages"):
+    with pytest.raises(InputError, match=r"second 2.0 and of broken 2.0: several packages"):
         require_detector("mine")
     require_detector("bow")
 
@@ -339,7 +351,9 @@ def test_a_reader_that_fails_costs_one_frame(broken, kitti_tree):
     sequence = open_sequence("mine", kitti_tree, "00")
     with pytest.raises(UnreadableImageError, match=r"broken 2.0 failed at frame 2 \(KeyError"):
         sequence.read(2)
-    with pytest.raises(UnreadableImageError, match=r"gave uint8 \(159, 480\) and .* at frame 3"):
+    with pytest.raises(
+        UnreadableImageError, match=r"returned uint8 \(159, 480\) and .* at frame 3"
+    ):
         sequence.read(3)
     assert np.array_equal(sequence.read(1)[0], open_sequence("kitti", kitti_tree, "00").read(1)[0])
 
@@ -388,12 +402,12 @@ def test_a_run_on_a_reader_that_streams(broken, kitti_tree):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (("return Source", "return dict"), "gave dict, not vslam.datasets.frames.Source"),
+        (("return Source", "return dict"), "returned dict, not vslam.datasets.frames.Source"),
         (("camera=inner.camera", "camera=3"), "camera is int, not vslam.camera.Camera"),
         (("live=LIVE", "n_expected=-1"), "n_expected is -1, neither None nor a number"),
         (
             ("play=play", "stored=(*inner.stored, inner.stored[0])"),
-            "x: the times of its frames do not increase",
+            "x: the times of the frames do not increase",
         ),
     ],
 )
@@ -417,7 +431,7 @@ def test_a_perturbation_that_fails_costs_one_frame(broken):
     assert np.array_equal(law.apply(0, 0.0, image, None)[0], image)
     for frame, says in (
         (1, r"broken 2.0 failed \(ValueError: no; broken.py, line 3\)"),
-        (2, r"gave uint8 \(2, 6\)"),
+        (2, r"returned uint8 \(2, 6\)"),
     ):
         with pytest.raises(UnreadableImageError, match=says):
             law.apply(frame, 0.1, image, None)

@@ -68,5 +68,5 @@ def test_bad_figures_are_refused():
         precision_recall(np.ones(2, bool), np.array([0.1, np.nan]))
     with pytest.raises(InputError, match="do not fit"):
         precision_recall(np.ones(2, bool), np.zeros(3))
-    with pytest.raises(InputError, match="both true and false"):
+    with pytest.raises(InputError, match="same place and of different places"):
         balanced_accuracy(np.ones(2, bool), np.zeros(2), 0.5)

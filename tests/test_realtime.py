@@ -27,7 +27,9 @@ from vslam.slam import Slam
 
 
 def cameras() -> list[str]:
-    return [thread.name for thread in threading.enumerate() if thread.name in ("camera", "handing")]
+    return [
+        thread.name for thread in threading.enumerate() if thread.name in ("camera", "preparation")
+    ]
 
 
 def frames_at(times):
@@ -40,13 +42,13 @@ def test_no_frame_comes_before_its_time_and_the_last_one_always_comes(threads):
     begin, seen = time.perf_counter(), []
     for played in play(frames_at(times), lambda n, f: (f.timestamp, time.perf_counter()), threads):
         seen.append(played)
-        if played.made is not None:
+        if played.prepared is not None:
             index = round((played.timestamp - 100.0) / 0.02)
-            assert played.made[0] == played.timestamp
-            assert played.made[1] >= played.came >= begin + 0.02 * index
+            assert played.prepared[0] == played.timestamp
+            assert played.prepared[1] >= played.arrived >= begin + 0.02 * index
     assert [played.timestamp for played in seen] == times.tolist()  # dropped ones too
-    assert seen[0].made is not None
-    assert seen[-1].made is not None
+    assert seen[0].prepared is not None
+    assert seen[-1].prepared is not None
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -61,9 +63,9 @@ def test_who_is_late_gets_the_newest_frame(threads):
     seen = []
     for played in play(film(), lambda n, frame: frame, threads, live=True):
         seen.append(played)
-        assert played.made is None or sent.wait(60)
+        assert played.prepared is None or sent.wait(60)
     assert [played.timestamp for played in seen] == [*range(10)]
-    used = [played.timestamp for played in seen if played.made is not None]
+    used = [played.timestamp for played in seen if played.prepared is not None]
     assert (used[0], used[-1]) == (0.0, 9.0)
     # With two threads, a second frame is prepared while the first one is used.
     assert len(used) <= 1 + threads
@@ -77,7 +79,7 @@ def test_with_one_thread_a_frame_is_prepared_after_the_last_one_was_used():
         return frame
 
     for played in play(frames_at(0.005 * np.arange(10)), prepare, 1):
-        if played.made is not None:
+        if played.prepared is not None:
             time.sleep(0.002)
             used.append(played)
     assert order == list(range(len(order)))

@@ -395,5 +395,5 @@ def test_a_viewer_that_cannot_be_started_is_refused(monkeypatch):
     with pytest.raises(InputError, match=r"no viewer can be started .*No such file"):
         open_viewer("native")
     monkeypatch.setattr(recorder_module, "_executable", lambda: "/bin/false")
-    with pytest.raises(InputError, match="the viewer does not start here"):
+    with pytest.raises(InputError, match="the viewer does not start here; run without --view"):
         open_viewer("native")

@@ -22,7 +22,7 @@ from vslam.loops import LoopCorrection, LoopEdge
 from vslam.report.folder import write_results
 from vslam.report.run_page import headlines
 from vslam.report.schema import DetectorFigures, ReportJson
-from vslam.report.summary import summarize
+from vslam.report.summary import evaluate_run, summarize
 from vslam.report.trajectory_figures import loop_closing, top_view
 from vslam.run.loop_pictures import LoopPicture
 from vslam.run.options import RunOptions
@@ -289,6 +289,45 @@ def test_causal_ate_is_of_the_poses_as_they_were_given(written: tuple[RunOutcome
     assert "Causal ATE" in (folder / "report.md").read_text()
 
 
+@pytest.mark.parametrize(
+    ("sensor", "scale", "says"),
+    [
+        ({}, 1.0, None),
+        ({}, 1.1, None),
+        ({}, 2.0, "2 times as large as the ground truth: check the baseline"),
+        ({"depth": True}, 0.2, "0.2 times as large as the ground truth: check the depth scale"),
+        ({"baseline": 0.0}, 5.0, None),
+    ],
+)
+def test_a_trajectory_of_another_scale_is_reported(sensor, scale: float, says: str | None):
+    outcome = make_outcome()
+    T_wc = outcome.trajectory.T_wc.copy()
+    T_wc[:, :3, 3] *= scale
+    camera = replace(outcome.sequence.camera, **sensor)
+    outcome = replace(
+        outcome,
+        trajectory=replace(outcome.trajectory, T_wc=T_wc),
+        sequence=replace(outcome.sequence, camera=camera),
+    )
+    warnings = summarize(outcome, evaluate_run(outcome)[0], None, None).warnings
+    assert len(warnings) == (says is not None)
+    assert says is None or says in warnings[0]
+
+
+def test_a_camera_that_stands_still_has_no_scale():
+    outcome = make_outcome()
+    truth, rng = outcome.sequence.ground_truth.copy(), np.random.default_rng(0)
+    truth[:, :3, 3] = rng.normal(0.0, 1e-3, (len(truth), 3))
+    T_wc = truth.copy()
+    T_wc[:, :3, 3] = rng.normal(0.0, 3e-3, (len(truth), 3))
+    outcome = replace(
+        outcome,
+        trajectory=replace(outcome.trajectory, T_wc=T_wc),
+        sequence=replace(outcome.sequence, ground_truth=truth),
+    )
+    assert not summarize(outcome, evaluate_run(outcome)[0], None, None).warnings
+
+
 @pytest.mark.slow
 def test_warnings_stand_above_the_numbers(written: tuple[RunOutcome, Path], tmp_path: Path) -> None:
     outcome, _ = written
@@ -405,7 +444,7 @@ def test_compared_trajectories_are_in_the_top_view(looped: tuple[RunOutcome, Pat
     alone = top_view(outcome, None, None, None).axes[0].lines
     own, compared = (line for line in alone if line.get_label() == "bow")
     np.testing.assert_allclose(own.get_xdata() + 40.0, compared.get_xdata(), atol=1e-6)
-    assert "Dashed: the detectors compared" in (folder / "report.html").read_text()
+    assert "Dashed: the detectors of --compare" in (folder / "report.html").read_text()
 
 
 def test_rejected_loops_do_not_drown_the_table(looped: tuple[RunOutcome, Path]) -> None:
@@ -448,7 +487,7 @@ def test_closed_loops_are_shown_in_pictures(tmp_path: Path) -> None:
     # The wrong one first, then the one by learned descriptors; that of frame 400 has no picture.
     names = ["loop-360-200.jpg", "loop-320-68.jpg", "loop-264-12.jpg"]
     captions = [
-        "Frame 360 (right) was wrongly taken for the place of frame 200 (left): 84 matches agree; "
+        "Frame 360 (right) was wrongly matched to the place of frame 200 (left): 84 matches agree; "
         "proposed by bow, verified by ORB descriptors.",
         "Frame 320 (right) shows the place of frame 68 (left): 84 matches agree; "
         "proposed by bow and capsule, verified by learned descriptors.",
@@ -546,7 +585,7 @@ def test_a_right_loop_on_a_revisit_too_short_to_count_is_explained() -> None:
     assert (report.revisit_stretches, report.loops_closed, report.loops[0].right) == (0, 1, True)
     note = headlines(report)[-1].note
     assert note.startswith(
-        "the ground truth revisits no stretch of 20 m or more (1 right on shorter ones), "
+        "the drive revisits no stretch of 20 m or more (1 right on shorter ones), "
     )
 
 
@@ -585,7 +624,7 @@ def test_a_monocular_report_speaks_of_no_stereo_and_no_metres(make, tmp_path: Pa
     report_of(replace(outcome, sequence=without_truth, compared=()), tmp_path)
     text = (tmp_path / "report.md").read_text()
     assert "stereo" not in text.lower().replace("| stereo ", "")  # a stage of the made-up run
-    assert "in the unit of the map" in text or "Moved" not in text
+    assert "in units of the map" in text or "Moved" not in text
     assert not re.search(r"\d\.\d\d m\b", text)
     assert top_view(outcome, None, None, None).axes[0].get_xlabel() == "x (map units)"
 

@@ -150,15 +150,15 @@ def test_a_step_takes_depth_in_metres_and_nothing_else(corridor):
     camera = replace(corridor.camera, depth=True)
     left = corridor.left[0]
     depth = corridor_depth(camera, corridor.T_wc[0]).astype(np.float32)
-    with pytest.raises(ValueError, match="uint8 and uint8, not of uint8 and float32"):
+    with pytest.raises(ValueError, match="uint8 and uint8 instead of uint8 and float32"):
         Slam(camera).step(left, corridor.right[0], 0.0)
-    with pytest.raises(ValueError, match=r"uint8 and uint16, not of .* millimetres"):
+    with pytest.raises(ValueError, match=r"uint8 and uint16 instead of .* millimetres"):
         Slam(camera).step(left, depth.astype(np.uint16), 0.0)
-    with pytest.raises(ValueError, match="the camera's"):
+    with pytest.raises(ValueError, match="but the camera's images have"):
         Slam(camera).step(left, depth[1:], 0.0)
     with pytest.raises(ValueError, match="the depth image is None"):
         Slam(camera).step(left, None, 0.0)
-    with pytest.raises(ValueError, match="uint8 and float32, not of uint8"):
+    with pytest.raises(ValueError, match="uint8 and float32 instead of uint8"):
         Slam(corridor.camera).step(left, depth, 0.0)
     assert Slam(camera).step(left, depth, 0.0).n_stereo > 100
 
@@ -248,6 +248,17 @@ def test_bad_input_of_tum(copy, tmp_path):
     refused(copy, "depth.txt", "missing", "--sensor mono")
 
 
+def test_images_without_depth_are_counted(copy, caplog):
+    lines = (copy / "depth.txt").read_text().splitlines()
+    (copy / "depth.txt").write_text("\n".join(lines[:-1]))
+    assert len(open_tum(copy, "")) == FRAMES - 1
+    assert not caplog.messages
+    (copy / "depth.txt").write_text("\n".join(lines[:-4]))
+    open_tum(copy, "")
+    (said,) = caplog.messages
+    assert f"only {FRAMES - 4} of {FRAMES} images have a depth image within 20 ms" in said
+
+
 @pytest.mark.parametrize(
     ("image", "part"),
     [
@@ -265,6 +276,8 @@ def test_depth_that_does_not_fit(copy, image, part):
     refused(copy, first.name, part)
     first.write_bytes(b"")
     refused(copy, first.name, "empty")
+    first.unlink()
+    refused(copy, first.name, "no such file")
 
 
 # Runs

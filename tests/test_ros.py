@@ -217,7 +217,7 @@ def test_covariances_are_those_of_errors_in_the_axes_of_ros():
 
 @pytest.mark.parametrize("timestamp", [-0.1, 1.6e12, math.nan])
 def test_times_that_ros_does_not_have_are_refused(timestamp):
-    with pytest.raises(InputError, match="ROS has no time"):
+    with pytest.raises(InputError, match="ROS cannot represent the time"):
         nanoseconds(timestamp)
 
 
@@ -227,7 +227,7 @@ def test_unix_times_keep_their_microseconds():
 
 @pytest.mark.slow
 def test_refusals(folder, tmp_path, monkeypatch):
-    with pytest.raises(InputError, match=r"run\.bag: .* end it in \.mcap"):
+    with pytest.raises(InputError, match=r"run\.bag: must end in \.mcap"):
         export(folder, "--out", tmp_path / "run.bag")
     (tmp_path / "run.mcap").touch()
     with pytest.raises(InputError, match="exists already"):
@@ -258,7 +258,7 @@ def test_a_run_that_only_localises_has_no_landmarks(folder, tmp_path):
         ("trajectory.tum", None, "No such file"),
         ("covariance.csv", "timestamp\n0.1,1,2,three\n", "damaged"),
         ("covariance.csv", "timestamp\n0.1,1,2\n", "damaged"),
-        ("trajectory_odom.tum", "0 0 0 0 0 0 0 1\n", "of different frames"),
+        ("trajectory_odom.tum", "0 0 0 0 0 0 0 1\n", "have different frames"),
     ],
 )
 def test_files_of_a_run_that_were_lost_or_changed(folder, tmp_path, name, text, why):

@@ -114,7 +114,7 @@ def test_a_zip_that_unpacks_beyond_the_memory(tmp_path: Path, monkeypatch):
     assert read_npz(path, "a map")["a"].nbytes == 2**22
     free = type("Memory", (), {"available": 2**20})
     monkeypatch.setattr(psutil, "virtual_memory", free)
-    with pytest.raises(InputError, match=r"unpacks to 0.0 GB .* hardly a map"):
+    with pytest.raises(InputError, match=r"unpacks to 0.0 GB, .* if this is not a map"):
         read_npz(path, "a map")
 
 
@@ -266,7 +266,7 @@ def test_a_header_that_is_a_number_is_not_that_many_bytes(tmp_path: Path, read):
     path = tmp_path / "a.npz"
     np.savez(path, header=np.array(100_000_000))
     tracemalloc.start()
-    with pytest.raises(InputError, match=r"not a map of vslam|the header is no text"):
+    with pytest.raises(InputError, match=r"not a map of vslam|the header is not text"):
         read(path)
     assert tracemalloc.get_traced_memory()[1] < 10_000_000
     tracemalloc.stop()
@@ -278,5 +278,5 @@ def test_an_archive_may_not_unpack_to_far_more_than_its_size(tmp_path: Path, rea
     """There may be memory for it, but not for a small file."""
     path = write_zip(tmp_path / "a.npz", {"header.npy": npy((2**25,), bytes(2**28))})
     assert path.stat().st_size < 300_000
-    with pytest.raises(InputError, match=r"0\.2 MB unpack to 256 MB; this is hardly"):
+    with pytest.raises(InputError, match=r"unpacks from 0\.2 MB to 256 MB, so it is probably not"):
         read(path)

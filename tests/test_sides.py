@@ -188,12 +188,12 @@ def test_warnings_say_what_was_seen_and_done():
     assert warned([fine] * 100) == []
     assert warned([fine] * 100 + [dark, black, black]) == []
     (said,) = warned([dark] * 7 + [fine] * 3)
-    assert "left side was 1.5 stops darker than the right one in 7 of 10 frames" in said
+    assert "left image was 1.5 stops darker than the right one in 7 of 10 frames" in said
     (said,) = warned([black] * 4 + [fine] * 6)
-    assert "right side was black in 4 of 10 frames" in said
-    assert "left side alone" in said
+    assert "right image was black in 4 of 10 frames" in said
+    assert "left image alone" in said
     (said,) = warned([Sides(black="left")] * 4)
-    assert "right side alone" in said
+    assert "right image alone" in said
 
 
 TWIST = np.array([0.3, 0.0, -8.0, 0.0, -0.3, 0.0])  # per second: ahead and to the right

@@ -104,7 +104,7 @@ def test_while_the_left_side_is_black_the_right_one_tracks(corridor, check_map):
 
 
 @pytest.mark.parametrize(
-    ("threads", "said"), [(1, "every frame was tracked"), (2, "make one after the fork")]
+    ("threads", "said"), [(1, "every frame was tracked"), (2, "create it after the fork")]
 )
 def test_a_fork_tracks_with_one_thread_and_is_refused_with_more(corridor, threads, said):
     """Its copy of the map has no thread that works on it: it would wait for ever."""

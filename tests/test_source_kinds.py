@@ -59,17 +59,17 @@ def test_what_is_not_known_is_told_what_was_looked_for(tmp_path):
         detect_dataset(str(tmp_path))
     for word in ("sequences", "mav0", "rgb.txt", "metadata.yaml", "left/", "video"):
         assert word in str(caught.value)
-    with pytest.raises(InputError, match=r"notes.txt: no images; name the folder"):
+    with pytest.raises(InputError, match=r"notes.txt: not images; name a folder"):
         detect_dataset(str(tmp_path / "notes.txt"))
     (tmp_path / "notes.txt").rename(tmp_path / "drive.tar.gz")
     with pytest.raises(InputError, match="an archive; unpack it"):
         detect_dataset(str(tmp_path / "drive.tar.gz"))
     (tmp_path / "drive" / "left").mkdir(parents=True)
     (tmp_path / "drive" / "left" / "1.png").touch()
-    with pytest.raises(InputError, match=r"but .*drive looks like images \(name that\)"):
+    with pytest.raises(InputError, match=r"but .*drive looks like images \(name that folder\)"):
         detect_dataset(str(tmp_path))
     (tmp_path / "sequences" / "00").mkdir(parents=True)
-    with pytest.raises(InputError, match="looks like KITTI's"):
+    with pytest.raises(InputError, match="looks like kitti"):
         detect_dataset(str(tmp_path / "sequences"))
     with pytest.raises(InputError, match="no such file or folder"):
         detect_dataset(str(tmp_path / "nothing.mp4"))

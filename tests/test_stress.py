@@ -486,8 +486,8 @@ rows = [f"1 0 0 {0.1 * (i % 3) + far * (i % 2)} 0 1 0 0 0 0 1 {i}" for i in k]
         ("--systems orbslam3", "--vocabulary"),
         ("--systems dso", "--systems dso: unknown"),
         ("--system x", "write NAME=COMMAND"),
-        ("--system both={folder}{out}", "--system both: a detector of this test has that name"),
-        ("--preset kitti-c --baseline capsule", "--baseline capsule: not tested"),
+        ("--system both={folder}{out}", "--system both: a detector of this test has the same name"),
+        ("--preset kitti-c --baseline capsule", "--baseline capsule: is not tested"),
     ],
 )
 def test_stress_refuses_before_it_starts(tmp_path, words, said):

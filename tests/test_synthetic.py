@@ -404,7 +404,7 @@ def test_damaged_frames_are_found_and_rendered_again(tmp_path, monkeypatch, capl
     (images / "000007.png").write_bytes(b"pn")  # another size
     store.render_sequence(small, Variation(), tmp_path)
     assert (fake.calls, fake.missing) == (2, [7])
-    assert "1 damaged, rendered again: 7" in caplog.text
+    assert "rendering 1 damaged frame again: 7" in caplog.text
     (images / "000008.png").write_bytes(b"xxx")  # the same size
     store.render_sequence(small, Variation(), tmp_path)
     assert fake.calls == 2

@@ -70,7 +70,7 @@ def test_a_share_of_what_was_learned_is_kept(tmp_path):
     ("changes", "message"),
     [
         ({"learned_share": 0.5}, "needs a network to start from"),
-        ({"emphasis": {"bulbs": 3.0}}, "no source bulbs; there are blobs"),
+        ({"emphasis": {"bulbs": 3.0}}, "there is no source bulbs; choose from blobs"),
     ],
 )
 def test_settings_that_would_do_nothing_are_refused(tmp_path, changes, message):
@@ -241,7 +241,7 @@ def test_a_network_goes_on_with_larger_images(tmp_path):
     assert (torch.diff(rows[:, 0]) >= 0).all()
     assert rows[-1, 0].item() == pytest.approx(side - 1)
     branch = pruned(first, lowest(torch.rand(8, SMALL.places), 0.2))
-    with pytest.raises(InputError, match="is pruned"):
+    with pytest.raises(InputError, match="a pruned network cannot be resized"):
         resized(branch, Layout((96, 96)))
 
 

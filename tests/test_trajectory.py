@@ -69,7 +69,7 @@ def test_comments_and_blank_lines_are_passed_over(tmp_path):
         ("0 1 2 3 0 0 0 1\n1 2 3\n", "line 2 has 3 numbers where a pose takes 8"),
         ("0 1 2 3 0 0 0 x\n", "line 1 is not a row of numbers"),
         ("0 1 2 3 0 0 nan 1\n", "line 1 holds NaN"),
-        ("0 1 2 3 0 0 0 2\n", "quaternion is not of length 1"),
+        ("0 1 2 3 0 0 0 2\n", "length of a quaternion is not 1"),
         ("1 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1\n", "pose 2 is not later"),
         ("2 0 0 0 0 2 0 0 0 0 2 0\n", "pose 1 is not a rotation"),
         ("-1 0 0 0 0 1 0 0 0 0 1 0\n", "pose 1 is not a rotation"),

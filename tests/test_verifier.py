@@ -98,7 +98,10 @@ def test_a_promising_candidate_is_verified_by_learned_descriptors(by_night, kind
 def test_learned_descriptors_alone_try_no_other_candidate(by_night):
     verifier = LearnedVerifier(CONFIG, CAMERA, by_night.images)
     edge = verifier.verify(by_night.map, PLAIN)
-    assert (edge.accepted, edge.reason) == (False, "not similar enough for learned descriptors")
+    assert (edge.accepted, edge.reason) == (
+        False,
+        "images not similar enough for learned verification",
+    )
     assert verifier.verify(by_night.map, PLAIN, REFUSAL) is REFUSAL
 
 
@@ -115,10 +118,10 @@ def test_orb_comes_first_where_both_verify(network, by_night):
 @pytest.mark.parametrize(
     ("kind", "refusal", "reason"),
     [
-        (LearnedVerifier, None, "no image is kept"),
-        (LearnedVerifier, REFUSAL, f"{REFUSAL.reason}; no image is kept"),
-        (OrbThenLearnedVerifier, None, "only 0 descriptors match; no image is kept"),
-        (OrbThenLearnedVerifier, REFUSAL, f"{REFUSAL.reason}; no image is kept"),
+        (LearnedVerifier, None, "no image is stored"),
+        (LearnedVerifier, REFUSAL, f"{REFUSAL.reason}; no image is stored"),
+        (OrbThenLearnedVerifier, None, "only 0 descriptors match; no image is stored"),
+        (OrbThenLearnedVerifier, REFUSAL, f"{REFUSAL.reason}; no image is stored"),
     ],
 )
 def test_a_failed_attempt_says_all_that_spoke_against_it_and_is_remembered(

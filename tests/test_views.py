@@ -61,9 +61,9 @@ def test_views_are_equally_far_apart():
     ("views", "view_width", "why"),
     [
         (2, None, "views 2: needs view_width"),
-        (1, 65, "view_width 65: one view is the whole image"),
-        (2, 81, "view_width 81: must be less than the 81"),
-        (3, 64, "view_width 64: 3 views in 81 columns must be a multiple of 1 columns apart"),
+        (1, 65, "view_width 65: a single view is the whole image"),
+        (2, 81, "view_width 81: must be less than the image width 81"),
+        (3, 64, "view_width 64: 3 views in 81 columns must be spaced by a multiple of 1 columns"),
         (2, 20, "view_width: must be at least 32"),
     ],
 )

@@ -233,7 +233,7 @@ def parts_of(tree: Vocabulary) -> dict[str, object]:
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        ({"schema": 9}, "schema 9, this version reads 1"),
+        ({"schema": 9}, "has schema 9, but this version of vslam reads schema 1"),
         ({"branching": 3}, "a node has 5 children, more than 3"),
         ({"levels": 2}, "deeper than 2 levels"),
         ({"levels": 99}, "must be 1 to 10"),
@@ -257,7 +257,7 @@ def test_an_npz_with_nonsense_inside(small, tmp_path, which):
         n_children[[0, -1]] = 0, n_children[0]  # the root's are given to the last leaf
     weight[3] = {"negative weight": -1.0, "nan weight": np.nan}.get(which, weight[3])
     np.savez(tmp_path / "v.npz", **(parts | {"n_children": n_children, "weight": weight}))
-    with pytest.raises(InputError, match=r"do not make a tree|negative or not finite"):
+    with pytest.raises(InputError, match=r"do not form a tree|negative or not finite"):
         load(tmp_path / "v.npz")
 
 
@@ -272,7 +272,7 @@ def test_files_that_are_no_npz(small, tmp_path):
     with pytest.raises(InputError, match=r"v\.npz: "):
         load(path)
     np.savez(path, other=3)
-    with pytest.raises(InputError, match="holds no vocabulary"):
+    with pytest.raises(InputError, match="not a vocabulary"):
         load(path)
     save(small, path)
     whole = path.read_bytes()
@@ -354,14 +354,14 @@ def test_text_round_trip(small, tmp_path):
         (3, node_line(1, 1, 256), "line 3 has a descriptor byte"),
         (3, node_line(1, 1, -1), "line 3 has a descriptor byte"),
         (3, node_line(1, 1).replace("1 1 0", "1 1 0.5"), "line 3 has a descriptor byte"),
-        (3, node_line(1, 1).replace("1 1 0", "1 1 x"), "line 3 holds something that is not a"),
-        (3, node_line(1, 1).replace("1 1 0", "1 1 7a"), "line 3 holds something that is not a"),
+        (3, node_line(1, 1).replace("1 1 0", "1 1 x"), "line 3 contains something that is not a"),
+        (3, node_line(1, 1).replace("1 1 0", "1 1 7a"), "line 3 contains something that is not a"),
         (3, node_line(1, 2), "line 3 has a leaf flag"),
         (3, node_line(2, 1), "line 3 names a parent that does not come before it"),
         (3, node_line(-1, 1), "line 3 names a parent that does not come before it"),
         (3, node_line(1, 1, 0, -2), "line 3 has a weight"),
         (3, node_line(1, 1, 0, 1e39), "line 3 has a weight"),
-        (3, node_line(1, 1)[:-3] + "nan", "line 3 holds something that is not a number"),
+        (3, node_line(1, 1)[:-3] + "nan", "line 3 contains something that is not a number"),
         (2, node_line(0, 1), "line 2 is a leaf but has children"),
         (4, node_line(0, 0), "line 4 is not a leaf but has no children"),
     ],
@@ -425,17 +425,18 @@ def test_commands_train_convert_and_show(call, tmp_path):
     assert same(load(tmp_path / "back.npz"), load(tmp_path / "vocabulary.npz"))
     code, out, _ = call("info", "v.txt")
     assert code == 0
-    assert f"words     {load(tmp_path / 'back.npz').n_words}, of which" in out
+    n_words = load(tmp_path / "back.npz").n_words
+    assert f"words     {n_words}, {n_words} of them with weight 0" in out
     assert call("info")[0] == 0
 
 
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        (("train", "nowhere"), "nowhere: no image there"),
+        (("train", "nowhere"), "nowhere: no images found"),
         (("train", "broken.jpg"), "1 of 1 images cannot be read"),
         (("train", "broken.jpg", "--out", "v.dat"), "must end in .npz or in .txt"),
-        (("train", "broken.jpg", "--out", "none/v.npz"), "there is no folder none"),
+        (("train", "broken.jpg", "--out", "none/v.npz"), "the folder none does not exist"),
         (("convert", "v.npz", "v.dat"), "must end in .npz or in .txt"),
         (("convert", "v.npz", "v.txt"), "v.npz: not a vocabulary (No such file"),
         (("info", "broken.jpg"), "must end in .npz or in .txt"),

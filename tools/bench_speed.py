@@ -1,18 +1,18 @@
-"""Measure the speed of vslam and ORB-SLAM3 (pyorbslam3), and write the results as Markdown.
+"""Measure the speed of vslam and ORB-SLAM3 (pyorbslam3) and write the results as Markdown.
 
     python tools/bench_speed.py --case "KITTI 00=/data/kitti:00:216" [--also capsule] \
         [--repeats 3] [--write docs/research/performance.md] [--csv docs/research/performance.csv] \
         [--orbslam3-python PY --vocabulary voc.txt]
 
-A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run one
-at a time and alternate, after one round that is not counted. vslam runs with its report, with
+A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run
+alternately, one at a time, after a round that is not counted. vslam runs with its report, with
 ``--no-report``, with ``--no-report`` and each detector of ``--also`` instead of ``bow``, and in the
 last round with ``--realtime``, which takes as long as the drive. The hand-written parts of the
 page, at its beginning and from "Limits" on, are kept.
 
-Wall time, CPU time and peak memory are those of the whole process, as the kernel reports them. The
-errors of both are computed by vslam.evaluation.trajectories from their trajectory files. ORB-SLAM3
-is run by vslam/lab/stress/orbslam3.py, as in ``vslam stress``.
+Wall time, CPU time and peak memory are those of the whole process, as the operating system reports
+them. vslam.evaluation.trajectories computes the errors of both systems from their trajectory files.
+vslam/lab/stress/orbslam3.py runs ORB-SLAM3, as in ``vslam stress``.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ MEASURES = (  # key of figures, title with an arrow to the better side, format
 
 
 class Case(NamedTuple):
-    """Frames to run on: ``frames`` of a sequence in KITTI's format, from the first one."""
+    """The first ``frames`` frames of a sequence in KITTI's format."""
 
     title: str
     data: Path
@@ -103,8 +103,8 @@ class OrbSlam3(NamedTuple):
 
 
 class Process(NamedTuple):
-    """A process that has ended: its output, and the resources used by it and its children;
-    ``held`` has its memory over time, as (s, MB)."""
+    """A process that has ended: its output, and the resources used by it and its children.
+    ``held``: its memory over time, as (s, MB)."""
 
     output: str
     wall_s: float
@@ -114,9 +114,9 @@ class Process(NamedTuple):
 
 
 class Run(NamedTuple):
-    """One run: the system's own report (``frames``, ``fps`` and ``cpu_ms_per_frame`` of the frame
-    loop, and more), lost frames, closed loops, and the file of the trajectory in KITTI's or TUM's
-    format, which lives as long as the folder of the run."""
+    """One run. ``report``: the system's own report, with at least ``frames``, ``fps`` and
+    ``cpu_ms_per_frame`` of the frame loop. ``trajectory``: a file in KITTI's or TUM's format, which
+    is deleted with the folder of the run."""
 
     process: Process
     report: dict[str, Any]
@@ -126,10 +126,10 @@ class Run(NamedTuple):
 
 
 def measure(command: list[str], folder: Path) -> Process:
-    """Run a command to its end and measure it. No large package may be imported before, because
-    the peak memory of a child starts at that of its parent."""
+    """Run a command and measure it. No large package may be imported before that, because the peak
+    memory of a child process starts at that of its parent."""
     log = folder / "output.txt"
-    # Modules are compiled once, as when pip installs them.
+    # Let Python keep compiled modules, as pip does when it installs them.
     environment = {key: os.environ[key] for key in os.environ if key != "PYTHONDONTWRITEBYTECODE"}
     start = time.perf_counter()
     with log.open("wb") as output:
@@ -166,7 +166,7 @@ def sample_memory(
 
 
 def parse_case(text: str) -> Case:
-    """``TITLE=DATA:SEQ:FRAMES``."""
+    """Parse ``TITLE=DATA:SEQ:FRAMES``."""
     title, separator, place = text.partition("=")
     parts = place.rsplit(":", 2)
     if not separator or len(parts) != 3 or not parts[2].isdecimal():
@@ -187,7 +187,7 @@ def sides(case: Case) -> list[Path]:
 
 
 def reading_ms(case: Case, system: str) -> float:
-    """CPU milliseconds in which a system decodes both images of a frame, in one thread."""
+    """CPU time in milliseconds for decoding both images of a frame in one thread."""
     files = [str(path) for side in sides(case) for path in sorted(side.iterdir())[: case.frames]]
     reader = "opencv" if system == ORBSLAM3 else "vslam"
     command = [sys.executable, "-c", READING, reader]
@@ -198,8 +198,8 @@ def reading_ms(case: Case, system: str) -> float:
 
 
 def run_vslam(case: Case, folder: Path, *words: str) -> Run:
-    """Run vslam, with more ``words`` on its command line. Without a report, it gets no ground
-    truth, as ORB-SLAM3 evaluates nothing."""
+    """Run vslam with more ``words`` on its command line. With --no-report, it gets no ground truth,
+    because ORB-SLAM3 does not evaluate anything either."""
     data = case.data
     if "--no-report" in words:
         data = folder / "data"
@@ -218,8 +218,8 @@ def run_orbslam3(case: Case, system: OrbSlam3, folder: Path) -> Run:
     command = [str(system.python), str(SCRIPT), str(system.vocabulary)]
     command += [str(case.data / "sequences" / case.seq), "out", "--frames", str(case.frames)]
     process = measure(command, folder)
-    said = next(line for line in reversed(process.output.splitlines()) if line.startswith("{"))
-    report = json.loads(said)
+    *_, costs = (line for line in process.output.splitlines() if line.startswith("{"))
+    report = json.loads(costs)
     loops = process.output.count(LOOP_MESSAGE)
     return Run(process, report, report["lost"], loops, folder / "out" / "trajectory.txt")
 
@@ -227,12 +227,12 @@ def run_orbslam3(case: Case, system: OrbSlam3, folder: Path) -> Run:
 def measure_case(
     case: Case, orbslam3: OrbSlam3 | None, repeats: int, also: list[str], scratch: str
 ) -> dict[str, list[Run]]:
-    """All counted runs of each system, in folders of their own in ``scratch``."""
+    """All counted runs of each system, each in its own folder in ``scratch``."""
     runs: dict[str, list[Run]] = {FULL: [], ORBSLAM3: [], LEAN: [], LIVE: []}
     words = {FULL: (), LEAN: ("--no-report",), LIVE: ("--no-report", "--realtime")}
     for name in also:
         runs[title := f"{LEAN} --detector {name}"] = []
-        # If the command line has two detectors, the last one counts.
+        # This option replaces the --detector of run_vslam, because the last one counts.
         words[title] = ("--no-report", "--detector", name)
     if orbslam3 is None:
         del runs[ORBSLAM3]
@@ -254,7 +254,7 @@ def measure_case(
 
 
 def figures(run: Run, case: Case, reading: float) -> dict[str, float]:
-    """Every measure of one run; NaN where it has no value."""
+    """Every measure of one run, NaN if unknown."""
     import numpy as np
 
     from vslam.datasets import open_sequence
@@ -281,7 +281,7 @@ def figures(run: Run, case: Case, reading: float) -> dict[str, float]:
     sequence = open_sequence("kitti", case.data, case.seq, max_frames=case.frames)
     if sequence.ground_truth is not None:
         times = sequence.timestamps
-        with suppress(InputError):  # hardly a frame has a pose
+        with suppress(InputError):  # too few frames have a pose
             # Frames without a pose get an interpolated one, as in ``vslam stress``.
             estimate = read_poses(run.trajectory, times, np.arange(len(times))).bridged(times)
             errors = evaluate_trajectory(estimate, Trajectory(times, sequence.ground_truth))
@@ -309,14 +309,14 @@ def comparison(measured: dict[str, list[dict[str, float]]]) -> str:
 
 
 def spread(values: list[float], form: str) -> str:
-    """Median (least - greatest), or the median alone if both are equal as printed."""
+    """``median (least - greatest)``, or only the median if both ends look the same."""
     low, high = format(min(values), form), format(max(values), form)
     median = format(statistics.median(values), form)
     return median if low == high else f"{median} ({low} - {high})"
 
 
 def latency(runs: dict[str, list[Run]], case: Case) -> str:
-    """Milliseconds from the time of an image to its pose, and ORB-SLAM3's own tracking times."""
+    """A table of the time from an image to its pose, and of the tracking times of ORB-SLAM3."""
     ours = [run.report for run in runs[LIVE]]
     values = [
         spread([report["latency_ms"][key] for report in ours], ".0f")
@@ -344,7 +344,7 @@ def rate(case: Case) -> float:
 
 
 def stages(report: dict[str, Any]) -> str:
-    """Wall milliseconds of each stage; stages in the thread pool overlap with the others."""
+    """A table of the wall time of each stage; stages in the thread pool overlap with others."""
     lines = ["| stage, ms | mean | p50 | p95 | p99 |", "|---|---|---|---|---|"]
     for name, ms in report["stage_ms"].items():
         cells = [f"{ms[key]:.1f}" for key in ("mean", "median", "p95", "p99")]
@@ -357,11 +357,11 @@ def memory(run: Run) -> str:
     before = [mb for seconds, mb in run.process.held if seconds <= run.report["startup_s"]]
     if not before or not run.report["keyframes"]:
         return "The run was too short to measure the memory of a keyframe."
-    grown = run.process.memory_mb - before[-1]
+    growth = run.process.memory_mb - before[-1]
     kept = run.report["keyframes"]
     return (
         f"Memory: {before[-1]:.0f} MB before the first frame, {run.process.memory_mb:.0f} MB at "
-        f"its peak, with {kept} keyframes in the final map: {grown / kept:.2f} MB per keyframe."
+        f"its peak, with {kept} keyframes in the final map: {growth / kept:.2f} MB per keyframe."
     )
 
 
@@ -392,7 +392,7 @@ def section(
 
 
 def profile(case: Case) -> str:
-    """The CPU time of a frame by stage; empty on failure, so that the measurements are not lost."""
+    """A table of the CPU time per frame by stage; empty on failure, so that the rest is kept."""
     tool = str(Path(__file__).with_name("profile_frame.py"))
     command = [sys.executable, tool, str(case.data), case.seq, str(case.frames)]
     done = subprocess.run(command, capture_output=True, text=True)
@@ -402,7 +402,7 @@ def profile(case: Case) -> str:
 
 
 def orbslam3_of(options: argparse.Namespace) -> OrbSlam3 | None:
-    """ORB-SLAM3 that the options name; None without them."""
+    """The ORB-SLAM3 that the options name, None without them."""
     given = (options.orbslam3_python, options.vocabulary)
     if not any(given):
         return None
@@ -417,10 +417,10 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument("--case", type=parse_case, action="append", required=True, metavar=shape)
     parser.add_argument("--repeats", type=int, default=3, help="counted runs of each system")
     parser.add_argument(
-        "--also", action="append", default=[], metavar="DETECTOR", help="run with it as well"
+        "--also", action="append", default=[], metavar="DETECTOR", help="another detector to run"
     )
-    # Paths must be absolute, because each run has its own working folder. Links must not be
-    # resolved, because the link to the interpreter determines the virtual environment.
+    # Paths must be absolute, because each run has its own working folder. Symbolic links are kept,
+    # because the link to the interpreter determines its virtual environment.
     for name in ("--orbslam3-python", "--vocabulary"):
         parser.add_argument(name, type=lambda text: Path(text).absolute())
     parser.add_argument("--write", type=Path, help="file to write; printed unless given")
@@ -432,12 +432,12 @@ def parse_options() -> argparse.Namespace:
 
 
 def setting_of(report: dict[str, Any], system: OrbSlam3 | None, repeats: int) -> str:
-    """Machine, versions and the number of runs, as one paragraph, from a report of vslam."""
+    """A paragraph with the machine, the versions and the number of runs, from a report of vslam."""
     ask = f"from importlib.metadata import version; print(version('{PACKAGE}'))"
     version = ""
     if system is not None:
-        said = subprocess.run([system.python, "-c", ask], capture_output=True, text=True)
-        version = f"; {PACKAGE} {said.stdout.strip() or '(version unknown)'}"
+        done = subprocess.run([system.python, "-c", ask], capture_output=True, text=True)
+        version = f"; {PACKAGE} {done.stdout.strip() or '(version unknown)'}"
     machine = report["machine"]
     ours = ", ".join(f"{name} {number}" for name, number in report["versions"].items())
     return (
@@ -485,7 +485,7 @@ def main() -> None:
     load = os.getloadavg()[0]
     orbslam3 = orbslam3_of(options)
     with tempfile.TemporaryDirectory(prefix="vslam-speed-") as scratch:
-        # No large package may be imported before the last run; see measure.
+        # No large package may be imported before the last run (measure).
         done = [
             (case, measure_case(case, orbslam3, options.repeats, options.also, scratch))
             for case in options.case

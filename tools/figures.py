@@ -4,13 +4,13 @@
     python tools/figures.py --check                    # make figures-check
     python tools/figures.py --adopt [VERSION]          # stamp files that were made by other means
 
-``figures.toml`` lists every table and figure with the commands that make it. A command is run by
-bash in the root of the repository and writes into the folder ``$OUT`` under the names of the files;
-``$TOWNS`` is the folder of rendered towns. ``$OUT`` is kept in ``runs/figures``, one folder for
-each version of the method, so that an interrupted command continues. The files are copied to their
-places, or below ``build/figures`` with ``--quick``, and ``docs/stamps.json`` there gets a stamp for
-each: commit, version of the method, machine, seed, command and digest. What has a valid stamp of
-this version is not made again.
+``figures.toml`` lists every table and figure with the commands that make it. bash runs a command in
+the root of the repository. The command writes the files, under their names, into the folder
+``$OUT``; ``$TOWNS`` is the folder of rendered towns. ``$OUT`` lies in ``runs/figures``, one for
+each version of the method, and is kept, so that an interrupted command continues. The files are
+copied to their places, or to ``build/figures`` with ``--quick``, and ``docs/stamps.json`` there
+gets a stamp for each: commit, version of the method, machine, seed, command and digest. Files with
+a valid stamp of this version are not made again.
 
 sources.py explains how a page names the file that its numbers come from.
 """
@@ -46,11 +46,15 @@ KINDS = {".csv", ".json", ".svg", ".png", ".jpg"}  # of files below docs/ that n
 class Entry:
     """Files that are made together.
 
-    ``run`` and ``quick`` are commands for bash, ``needs`` environment variables that must name a
-    path, ``reads`` files of other entries. ``trajectories`` is False if no version of the method
-    changes the files. ``tested`` names the test that compares the files with the code, so that they
-    need no stamp. ``history`` says what made the files of a finished experiment; no command makes
-    them again, and patterns may name them.
+    Attributes:
+        files: paths, or patterns if there is a ``history``.
+        run, quick: bash commands that make the files and short variants of them.
+        needs: environment variables that must name a path.
+        reads: files of other entries that the commands read.
+        seed: seed of the random numbers.
+        trajectories: whether the files depend on the version of the method.
+        tested: the test that compares the files with the code; they then need no stamp.
+        history: how the files of a finished experiment were made; no command makes them again.
     """
 
     files: tuple[str, ...]
@@ -71,7 +75,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Stamp:
-    """How a file was made. What git's history does not tell of an older file is None."""
+    """How a file was made. Facts about an older file that are not in git's history are None."""
 
     digest: str
     commit: str
@@ -83,7 +87,8 @@ class Stamp:
 
 
 class Report(NamedTuple):
-    """What a check found: ``faults`` must be repaired, ``older`` and ``typed`` are listed."""
+    """The result of a check: ``faults``, which must be repaired, files made by another version of
+    the method (``older``), and pages with tables that name no source (``typed``)."""
 
     faults: list[str]
     older: list[str]
@@ -91,7 +96,7 @@ class Report(NamedTuple):
 
 
 def read_entries(root: Path = ROOT) -> list[Entry]:
-    """The entries of figures.toml, inputs before what is made of them."""
+    """The entries of figures.toml, ordered so that inputs come first."""
     tables = tomllib.loads((root / "tools" / "figures.toml").read_text())["figure"]
     entries = [
         Entry(**{k: tuple(v) if isinstance(v, list) else v for k, v in one.items()})
@@ -103,7 +108,7 @@ def read_entries(root: Path = ROOT) -> list[Entry]:
 
 
 def read_stamps(folder: Path) -> dict[str, Stamp]:
-    """Stamps by the path of the file; empty without stamps.json."""
+    """The stamps by file; empty without stamps.json."""
     path = folder / STAMPS
     known = json.loads(path.read_text()) if path.exists() else {}
     return {file: Stamp(**one) for file, one in known.items()}
@@ -117,22 +122,22 @@ def write_stamps(folder: Path, stamps: dict[str, Stamp]) -> None:
 
 
 def digest_of(path: Path) -> str:
-    """The first 16 hexadecimal digits of SHA-256."""
+    """The first 16 hexadecimal digits of the file's SHA-256."""
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def is_older(stamp: Stamp, entry: Entry) -> bool:
-    """Whether another version of the method made a file that depends on it."""
+    """Whether a file depends on the method and another version of it made the file."""
     return entry.trajectories and stamp.method != METHOD_VERSION
 
 
 def make(root: Path, *, quick: bool, only: str = "") -> int:
-    """Make what is missing or older, and print a sentence for each entry.
+    """Make the files that are missing or older, and print a sentence for each entry.
 
     Args:
-        root: repository.
-        quick: run the short commands, and write below build/figures.
-        only: leave out entries that have no file with this text in its path.
+        root: root of the repository.
+        quick: run the short commands and write to build/figures.
+        only: make only entries with a file whose path contains this text.
 
     Returns:
         Number of entries that failed.
@@ -147,25 +152,25 @@ def make(root: Path, *, quick: bool, only: str = "") -> int:
         name = f"{entry.files[0]}{more}"
         absent = [x for x in entry.needs if not os.path.exists(os.environ.get(x, ""))]
         if entry.history:
-            print(f"{name}: kept, {entry.history}.")
+            print(f"{name}: kept ({entry.history}).")
         elif not command:
-            print(f"{name}: skipped, it has no quick variant.")
+            print(f"{name}: skipped, because it has no quick variant.")
         elif absent and not quick:
-            print(f"{name}: skipped, {' and '.join(absent)} must name files (datasets.md).")
+            print(f"{name}: skipped; set {' and '.join(absent)} (datasets.md).")
         elif _is_done(entry, target, command):
             print(f"{name}: up to date.")
         else:
             start = time.monotonic()
-            made = _made(entry, command, root, target)
-            failed += not made
-            what = "made in" if made else "FAILED after"
+            succeeded = _run(entry, command, root, target)
+            failed += not succeeded
+            what = "made in" if succeeded else "FAILED after"
             print(f"{name}: {what} {time.monotonic() - start:.0f} s.", flush=True)
     return failed
 
 
 def _is_done(entry: Entry, target: Path, command: str) -> bool:
     stamps = read_stamps(target)
-    mine = [stamps.get(file) for file in entry.files]
+    own = [stamps.get(file) for file in entry.files]
     inputs = [stamps[file].date for file in entry.reads if file in stamps]
     return all(
         stamp is not None
@@ -174,11 +179,12 @@ def _is_done(entry: Entry, target: Path, command: str) -> bool:
         and stamp.command == command
         and not is_older(stamp, entry)
         and stamp.date >= max(inputs, default="")
-        for file, stamp in zip(entry.files, mine, strict=True)
+        for file, stamp in zip(entry.files, own, strict=True)
     )
 
 
-def _made(entry: Entry, command: str, root: Path, target: Path) -> bool:
+def _run(entry: Entry, command: str, root: Path, target: Path) -> bool:
+    """Run the command of an entry, copy and stamp its files; whether it succeeded."""
     from vslam.datasets.synthetic.site import Variation
     from vslam.datasets.synthetic.store import cache_folder, folder_name
 
@@ -204,7 +210,7 @@ def _made(entry: Entry, command: str, root: Path, target: Path) -> bool:
 
 
 def _stamp(path: Path, entry: Entry, command: str, root: Path, method: int) -> Stamp:
-    """The stamp of a file that was made just now."""
+    """The stamp of a file that has just been made."""
     from vslam.report.summary import this_machine
 
     machine = this_machine()
@@ -220,7 +226,7 @@ def _stamp(path: Path, entry: Entry, command: str, root: Path, method: int) -> S
 
 
 def _commit(root: Path) -> str:
-    """The commit that is checked out, with a mark if code was changed since."""
+    """The commit that is checked out, marked if files outside docs/ have been changed."""
     head = _git(root, "rev-parse", "--short", "HEAD")
     changed = _git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs")
     return f"{head} with changes" if changed else head
@@ -235,9 +241,9 @@ def adopt(root: Path, method: int | None = None) -> list[str]:
     """Stamp every file that has no valid stamp, and return these files.
 
     Args:
-        root: repository.
-        method: version of the method that made the files with the commands of figures.toml on this
-            machine; None if unknown: then the stamp has only the commit that wrote the file.
+        root: root of the repository.
+        method: version of the method that made the files, with the commands of figures.toml on this
+            machine; if it is None, a stamp has only the commit that wrote the file.
     """
     stamps, adopted = read_stamps(root), []
     entries = {file: entry for entry in read_entries(root) for file in entry.paths(root)}
@@ -260,7 +266,7 @@ def adopt(root: Path, method: int | None = None) -> list[str]:
 
 
 def check(root: Path) -> Report:
-    """Check that all tables and figures have valid stamps and tables in Markdown their values."""
+    """Check that all files have valid stamps, and that the tables of pages agree with them."""
     entries = {file: entry for entry in read_entries(root) for file in entry.paths(root)}
     stamps, report = read_stamps(root), Report([], [], [])
     below = (path for path in (root / "docs").rglob("*") if path.suffix in KINDS)
@@ -281,7 +287,7 @@ def check(root: Path) -> Report:
             names = [
                 p.relative_to(root) for p, text in texts.items() if file in used(p, text, root)
             ]
-            on = f", on {', '.join(map(str, names))}" if names else ""
+            on = f", shown on {', '.join(map(str, names))}" if names else ""
             report.older.append(f"{file}: {origin(stamps[file])}{on}")
     for page, text in texts.items():
         name = page.relative_to(root)
@@ -293,28 +299,28 @@ def check(root: Path) -> Report:
 
 
 def pages(root: Path) -> list[Path]:
-    """README and the pages of the documentation, but for those that are made from the code."""
+    """README and the pages of the documentation, except those that are made from the code."""
     below = sorted((root / "docs").rglob("*.md"))
     made = root / "docs" / "reference"
     return [root / "README.md", *(page for page in below if made not in page.parents)]
 
 
 def used(page: Path, text: str, root: Path) -> set[str]:
-    """The files that a page links, shows or names as a source."""
+    """The files that a page links to, shows or names as a source."""
     links = re.findall(r"\]\(([^)#\s:]+)\)", text)
     named = {os.path.relpath(os.path.normpath(page.parent / link), root) for link in links}
     return named.union(*map(sources.files_of, sources.COMMENT.findall(text)))
 
 
 def origin(stamp: Stamp) -> str:
-    """``version 1, commit 0123abc, 2026-11-25``."""
+    """The origin of a file, for example ``version 1, commit 0123abc, 2026-11-25``."""
     version = "before version 1" if stamp.method is None else f"version {stamp.method}"
     return f"{version}, commit {stamp.commit}, {stamp.date[:10]}"
 
 
 def mark_older(page: Path, text: str, root: Path) -> str:
-    """The text of a page, in which a line before each traced table and a note at the end name the
-    files that another version of the method made."""
+    """The text of a page with marks of the files that another version of the method made: a line
+    before each table with such a source, and a note at the end."""
     stamps = read_stamps(root)
     older = {
         file: origin(stamps[file])
@@ -341,12 +347,12 @@ def mark_older(page: Path, text: str, root: Path) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="minutes; writes to build/figures")
-    parser.add_argument("--only", default="", help="files whose path contains this text")
-    parser.add_argument("--check", action="store_true", help="make nothing; check what is there")
+    parser.add_argument("--quick", action="store_true", help="short variants, in build/figures")
+    parser.add_argument("--only", default="", help="only files whose path contains this text")
+    parser.add_argument("--check", action="store_true", help="only check the files and pages")
     parser.add_argument(
         "--adopt", type=int, nargs="?", const=0, metavar="VERSION",
-        help="stamp files that were made by other means, by this version of the method if known",
+        help="stamp files that were made by other means; VERSION of the method, if known",
     )  # fmt: skip
     options = parser.parse_args()
     if options.adopt is not None:

@@ -1,8 +1,8 @@
-"""Fuzz every reader with damaged files: it must soon return a result or raise an `InputError`.
+"""Fuzz every reader with damaged files: it must quickly return a result or raise an `InputError`.
 
 Each input is a small valid file, changed by a seeded mutation. Any other outcome is a failure:
 another exception, a crash, more than SECONDS of CPU time or MEGABYTES of memory. Readers run in a
-separate process, so that a crash becomes a line in the table.
+separate process, so that a crash is recorded like any other failure.
 
 usage: python tools/fuzz.py [--inputs 1000] [--seed 0] [--readers kitti,video] [--keep FOLDER]
 """
@@ -39,16 +39,23 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import valid_files
 
 SECONDS, MEGABYTES = 20, 600
-WALL_SECONDS = 300  # for readers that wait without using CPU time; a busy machine is slow
-ADDRESS_SPACE = 8 * 2**30  # limit beyond which a MemoryError protects this machine
+WALL_SECONDS = 300  # for readers that hang without using CPU time, even on a busy machine
+ADDRESS_SPACE = 8 * 2**30  # bytes; a reader that wants more gets a MemoryError
 _NUMBERS = ["nan", "inf", "-inf", "1e999", "-1", "0", "1e-320", "9" * 30, "2147483648", "0x10", ""]
 _SPECIAL = [0, 1, 0x7F, 0xFF, 0x7FFFFFFF, 0xFFFFFFFF, 0x80000000, 0x7FFFFFFFFFFFFFFF]
 
 
 @dataclass(frozen=True)
 class Reader:
-    """A reader to fuzz: ``write`` makes valid files in a folder, one file that matches ``changed``
-    is mutated by ``mutation``, and ``read`` reads the files."""
+    """A reader to fuzz.
+
+    Attributes:
+        write: writes valid files into a folder.
+        read: reads the files in a folder.
+        changed: pattern of the files to mutate, one at a time.
+        mutation: function of the file's content, a random generator and the file's name; None for
+            `mutate`.
+    """
 
     write: Callable[[Path], object]
     read: Callable[[Path], object]
@@ -60,7 +67,7 @@ class Reader:
 
 
 def _use(source) -> None:
-    """Read every frame of a source; single frames may be refused."""
+    """Read every frame of a source; single frames may be unreadable."""
     from vslam.errors import InputError, UnreadableImageError
 
     try:
@@ -74,7 +81,7 @@ def _use(source) -> None:
 
 
 def _each(read: Callable[[str], object], names: Iterable[str]) -> None:
-    """Read all files; if one is refused, raise its error after the last."""
+    """Read all files, then raise the error of one that was refused."""
     from vslam.errors import InputError
 
     refused = None
@@ -129,14 +136,13 @@ def _read_map(folder: Path) -> None:
 
 
 def _use_map(folder: Path) -> None:
-    """Use a map in every way: export it, resume its drive, start a new drive in it, localise in it,
-    and merge it with another map."""
+    """Use a map in every way: export it, resume its drive, continue it with a new drive, localise
+    in it, and merge it with another map."""
     with tempfile.TemporaryDirectory(dir=folder) as out:
         _use_map_in(folder / "map.npz", folder / "other.npz", Path(out))
 
 
 def _use_map_in(file: Path, other: Path, out: Path) -> None:
-
     from vslam.cli.export import g2o
     from vslam.cli.map import info
     from vslam.config import Config
@@ -169,11 +175,7 @@ def _use_map_in(file: Path, other: Path, out: Path) -> None:
             load_map(out / "again.npz")
     config = Config()
     try:
-        merge_maps(
-            [load_map(other), stored],
-            config,
-            lambda: detector_with_images("bow", config),
-        )
+        merge_maps([load_map(other), stored], config, lambda: detector_with_images("bow", config))
     except ValueError as error:  # as ``vslam map merge`` does
         raise InputError(str(error)) from error
 
@@ -234,15 +236,15 @@ def _bag(kind: str, encoding: str, data: str, changed: str, compression: str = "
 
 _INTEGERS = [-(2**62), -(2**31), -2, -1, 0, 1, 2, 7, 255, 2**31 - 1, 2**40, 2**62]
 _FLOATS = [np.nan, np.inf, -np.inf, 0.0, -0.0, -1.0, 0.5, 5e-324, 1e-30, 1e6, 1e30, 1e200, -1e200]
-_OF_HEADER = [
+_HEADER_VALUES = [
     np.nan, np.inf, -np.inf, -1, 0, 0.5, 1, 2, 2**31, 2**63, 10**30, 1e-300, 1e300, True, None,
     "x", [], {}, [[]],
 ]  # fmt: skip
 
 
 def _mutate_meaning(data: bytes, rng: np.random.Generator, name: str) -> bytes:
-    """One to three changes of values in arrays or in the header that keep the type and shape of
-    every array."""
+    """Change one or two values in arrays or in the header; the types and shapes of the arrays
+    stay."""
     with np.load(io.BytesIO(data)) as file:
         arrays = {name: file[name].copy() for name in file.files}
     for _ in range(int(rng.integers(1, 3))):
@@ -259,7 +261,7 @@ def _mutate_meaning(data: bytes, rng: np.random.Generator, name: str) -> bytes:
 
 
 def _change(flat: np.ndarray, rng: np.random.Generator, length: int) -> None:
-    """Change one number, some, or all, in place."""
+    """Change one, some or all numbers in place."""
     share = rng.choice([0.0, 0.1, 1.0], p=[0.6, 0.2, 0.2])
     at = np.flatnonzero(rng.random(len(flat)) < share)
     if not len(at):
@@ -290,7 +292,7 @@ def _other_number(value: object, rng: np.random.Generator) -> object:
         key = keys[int(rng.integers(len(keys)))]
         value[key] = _other_number(value[key], rng)
         return value
-    return _OF_HEADER[int(rng.integers(len(_OF_HEADER)))]
+    return _HEADER_VALUES[int(rng.integers(len(_HEADER_VALUES)))]
 
 
 READERS: dict[str, Reader] = {
@@ -327,7 +329,7 @@ READERS: dict[str, Reader] = {
 
 
 def mutate(data: bytes, rng: np.random.Generator, name: str) -> bytes:
-    """Apply one to four changes to a file; sometimes one that is specific to its format."""
+    """Apply one to four changes to a file, or sometimes one that is specific to its format."""
     if name.endswith(".npz") and rng.random() < 0.6:
         return _mutate_npz(data, rng)
     if data[:8] == b"\x89PNG\r\n\x1a\n" and rng.random() < 0.3:
@@ -341,12 +343,12 @@ def mutate(data: bytes, rng: np.random.Generator, name: str) -> bytes:
 
 
 def _place(data: bytes, rng: np.random.Generator) -> int:
-    """Half of all changes fall into the first 256 bytes, where headers are."""
+    """A random position; half of them are in the first 256 bytes, where headers are."""
     return int(rng.integers(min(len(data), 256) if rng.random() < 0.5 else len(data)))
 
 
 def _bytes(data: bytes, rng: np.random.Generator) -> bytes:
-    """Flip a bit, or replace, cut off, remove, repeat or insert bytes."""
+    """Flip a bit, or replace, truncate, remove, repeat or insert bytes."""
     way, at, size = rng.integers(8), _place(data, rng), int(rng.integers(1, 64))
     if way < 2:
         return data[:at] + bytes([data[at] ^ 1 << int(rng.integers(8))]) + data[at + 1 :]
@@ -365,7 +367,7 @@ def _bytes(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _number(data: bytes, rng: np.random.Generator) -> bytes:
-    """Replace a number by another one."""
+    """Replace a number in a text by another one."""
     found = list(re.finditer(rb"-?\d+(\.\d+)?(e[-+]?\d+)?", data))
     if not found:
         return data
@@ -384,9 +386,9 @@ def _lines(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _nest(data: bytes, rng: np.random.Generator) -> bytes:
-    """Insert deeply nested brackets, or YAML aliases that grow at every level."""
+    """Insert deeply nested brackets, or YAML aliases that grow exponentially."""
     way = int(rng.integers(6))
-    if way == 5:  # a number becomes a growing list
+    if way == 5:  # a list becomes a growing one
         return _GROWING + b"\n" + re.sub(rb"\[[^]]*\]", b"*a8", data, count=1)
     bombs = (
         b"[" * 20_000,
@@ -423,7 +425,7 @@ def _mutate_npz(data: bytes, rng: np.random.Generator) -> bytes:
     elif way == 4 and array.size and array.dtype.kind in "biuf":
         arrays[name] = array.copy()
         _change(arrays[name].reshape(-1), rng, len(array.reshape(-1)))
-    np.savez(out, **arrays)  # otherwise without the array
+    np.savez(out, **arrays)  # in the other cases without the array
     if way == 5:
         header = {"descr": "<f8", "fortran_order": False, "shape": (12_500_000_000,)}
         np.lib.format.write_array_header_1_0(claim, header)
@@ -433,7 +435,7 @@ def _mutate_npz(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _mutate_png(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change the size, depth or colour type in a header, with a correct checksum."""
+    """Change the size, depth or colour type in the header and correct the checksum."""
     sizes = [0, 1, 47, 64, 65, 11_000, 100_000, 2**31 - 1]
     width, height = (int(rng.choice(sizes)) for _ in range(2))
     depth, kind = int(rng.choice([1, 8, 16])), int(rng.choice([0, 2, 3, 6]))
@@ -441,7 +443,7 @@ def _mutate_png(data: bytes, rng: np.random.Generator) -> bytes:
     return data[:12] + body + struct.pack(">I", zlib.crc32(body)) + data[33:]
 
 
-# -- in the process of the readers ----------------------------------------------------------------
+# -- in the child process that runs the readers ---------------------------------------------------
 
 
 def _peak_mb() -> float:
@@ -450,25 +452,25 @@ def _peak_mb() -> float:
     return int(found[1]) / 1024 if found else 0.0
 
 
-def _forget_peak() -> None:
+def _reset_peak() -> None:
     clear = Path("/proc/self/clear_refs")
     if clear.exists():
         clear.write_text("5")
 
 
 def _work(name: str, first: int, inputs: int, seed: int, scratch: Path) -> None:
-    """Try inputs; print a JSON line with the number of each before it, and its outcome after it."""
+    """Try inputs; print a JSON line with the number of each before it and its outcome after it."""
     from vslam.errors import InputError
 
     logging.disable(logging.CRITICAL)
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
-    faulthandler.register(signal.SIGPROF, chain=True)  # says where, then ends the process
+    faulthandler.register(signal.SIGPROF, chain=True)  # prints a traceback, then ends the process
     reader = READERS[name]
     valid = scratch / "valid"
     valid.mkdir(parents=True, exist_ok=True)
     if not any(valid.iterdir()):
         reader.write(valid)
-    reader.read(valid)  # must succeed; also imports and compiles everything needed
+    reader.read(valid)  # must succeed; also imports and compiles everything that is needed
     files = sorted(p for p in valid.glob(reader.changed) if p.is_file())
     for number in range(first, inputs):
         print(json.dumps({"begin": number}), flush=True)
@@ -480,27 +482,26 @@ def _work(name: str, first: int, inputs: int, seed: int, scratch: Path) -> None:
         shutil.copytree(valid, folder)
         (folder / file.relative_to(valid)).write_bytes(data)
         gc.collect()
-        _forget_peak()
+        _reset_peak()
         before, start = _peak_mb(), time.process_time()
         signal.setitimer(signal.ITIMER_PROF, SECONDS)
         faulthandler.dump_traceback_later(WALL_SECONDS, exit=True)
-        said = None
+        message = None
         try:
             reader.read(folder)
             outcome = "read"
         except InputError as error:
-            outcome, said = "refused", str(error)
-            if "\n" in said:
-                outcome, said = "more than a line", said
+            message = str(error)
+            outcome = "more than a line" if "\n" in message else "refused"
         except BaseException as error:
-            outcome, said = type(error).__name__, traceback.format_exc()
+            outcome, message = type(error).__name__, traceback.format_exc()
         signal.setitimer(signal.ITIMER_PROF, 0)
         faulthandler.cancel_dump_traceback_later()
         seconds, grown = time.process_time() - start, _peak_mb() - before
         if outcome in ("read", "refused") and grown > MEGABYTES:
-            outcome, said = "memory", f"{grown:.0f} MB"
+            outcome, message = "memory", f"{grown:.0f} MB"
         line = {"reader": name, "number": number, "file": file.name, "outcome": outcome}
-        line |= {"said": said, "seconds": seconds, "mb": grown}
+        line |= {"message": message, "seconds": seconds, "mb": grown}
         print(json.dumps(line), flush=True)
 
 
@@ -508,7 +509,7 @@ def _work(name: str, first: int, inputs: int, seed: int, scratch: Path) -> None:
 
 
 def fuzz(name: str, inputs: int, seed: int, keep: Path | None = None) -> dict[str, object]:
-    """Fuzz a reader; returns the numbers of inputs read and refused, and all failures."""
+    """Fuzz a reader and return the numbers of inputs read and refused, and all failures."""
     tried, read, refused, slowest, most = 0, 0, 0, 0.0, 0.0
     failures: list[dict[str, object]] = []
     with tempfile.TemporaryDirectory(prefix="vslam-fuzz-") as scratch:
@@ -531,7 +532,7 @@ def fuzz(name: str, inputs: int, seed: int, keep: Path | None = None) -> dict[st
                 number = begun[-1] if begun else first
                 slow = "Timeout" in done.stderr or done.returncode == -signal.SIGPROF
                 why = "hang" if slow else f"exit code {done.returncode}"
-                failures.append({"number": number, "outcome": why, "said": done.stderr[-3000:]})
+                failures.append({"number": number, "outcome": why, "message": done.stderr[-3000:]})
                 if not begun:
                     break
                 if keep is not None:
@@ -557,17 +558,17 @@ def main() -> None:
             _work(name, int(first), int(inputs), int(seed), Path(scratch) / name)
         return
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--inputs", type=int, default=1000, help="of each reader")
+    parser.add_argument("--inputs", type=int, default=1000, help="number per reader")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--readers", default=",".join(READERS))
     parser.add_argument("--keep", type=Path, help="folder for inputs that crash or hang")
-    given = parser.parse_args()
+    options = parser.parse_args()
     total, failed = 0, 0
     print("| reader | inputs | read | refused | failures | slowest | most memory |")
     print("|---|---|---|---|---|---|---|")
     problems = []
-    for name in given.readers.split(","):
-        found = fuzz(name, given.inputs, given.seed, given.keep)
+    for name in options.readers.split(","):
+        found = fuzz(name, options.inputs, options.seed, options.keep)
         failures = found["failures"]
         assert isinstance(failures, list)
         total, failed = total + int(str(found["tried"])), failed + len(failures)
@@ -579,7 +580,7 @@ def main() -> None:
         )
     print(f"\n{total} inputs, {failed} failures")
     for name, one in problems:
-        print(f"\n{name} {one['number']}: {one['outcome']}\n{one['said']}")
+        print(f"\n{name} {one['number']}: {one['outcome']}\n{one['message']}")
     sys.exit(1 if failed else 0)
 
 

@@ -12,7 +12,7 @@ TABLE = Path(__file__).parents[1] / "docs" / "howto" / "laws.csv"
 
 
 def table() -> str:
-    """A row for each law; ``vslam stress`` searches between the weakest and strongest value."""
+    """A row for each law; ``vslam stress`` searches from the weakest to the strongest value."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(

@@ -1,4 +1,4 @@
-"""Write the tables and curves of docs/research/loops from ``loops.json`` of ``vslam loops bench``.
+"""Write the tables and curves of docs/research/loops from the results of ``vslam loops bench``.
 
 python tools/loop_tables.py loops-bench/loops.json FOLDER
 """
@@ -35,7 +35,7 @@ def main() -> None:
 
 
 def tables(report: LoopsJson) -> dict[str, list[Row]]:
-    """The rows of every table by its name; none where the report has no such figures."""
+    """The rows of every table, by its name; none if the report has no such results."""
     cells = report.cells
     ordered = [cell for cell in cells if cell.sequence_right is not None]
     return {
@@ -57,7 +57,7 @@ def _share(value: float | None) -> str:
 
 
 def _wide(cells: Iterable[Score], columns: Callable[[Score], Row]) -> list[Row]:
-    """A row for each set of images and condition, with columns for each detector."""
+    """A row for each set of images and condition; each detector has its own columns."""
     rows: dict[tuple[str, str], Row] = {}
     for cell in cells:
         row = rows.setdefault(

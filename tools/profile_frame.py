@@ -3,9 +3,9 @@
     python tools/profile_frame.py DATA SEQ FRAMES [--detector bow] [--report]
 
 DATA is a folder in KITTI's format. One thread does all the work, so that its CPU clock measures
-every stage; the time of a stage called by another one counts only for the inner one. The total is
-that of the process, from the start of Python to the last file written. Run it twice, so that
-kernels come from Numba's cache; a kernel is loaded in the first stage that calls it.
+every stage. If a stage calls another one, the time counts only for the inner stage. The total is
+that of the process, from the start of Python to the last file written. Run it twice, so that the
+kernels come from Numba's cache; loading a kernel counts for the first stage that calls it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-# Stages and the functions that belong to them: module, and name or Class.name in it.
+# Stages and their functions: the module, and the name or Class.name in it.
 STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
     ("start: vocabulary", (("vslam.run.pipeline", "detector_with_images"),)),
     ("read images", (("vslam.datasets.image_files", "read_grey"),)),
@@ -58,7 +58,7 @@ STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
 
 
 class StageClock:
-    """CPU seconds of this thread by stage; the time of an inner stage is not in the outer one."""
+    """CPU seconds of this thread by stage, without the time of inner stages."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
@@ -104,7 +104,7 @@ def main() -> None:
     parser.add_argument("seq")
     parser.add_argument("frames", type=int)
     parser.add_argument("--detector", default="bow")
-    parser.add_argument("--report", action="store_true", help="write pages and figures, too")
+    parser.add_argument("--report", action="store_true", help="also write pages and figures")
     options = parser.parse_args()
 
     clock = StageClock()

@@ -1,4 +1,4 @@
-"""Write a table with a row for each run from the ``report.json`` of ``vslam bench``.
+"""Write a CSV table with a row for each run from the ``report.json`` of ``vslam bench``.
 
 python tools/run_table.py bench/report.json [MORE ...] --out runs.csv
 """
@@ -26,7 +26,7 @@ def main() -> None:
 
 
 def row_of(run: RunEntry) -> dict[str, object]:
-    """Drive, system, seeds of the perturbation and of the town, and measures of a run."""
+    """Drive, system, seeds (of the perturbation and of the town) and measures of a run."""
     measures = {
         name: "" if run.measures[name] is None else f"{run.measures[name]:.{decimals}f}"
         for name, decimals in DECIMALS.items()

@@ -1,16 +1,22 @@
 """Compare the numbers of pages with the CSV files that they come from.
 
-A table in Markdown names its source in a comment before it. A line of the comment describes one row
-of the table, and the last line all further rows::
+A table in Markdown names its source in a comment before it. Each line of the comment describes one
+row of the table, and the last line also all further rows::
 
     <!-- from: docs/x.csv | drive=$1, light=clean | | ate_m (system=ours) | found; missed -->
 
-It holds the CSV file, the filter that selects its row (``$1``: the text of the first cell of the
-table's row, or what its backticks enclose), then the columns that the numbers of each cell must
-equal, as they are rounded there; the last place is for all further columns. ``$0`` is the head of
-the column. A filter in parentheses belongs to the columns before it in the
-cell. An empty place is not compared; ``mean x`` and ``sum x`` are over all selected rows; a line
-``-`` skips a row. Before a paragraph, the comment names columns whose values it must mention.
+The fields of a line, separated by ``|``, are:
+
+- the CSV file;
+- a filter that selects a row of the file. ``$1`` stands for the text of the first cell of the
+  table's row, or for the part of it in backticks; ``$0`` stands for the head of the column;
+- for each cell of the table's row, the columns of the file whose values it must show, rounded as in
+  the cell. The last field also applies to all further cells; an empty one is not compared. A filter
+  in parentheses applies to the columns before it. ``mean x`` and ``sum x`` are over all selected
+  rows.
+
+The line ``-`` skips a row. Before a paragraph, the comment names columns whose values the paragraph
+must mention.
 """
 
 from __future__ import annotations
@@ -39,7 +45,7 @@ def files_of(comment: str) -> set[str]:
 
 
 def untraced(text: str) -> tuple[int, int]:
-    """The number of tables with decimal numbers but no source, and of all tables."""
+    """The number of tables with decimal numbers but no source, and the number of all tables."""
     tables = TABLE.findall(text)
     return sum(not comment and bool(DECIMAL.search(body)) for comment, body in tables), len(tables)
 
@@ -77,7 +83,7 @@ def _row_faults(line: str, head: list[str], row: list[str], root: Path) -> Itera
         for value in values:
             if isinstance(value, str):
                 if value not in left:
-                    yield f"{row[0]}: {cell!r} lacks {value!r} of {file} ({column})"
+                    yield f"{row[0]}: {cell!r} does not show {value!r} of {file} ({column})"
                 left = left.replace(value, "", 1)
             else:
                 numbers.append(value)
@@ -106,16 +112,16 @@ def _is_rounded(shown: str, value: float) -> bool:
 
 
 def _values(path: Path, filters: str, column: str, row: list[str]) -> list[float | str]:
-    """The values that a cell must show: numbers, or texts where the CSV file has texts. ``row``
-    holds the head of its column, then all cells of its row."""
+    """The numbers and texts of the CSV file that a cell must show. ``row`` contains the head of the
+    cell's column, then all cells of its row."""
     with path.open(newline="", encoding="utf-8") as file:
         table = list(csv.DictReader(file))
     found: list[float | str] = []
-    own = ""
+    in_parentheses = ""
     for field in reversed(column.split(";")):
         name, _, more = field.strip().removesuffix(")").partition(" (")
-        own = more or own
-        wanted = _wanted(f"{filters}, {own}", row)
+        in_parentheses = more or in_parentheses
+        wanted = _wanted(f"{filters}, {in_parentheses}", row)
         rows = [one for one in table if wanted.items() <= one.items()]
         over, _, summed = name.partition(" ")
         if over in OVER_ROWS and rows:
@@ -128,7 +134,7 @@ def _values(path: Path, filters: str, column: str, row: list[str]) -> list[float
 
 
 def _wanted(filters: str, row: list[str]) -> dict[str, str]:
-    """Values by column, in which ``$1`` is replaced by the text of ``row[1]``."""
+    """The filter as values by column, with ``$1`` replaced by the text of ``row[1]``."""
 
     def text(found: re.Match[str]) -> str:
         cell = row[int(found[1])]

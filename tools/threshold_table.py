@@ -1,7 +1,7 @@
 """Write docs/reference/thresholds.md: every threshold of vslam/config.py with its unit and source.
 
 The docstring below a field ends with its source in brackets: paper, section and status of the
-value, as in "[OS1 V-D, customary]", or "[own]" where the rule has no paper either.
+value, as in "[OS1 V-D, customary]", or "[own]" if neither rule nor value comes from a paper.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ The other numbers of the method are constants in the code: mathematics, numerica
 
 
 class Row(NamedTuple):
-    """One threshold: dotted name, default in JSON, meaning with unit, source."""
+    """One threshold: dotted name, default, meaning with unit, source."""
 
     name: str
     default: str
@@ -43,7 +43,7 @@ class Row(NamedTuple):
 
 
 def descriptions(model: type[BaseModel]) -> dict[str, str]:
-    """The docstring below each field of a class, on one line; "" if there is none."""
+    """The docstring below each field of a class, as one line; "" if there is none."""
     (definition,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
     assert isinstance(definition, ast.ClassDef)
     found = {}
@@ -74,7 +74,7 @@ def rows(config: Config, section: str) -> list[Row]:
 
 
 def page(config: Config) -> str:
-    """The page for a configuration: one table for each section, its docstring above."""
+    """The page for a configuration: for each section its docstring and a table."""
     lines = [HEAD]
     for section in type(config).model_fields:
         title, _, rest = (type(getattr(config, section)).__doc__ or "").partition("\n\n")

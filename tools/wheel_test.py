@@ -1,8 +1,8 @@
 """Build the wheel, install it into a clean environment and run it from another folder.
 
-This finds errors that the tests cannot see: files missing in the wheel, dependencies that only the
+This finds errors that the tests cannot: files missing in the wheel, dependencies that only the
 development environment has, and imports that work only in the checkout. It runs the first frames of
-a rendered drive, whose true trajectory is exact.
+a rendered drive, whose ground truth is exact.
 
 Each additional Python gets its own environment. With ``--runners``, the wheel is also started by
 pipx and uvx, if installed.
@@ -42,7 +42,7 @@ def run(*command: str | Path, cwd: Path, **environment: str) -> str:
 
 
 def check_run(folder: Path) -> None:
-    """Check that all files exist and that the figures are right."""
+    """Check that all files exist, that no frame is lost, and that the ATE is small."""
     wanted = (
         "report.json report.md report.html config.json map.npz recording.rrd "
         "trajectory_kitti.txt trajectory.tum keyframes.tum"
@@ -57,18 +57,18 @@ def check_run(folder: Path) -> None:
 
 
 def try_environment(python: str, wheel: Path, scratch: Path) -> None:
-    """Install the wheel for a Python, and run it where nothing else of the checkout is."""
+    """Install the wheel for a Python and run it outside the checkout."""
     run(python, "-m", "venv", scratch / "env", cwd=scratch)
     binaries = scratch / "env" / "bin"
     pip = binaries / "pip"
     constraints = ("-c", ROOT / "constraints.txt")
     run(pip, "install", "--quiet", wheel, *constraints, cwd=scratch)
     if "torch" in run(pip, "list", cwd=scratch):
-        sys.exit("wheel test: failed; a plain installation brings torch, which only training needs")
+        sys.exit("wheel test: failed; a plain installation has torch, which only training needs")
 
     vslam = binaries / "vslam"
     if "run" not in run(vslam, "--help", cwd=scratch):
-        sys.exit("wheel test: failed; vslam --help does not name its commands")
+        sys.exit("wheel test: failed; vslam --help does not list its commands")
     print(run(vslam, "info", cwd=scratch))
     if "100000" not in run(vslam, "vocabulary", "info", cwd=scratch):
         sys.exit("wheel test: failed; the vocabulary of 100000 words is not in the wheel")
@@ -80,7 +80,7 @@ def try_environment(python: str, wheel: Path, scratch: Path) -> None:
 
 
 def try_runners(wheel: Path, scratch: Path) -> None:
-    """``pipx run`` and ``uvx``, with folders of their own; both install the wheel by themselves."""
+    """Start vslam by ``pipx run`` and ``uvx``, which install the wheel into their own folders."""
     constraints = str(ROOT / "constraints.txt")
     commands = {
         "uvx": ["--no-python-downloads", "--from", wheel, "vslam", "--version"],
@@ -92,32 +92,32 @@ def try_runners(wheel: Path, scratch: Path) -> None:
         if command is None:
             print(f"wheel test: {name} is not installed: not tried")
             continue
-        said = run(
+        version = run(
             command, *words, cwd=scratch, PIP_CONSTRAINT=constraints, UV_CONSTRAINT=constraints,
             PIPX_HOME=str(scratch / "pipx"), UV_CACHE_DIR=str(scratch / "uv"),
             PIPX_DEFAULT_PYTHON=sys.executable, UV_PYTHON=sys.executable,
         )  # fmt: skip
-        print(f"wheel test: {name} starts vslam {said.strip()}")
+        print(f"wheel test: {name} starts vslam {version.strip()}")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--python", nargs="+", default=[sys.executable], help="each is tried")
-    parser.add_argument("--runners", action="store_true", help="try pipx and uvx, too")
-    given = parser.parse_args()
+    parser.add_argument("--python", nargs="+", default=[sys.executable], help="interpreters to try")
+    parser.add_argument("--runners", action="store_true", help="also try pipx and uvx")
+    options = parser.parse_args()
     os.environ.pop("PYTHONPATH", None)
-    shutil.rmtree(ROOT / "build" / "lib", ignore_errors=True)  # old builds' files would be packed
+    shutil.rmtree(ROOT / "build" / "lib", ignore_errors=True)  # would be packed into the wheel
     with tempfile.TemporaryDirectory(prefix="vslam-wheel-") as name:
         scratch = Path(name)
         pip = (sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check")
         run(*pip, "wheel", "--no-deps", "--wheel-dir", scratch, ROOT, cwd=scratch)
         (wheel,) = scratch.glob("vslam-*.whl")
-        for number, python in enumerate(given.python):
+        for number, python in enumerate(options.python):
             (scratch / str(number)).mkdir()
             print(f"wheel test: {run(python, '--version', cwd=scratch).strip()}", flush=True)
             try_environment(python, wheel, scratch / str(number))
-            shutil.rmtree(scratch / str(number))  # a gigabyte each
-        if given.runners:
+            shutil.rmtree(scratch / str(number))  # each takes a gigabyte
+        if options.runners:
             try_runners(wheel, scratch)
     print("wheel test: ok")
 

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 from vslam.untrusted import limit_images
 
 __version__ = "0.1.0"
-# Raise it with every change of what the method computes; tests/test_method_version.py notices one.
+# Increment it whenever the results of the method change; tests/test_method_version.py detects that.
 METHOD_VERSION = 1
 __all__ = ["METHOD_VERSION", "Camera", "Slam", "TrackResult", "TrackingState", "__version__"]
 
-_HOME = {
+_MODULES = {
     "Slam": "vslam.slam",
     "Camera": "vslam.camera",
     "TrackResult": "vslam.features",
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    """Import the public names on first use, so that ``vslam --help`` stays instant."""
-    if name in _HOME:
-        return getattr(import_module(_HOME[name]), name)
+    """Import public names on first use, so that ``vslam --help`` starts quickly."""
+    if name in _MODULES:
+        return getattr(import_module(_MODULES[name]), name)
     raise AttributeError(f"module 'vslam' has no attribute {name!r}")

@@ -17,32 +17,36 @@ Image = NDArray[np.uint8]  # (H, W) grey
 DepthImage = NDArray[np.float32]  # (H, W) metres along z, 0 where unknown
 Sensor = Literal["stereo", "mono", "rgbd"]
 
-# The disparity of an observation is more accurate than its column and row; its reprojection error
-# has this weight (docs/research/motorway.md).
+# Disparities are more accurate than columns and rows, so that the errors of disparities have this
+# weight in the reprojection error (docs/research/motorway.md).
 DISPARITY_WEIGHT = 3.0
 
-_OFF_CENTRE = 0.2  # of the image size; a calibration of half the size gives 0.25, of twice it 0.5
-_SAME_RATIO = 1.25  # between the two axes, of the image sizes that the principal point suggests
+# Largest plausible distance of the principal point from the middle, as a share of the image size.
+# A calibration for images of half the size gives 0.25, one for twice the size 0.5.
+_OFF_CENTRE = 0.2
+# A principal point at a share x of the width and y of the height suggests a calibration for another
+# image size only if x / y is below this and above its inverse.
+_SAME_RATIO = 1.25
 _FACTORS = {0.5: "half", 2.0: "twice"}
-_NARROWEST, _WIDEST = 10.0, 150.0  # degrees; fields of view of the cameras that vehicles carry
+_NARROWEST, _WIDEST = 10.0, 150.0  # degrees; plausible fields of view of a camera on a vehicle
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A rectified stereo pair, whose cameras share one focal length and corresponding rows; or an
-    RGB-D camera; or a single camera.
+    """A rectified stereo pair, whose images have the same focal lengths and corresponding rows, an
+    RGB-D camera, or a single camera.
 
     Attributes:
         fx, fy: focal lengths in pixels.
         cx, cy: principal point of the left camera in pixels.
         baseline: distance from the left to the right camera in metres. It is 0 for a single camera,
-            whose map has a unit of its own instead of metres (``backend/two_views.py``). For an
+            whose map has an arbitrary unit instead of metres (``backend/two_views.py``). For an
             RGB-D camera it is virtual and sets the uncertainty of depth (``frontend/depth.py``).
         width, height: image size in pixels.
         depth: whether the second image is the depth of the left image's pixels instead of a right
             image.
-        right_delay: seconds by which the right image of a pair is taken later than the left one,
-            negative if it is taken earlier; 0 for cameras that share a trigger.
+        right_delay: seconds from the exposure of the left image of a pair to that of the right one,
+            negative if the right one comes first; 0 for cameras that share a trigger.
 
     Raises:
         ValueError: a size or focal length is not positive, the baseline is negative, or the
@@ -60,7 +64,7 @@ class Camera:
     right_delay: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse impossible numbers.
+        """Reject impossible numbers.
 
         Raises:
             ValueError: a number is impossible; the message says which one.
@@ -100,7 +104,7 @@ class Camera:
 
     @property
     def T_right_left(self) -> NDArray[np.float64]:
-        """``(4, 4)`` pose of the left camera in the right one."""
+        """``(4, 4)`` pose of the left camera in the frame of the right one."""
         T = np.eye(4)
         T[0, 3] = -self.baseline
         return T
@@ -132,8 +136,9 @@ class Camera:
 
 
 def calibration_doubts(camera: Camera) -> list[str]:
-    """What makes a calibration implausible, in sentences without a full stop; empty if nothing
-    does. Such a camera can exist, but more often the numbers belong to other images."""
+    """Reasons why a calibration is implausible, one sentence each without a full stop; empty if
+    there are none. Such a camera can exist, but more often the calibration belongs to other
+    images."""
     sizes, centre = (camera.width, camera.height), (camera.cx, camera.cy)
     shares = [c / size for c, size in zip(centre, sizes, strict=True)]
     doubts = []
@@ -153,7 +158,7 @@ def calibration_doubts(camera: Camera) -> list[str]:
 
 
 def _cause(across: float, down: float) -> str:
-    """Why a principal point lies at these shares of the image's width and height."""
+    """The probable cause of a principal point at these shares of the image's width and height."""
     if min(across, down) <= 0.0 or not 1 / _SAME_RATIO < across / down < _SAME_RATIO:
         return "check the order of its numbers, and whether the images were cropped or turned"
     ratio = across + down  # 1 for a principal point in the middle
@@ -163,7 +168,7 @@ def _cause(across: float, down: float) -> str:
 
 
 def field_of_view(camera: Camera) -> tuple[float, float]:
-    """Degrees that the image spans across and down."""
+    """Horizontal and vertical field of view in degrees."""
     across, down = (
         2 * math.degrees(math.atan(size / (2 * focal)))
         for size, focal in ((camera.width, camera.fx), (camera.height, camera.fy))
@@ -192,7 +197,7 @@ class ImageMap(Protocol):
 
 
 def check_images(left: Image, second: Image | DepthImage | None, camera: Camera) -> None:
-    """Refuse images that do not fit a camera (``Slam.step``).
+    """Check that images match a camera (``Slam.step``).
 
     Raises:
         ValueError: the sizes, types or number of the images are wrong; the message says which.
@@ -208,13 +213,13 @@ def check_images(left: Image, second: Image | DepthImage | None, camera: Camera)
     images = [left] if second is None else [left, second]
     if any(image.shape[:2] == expected and image.ndim == 3 for image in images):
         raise ValueError(
-            f"an image is in colour, {' and '.join(str(image.shape) for image in images)}, where "
-            f"grey is wanted, {expected}; convert it with "
+            f"an image is in colour (shape {' and '.join(str(image.shape) for image in images)}), "
+            f"but grey images of shape {expected} are expected; convert it with "
             "cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)"
         )
     if any(image.shape != expected for image in images):
         shapes = " and ".join(str(image.shape) for image in images)
-        raise ValueError(f"images are {shapes}, the camera's {expected}")
+        raise ValueError(f"the images have shape {shapes}, but the camera's images have {expected}")
     wanted = [np.uint8, np.float32 if camera.depth else np.uint8]
     if any(image.dtype != dtype for image, dtype in zip(images, wanted, strict=False)):
         types = " and ".join(str(image.dtype) for image in images)
@@ -225,16 +230,18 @@ def check_images(left: Image, second: Image | DepthImage | None, camera: Camera)
             else "convert grey values of 0 to 255 with image.astype(np.uint8), or those of 0 to 1 "
             "with (255 * image).astype(np.uint8)"
         )
-        raise ValueError(f"images are of {types}, not of {expected_types}; {how}")
+        raise ValueError(f"the images have type {types} instead of {expected_types}; {how}")
 
 
 def check_mask(mask: NDArray[np.uint8] | NDArray[np.bool_], camera: Camera) -> None:
-    """Refuse a mask that does not fit a camera (``Slam.step``).
+    """Check that a mask matches a camera (``Slam.step``).
 
     Raises:
         ValueError: its size or type is wrong; the message says which.
     """
     if mask.shape != (expected := (camera.height, camera.width)):
-        raise ValueError(f"the mask is {mask.shape}, the camera's images are {expected}")
+        raise ValueError(
+            f"the mask has shape {mask.shape}, but the camera's images have {expected}"
+        )
     if mask.dtype not in (np.uint8, np.bool_):
-        raise ValueError(f"the mask is of {mask.dtype}, not of uint8 or bool; use mask > 0")
+        raise ValueError(f"the mask has type {mask.dtype} instead of uint8 or bool; use mask > 0")

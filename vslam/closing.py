@@ -1,9 +1,9 @@
-"""Loop closing: from a keyframe that looks familiar to a corrected map (ORB-SLAM, section VII).
+"""Loop closing: from the loop candidates of a keyframe to a corrected map (ORB-SLAM, section VII).
 
-The caller of these methods, usually the mapping job of a keyframe, must be the map's only writer
-meanwhile. Only the global bundle adjustment after a loop runs in parallel, on a snapshot.
-Its result is merged after a number of keyframes that depends only on the size of the problem, so
-that the same input always gives the same map.
+While a method runs, no other thread may write the map; usually the mapping job of a keyframe calls
+it. Only the global bundle adjustment after a loop runs in parallel, on a snapshot. Its result is
+merged after a number of keyframes that depends only on the size of the problem, so that the same
+input always gives the same map.
 """
 
 from __future__ import annotations
@@ -49,8 +49,9 @@ class LoopClosing:
         verifier: decides which candidates are loops.
         edges: the outcome of every candidate, in order.
         corrections: the loops that were closed.
-        closed: all closed edges, those of a loaded map first, in the current units of the map.
-        problems: what failed without harm to the map, a sentence each.
+        closed: the edges of all closed loops, in the current units of the map; those of a loaded
+            map come first.
+        problems: one sentence for each failure that did not harm the map.
     """
 
     def __init__(
@@ -74,7 +75,7 @@ class LoopClosing:
         self._consistency = LoopConsistency(config.consistency.model_copy(update=memory))
         self._executor = ThreadPoolExecutor(1, "global-adjustment") if threads > 1 else None
         self._global: _PendingAdjustment | None = None
-        self._followed = 0  # how often an old keyframe was reused instead of a new one
+        self._followed = 0  # how often an old keyframe was reused instead of inserting a new one
 
     def process(
         self, map_: Map, keyframe: int, features: Features, image: NDArray[np.uint8] | None
@@ -83,9 +84,9 @@ class LoopClosing:
         if self._is_due(keyframe):
             self.finish(map_)
         found = None
-        with self._sparing_the_map("Looking for loops"):
+        with self._failure_reported("Looking for loops"):
             if self.verifier.is_image_redundant(map_, keyframe):
-                image = None  # no network needs to see it
+                image = None  # then no network processes it
             self.detector.add(keyframe, image, features)
             self.verifier.add(map_, keyframe, image)
             found = self._find(map_, keyframe, self.detector.query(keyframe, map_))
@@ -93,21 +94,21 @@ class LoopClosing:
             self._close(map_, found)
 
     def consider(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> None:
-        """Verify the candidates of a keyframe, best first, and close the first real loop."""
+        """Verify the candidates of a keyframe, best first, and close the first true loop."""
         found = self._find(map_, keyframe, candidates)
         if found is not None:
             self._close(map_, found)
 
     def _find(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> _Loop | None:
-        """The first real loop among candidates, best first. Only reads the map."""
+        """Verify candidates, best first, and return the first true loop. The map is only read."""
         candidates = self.verifier.rate(map_, keyframe, candidates)
-        _, refused = self._consistency.update(keyframe, candidates, map_)
-        refusals = {edge.match: edge for edge in refused}
-        tried = [one for one in candidates if one.promising or one.match not in refusals]
+        _, rejected = self._consistency.update(keyframe, candidates, map_)
+        rejections = {edge.match: edge for edge in rejected}
+        tried = [one for one in candidates if one.promising or one.match not in rejections]
         matches = {one.match for one in tried}
-        self.edges += [edge for edge in refused if edge.match not in matches]
+        self.edges += [edge for edge in rejected if edge.match not in matches]
         for number, candidate in enumerate(tried):
-            edge = self.verifier.verify(map_, candidate, refusals.get(candidate.match))
+            edge = self.verifier.verify(map_, candidate, rejections.get(candidate.match))
             edge = self._consistency.confirm(edge, map_)
             if not edge.accepted:
                 self.edges.append(edge)
@@ -117,11 +118,11 @@ class LoopClosing:
         return None
 
     def state(self) -> ClosingState:
-        """What ``restore`` needs to continue from here, apart from the detector and the images."""
+        """The state for a checkpoint, without the detector and the images."""
         return ClosingState(self._consistency.state(), self.verifier.state(), self._followed)
 
     def restore(self, state: ClosingState) -> None:
-        """Continue from what ``state`` returned."""
+        """Continue from a state that ``state`` returned."""
         self._consistency.restore(state.consistency)
         self.verifier.restore(state.verifier)
         self._followed = state.followed
@@ -132,8 +133,8 @@ class LoopClosing:
         return self._global is not None
 
     def count_reused_keyframe(self, keyframe: int) -> bool:
-        """Count a keyframe that was not inserted after ``keyframe`` because its place was mapped
-        already; returns whether the global bundle adjustment must be merged now."""
+        """Count a frame that reused an old keyframe instead of becoming one, where ``keyframe`` is
+        the newest keyframe; returns whether the global bundle adjustment must be merged now."""
         self._followed += 1
         return self._is_due(keyframe)
 
@@ -144,7 +145,7 @@ class LoopClosing:
         """At the end of a drive, close a verified loop that no second keyframe has confirmed yet,
         if an earlier keyframe confirms it."""
         gates, found = self._config.verification, None
-        with self._sparing_the_map("Looking for loops"):
+        with self._failure_reported("Looking for loops"):
             for edge in self._consistency.confirmed_by_earlier(map_, self._camera, gates):
                 if (found := self._solve(map_, edge)) is not None:
                     break
@@ -161,14 +162,14 @@ class LoopClosing:
         if pending is None:
             return
         solution = None
-        with self._sparing_the_map("Global bundle adjustment after a loop"):
+        with self._failure_reported("Global bundle adjustment after a loop"):
             solution = pending.solution()
         if solution is not None:
             merge_solution(map_, pending.snapshot, solution)
 
     @contextmanager
-    def _sparing_the_map(self, what: str) -> Iterator[None]:
-        """Report what fails without having changed the map, which is sound without it."""
+    def _failure_reported(self, what: str) -> Iterator[None]:
+        """Report a failure instead of raising it, for steps that fail without changing the map."""
         try:
             yield
         except Exception as error:
@@ -178,8 +179,8 @@ class LoopClosing:
                 _log.warning(problem)
 
     def _solve(self, map_: Map, edge: LoopEdge) -> _Loop | None:
-        """How a verified loop would correct the map; None if it contradicts the rest. What became
-        of the loop is added to ``edges``."""
+        """Solve the pose graph with a verified loop and append the outcome to ``edges``; None if
+        the loop contradicts the rest of the graph."""
         start = time.perf_counter()
         solution = self._solution(map_, edge, Hypothesis.PREDICTED)
         if not solution.verdict.consistent and solution.has_gaps:
@@ -191,14 +192,14 @@ class LoopClosing:
         return _Loop(edge, solution, start)
 
     def _close(self, map_: Map, loop: _Loop) -> None:
-        """Correct the map by a verified loop that agrees with the rest."""
+        """Correct the map by a loop that ``_solve`` accepted."""
         edge, solution = loop.edge, loop.solution
-        if self._global is not None:  # it started before this loop was known
+        if self._global is not None:  # its snapshot does not contain this loop
             self._global.cancel()
             self._global = None
         keyframes = solution.graph.keyframes
         before = map_.arrays.T_cw[keyframes]
-        # Fusion makes the two sides neighbours, so their own neighbours are collected before it.
+        # Fusion makes both sides covisible, so their neighbours are collected before it.
         query_side = [edge.query, *strong_neighbours(map_, edge.query, self._config)]
         match_side = [edge.match, *strong_neighbours(map_, edge.match, self._config)]
         self.closed.append(edge)
@@ -208,8 +209,8 @@ class LoopClosing:
         edge = replace(edge, reason="closed")
         seconds = time.perf_counter() - loop.start
         self.corrections.append(LoopCorrection(edge, keyframes, before, solution.T_cw, seconds))
-        self._consistency.reset()  # its places are those of the map before the correction
-        with self._sparing_the_map("Global bundle adjustment after a loop"):
+        self._consistency.reset()  # it remembers places of the map before the correction
+        with self._failure_reported("Global bundle adjustment after a loop"):
             self._global = self._start_global(map_, edge.query)
 
     def _solution(self, map_: Map, edge: LoopEdge, hypothesis: Hypothesis) -> Solution:
@@ -255,7 +256,8 @@ def _superseded(candidate: LoopCandidate) -> LoopEdge:
 
 @dataclass(frozen=True)
 class _Loop:
-    """A verified loop, how it corrects the map, and when that was asked (``perf_counter``)."""
+    """A verified loop, its correction of the map, and the time (``perf_counter``) at which the
+    computation of that correction started."""
 
     edge: LoopEdge
     solution: Solution

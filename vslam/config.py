@@ -22,9 +22,9 @@ class Section(BaseModel):
     ``tools/threshold_table.py`` reads these docstrings from the source. Pydantic could do so itself
     (``use_attribute_docstrings``), but that would take 0.1 s at the start of every run.
 
-    A docstring ends with the source of the value in brackets: [own], or the paper and section of
-    the rule and the status of the value: printed there, customary in the programs of the ORB-SLAM
-    family, or our own.
+    Each docstring ends with the source of the value in brackets: [own], or the paper and section
+    that the rule comes from and whether the value is printed there, customary in the programs of
+    the ORB-SLAM family, or our own.
 
     OS1: Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2: Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017.
     ZS: Zhou and Sun, Sci Rep 15, 7644 (2025).
@@ -37,13 +37,16 @@ class OrbConfig(Section):
     """ORB extraction."""
 
     n_features: int = Field(2000, ge=100)
-    """Number of features extracted from each image. [OS1 V-A, printed]"""
+    """Number of features to extract from each image. More features make tracking more robust and
+    slower. [OS1 V-A, printed]"""
     n_levels: int = Field(8, ge=2, le=16)
-    """Number of levels of the image pyramid. [OS1 V-A, printed]"""
+    """Number of levels of the image pyramid. With more levels, a landmark can be matched over a
+    larger range of distances. [OS1 V-A, printed]"""
     scale_factor: float = Field(1.2, gt=1.0, le=2.0)
     """Scale factor from one pyramid level to the next. [OS1 V-A, printed]"""
     fast_threshold: int = Field(12, ge=1, le=255)
-    """FAST threshold, in grey levels. [OS1 V-A, customary]"""
+    """FAST threshold, in grey levels. A larger threshold finds fewer, stronger corners.
+    [OS1 V-A, customary]"""
     fast_threshold_min: int = Field(7, ge=1, le=255)
     """FAST threshold in cells where `fast_threshold` finds no corner, in grey levels.
     [OS1 V-A, customary]"""
@@ -59,33 +62,34 @@ class WeakImageConfig(Section):
     """Images are blurred if the standard deviation of their noise is at least this, in grey levels.
     Undisturbed images have at most 2.5. [own]"""
     noise_left: float = Field(4.0, gt=0)
-    """Standard deviation of the noise that this blur is meant to leave, in grey levels. [own]"""
+    """Standard deviation of the noise that should remain after this blur, in grey levels. A smaller
+    value blurs more. [own]"""
     max_blur: float = Field(3.5, gt=0)
     """Upper bound of the standard deviation of the blur, in pixels. [own]"""
     spikes_from: float = Field(0.04, ge=0, le=1)
-    """A median filter is applied if more than this share of the pixels stand out from both
-    neighbours. [own]"""
+    """A median filter is applied if more than this share of the pixels are spikes, that is, much
+    brighter or much darker than both neighbours. [own]"""
     few_features: float = Field(0.5, ge=0, le=1)
     """Contrast is measured only in images that yield fewer features than this share of
     `orb.n_features`. [own]"""
     low_contrast: float = Field(6.0, ge=0)
-    """Contrast is raised if it is below this, in grey levels; 0 never raises it. The contrast of an
-    image is the median, over its blocks of 16 x 16 pixels, of the standard deviation of their grey
-    values. [own]"""
+    """Contrast is raised if it is below this, in grey levels; with 0 it is never raised. The
+    contrast of an image is the median, over its blocks of 16 x 16 pixels, of the standard deviation
+    of the grey values. [own]"""
     least_detail: float = Field(0.25, ge=0)
     """An image is out of focus, and its contrast is not raised, if its mean absolute second
     difference is below this share of its contrast. Sharp images have 0.4 and more. [own]"""
     raised_contrast: float = Field(12.0, gt=0)
-    """Standard deviation that contrast is raised to, in grey levels. KITTI's images have it on a
-    bright day. [own]"""
+    """Contrast is raised until the grey values in each window have this standard deviation, in grey
+    levels. It is the contrast of KITTI's images on a bright day. [own]"""
     contrast_window: int = Field(33, ge=3)
     """Side of the window in which contrast is raised, in pixels. [own]"""
     flat_share: float = Field(0.25, gt=0, le=1)
-    """Bounds the gain in flat parts of the image: their contrast counts as at least this share of
-    the median over the image. [own]"""
+    """The contrast of flat parts of the image counts as at least this share of the median contrast.
+    A larger share amplifies flat parts less. [own]"""
     least_contrast: float = Field(0.15, gt=0)
-    """The contrast of flat parts also counts as at least this, in grey levels, which is what
-    rounding alone causes. [own]"""
+    """The contrast of flat parts also counts as at least this, in grey levels. Rounding alone
+    causes as much. [own]"""
 
 
 class StereoConfig(Section):
@@ -94,14 +98,14 @@ class StereoConfig(Section):
     max_descriptor_distance: int = Field(75, ge=0, le=256)
     """Upper bound of the descriptor distance of a match, in bits. [OS2 III-A, customary]"""
     sad_window: int = Field(5, ge=1)
-    """Half width of the patch that is compared by its sum of absolute differences, in pixels of the
-    keypoint's octave. [OS2 III-A, customary]"""
+    """Half width of the patch that is compared by the sum of absolute differences (SAD), in pixels
+    of the keypoint's octave. [OS2 III-A, customary]"""
     sad_search: int = Field(5, ge=1)
-    """The patch is searched for up to this far to each side, in pixels of the keypoint's octave.
-    [OS2 III-A, customary]"""
+    """The patch is searched for up to this far to the left and to the right, in pixels of the
+    keypoint's octave. [OS2 III-A, customary]"""
     balance_from: float = Field(0.3, ge=0)
-    """The darker image is brightened if the gain between the two images is above this, in stops.
-    [own]"""
+    """The darker image of the pair is brightened before matching if the gain between the two images
+    is above this, in stops. [own]"""
     max_gain_disagreement: float = Field(0.75, gt=0)
     """A difference in brightness counts as a gain only if the gains of dark and of bright pixels
     differ by at most this, in stops. [own]"""
@@ -112,18 +116,21 @@ class StereoConfig(Section):
     """An image is black, and not used, if its 95 % quantile is below this while the other image has
     contrast, in grey levels. Video of limited range (16 to 235) needs about 22. [own]"""
     close_depth_baselines: float = Field(40.0, gt=0)
-    """A point is close if its depth is below this, in baselines. [OS2 III-A, printed]"""
+    """A stereo point is close if its depth is below this, in baselines. Keyframes map close points
+    from a single stereo pair; most far points are triangulated from several keyframes.
+    [OS2 III-A, printed]"""
     offset_sigma: float = Field(0.2, ge=0)
-    """Prior standard deviation of the common offset of all disparities, which is estimated from the
-    motion of the camera, in pixels; 0 disables the estimation (docs/research/motorway.md). [own]"""
+    """Prior standard deviation of an offset common to all disparities, in pixels. The offset is
+    estimated from the motion of the camera (docs/research/motorway.md); a larger value corrects
+    disparities more, and 0 disables the estimation. [own]"""
     offset_keyframes: int = Field(12, ge=3)
-    """The offset is measured again after this many keyframes. [own]"""
+    """The offset is estimated again after this many keyframes. [own]"""
     least_delay: float = Field(1.2e-3, gt=0)
     """The report warns if the measured delay of the right camera differs from the calibration's by
     more than this, in seconds, and by more than `delay_sigmas` (docs/research/stress.md). [own]"""
     delay_sigmas: float = Field(5.0, gt=0)
-    """That difference must also exceed this many standard deviations of the measured delay.
-    [own]"""
+    """The report warns of a delay only if the difference also exceeds this many standard deviations
+    of the measured delay. [own]"""
 
 
 class DepthConfig(Section):
@@ -137,8 +144,8 @@ class DepthConfig(Section):
     """A keypoint gets a depth only if the depths within this radius agree, in pixels at octave 0.
     It is one pixel more than the radius of FAST's circle. [own]"""
     edge_ratio: float = Field(0.07, gt=0)
-    """A keypoint lies on a depth edge, and gets no depth, if the range of the depths around it is
-    above this share of the nearest depth. [own]"""
+    """A keypoint lies on a depth edge, and gets no depth, if the depths around it differ by more
+    than this share of the nearest depth. [own]"""
 
 
 class AlignmentConfig(Section):
@@ -147,13 +154,17 @@ class AlignmentConfig(Section):
     iterations: int = Field(7, ge=1)
     """Upper bound of the number of Gauss-Newton iterations. [own]"""
     max_shift: float = Field(2.0, gt=0, le=2.0)
-    """Upper bound of the shift from the keypoint, in x and in y, in pixels of its octave. [own]"""
+    """Upper bound of the shift between a keypoint and its aligned position, in x and in y, in
+    pixels of its octave. [own]"""
     min_correlation: float = Field(0.85, gt=0, le=1)
-    """Lower bound of the normalised cross-correlation of an aligned patch with the image. [own]"""
+    """A match is aligned only if the normalised cross-correlation of its patch with the image is at
+    least this. [own]"""
     certainty: int = Field(4, ge=1, le=255)
-    """Ratio of the variance of a keypoint's position to that of an aligned match. [own]"""
+    """Ratio of the variance of a keypoint's position to that of an aligned match. A larger ratio
+    gives aligned matches more weight. [own]"""
     keyframes: int = Field(5, ge=1)
-    """Patches are kept for this many of the newest keyframes. [own]"""
+    """Patches are kept for this many of the newest keyframes. Landmarks that only older keyframes
+    observe are not aligned. [own]"""
 
 
 class TrackingConfig(Section):
@@ -161,13 +172,13 @@ class TrackingConfig(Section):
 
     method: Literal["auto", "orb", "patches"] = "auto"
     """How frames are tracked: `orb` matches ORB features in every frame; `patches` looks for image
-    patches of the landmarks, and extracts features only where a keyframe is due or patches fail
-    (Forster et al., T-RO 2017); `auto` takes `patches` for stereo cameras and `orb` for the others.
-    RGB-D cameras are never tracked by patches. [own]"""
+    patches of the landmarks, and extracts features only when a keyframe is due or patches fail
+    (Forster et al., T-RO 2017); `auto` selects `patches` for stereo cameras and `orb` for the
+    others. RGB-D cameras are never tracked by patches. [own]"""
     patch_min_inliers: int = Field(40, ge=10)
-    """Features are extracted for a frame in which fewer patches than this are found. [own]"""
+    """Features are extracted for a frame if fewer patches than this agree with its pose. [own]"""
     patch_min_inlier_ratio: float = Field(0.5, ge=0, le=1)
-    """Features are extracted for a frame of whose patches a smaller share than this agrees on a
+    """Features are extracted for a frame if less than this share of its patches agree with its
     pose. [own]"""
     match_distance: int = Field(100, ge=0, le=256)
     """Upper bound of the descriptor distance when landmarks are matched near their projections, in
@@ -192,143 +203,151 @@ class TrackingConfig(Section):
     """Replaces `local_window` for an RGB-D camera, in pixels at octave 0. ORB-SLAM2 uses 7.5.
     [OS1 V-D, own]"""
     predicted_window: float = Field(7.0, gt=0)
-    """Replaces `local_window` for a frame in which neither the previous frame nor the reference
-    keyframe is recognised, in pixels at octave 0. [own]"""
+    """Replaces `local_window` for a frame that could be matched with neither the previous frame nor
+    the reference keyframe, in pixels at octave 0. [own]"""
     local_keyframes: int = Field(80, ge=1)
-    """Upper bound of the number of keyframes in the local map. [OS1 V-D, customary]"""
+    """Upper bound of the number of keyframes in the local map; those that share the most landmarks
+    with the reference keyframe are chosen. [OS1 V-D, customary]"""
     min_stereo_start: int = Field(100, ge=10)
     """Number of stereo features that a frame needs to start a map. [OS2 III-B, own]"""
     min_inliers_motion: int = Field(20, ge=3)
-    """If tracking from the previous frame has fewer inliers than this, the reference keyframe is
-    tried. [OS1 V-B, customary]"""
+    """The reference keyframe is tried if tracking from the previous frame has fewer inliers than
+    this. [OS1 V-B, customary]"""
     min_inlier_ratio: float = Field(0.3, ge=0, le=1)
-    """If tracking from the previous frame has a smaller share of inliers among its matches than
-    this, the reference keyframe is tried. [own]"""
+    """The reference keyframe is also tried if less than this share of the matches with the previous
+    frame are inliers. [own]"""
     min_inliers_frame: int = Field(10, ge=3)
     """The local map is not tried for a frame with fewer inliers than this. [OS1 V-B, customary]"""
     min_inliers: int = Field(30, ge=3)
-    """A frame with fewer inliers than this in the local map is WEAK. [OS1 V-D, customary]"""
+    """A frame with fewer inliers than this in the local map is WEAK: its pose is used, but reported
+    as uncertain. [OS1 V-D, customary]"""
     min_inliers_lost: int = Field(15, ge=3)
-    """A frame with fewer inliers than this in the local map is LOST. [own]"""
+    """A frame with fewer inliers than this in the local map is LOST: its pose is only predicted.
+    [own]"""
     depth_min_inlier_ratio: float = Field(0.2, ge=0, le=1)
-    """A frame of an RGB-D camera is LOST if the share of inliers among its matches is below this.
+    """A frame of an RGB-D camera is also LOST if less than this share of its matches are inliers.
     [own]"""
     lost_frames_before_restart: int = Field(3, ge=1)
-    """Number of lost frames after which a stereo or RGB-D camera starts a sub-map at the predicted
-    pose. [own]"""
+    """A stereo or RGB-D camera starts a sub-map at the predicted pose after this many lost frames.
+    [own]"""
     young_keyframes: int = Field(5, ge=0)
-    """A map with at most this many keyframes is young; there a stereo or RGB-D camera starts a
+    """A map with at most this many keyframes is young. There, a stereo or RGB-D camera starts a
     sub-map after a single lost frame. [own]"""
     monocular_lost_frames: int = Field(4, ge=1)
-    """Number of lost frames after which a monocular camera starts a sub-map from two new views.
-    [own]"""
+    """A monocular camera starts a sub-map from two new views after this many lost frames. [own]"""
 
 
 class InitializationConfig(Section):
     """The first two keyframes of a monocular map [OS1, IV]."""
 
     min_features: int = Field(200, ge=20)
-    """Number of features that a frame needs to become the first view. [own]"""
+    """A frame can become the first view if it has at least this many features. [own]"""
     window: float = Field(100.0, gt=0)
-    """Search radius in the second view, in pixels. [OS1 IV, customary]"""
+    """Search radius for matches in the second view, in pixels. A larger radius allows faster motion
+    between the views. [OS1 IV, customary]"""
     match_distance: int = Field(50, ge=0, le=256)
     """Upper bound of the descriptor distance of a match, in bits. [OS1 IV, customary]"""
     match_ratio: float = Field(0.9, gt=0, le=1)
     """Upper bound of the ratio of the best to the second-best distance. [OS1 IV, customary]"""
     min_matches: int = Field(100, ge=8)
-    """If the two views have fewer matches than this, another first view is taken.
+    """If the two views have fewer matches than this, the second view replaces the first.
     [OS1 IV, customary]"""
     draws: int = Field(300, ge=1)
     """Number of RANSAC draws for each of the two models. ORB-SLAM uses 200. [OS1 IV, own]"""
     homography_share: float = Field(0.45, gt=0, lt=1)
     """The homography is chosen if its share of the sum of both scores is above this; otherwise the
-    fundamental matrix is. [OS1 IV, printed]"""
+    fundamental matrix is chosen. [OS1 IV, printed]"""
     max_error: float = Field(2.0, gt=0)
     """Upper bound of the reprojection error of an inlier, in pixels at octave 0.
     [OS1 IV, customary]"""
     min_parallax_deg: float = Field(1.0, gt=0)
-    """Parallax that at least `min_points` points must have, in degrees. [OS1 IV, customary]"""
+    """At least `min_points` points must have this parallax, in degrees. A larger value waits for a
+    longer baseline. [OS1 IV, customary]"""
     min_points: int = Field(50, ge=8)
-    """Number of triangulated points that must have that parallax. [OS1 IV, customary]"""
+    """At least this many points must be triangulated with that parallax. [OS1 IV, customary]"""
     min_point_share: float = Field(0.7, gt=0, le=1)
-    """Share of the inliers of the model that must lie in front of both cameras. [OS1 IV, own]"""
+    """At least this share of the model's inliers must be triangulated in front of both cameras.
+    [OS1 IV, own]"""
     max_rival_share: float = Field(0.7, gt=0, le=1)
-    """The motion is ambiguous, and refused, if the second-best motion explains more than this share
-    of the points that the best one explains. [OS1 IV, customary]"""
+    """The motion is ambiguous, and rejected, if the second-best motion explains more than this
+    share of the points that the best one explains. [OS1 IV, customary]"""
     min_landmarks: int = Field(100, ge=8)
-    """Number of landmarks that must remain after the first bundle adjustment.
+    """At least this many landmarks must remain after the first bundle adjustment.
     [OS1 IV, customary]"""
     median_depth: float = Field(15.0, gt=0)
-    """Median depth that the first landmarks are scaled to, in map units. [own]"""
+    """The first landmarks are scaled to this median depth, in map units. [own]"""
     max_rescaling: float = Field(10.0, gt=1)
-    """Upper bound of the factor by which a sub-map is rescaled to keep the speed that the camera
-    had before it was lost. [own]"""
+    """A sub-map is rescaled so that the camera keeps the speed that it had before it was lost,
+    unless this needs a factor larger than this (or smaller than its inverse). [own]"""
     max_seconds: float = Field(1.5, gt=0)
-    """Longest time between the two views, in seconds. [own]"""
+    """Longest time between the two views, in seconds. After that, the next frame becomes the first
+    view. [own]"""
 
 
 class KeyframeConfig(Section):
     """Keyframe decision [OS2, III-E]."""
 
     max_interval_s: float = Field(1.0, gt=0)
-    """Longest time without a keyframe, in seconds. [OS1 V-E, customary]"""
+    """A keyframe is inserted if the last one is at least this old, in seconds.
+    [OS1 V-E, customary]"""
     depth_max_interval_s: float = Field(0.3, gt=0)
     """Replaces `max_interval_s` for an RGB-D camera, which is usually hand-held, in seconds.
     [own]"""
     min_tracked_close: int = Field(100, ge=0)
-    """A keyframe is inserted if fewer close points than this are tracked and more than
-    `min_new_close` are not. [OS2 III-E, printed]"""
+    """A keyframe is inserted if the frame tracks fewer close points than this and could add more
+    than `min_new_close` new ones. [OS2 III-E, printed]"""
     min_new_close: int = Field(70, ge=0)
-    """Such a keyframe is inserted only if more close points than this are not tracked.
-    [OS2 III-E, printed]"""
+    """Too few tracked close points cause a keyframe only if the keyframe could add more new close
+    points than this. [OS2 III-E, printed]"""
     min_kept_close: float = Field(0.2, ge=0, le=1)
-    """Where a keyframe adds fewer close points than `min_tracked_close` on average, this share of
-    that average replaces `min_tracked_close` (docs/research/motorway.md). [own]"""
+    """If a keyframe adds fewer close points than `min_tracked_close` on average, this share of that
+    average replaces `min_tracked_close` (docs/research/motorway.md). [own]"""
     first_gain: float = Field(2.0, ge=0)
-    """Number of close points that a keyframe is assumed to add before this has been observed, as a
-    multiple of `min_tracked_close`. [own]"""
+    """Until the number of close points that a keyframe adds has been observed, it is assumed to be
+    this multiple of `min_tracked_close`. [own]"""
     gain_weight: float = Field(0.2, gt=0, le=1)
     """Weight of the latest keyframe in the running mean of the number of close points that a
-    keyframe adds. [own]"""
+    keyframe adds. A larger weight adapts faster to the scene. [own]"""
     patch_kept_close: float = Field(0.4, ge=0, le=1)
-    """A keyframe is also inserted if patches find less than this share of the close points that
-    were tracked in the first frame after the last keyframe. [own]"""
+    """A frame tracked by patches becomes a keyframe if it tracks less than this share of the close
+    points that the first frame after the last keyframe tracked. [own]"""
     patch_lead_frames: int = Field(2, ge=0)
-    """A keyframe that was tracked by patches is planned this many frames ahead, so that its
-    features can be extracted meanwhile. [own]"""
+    """When frames are tracked by patches, a keyframe is planned up to this many frames ahead, so
+    that its features can be extracted in advance. [own]"""
     max_tracked_ratio: float = Field(0.75, gt=0, le=1)
-    """A keyframe is inserted if the frame tracks less than this share of the points of the
-    reference keyframe. [OS1 V-E, customary]"""
+    """A keyframe is inserted if the frame tracks less than this share of the landmarks of the
+    reference keyframe. A larger share inserts keyframes more often. [OS1 V-E, customary]"""
     urgent_ratio: float = Field(0.25, gt=0, le=1)
-    """If the tracked share is below this, a keyframe is inserted even while local mapping is busy.
-    [OS1 V-E, customary]"""
+    """A keyframe is inserted even while local mapping is busy if the frame tracks less than this
+    share of the landmarks of the reference keyframe. [OS1 V-E, customary]"""
     monocular_ratio: float = Field(0.9, gt=0, le=1)
     """Replaces `max_tracked_ratio` for a monocular camera. [OS1 V-E, printed]"""
     monocular_min_tracked: int = Field(100, ge=0)
     """With a monocular camera, a keyframe is also inserted while local mapping is busy if fewer
-    points than this are tracked. [own]"""
+    landmarks than this are tracked. [own]"""
     monocular_urgent_ratio: float = Field(0.5, gt=0, le=1)
     """Replaces `urgent_ratio` for a monocular camera. [own]"""
     known_after_s: float = Field(30.0, gt=0)
-    """A place can be known only if a keyframe of it is at least this old, in seconds. [own]"""
+    """At a known place, an old keyframe becomes the reference again, and no new keyframe is
+    inserted. A keyframe is old after this time, in seconds. [own]"""
     known_ratio: float = Field(0.5, gt=0)
-    """A place is known if the frame tracks at least this share of the points of an old keyframe.
-    [own]"""
+    """A place is known if the frame tracks at least this share of the landmarks of an old keyframe.
+    A larger share inserts more new keyframes at old places. [own]"""
     known_min_inliers: int = Field(50, ge=0)
-    """The place of a frame can be known only if the frame tracks at least this many landmarks.
-    [own]"""
+    """A place is known only if the frame tracks at least this many landmarks. [own]"""
     merge_after_frames: int = Field(2, ge=1)
-    """The result of the local mapping of a keyframe is merged this many frames later. [own]"""
+    """Tracking uses the result of local mapping this many frames after the keyframe, or at the next
+    keyframe if that comes first. With a smaller value, tracking waits for mapping more often.
+    [own]"""
 
 
 class MappingConfig(Section):
     """Local mapping and bundle adjustment."""
 
     neighbours: int = Field(10, ge=1)
-    """Number of covisible keyframes that a new keyframe is triangulated with.
-    [OS1 VI-C, customary]"""
+    """A new keyframe is triangulated with this many covisible keyframes. [OS1 VI-C, customary]"""
     fuse_neighbours: int = Field(10, ge=1)
-    """Number of covisible keyframes whose landmarks are fused with those of a new keyframe.
+    """Duplicate landmarks of a new keyframe and of this many covisible keyframes are fused.
     [OS1 VI-C, customary]"""
     monocular_neighbours: int = Field(20, ge=1)
     """Replaces `neighbours` for a monocular camera. [OS1 VI-C, customary]"""
@@ -336,39 +355,42 @@ class MappingConfig(Section):
     """With a monocular camera, two keyframes are triangulated only if the distance between them is
     at least this share of the median depth. [OS1 VI-C, customary]"""
     min_parallax_cosine: float = Field(0.9998, gt=0, le=1)
-    """Upper bound of the cosine of the parallax of a triangulated point. [OS1 VI-C, customary]"""
+    """Upper bound of the cosine of the parallax of a triangulated point; the default corresponds to
+    1.1 degrees. A larger value also accepts points with less parallax. [OS1 VI-C, customary]"""
     epipolar_distance: int = Field(50, ge=0, le=256)
     """Upper bound of the descriptor distance when features are matched for triangulation, in bits.
     [OS1 VI-C, customary]"""
     fuse_distance: int = Field(50, ge=0, le=256)
-    """Upper bound of the descriptor distance when landmarks are fused, in bits.
+    """Upper bound of the descriptor distance between duplicate landmarks, in bits.
     [OS1 VI-C, customary]"""
     fuse_window: float = Field(3.0, gt=0)
-    """Search radius when landmarks are fused, in pixels at octave 0. [OS1 VI-C, customary]"""
+    """Search radius for duplicate landmarks, in pixels at octave 0. [OS1 VI-C, customary]"""
     min_stereo_points: int = Field(100, ge=0)
-    """If fewer stereo features of a keyframe than this are close, this many of the nearest are
-    mapped. [OS2 III-E, printed]"""
+    """If a keyframe has fewer close stereo features than this, this many of its nearest stereo
+    features are mapped. [OS2 III-E, printed]"""
     min_found_ratio: float = Field(0.25, ge=0, le=1)
-    """A recent landmark is culled if it is found in less than this share of the frames that should
-    see it. [OS1 VI-B, printed]"""
+    """A recent landmark is culled if it is found in less than this share of the frames in which it
+    should be visible. [OS1 VI-B, printed]"""
     redundant_ratio: float = Field(0.9, gt=0, le=1)
-    """A keyframe is culled if more than this share of its landmarks is redundant, that is, seen by
-    three other keyframes as well. [OS1 VI-E, printed]"""
+    """A keyframe is culled if more than this share of its landmarks are redundant, that is,
+    observed by three other keyframes as well. A larger share keeps more keyframes.
+    [OS1 VI-E, printed]"""
     min_shared: int = Field(15, ge=1)
     """Two keyframes are joined by a covisibility edge if they share at least this many landmarks.
     [OS1 III-D, printed]"""
     max_ba_keyframes: int = Field(60, ge=2)
-    """Upper bound of the number of free keyframes in local bundle adjustment. [OS1 VI-D, own]"""
+    """Upper bound of the number of keyframes that local bundle adjustment optimises.
+    [OS1 VI-D, own]"""
     ba_iterations: int = Field(10, ge=1)
     """Upper bound of the number of iterations of local bundle adjustment. The first pass, before
-    the outliers are removed, has half as many. [OS1 VI-D, customary]"""
+    outliers are removed, has half as many. [OS1 VI-D, customary]"""
 
 
 class VerificationConfig(Section):
-    """When a loop candidate is a revisit [OS1, VII-B; OS2, III-C]."""
+    """Geometric verification of loop candidates [OS1, VII-B; OS2, III-C]."""
 
     descriptors: Literal["usual", "orb", "learned", "both"] = "usual"
-    """Descriptors that verify candidates, whichever detector proposed them: `orb`, `learned` (the
+    """Which descriptors verify candidates, whatever detector proposed them: `orb`, `learned` (the
     network's local descriptors), or `both`, which uses the learned ones where ORB fails. `usual`
     means `orb` for `bow`, `capsule-paper` and plug-ins, and `both` for the other networks and the
     detector `both`. [own]"""
@@ -377,16 +399,17 @@ class VerificationConfig(Section):
     match_ratio: float = Field(0.8, gt=0, le=1)
     """Upper bound of the ratio of the best to the second-best distance. [OS1 VII-B, own]"""
     min_matches: int = Field(20, ge=3)
-    """Number of landmarks that must match by descriptor. [OS1 VII-B, customary]"""
+    """At least this many landmarks must be matched by descriptor. [OS1 VII-B, customary]"""
     max_draws: int = Field(600, ge=1)
     """Upper bound of the number of RANSAC draws. [OS1 VII-B, own]"""
     confidence: float = Field(0.99, gt=0, lt=1)
     """Probability with which RANSAC must draw at least one sample without outliers.
     [OS1 VII-B, own]"""
     min_consensus: int = Field(15, ge=6)
-    """Number of inliers that RANSAC must find. [OS1 VII-B, own]"""
+    """RANSAC must find at least this many inliers. [OS1 VII-B, own]"""
     place_keyframes: int = Field(10, ge=0)
-    """Number of covisible keyframes that form a place together with the matched one. [own]"""
+    """The landmarks of the matched keyframe and of this many covisible keyframes form the place
+    that guided search looks for. [own]"""
     first_window: float = Field(8.0, gt=0)
     """Search radius of the first guided search, in pixels at octave 0. [OS1 VII-B, own]"""
     second_window: float = Field(4.0, gt=0)
@@ -394,51 +417,53 @@ class VerificationConfig(Section):
     guided_distance: int = Field(64, ge=0, le=256)
     """Upper bound of the descriptor distance in guided search, in bits. [OS1 VII-B, own]"""
     min_inliers: int = Field(40, ge=6)
-    """Number of inliers that must remain after guided search. [OS1 VII-B, customary]"""
+    """At least this many inliers must remain after guided search. [OS1 VII-B, customary]"""
     min_inlier_ratio: float = Field(0.5, ge=0, le=1)
-    """Share of the matches of guided search that must be inliers. [own]"""
+    """At least this share of the matches of guided search must be inliers. [own]"""
     min_elsewhere: int = Field(15, ge=0)
-    """Number of inliers that must lie outside the third of the image with the most inliers.
-    [own]"""
+    """At least this many inliers must lie outside the vertical third of the image that has the most
+    inliers, because look-alikes often agree on a single object only. [own]"""
     min_cells: int = Field(8, ge=1)
-    """Number of cells of a grid of 8 x 4 over the image that must have inliers. [own]"""
+    """At least this many cells of an 8 x 4 grid over the image must contain inliers. [own]"""
     min_cell_ratio: float = Field(0.3, ge=0, le=1)
-    """Share of the cells in which the place should appear that must have inliers. [own]"""
+    """At least this share of the grid cells into which landmarks of the place are projected must
+    contain inliers. [own]"""
     min_seen_ratio: float = Field(0.07, ge=0, le=1)
-    """Share of the landmarks of each side that the other side must see. [own]"""
+    """The query must observe at least this share of the landmarks of the match that it should see,
+    and vice versa. [own]"""
     max_distance: float = Field(15.0, gt=0)
-    """Upper bound of the distance between the two cameras, in metres. [own]"""
+    """Upper bound of the distance between the cameras of query and match, in metres. [own]"""
 
 
 class LearnedMatchingConfig(Section):
-    """Places matched by the network's local descriptors, where ORB fails."""
+    """Verification by the network's local descriptors, where ORB fails."""
 
     max_candidates: int = Field(2, ge=1)
     """Upper bound of the number of candidates that are tried for a keyframe or a lost frame.
     [own]"""
     rated: int = Field(5, ge=0)
-    """If the detector has not rated its candidates by local descriptors, at most this many of them
-    are rated before verification. [own]"""
+    """If the detector has not compared its candidates by local descriptors, the first candidates
+    are compared before verification, at most this many. [own]"""
     views: int = Field(2, ge=1)
-    """Upper bound of the number of keyframes of a place that are matched. [own]"""
+    """Upper bound of the number of keyframes that are matched at each place. [own]"""
     most_shared: float = Field(0.4, gt=0, le=1)
-    """The network does not process a keyframe that shares at least this share of its landmarks with
-    a keyframe whose image is kept. [own]"""
+    """The image of a keyframe is not kept for the network if the keyframe shares at least this
+    share of its landmarks with another keyframe whose image is kept. [own]"""
     min_alike: float = Field(0.35, ge=0, le=1)
     """Two images are matched only if their similarity by local descriptors is at least this.
     [own]"""
     rest: int = Field(8, ge=0)
-    """For this many keyframes after a failed attempt, only places that are more similar
-    (`more_alike`) are tried. [own]"""
+    """For this many keyframes after a failed attempt, a place is tried only if its similarity
+    exceeds that of the failed attempt by the factor `more_alike`. [own]"""
     more_alike: float = Field(1.1, ge=1)
-    """A place is tried during this rest only if its similarity is at least this many times that of
-    the failed attempt. [own]"""
+    """Lower bound, during these keyframes, of the similarity of a place divided by that of the
+    failed attempt. [own]"""
     min_share: float = Field(0.1, ge=0, le=1)
-    """Share of the coarse cells that one homography must explain. [own]"""
+    """At least this share of the coarse cells must agree with one homography. [own]"""
     coarse_alike: float = Field(0.3, ge=-1, le=1)
-    """Lower bound of the cosine of two coarse descriptors that match. [own]"""
+    """Two coarse descriptors match only if their cosine is at least this. [own]"""
     alike: float = Field(0.5, ge=-1, le=1)
-    """Lower bound of the cosine of two fine descriptors that match. [own]"""
+    """Two fine descriptors match only if their cosine is at least this. [own]"""
     reach: int = Field(5, ge=1)
     """The fine match is searched for up to this far to each side of the coarse match, in fine
     cells. [own]"""
@@ -446,53 +471,58 @@ class LearnedMatchingConfig(Section):
     """A landmark is searched for up to this far to each side of its projection, in fine cells.
     [own]"""
     sigma: float = Field(1.5, gt=0)
-    """Standard deviation of the position of a match, in pixels of the network's image. [own]"""
+    """Standard deviation of the position of a match, in pixels of the network's image. A larger
+    value accepts more distant matches as inliers. [own]"""
     max_draws: int = Field(1000, ge=1)
     """Upper bound of the number of RANSAC draws. [own]"""
     confidence: float = Field(0.99, gt=0, lt=1)
     """Probability with which RANSAC must draw at least one sample without outliers. [own]"""
     min_consensus: int = Field(40, ge=4)
-    """Number of inliers that RANSAC must find. [own]"""
+    """RANSAC must find at least this many inliers. [own]"""
     min_consensus_ratio: float = Field(0.15, ge=0, le=1)
-    """Share of the landmarks searched for that RANSAC must find as inliers. [own]"""
+    """RANSAC must find at least this share of the landmarks searched for as inliers. [own]"""
     min_inliers: int = Field(80, ge=6)
-    """Number of inliers that must remain after guided search. [own]"""
+    """At least this many inliers must remain after guided search. [own]"""
     min_elsewhere: int = Field(40, ge=0)
-    """Number of inliers that must lie outside the third of the image with the most inliers.
-    [own]"""
+    """At least this many inliers must lie outside the vertical third of the image that has the most
+    inliers. [own]"""
     min_seen_ratio: float = Field(0.3, ge=0, le=1)
-    """Share of the landmarks of each side that the other side must see. [own]"""
+    """The query must observe at least this share of the landmarks of the match that it should see,
+    and vice versa. [own]"""
     fuse_pixels: float = Field(2.0, gt=0)
-    """Upper bound of the distance between a projected landmark and the keypoint that will observe
-    it, in pixels at octave 0. [own]"""
+    """A keypoint can observe a matched landmark only if it lies within this distance of the
+    landmark's projection, in pixels at octave 0. [own]"""
     verified_memory: int = Field(10, ge=1)
-    """Replaces `consistency.verified_memory`, if it is greater, where the images of keyframes are
-    kept, since not every keyframe has one. [own]"""
+    """Replaces `consistency.verified_memory`, if it is greater, when images of keyframes are kept,
+    because not every keyframe has an image. [own]"""
 
 
 class ConsistencyConfig(Section):
-    """What makes verified candidates a loop [OS1, VII-A]."""
+    """Agreement of several keyframes on a loop [OS1, VII-A]."""
 
     min_keyframes: int = Field(2, ge=1)
-    """Number of consecutive keyframes that must resemble the place. OS1 requires 3.
+    """At least this many consecutive keyframes must resemble the place. OS1 requires 3.
     [OS1 VII-A, own]"""
     max_gap: int = Field(1, ge=0)
-    """Number of keyframes in between that may fail to resemble it. OS1 allows none.
+    """Up to this many keyframes in between need not resemble the place. OS1 allows none.
     [OS1 VII-A, own]"""
     min_shared: int = Field(30, ge=1)
-    """A keyframe belongs to the group of a candidate if they share at least this many landmarks.
+    """The keyframes that share at least this many landmarks with a candidate belong to its place.
     [own]"""
     min_verified: int = Field(2, ge=1)
-    """Number of verified keyframes that must agree. [own]"""
+    """The verified loops of at least this many keyframes must agree. [own]"""
     verified_memory: int = Field(5, ge=1)
     """A verified loop is remembered for this many keyframes. [own]"""
     max_apart: float = Field(0.5, gt=0)
-    """Upper bound of the distance between loops that agree, in metres. [own]"""
+    """Two loops agree if the positions of the query that they imply are at most this far apart, in
+    metres. [own]"""
     max_turn: float = Field(1.0, gt=0)
-    """Upper bound of the rotation between loops that agree, in degrees. [own]"""
+    """Two loops agree if the orientations of the query that they imply differ by at most this, in
+    degrees. [own]"""
     min_moved: float = Field(2.0, ge=0)
-    """At the end of a drive an earlier keyframe may confirm a loop only if it is at least this far
-    from the query, in metres. A nearer one would only repeat the query. [own]"""
+    """At the end of a drive, an earlier keyframe may confirm a loop only if it is at least this far
+    from the query, in metres. A nearer keyframe would only repeat the evidence of the query.
+    [own]"""
 
 
 class RelocalizationConfig(Section):
@@ -503,35 +533,35 @@ class RelocalizationConfig(Section):
     match_ratio: float = Field(0.75, gt=0, le=1)
     """Upper bound of the ratio of the best to the second-best distance. [OS1 V-C, customary]"""
     min_matches: int = Field(15, ge=4)
-    """Number of landmarks that must match by descriptor. [OS1 V-C, customary]"""
+    """At least this many landmarks must be matched by descriptor. [OS1 V-C, customary]"""
     max_draws: int = Field(600, ge=1)
     """Upper bound of the number of RANSAC draws. [OS1 V-C, own]"""
     confidence: float = Field(0.99, gt=0, lt=1)
-    """Probability with which RANSAC shall draw at least one sample without outliers.
+    """Probability with which RANSAC must draw at least one sample without outliers.
     [OS1 V-C, customary]"""
     min_consensus: int = Field(10, ge=4)
-    """Number of inliers that RANSAC must find. [OS1 V-C, customary]"""
+    """RANSAC must find at least this many inliers. [OS1 V-C, customary]"""
     first_window: float = Field(8.0, gt=0)
     """Search radius of the first guided search, in pixels at octave 0. [OS1 V-C, own]"""
     min_inliers: int = Field(50, ge=6)
-    """A frame counts as found if it has at least this many inliers. [OS1 V-C, customary]"""
+    """A frame is relocalised if it has at least this many inliers. [OS1 V-C, customary]"""
     min_elsewhere: int = Field(15, ge=0)
-    """Number of inliers that must lie outside the third of the image with the most inliers.
-    [own]"""
+    """At least this many inliers must lie outside the vertical third of the image that has the most
+    inliers. [own]"""
     max_candidates: int = Field(5, ge=1)
     """Upper bound of the number of places that are tried for a lost frame. [own]"""
     doubtful_gap: float = Field(1.5, gt=1)
     """A frame comes after a gap if the time since the last tracked frame is above this multiple of
     the usual interval between frames. [own]"""
     doubtful_share: float = Field(0.5, ge=0, le=1)
-    """A frame is in doubt if it tracks less than this share of the landmarks of the reference
+    """A frame is doubtful if it tracks less than this share of the landmarks of the reference
     keyframe and also comes after a gap, could not be predicted, or tracks less than this share of
-    what the previous frame tracked. It is then searched for in the whole map. [own]"""
+    what the previous frame tracked. The whole map is then searched for it. [own]"""
     better: float = Field(1.5, ge=1)
-    """A frame in doubt is moved to the place where it was found if it has more than this many times
-    as many inliers there. [own]"""
+    """A doubtful frame is moved to the place that the search finds if it has more than this many
+    times as many inliers there. [own]"""
     neighbours: int = Field(20, ge=1)
-    """Number of keyframes around the place whose landmarks are searched for. [own]"""
+    """The landmarks of this many keyframes around the place are matched. [own]"""
 
 
 class LoopConfig(Section):
@@ -541,8 +571,9 @@ class LoopConfig(Section):
     """Upper bound of the number of iterations of global bundle adjustment.
     [OS2 III-D, customary]"""
     observations_per_keyframe: int = Field(25000, ge=1)
-    """The result of global bundle adjustment is merged one keyframe after its loop, and one more
-    keyframe later for every this many observations in the problem. [own]"""
+    """The result of global bundle adjustment is merged `1 + n // observations_per_keyframe`
+    keyframes after its loop, where n is the number of observations. With a smaller value, mapping
+    waits for the result less often. [own]"""
 
 
 class BowConfig(Section):
@@ -552,12 +583,12 @@ class BowConfig(Section):
     """Two keyframes are neighbours if they share at least this many landmarks.
     [OS1 III-D, printed]"""
     exclude_recent: int = Field(20, ge=1)
-    """This many of the newest keyframes, the query among them, are never candidates. [own]"""
+    """This many of the newest keyframes, including the query, are never candidates. [own]"""
     common_words_ratio: float = Field(0.8, ge=0, le=1)
-    """The number of words that a candidate shares with the query must be at least this fraction of
-    the largest such number of any keyframe. [OS1 III-E, customary]"""
+    """A candidate must share at least this fraction of the largest number of words that any
+    keyframe shares with the query. [OS1 III-E, customary]"""
     group_size: int = Field(10, ge=0)
-    """This many of the best covisible keyframes of a candidate may join its group.
+    """At most this many of the best covisible keyframes of a candidate join its group.
     [OS1 III-E, customary]"""
     group_score_ratio: float = Field(0.75, ge=0, le=1)
     """A group is kept if its score is at least this share of the best group's.
@@ -568,13 +599,14 @@ class BowConfig(Section):
 
 
 class PoseGraphConfig(Section):
-    """The pose graph of a loop closure: how far each edge is trusted, and when a loop is refused.
+    """The pose graph of a loop closure: weights of the edges, and when a loop is rejected.
 
-    Drift is modelled as a random walk: its standard deviation grows with the square root of the
-    distance travelled. With the default values it is 1.2 % after 400 m, nearly all of it caused by
-    errors of rotation. A gap is an edge over frames in which tracking was lost and the motion was
-    only predicted. Such an edge is weak if there was no prediction, or under the hypothesis that
-    the camera was carried elsewhere meanwhile.
+    An edge has less weight if its standard deviation is larger. Drift is modelled as a random walk:
+    its standard deviation grows with the square root of the distance travelled. With the default
+    values it is 1.2 % after 400 m, nearly all of it caused by errors of rotation. A gap is an edge
+    over frames in which tracking was lost and the motion was only predicted. Such an edge is weak
+    if there was no prediction, or under the hypothesis that the camera was carried elsewhere
+    meanwhile.
     """
 
     min_shared: int = Field(100, ge=1)
@@ -584,12 +616,12 @@ class PoseGraphConfig(Section):
     """An edge of the spanning tree across a restart of mapping is weak if its ends share fewer
     landmarks than this. [OS1 III-D, printed]"""
     translation_drift: float = Field(0.03, gt=0)
-    """Standard deviation of odometry, in metres per square root of a metre. [own]"""
+    """Standard deviation of the drift of odometry, in metres per square root of a metre. [own]"""
     rotation_drift: float = Field(0.001, gt=0)
-    """Standard deviation of odometry, in radians per square root of a metre. [own]"""
+    """Standard deviation of the drift of odometry, in radians per square root of a metre. [own]"""
     scale_drift: float = Field(0.01, gt=0)
-    """Standard deviation of monocular odometry, in log scale per square root of a map unit.
-    [own]"""
+    """Standard deviation of the scale drift of monocular odometry, in log scale per square root of
+    a map unit. [own]"""
     min_length: float = Field(0.3, gt=0)
     """Shorter edges count as this long in the drift model, in metres. [own]"""
     loop_translation: float = Field(0.1, gt=0)
@@ -605,7 +637,7 @@ class PoseGraphConfig(Section):
     weak_rotation: float = Field(1.0, gt=0)
     """Standard deviation of a weak edge, in radians. [own]"""
     gap_translation: float = Field(0.5, gt=0)
-    """Standard deviation of a gap, as a share of the distance that was predicted. [own]"""
+    """Standard deviation of a gap, as a share of the predicted distance. [own]"""
     gap_speed: float = Field(2.0, gt=0)
     """Lower bound of the standard deviation of a gap, in metres per second of its duration.
     [own]"""
@@ -616,13 +648,14 @@ class PoseGraphConfig(Section):
     min_gap: float = Field(0.3, gt=0)
     """Shorter gaps count as this long, in seconds. [own]"""
     robust_scale: float = Field(3.0, gt=0)
-    """Scale of the Cauchy loss on loops, in standard deviations. [own]"""
+    """Scale of the Cauchy loss on loops, in standard deviations. A smaller scale reduces the
+    influence of loops that contradict the other edges. [own]"""
     iterations: int = Field(50, ge=1)
     """Upper bound of the number of Levenberg-Marquardt iterations. [own]"""
     max_loop_error: float = Field(30.0, gt=0)
-    """A loop is refused if its chi-square after optimisation is above this. [own]"""
+    """A loop is rejected if its chi-square after optimisation is above this. [own]"""
     max_strain: float = Field(60.0, gt=0)
-    """A loop is refused if the chi-square of all other edges is above this times the number of
+    """A loop is rejected if the chi-square of all other edges is above this times the number of
     closed loops. [own]"""
 
 
@@ -632,7 +665,8 @@ class SiameseConfig(Section):
     threshold: float = Field(0.9, ge=0, le=1)
     """A keyframe is a loop candidate if its similarity is at least this. [ZS, printed]"""
     offered: float = Field(0.1, ge=0, le=1)
-    """Replaces `threshold` where learned descriptors verify the candidates. [own]"""
+    """Replaces `threshold` if learned descriptors verify the candidates. A smaller value proposes
+    more candidates. [own]"""
     reranked: int = Field(20, ge=1)
     """This many of the most similar keyframes are re-ranked by local descriptors. [own]"""
     max_candidates: int = Field(5, ge=1)
@@ -643,32 +677,32 @@ class SiameseConfig(Section):
     """Two candidates show the same place if they share at least this many landmarks.
     [OS1 III-D, printed]"""
     reach: float = Field(20.0, ge=0)
-    """Where learned descriptors verify the candidates, the query is compared only with keyframes
-    within this distance, in metres. The distance grows by `reach_share` of the way driven since
-    the keyframe. [own]"""
+    """If learned descriptors verify the candidates, the query is compared only with keyframes
+    within this distance, in metres. The distance grows by `reach_share` of the distance driven
+    since the keyframe. [own]"""
     reach_share: float = Field(0.05, ge=0)
-    """Share of the way driven since the keyframe by which `reach` grows. It is several times the
-    drift of a stereo camera in a street, which is about one per cent. [own]"""
+    """`reach` grows by this share of the distance driven since the keyframe. It is several times
+    the drift of a stereo camera in a street, which is about one per cent. [own]"""
     monocular_reach_share: float = Field(0.3, ge=0)
     """Replaces `reach` and `reach_share` in monocular maps, whose scale is unknown and drifts: the
-    query is compared only with keyframes nearer than this share of the way driven since the
+    query is compared only with keyframes nearer than this share of the distance driven since the
     keyframe. The default is twice what KITTI 00 needs, where the scale drifts by a factor of 2.3.
     [own]"""
     reach_angle: float = Field(60.0, gt=0, le=180)
     """The query is compared only with keyframes whose viewing directions differ from its own by at
-    most this, in degrees: no place is recognised from behind or from the side. [own]"""
+    most this, in degrees, because no place is recognised from behind or from the side. [own]"""
     embedded_at_once: int = Field(8, ge=1)
     """Upper bound of the number of keyframes that the network processes for one query; the nearest
-    ones are taken. [own]"""
+    ones are chosen. [own]"""
     fit: Literal["squash", "crop"] = "squash"
-    """How an image is brought to the network's input size: `squash` scales the whole image, `crop`
+    """How an image is fitted to the network's input size: `squash` scales the whole image, `crop`
     cuts out its middle. [own]"""
 
 
 class Config(Section):
     """The whole configuration: each run writes it to ``config.json``, and --config reads it.
 
-    A threshold has a dotted name, too: ``{"orb.n_features": 1000}`` is read like
+    A threshold can also be given by its dotted name: ``{"orb.n_features": 1000}`` means the same as
     ``{"orb": {"n_features": 1000}}``.
     """
 
@@ -703,7 +737,7 @@ class Config(Section):
             if isinstance(values, dict):
                 nested[section] = {**values, key: given[name]}
             else:
-                nested[name] = given[name]  # refused as an unknown key
+                nested[name] = given[name]  # validation reports it as an unknown key
         return nested
 
 
@@ -718,11 +752,12 @@ def load_config(path: Path | str) -> Config:
 
 
 def as_config(given: Config | Mapping[str, Any], where: str = "config") -> Config:
-    """Thresholds from a dictionary like the content of ``config.json``.
+    """Check thresholds given as a dictionary like the content of ``config.json``.
 
     Args:
-        given: those that it omits keep their defaults; a ``Config`` is returned as it is.
-        where: where they come from, for the messages.
+        given: thresholds by section or dotted name; those left out keep their defaults. A
+            ``Config`` is returned unchanged.
+        where: the file or argument that the thresholds come from, for error messages.
 
     Raises:
         InputError: a key is unknown, or a value is out of range.
@@ -734,7 +769,7 @@ def changed_thresholds(config: Mapping[str, Mapping[str, Any]]) -> dict[str, Any
     """The thresholds of a ``config.json`` that differ from the defaults, by dotted name.
 
     Args:
-        config: thresholds by section; the file may be that of another version.
+        config: thresholds by section; the file may come from another version of vslam.
     """
     default = Config().model_dump()
     return {
@@ -746,7 +781,8 @@ def changed_thresholds(config: Mapping[str, Mapping[str, Any]]) -> dict[str, Any
 
 
 def thresholds_in_words(changed: Mapping[str, Any], most: int = 3) -> str:
-    """``orb.n_features=1000, 2 more in config.json``: at most so many by name."""
+    """List the first ``most`` thresholds and count the others: ``orb.n_features=1000, 2 more in
+    config.json``."""
     words = [f"{name}={value}" for name, value in changed.items()]
     more = [f"{len(words) - most} more in config.json"] if len(words) > most else []
     return ", ".join(words[:most] + more)
@@ -756,9 +792,9 @@ def read_json(model: type[_Model], path: Path, what: str) -> _Model:
     """Read a file of thresholds or settings; keys that it omits keep their defaults.
 
     Args:
-        model: what the file describes.
+        model: the class that describes the values and their ranges.
         path: the file.
-        what: a name for its content, for the messages.
+        what: what error messages call its content, such as ``configuration``.
 
     Raises:
         InputError: the file is missing or is not JSON, a key is unknown, or a value is out of
@@ -776,7 +812,7 @@ def checked(model: type[_Model], given: object, where: str, what: str) -> _Model
 
     Args:
         model: the class that describes the values and their ranges.
-        given: JSON as bytes, a dictionary, or a model, which is returned as it is.
+        given: JSON as bytes, a dictionary, or a model, which is returned unchanged.
         where: the file or argument that the values come from, for error messages.
         what: what error messages call the values, such as ``thresholds``.
 
@@ -792,7 +828,7 @@ def checked(model: type[_Model], given: object, where: str, what: str) -> _Model
 
 
 def _fault(model: type[BaseModel], error: ValidationError, what: str) -> str:
-    """What is wrong with the first of the values that are."""
+    """Describe the first error of a validation."""
     first = error.errors()[0]
     place = [str(name) for name in first["loc"]]
     if first["type"] == "json_invalid":
@@ -808,15 +844,15 @@ def _fault(model: type[BaseModel], error: ValidationError, what: str) -> str:
 
 
 def _without_section(model: type[BaseModel], place: list[str]) -> str:
-    """A suggestion for a key that belongs into a section, and was given without one."""
-    of = [section for section in model.model_fields if place[-1] in _keys(model, [section])]
-    if len(place) > 1 or not of:
+    """A suggestion for a key that was given without its section; "" if no section has it."""
+    sections = [section for section in model.model_fields if place[-1] in _keys(model, [section])]
+    if len(place) > 1 or not sections:
         return ""
-    return f" (did you mean {' or '.join(f'{section}.{place[-1]}' for section in of)}?)"
+    return f" (did you mean {' or '.join(f'{section}.{place[-1]}' for section in sections)}?)"
 
 
 def _keys(model: type[BaseModel], place: list[str]) -> list[str]:
-    """The keys of a section of ``model``; none where a place is no section."""
+    """The keys of the section of ``model`` at ``place``; empty if it is not a section."""
     for name in place:
         field = model.model_fields.get(name)
         if field is None or not isinstance(field.annotation, type):

@@ -41,7 +41,8 @@ class ResultsError(Exception):
 
 
 def write_file(path: Path, content: str | bytes, fix: str = "free some space") -> None:
-    """Write a file, which appears only when it is complete, into a folder that is made if needed.
+    """Write a file atomically, so that it appears only when it is complete. Its folder is created
+    if needed.
 
     Raises:
         ResultsError: it cannot be written; the message ends with ``fix``.
@@ -58,8 +59,8 @@ def write_file(path: Path, content: str | bytes, fix: str = "free some space") -
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """`` (did you mean NAME?)`` with the known name that a misspelt word resembles most; empty if
-    it resembles none."""
+    """`` (did you mean NAME?)`` with the known name that is most similar to a misspelt word; empty
+    if none is similar."""
     from difflib import get_close_matches  # slow to import, and only an error message needs it
 
     near = get_close_matches(word.lower(), list(known), n=1)
@@ -72,7 +73,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def plain_reason(message: str) -> str:
-    """What is wrong with a value, in our words instead of those of the library that checked it."""
+    """Rephrase an error message of pydantic in plain words."""
     message = message.removeprefix("Value error, ").partition(", unable to parse")[0]
     for theirs, ours in (
         ("Input should be", "must be"),

@@ -13,11 +13,11 @@ from vslam.geometry import inverse
 from vslam.kernels import inner_kernel, kernel
 from vslam.odometry import PoseUncertainty
 
-MIN_DISPARITY = 0.01  # pixels; farther points are clamped to the depth of this disparity
+MIN_DISPARITY = 0.01  # pixels; smaller disparities are clamped to this
 PATCH_RADIUS = 8  # half width of the patch kept around a feature, in pixels of its octave
 PATCH_SIDE = 2 * PATCH_RADIUS + 1
 PATCH_PIXELS = PATCH_SIDE**2
-CELL = 16  # pixels of a FeatureGrid cell; search windows are 5 to 60 px wide
+CELL = 16  # side of a FeatureGrid cell in pixels; search windows are 5 to 60 px wide
 
 
 @dataclass(frozen=True)
@@ -46,21 +46,21 @@ class Pyramid:
 
 @inner_kernel
 def level_pixel(x, ratio):
-    """Coordinate in a pyramid level, rounded, of the coordinate ``x`` in an image that has
-    ``ratio`` pixels per pixel of the level."""
+    """Convert the image coordinate ``x`` to a pyramid level, where ``ratio`` is the number of image
+    pixels per pixel of the level, and round it."""
     return int(np.rint((np.float64(x) + 0.5) / ratio - 0.5))
 
 
 @dataclass(frozen=True)
 class Features:
-    """ORB features of one image, with the stereo match of each where there is one.
+    """ORB features of one image and their stereo matches.
 
     Attributes:
         xy: ``(N, 2)`` float32, position at full resolution (pixels).
         octave: ``(N,)`` uint8, pyramid level.
         angle: ``(N,)`` float32, orientation in radians.
         descriptors: ``(N, 32)`` uint8, 256-bit rotated BRIEF.
-        u_right: ``(N,)`` float32, column of the match in the right image, NaN without one.
+        u_right: ``(N,)`` float32, column of the stereo match in the right image, NaN without one.
     """
 
     xy: NDArray[np.float32]
@@ -89,7 +89,7 @@ Keypoints = tuple[NDArray[np.float32], NDArray[np.uint8]]
 
 
 class Side(StrEnum):
-    """One camera of a stereo pair. A camera without a second one counts as the left one."""
+    """One camera of a stereo pair. A single camera counts as the left one."""
 
     LEFT = "left"
     RIGHT = "right"
@@ -105,8 +105,8 @@ class Extracted:
         row_offset: ``(N,)`` float32, row of the stereo match in the right image minus row in the
             left image, in pixels; NaN for features without this measurement. None if no feature
             has it.
-        side: the camera whose image was used: the right one only if the left image is black, and
-            then no feature has a stereo match.
+        side: the camera whose image was used. The right image is used only if the left one is
+            black; then no feature has a stereo match.
     """
 
     features: Features
@@ -222,10 +222,9 @@ def build_grid(xy, columns, rows):
 class TrackingState(StrEnum):
     """How a frame was tracked.
 
-    OK: with enough inliers. WEAK: the pose rests on few inliers. LOST: the pose is only predicted,
-    or no map has begun yet.
-    DROPPED: the images arrived while earlier ones were being processed (``--realtime``); the pose
-    is interpolated.
+    OK: the pose has enough inliers. WEAK: it has few inliers. LOST: it is only predicted, or no map
+    has begun yet. DROPPED: the images arrived while earlier ones were being processed
+    (``--realtime``), and the pose is interpolated.
     """
 
     OK = "OK"
@@ -236,7 +235,7 @@ class TrackingState(StrEnum):
 
 @dataclass(frozen=True)
 class TrackResult:
-    """The result of tracking one frame; lost frames have one too.
+    """The result of tracking one frame. Lost frames have one, too.
 
     Attributes:
         index: frame number within the run, from 0.
@@ -245,15 +244,15 @@ class TrackResult:
             the final poses, after later bundle adjustments.
         state: OK, WEAK, LOST or DROPPED.
         n_features: features extracted from the left image; 0 if the frame was tracked by patches.
-        n_stereo: of these, features with a stereo match.
-        n_matches: landmarks matched or found by their patches, before the last pose optimisation.
-        n_inliers: matches that are inliers of it.
+        n_stereo: features with a stereo match.
+        n_matches: landmarks matched by descriptor or patch, before the last pose optimisation.
+        n_inliers: matches that are inliers of that optimisation.
         is_keyframe: whether the frame became a keyframe.
-        relocalised: whether the frame was searched for in the whole map and found there.
+        relocalised: whether the pose was found by a search in the whole map.
         stage_ms: wall time of each stage of the pipeline, in milliseconds.
-        T_odom_camera: ``(4, 4)`` pose in a frame that never jumps, but drifts; it is the identity
+        T_odom_camera: ``(4, 4)`` pose by odometry, which drifts but never jumps; it is the identity
             at the first frame. None in the results of older files.
-        uncertainty: how sure the pose is; None in the results of older files.
+        uncertainty: covariance of the pose; None in the results of older files.
     """
 
     index: int
@@ -272,8 +271,8 @@ class TrackResult:
 
     @property
     def T_map_odom(self) -> NDArray[np.float64]:
-        """``(4, 4)`` the correction that leads from ``T_odom_camera`` to ``T_wc``; it jumps where a
-        loop is closed, the map is adjusted or the camera is found again (ROS REP 105)."""
+        """``(4, 4)`` correction of the odometry: ``T_wc = T_map_odom @ T_odom_camera``. It jumps
+        when a loop is closed, the map is adjusted or the camera is relocalised (ROS REP 105)."""
         if self.T_odom_camera is None:
             return np.eye(4)
         T: NDArray[np.float64] = self.T_wc @ inverse(self.T_odom_camera)

@@ -29,8 +29,8 @@ class KeyframePoses(Protocol):
         ...
 
     def unit_scale(self, keyframe: int) -> float:
-        """Length in today's map units, around a keyframe, of what was one unit long when the
-        keyframe was added: 1 in metric maps."""
+        """Factor by which loops have scaled lengths near a keyframe since it was added; 1 in metric
+        maps."""
         ...
 
 
@@ -68,7 +68,8 @@ def _room_for(frames: int) -> FrameTable:
 
 
 class FramePoses:
-    """The poses of all frames, in order; before the first keyframe, relative to the world."""
+    """The poses of all frames, in order, relative to keyframes. Before there is a keyframe, they
+    are relative to the world."""
 
     def __init__(self, keyframes: KeyframePoses, before: FrameTable | None = None) -> None:
         """``before``: the poses of earlier frames of the same drive."""
@@ -115,7 +116,7 @@ class FramePoses:
         self.follow_reference(self._n - 1, T_cw)
 
     def replace(self, index: int, keyframe: int) -> None:
-        """Give a frame that became a keyframe the pose of that keyframe."""
+        """Set the pose of a frame that became a keyframe to the pose of that keyframe."""
         unit = self._keyframes.unit_scale(keyframe)
         self._frames.tracked[self._number(index)] = True
         self._set(index, keyframe, np.eye(4), unit)

@@ -42,10 +42,10 @@ def inverse(T_a_b: Matrix) -> Matrix:
 
 @kernel
 def orthonormalised(T_a_b: Matrix) -> Matrix:
-    """The rigid motion nearest to one that round-off has taken off SO(3).
+    """Project the rotation of a ``(4, 4)`` motion, which is inexact by round-off, back onto SO(3).
 
-    One Newton step of the polar decomposition, R (3 I - R'R) / 2: enough for any drift that a
-    few compositions can cause.
+    One Newton step of the polar decomposition, R (3 I - R'R) / 2, corrects the round-off of a few
+    compositions.
     """
     T = T_a_b.copy()
     for i in range(3):

@@ -1,9 +1,9 @@
 """The pose graph of a loop under two hypotheses about how the camera moved while it was lost.
 
-Where tracking was lost, a new sub-map begins whose place in the map is only predicted. Either the
-camera moved about as predicted, and the prediction is a measurement with a known error; or it was
-kidnapped, that is, carried to an unknown place, and the prediction is worthless. A loop is tried
-under the first hypothesis, then under the second.
+After tracking is lost, a new sub-map begins, whose pose in the map is only predicted. Either the
+camera moved about as predicted, so that the prediction is a measurement with a known error, or it
+was kidnapped, that is, carried to an unknown place, so that the prediction is worthless. A loop is
+tried under the first hypothesis, then under the second.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Solution:
     Attributes:
         graph: N keyframes, with the poses that the optimisation started from.
         T_cw: ``(N, 4, 4)`` optimised poses.
-        S_wc: ``(N, 4, 4)`` the same as similarities, whose scale is 1 in a metric map.
+        S_wc: ``(N, 4, 4)`` their inverses as similarities; the scale is 1 in a metric map.
         verdict: whether the edges of the optimised graph are consistent.
     """
 
@@ -79,7 +79,7 @@ def solve(
     Args:
         closed: loops that were closed before, in the map's present units.
         edge: the new loop, with its pose.
-        monocular: whether scale drifts too, so that similarities are optimised.
+        monocular: optimise similarities, because scale drifts, too.
     """
     predicted = hypothesis is Hypothesis.PREDICTED
     graph = essential_graph(
@@ -129,8 +129,8 @@ def _aligned(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
 
 
 def _aligned_similarities(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
-    """``_aligned`` for a monocular map: similarities ``S_wc``, since the sub-map that moves adopts
-    the unit of the other one."""
+    """As ``_aligned``, but ``S_wc`` for a monocular map: the sub-map that moves also adopts the
+    unit of the other one, so its poses become similarities."""
     T_cw = map_.arrays.T_cw[: map_.n_keyframes]
     S_wc = inverses(T_cw)
     moving, keyframes = _moving_submap(map_, closed, edge)
@@ -148,8 +148,8 @@ def _aligned_similarities(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge)
 def _moving_submap(
     map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge
 ) -> tuple[int, NDArray[np.int64]]:
-    """The end of a loop whose sub-map moves, and the keyframes of that sub-map; there are none if
-    both ends lie in one sub-map."""
+    """The end of a loop whose sub-map moves, and the keyframes of that sub-map, which are none if
+    both ends lie in the same sub-map."""
     submap = joined_submaps(map_, closed)
     if submap[edge.query] == submap[edge.match]:
         return edge.query, np.empty(0, np.int64)

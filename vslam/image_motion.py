@@ -15,13 +15,14 @@ from vslam.camera import Camera
 from vslam.features import MIN_DISPARITY, shifted_columns
 from vslam.geometry import Matrix
 
-_ROUNDS = 3  # the speed depends on the disparity, and the disparity on the speed
+_ROUNDS = 3  # of a fixed-point iteration, since speed and disparity depend on each other
 
 
 def rays(
     xy: NDArray[np.float32], camera: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """``(N,)`` x and ``(N,)`` y at depth 1 in the left camera, for ``(N, 2)`` pixels."""
+    """Normalised image coordinates ``(N,)`` x and ``(N,)`` y of ``(N, 2)`` pixels of the left
+    image."""
     u, v = xy.astype(np.float64).T
     return (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
 
@@ -64,10 +65,10 @@ def columns_without_delay(
         twist: ``(6,)`` of the points relative to the camera, per second.
     """
     x, y = rays(xy, camera)
-    seen = xy[:, 0].astype(np.float64) - u_right
-    disparity = seen
+    measured = xy[:, 0].astype(np.float64) - u_right
+    disparity = measured
     for _ in range(_ROUNDS):
         inverse_depth = np.maximum(disparity, MIN_DISPARITY) / camera.bf
         speed = camera.fx * column_speeds(x, y, inverse_depth, camera.baseline) @ twist
-        disparity = seen + delay * speed
-    return shifted_columns(u_right, xy[:, 0], disparity - seen)
+        disparity = measured + delay * speed
+    return shifted_columns(u_right, xy[:, 0], disparity - measured)

@@ -1,20 +1,20 @@
 """How vslam compiles its kernels, and the bit arithmetic that several of them share.
 
 A kernel is compiled once on each machine and kept in Numba's cache. It releases the GIL, so that
-threads of the pipeline run kernels side by side. ``error_model="numpy"`` and fused multiply-add are
+threads of the pipeline run kernels in parallel. ``error_model="numpy"`` and fused multiply-add are
 the only relaxations; without re-association, a result never depends on how a loop was vectorised.
 
-Numba prepares to compile before it looks into its cache: it imports everything that it can compile,
-and scipy for the linear algebra, which takes 0.25 s of CPU time. For each kernel it also loads the
-environments of all functions in it, which imports their modules, and parses the code that would be
-needed to inline the kernel into another one. A run that finds all kernels in the cache needs none
-of this. ``_KernelCache`` skips it, or defers it until a kernel is compiled, and so loads kernels in
-a fifth of the time. Its files have Numba's format. It relies on Numba's internals: with a release
-of Numba that it was not tested with, Numba's own cache is used.
+Numba prepares for compilation before it looks into its cache: it imports support for everything
+that it can compile, including scipy for linear algebra, which takes 0.25 s of CPU time. For each
+kernel it also loads the environments of all functions in it, which imports their modules, and
+parses the code that would be needed to inline the kernel into another one. A run that finds all
+kernels in the cache needs none of this. ``_KernelCache`` skips it, or defers it until a kernel is
+compiled, and so loads kernels in a fifth of the time. Its files have Numba's format. Because it
+relies on Numba's internals, other releases of Numba than the tested ones use Numba's own cache.
 
-A cache problem never ends a run. Files that a power cut damaged are found by their checksum and
-written again; truncated code would abort Python. If neither the folder of the source nor the home
-folder is writable, the process uses a temporary cache.
+A cache problem never ends a run. A checksum detects files that were truncated by a power cut, which
+would abort Python if they were loaded; they are compiled again. If neither the folder of the source
+nor the home folder is writable, the process uses a temporary cache.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ class _KernelFormat(CompileResultCacheImpl):
 
     def reduce(self, compiled: Any) -> tuple[Any, ...]:
         *parts, environments = super().reduce(compiled)
-        # Code without Python objects needs nothing of an environment without constants.
+        # Only the constants of an environment are needed, because kernels use no Python objects.
         return *parts, tuple(one for one in environments if one.consts)
 
     def rebuild(self, target_context: Any, payload: tuple[Any, ...]) -> Any:
         (name, kind, (machine_code, bitcode)), function, *rest = payload
-        # The entry point for calls from Python, which an inner kernel lacks.
+        # The entry point for calls from Python; an inner kernel has none.
         entry = function.llvm_cpython_wrapper_name
         if entry.encode() in machine_code:
             target_context.codegen()._engine._defined_symbols.add(entry)
@@ -148,7 +148,7 @@ class _KernelCache(FunctionCache):
             return self._load_overload(signature, target_context)
 
     def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, ...]:
-        # Never load an entry that Numba itself wrote, without a checksum.
+        # Entries that Numba itself wrote have no checksum, and must not be loaded.
         return (*super()._index_key(signature, codegen), "vslam, with checksums")
 
 
@@ -192,12 +192,13 @@ def _enable_cache(dispatcher: Any, function: Callable[..., Any]) -> None:
 
 
 def kernel(function: Function) -> Function:
-    """Compile ``function`` as described above, on its first call."""
+    """Compile ``function`` on its first call, with the options of all kernels and the cache."""
     return cast(Function, _cached(function, _OPTIONS))
 
 
 def inner_kernel(function: Function) -> Function:
-    """Compile a function that only kernels call; without an entry point for Python it is faster."""
+    """Compile a function that only kernels call. It has no entry point for Python, which makes
+    compilation faster."""
     return cast(Function, _cached(function, _OPTIONS | {"no_cpython_wrapper": True}))
 
 
@@ -232,14 +233,14 @@ def borrowed(typing_context, array):
     """The same array without reference counting, valid while a caller holds the original.
 
     Numba counts a reference whenever an array is passed to another function. This atomic operation
-    costs more than a small function does.
+    takes longer than a small function.
     """
 
     def generate(context, builder, signature, arguments):
-        seen = context.make_array(signature.return_type)(context, builder, arguments[0])
-        seen.meminfo = seen.meminfo.type(None)
-        seen.parent = seen.parent.type(None)
-        return seen._getvalue()
+        view = context.make_array(signature.return_type)(context, builder, arguments[0])
+        view.meminfo = view.meminfo.type(None)
+        view.parent = view.parent.type(None)
+        return view._getvalue()
 
     return array(array), generate
 

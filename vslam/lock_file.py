@@ -14,7 +14,8 @@ from vslam.errors import InputError
 
 @contextmanager
 def locked(lock: Path, folder: Path, doing: str) -> Iterator[None]:
-    """Keep other processes from writing to a folder; the lock also ends if its process is killed.
+    """Keep other processes from writing to a folder. If the process is killed, the system releases
+    the lock.
 
     Args:
         lock: the lock file, which is created and removed.
@@ -34,7 +35,7 @@ def locked(lock: Path, folder: Path, doing: str) -> Iterator[None]:
                     f"{folder}: another process {doing}; wait until it is done."
                 ) from None
             if not _is_at(file, lock):
-                continue  # its owner has removed the file since it was opened here
+                continue  # the previous owner removed this file after it was opened here
             try:
                 yield
             finally:

@@ -18,9 +18,9 @@ class LoopCandidate:
         query: keyframe whose place is searched for; -1 for a frame that is not in the map.
         match: keyframe that shows the same place, alive in the map.
         score: the detector's own measure; greater means more similar.
-        alike: similarity of the two images by the network's local descriptors, which tells whether
-            these may verify a candidate that ORB does not; None if it was not computed.
-        promising: whether the verifier tries it even if the consistency test refuses it.
+        alike: similarity of the two images by the network's local descriptors. Learned verification
+            is tried only for similar images. None if it was not computed.
+        promising: whether the candidate is verified even if the consistency test rejects it.
         proposed_by: name of the detector that proposed it; several names are joined by ``+``.
     """
 
@@ -33,9 +33,13 @@ class LoopCandidate:
 
 
 class Sighting(NamedTuple):
-    """Where a frame outside the map was recognised: near ``keyframe``, at the pose ``T_cw``
-    ``(4, 4)``. Feature ``feature[i]`` of the frame observes landmark ``landmark[i]``; ``(N,)``
-    each."""
+    """The place where a frame outside the map was recognised.
+
+    Attributes:
+        keyframe: the keyframe that the frame resembles.
+        T_cw: ``(4, 4)`` pose of the frame.
+        feature, landmark: ``(N,)`` features of the frame and the landmarks that they observe.
+    """
 
     keyframe: int
     T_cw: NDArray[np.float64]
@@ -51,14 +55,14 @@ class LoopEdge:
         query, match, score, proposed_by: as in the candidate.
         accepted: whether the loop was closed.
         reason: "closed", or in a few words why the candidate was rejected.
-        n_matches: landmarks of the place matched to features of the query.
-        n_inliers: how many of these agree with ``T_query_match``.
+        n_matches: number of landmarks of the place that were matched to features of the query.
+        n_inliers: number of matches that agree with ``T_query_match``.
         T_query_match: ``(4, 4)`` float64, maps the match's camera to the query's, in the unit of
             the map around the match; None if the candidate was rejected before it was computed.
         features: ``(N,)`` int32, inlier features of the query (index within the keyframe).
-        landmarks: ``(N,)`` int32, the landmark of the place that each of them observes.
-        scale: map units around the query per map unit around the match: 1 in metric maps; scale
-            drift changes it in monocular ones.
+        landmarks: ``(N,)`` int32, the landmark of the place that each feature observes.
+        scale: map units around the query per map unit around the match. It is 1 in metric maps, and
+            differs from 1 by the scale drift in monocular ones.
         matched_by: "orb" or "learned", the descriptors that were matched.
     """
 
@@ -83,7 +87,7 @@ class LoopEdge:
         reason: str = "",
         matched_by: Literal["orb", "learned"] = "orb",
     ) -> LoopEdge:
-        """The edge of a candidate that is not accepted (yet), with the reason if there is one."""
+        """The edge of a candidate that was rejected for a reason, or was not verified yet."""
         return cls(
             candidate.query,
             candidate.match,
@@ -122,7 +126,7 @@ class LoopCorrection:
 
     Attributes:
         edge: the loop.
-        keyframes: ``(N,)`` the keyframes that were alive at the time.
+        keyframes: ``(N,)`` ids of the keyframes in the pose graph.
         T_cw_before, T_cw_after: ``(N, 4, 4)`` their poses before and after the pose graph.
         seconds: wall time of the correction without the global bundle adjustment.
     """
@@ -167,7 +171,7 @@ class PerKeyframe:
         return PerKeyframe(first, np.concatenate([nothing, *parts]))
 
     def followed_by(self, other: PerKeyframe) -> PerKeyframe:
-        """These values, then those of another map's keyframes."""
+        """These values, followed by those of another map's keyframes."""
         first = np.concatenate([self.first, self.first[-1] + other.first[1:]])
         return PerKeyframe(first, np.concatenate([self.values, other.values]))
 
@@ -179,7 +183,7 @@ class DetectorMemory:
     Attributes:
         name: name of the detector.
         fingerprint: checksum of the vocabulary or weights that it used.
-        tables: its values for each keyframe, by names that the detector chooses.
+        tables: what it stored for each keyframe, under names that the detector chooses.
     """
 
     name: str = "none"

@@ -3,14 +3,14 @@
 A *row* is one keypoint of one keyframe; the rows of a keyframe are consecutive. The table of rows
 is also the table of observations: ``landmark[row]`` is the landmark that the keypoint observes, and
 ``next_row`` links the rows of each landmark into a chain. Covisibility is not stored, but counted
-from the rows when it is needed. Arrays instead of objects follow DPVO's PatchGraph. Ids of
-keyframes are never reused; ids of landmarks change only when dead landmarks are dropped. Arrays
+from the rows when it is needed. The use of arrays instead of objects follows DPVO's PatchGraph. Ids
+of keyframes are never reused; ids of landmarks change only when dead landmarks are dropped. Arrays
 grow by half their size.
 
 To add a column, declare it in ``Arrays`` or ``KeyframeTable`` with an empty array of its dtype and
-shape as the default. A number that describes the map as a whole belongs in ``Scalars``. It is then
-grown, copied, selected, appended, saved and loaded with the others. In a new row it is zero unless
-``Map.add_keyframe`` or ``Map.add_landmarks`` sets it.
+shape as the default. It is then grown, copied, selected, appended, saved and loaded with the other
+columns. A new entry is zero unless ``Map.add_keyframe`` or ``Map.add_landmarks`` sets it. A number
+that describes the map as a whole belongs in ``Scalars``.
 """
 
 from __future__ import annotations
@@ -28,23 +28,24 @@ from vslam.loops import LoopEdge
 from vslam.map_kernels import count_shared, detach_keyframe, resolve
 
 NONE = -1
-_FEW_LANDMARKS = 8192  # 1 MB
+_FEW_LANDMARKS = 8192  # take about 1 MB; dropping fewer dead landmarks is not worth it
 
 
 class Arrays(NamedTuple):
-    """The part of the map that kernels read and write, as arrays of capacity K keyframes, L
+    """The part of the map that kernels read and write: arrays with a capacity of K keyframes, L
     landmarks and R rows.
 
     Keyframes: ``T_cw`` (K, 4, 4) f8; ``first_row`` (K + 1,) i8; ``keyframe_alive`` (K,) bool.
     Landmarks: ``xyz`` (L, 3) f8 world; ``normal`` (L, 3) f8 mean viewing direction;
     ``distance_range`` (L, 2) f8 least and greatest distance at which the pyramid detects it;
-    ``landmark_descriptor`` (L, 4) u8; ``first_keyframe`` (L,) i4 that observed it; ``visible``,
-    ``found`` (L,) i4 number of frames in which it should be, and was, found; ``landmark_alive``
-    (L,) bool; ``merged_into`` (L,) i4; ``head`` (L,) i4 first row of its chain; ``n_observations``
-    (L,) i4, in which a stereo observation counts twice (ORB-SLAM2).
+    ``landmark_descriptor`` (L, 4) u8; ``first_keyframe`` (L,) i4 the first one that observed it;
+    ``visible`` (L,) i4 number of frames in which it should have been found; ``found`` (L,) i4
+    number of frames in which it was found; ``landmark_alive`` (L,) bool; ``merged_into`` (L,) i4;
+    ``head`` (L,) i4 first row of its chain; ``n_observations`` (L,) i4, in which a stereo
+    observation counts twice (ORB-SLAM2).
     Rows: ``xy`` (R, 2) f4 pixels; ``u_right`` (R,) f4; ``octave`` (R,) u1; ``angle`` (R,) f4
     radians; ``descriptor`` (R, 4) u8; ``keyframe`` (R,) i4; ``landmark``, ``next_row`` (R,) i4;
-    ``certainty`` (R,) u1, the variance of a keypoint over the variance of ``xy``.
+    ``certainty`` (R,) u1, variance of an unaligned keypoint divided by the variance of ``xy``.
     The types are NumPy's: f8 is float64, u8 is uint64. An id of -1 means none.
     """
 
@@ -85,15 +86,15 @@ class KeyframeTable(NamedTuple):
     """The columns of keyframes that kernels do not need, with a capacity of K keyframes.
 
     ``timestamp`` (K,) f8 seconds; ``frame`` (K,) i8 index of the frame that became the keyframe;
-    ``parent`` (K,) i8 its parent in the spanning tree, or -1;
+    ``parent`` (K,) i8 parent of the keyframe in the spanning tree, or -1;
     ``session`` (K,) i8 the drive, counted from 0, that its timestamp and frame index belong to;
-    ``unit_scale`` (K,) f8 present length, near the keyframe, of what was one unit long when the
-    keyframe was added: always 1 in metric maps, changed by the loops of monocular maps;
+    ``unit_scale`` (K,) f8 factor by which loops have scaled lengths near the keyframe since it was
+    added, always 1 in metric maps;
     ``T_c_parent`` (K, 4, 4) f8 the pose of a culled keyframe relative to its parent, identity while
     the keyframe is alive;
-    ``restart`` (K,) u1 whether mapping restarted at this keyframe after the camera was lost, which
-    makes it the root of a sub-map: 0 if not; ``PREDICTED`` if its pose relative to its parent is a
-    prediction; ``UNPREDICTED`` if nothing was predicted because the camera's speed was unknown.
+    ``restart`` (K,) u1 nonzero if mapping restarted at this keyframe after the camera was lost, so
+    that it is the root of a sub-map: ``PREDICTED`` if its pose relative to its parent was
+    predicted, ``UNPREDICTED`` if it was not, because the camera's speed was unknown.
     """
 
     timestamp: NDArray[np.float64] = np.zeros(0)
@@ -111,8 +112,8 @@ class Scalars:
 
     Attributes:
         session: the drive that new keyframes belong to.
-        disparity_offset: pixels by which the stereo pair measures every disparity too small;
-            ``u_right`` of all rows is corrected for it (``backend/disparity_offset.py``).
+        disparity_offset: pixels by which every measured disparity is too small; ``u_right`` of all
+            rows is corrected by it (``backend/disparity_offset.py``).
         offset_information: inverse variance of the measurements behind ``disparity_offset``.
         calibrated_until: the newest keyframe that those measurements used, or -1.
     """
@@ -136,7 +137,7 @@ class Map:
         arrays: the columns that kernels use.
         keyframes: the other columns of keyframes.
         scalars: numbers that describe the map as a whole.
-        n_keyframes, n_landmarks, n_rows: how much of the capacity is in use, with dead entries.
+        n_keyframes, n_landmarks, n_rows: number of entries in use, including dead ones.
     """
 
     def __init__(self, scales: NDArray[np.float64]) -> None:
@@ -184,7 +185,7 @@ class Map:
 
     @property
     def unpredicted_restarts(self) -> list[int]:
-        """The ``restarts`` whose pose is not even a prediction."""
+        """The ``restarts`` whose pose was not predicted."""
         unpredicted = self.keyframes.restart[: self.n_keyframes] == UNPREDICTED
         return np.flatnonzero(unpredicted).tolist()
 
@@ -282,13 +283,13 @@ class Map:
 
     def with_columns(self, columns: dict[str, NDArray]) -> Map:
         """This map with other columns, named as by ``columns``; they are not copied."""
-        found = copy.copy(self)
-        found.arrays = Arrays(**{name: columns[name] for name in Arrays._fields})
-        found.keyframes = KeyframeTable(**{name: columns[name] for name in KeyframeTable._fields})
-        found.n_keyframes = len(found.arrays.keyframe_alive)
-        found.n_landmarks = len(found.arrays.landmark_alive)
-        found.n_rows = len(found.arrays.keyframe)
-        return found
+        other = copy.copy(self)
+        other.arrays = Arrays(**{name: columns[name] for name in Arrays._fields})
+        other.keyframes = KeyframeTable(**{name: columns[name] for name in KeyframeTable._fields})
+        other.n_keyframes = len(other.arrays.keyframe_alive)
+        other.n_landmarks = len(other.arrays.landmark_alive)
+        other.n_rows = len(other.arrays.keyframe)
+        return other
 
     def copy(self) -> Map:
         """A copy without unused capacity."""
@@ -310,12 +311,12 @@ class Map:
         Most landmarks die within a few keyframes of their creation.
 
         Returns:
-            ``(n_landmarks,)`` for each old id, the new id of the landmark that it stands for
-            (``resolve``), or -1.
+            ``(n_landmarks,)`` for each old id, the new id of the living landmark that it was merged
+            into (``resolve``), or -1.
         """
         a, living = self.arrays, self.living_landmarks()
-        stands_for = resolve(a, np.arange(self.n_landmarks, dtype=np.int32))
-        new_id = np.full(self.n_landmarks + 1, NONE, np.int32)  # index -1, the last, gives -1
+        resolved = resolve(a, np.arange(self.n_landmarks, dtype=np.int32))
+        new_id = np.full(self.n_landmarks + 1, NONE, np.int32)  # the extra entry maps -1 to -1
         new_id[living] = np.arange(len(living))
         for name in LANDMARK_FIELDS:
             values = getattr(a, name)
@@ -323,7 +324,7 @@ class Map:
             values[len(living) : self.n_landmarks] = 0
         a.landmark[: self.n_rows] = new_id[a.landmark[: self.n_rows]]
         self.n_landmarks = len(living)
-        return new_id[stands_for]
+        return new_id[resolved]
 
     def rows(self, keyframe: int) -> slice:
         """Rows of one keyframe."""
@@ -355,7 +356,7 @@ class Map:
     def cull_keyframe(self, keyframe: int) -> None:
         """Remove a keyframe and its observations; its children become children of its parent.
 
-        These include keyframes that were culled before, so every parent is alive.
+        Its children include keyframes that were culled before, so that every parent is alive.
         """
         a, table, parents = self.arrays, self.keyframes, self.parents
         parent = parents[keyframe]
@@ -369,8 +370,8 @@ class Map:
         a.keyframe_alive[keyframe] = False
 
     def begin_submap(self, keyframe: int, parent: int, *, predicted: bool) -> None:
-        """Record that mapping restarted at a keyframe; ``predicted`` tells whether its pose
-        relative to the parent is at least a prediction."""
+        """Record that mapping restarted at a keyframe, and whether its pose relative to the parent
+        was ``predicted``."""
         self.keyframes.parent[keyframe] = parent
         self.keyframes.restart[keyframe] = PREDICTED if predicted else UNPREDICTED
 

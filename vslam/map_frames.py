@@ -38,7 +38,7 @@ def add_frame(
     Args:
         certainty: ``(N,)`` certainty of the frame's features (``Arrays.certainty``).
         reference: the parent of the keyframe if it begins a sub-map.
-        predicted: whether its pose is at least a prediction if it begins a sub-map.
+        predicted: whether its pose was predicted, if it begins a sub-map.
 
     Returns:
         The id of the keyframe.
@@ -76,8 +76,8 @@ def add_two_views(map_: Map, start: TwoViewStart, reference: int) -> tuple[int, 
     ]
     xyz = transform(inverse(T_1_w), start.points)
     ids = map_.add_landmarks(xyz, map_.arrays.descriptor[rows[1]], first)
-    for of_view in rows:
-        link_many(map_.arrays, of_view, ids)
+    for rows_of_view in rows:
+        link_many(map_.arrays, rows_of_view, ids)
     refresh_landmarks(map_.arrays, ids, map_.scales)
     if first > 0:
         map_.begin_submap(first, reference, predicted=start.predicted)
@@ -86,8 +86,8 @@ def add_two_views(map_: Map, start: TwoViewStart, reference: int) -> tuple[int, 
 
 
 class LandmarkCounts:
-    """Collects which landmarks each frame should have seen and did see, until the map is free and
-    its counters can be updated."""
+    """Collects the landmarks that frames should have seen and those that they found, until no other
+    thread writes the map and its counters can be updated."""
 
     def __init__(self) -> None:
         self._visible: list[NDArray[np.int32]] = []
@@ -124,14 +124,14 @@ def has_more_points(map_: Map, keyframe: int, frame: Frame) -> bool:
 
 
 def observe_keyframe(frame: Frame, map_: Map, keyframe: int) -> None:
-    """Let a frame that became a keyframe track all landmarks that the keyframe observes."""
+    """Assign all landmarks that a keyframe observes to the frame that became it."""
     frame.landmark = map_.arrays.landmark[map_.rows(keyframe)]
     update_landmarks(frame, map_)
 
 
 def update_landmarks(frame: Frame, map_: Map) -> None:
     """Update a frame's landmarks: ids of merged landmarks are replaced, ids of dead ones become -1,
-    and ``frame.xyz`` gets their present positions.
+    and ``frame.xyz`` is set to their present positions.
 
     If two tracked landmarks were merged, only the first feature keeps the result.
     """
@@ -186,7 +186,8 @@ def keyframe_trajectory(map_: Map) -> Trajectory:
 
 
 def in_first_part(map_: Map, closed: Sequence[LoopEdge], frames: FrameTable) -> NDArray[np.bool_]:
-    """``(N,)`` bool: which frames were tracked in the part of the map with its first keyframe.
+    """``(N,)`` bool: which frames were tracked in the part of the map that contains the first
+    keyframe.
 
     Args:
         closed: closed loops; the sub-maps that they join form one part.

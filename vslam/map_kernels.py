@@ -30,7 +30,7 @@ def count_shared(a, keyframe, n_keyframes):
 
 @kernel
 def link(a, row, landmark):
-    """Let a free row observe a landmark."""
+    """Record that a free row observes a landmark."""
     a.landmark[row] = landmark
     a.next_row[row] = a.head[landmark]
     a.head[landmark] = row
@@ -39,14 +39,14 @@ def link(a, row, landmark):
 
 @kernel
 def link_many(a, rows, landmarks):
-    """Let each of ``(N,)`` free rows observe its landmark."""
+    """Record that ``(N,)`` free rows observe ``(N,)`` landmarks."""
     for i in range(len(rows)):
         link(a, rows[i], landmarks[i])
 
 
 @kernel
 def unlink(a, row):
-    """Remove one observation. A landmark without observations is dead."""
+    """Remove one observation. A landmark that has no observations left is dead."""
     landmark = a.landmark[row]
     if a.head[landmark] == row:
         a.head[landmark] = a.next_row[row]
@@ -97,9 +97,9 @@ def observed_by(a, landmark, keyframe):
 
 @kernel
 def merge_landmarks(a, loser, winner):
-    """Move the observations of ``loser`` to ``winner``; a keyframe that sees both keeps one.
+    """Move the observations of ``loser`` to ``winner``; a keyframe that observes both keeps one.
 
-    Rows and keyframes are cast to int64, as other callers pass them, so that ``link`` and
+    Rows and keyframes are cast to int64, the type that other callers pass, so that ``link`` and
     ``observed_by`` are compiled only once.
     """
     row = np.int64(a.head[loser])
@@ -147,8 +147,8 @@ def refresh_landmarks(a, landmarks, scales):
     """Recompute descriptor, normal and distance range of landmarks from their observations.
 
     The descriptor is that of the observation with the least median distance to the others
-    (ORB-SLAM, III-C), among the newest 32 to bound the work. The distance range follows from the
-    octave in the first keyframe that observes the landmark.
+    (ORB-SLAM, III-C). Only the newest 32 observations are considered, to bound the work. The
+    distance range follows from the octave in the first keyframe that observes the landmark.
     """
     limit = 32
     rows = np.empty(limit, np.int64)
@@ -221,7 +221,8 @@ def collect_landmarks(a, keyframes, n_landmarks):
 
 @kernel
 def count_seen_by(a, keyframe, needed):
-    """Count a keyframe's landmarks that ``needed`` or more keyframes observe, including itself."""
+    """Count a keyframe's landmarks that at least ``needed`` keyframes observe, including this
+    one."""
     count = 0
     for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
         if a.landmark[row] < 0:

@@ -1,4 +1,4 @@
-"""Copies of the map that tracking reads, so that local mapping can write the map meanwhile."""
+"""Copies of the map that tracking reads while local mapping writes the map."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def local_map(map_: Map, keyframe: int, limit: int) -> LocalMap:
     (docs/explanation/design.md).
 
     Args:
-        limit: greatest number of keyframes; those that share the most landmarks are taken.
+        limit: greatest number of keyframes; those that share the most landmarks are chosen.
     """
     first, _ = map_.covisible(keyframe)
     chosen = [keyframe, *first[: limit - 1].tolist()]
@@ -57,8 +57,8 @@ NO_LANDMARKS = LocalMap(
 
 @dataclass(frozen=True)
 class MapView:
-    """The map as tracking sees it: its state at the last merge of local mapping, which the mapping
-    thread does not change. The defaults are those of an empty map.
+    """The map as tracking sees it: a copy of its state at the last merge of local mapping. The
+    defaults describe an empty map.
 
     Attributes:
         reference: the keyframe that frames are tracked against and that their poses are relative
@@ -68,8 +68,8 @@ class MapView:
         n_keyframes: number of keyframes so far, culled ones included.
         local_landmarks: landmarks of the reference keyframe and of its covisible keyframes.
         reference_landmarks: landmarks of the reference keyframe alone.
-        n_reference: how many of these are observed by at least three keyframes (in a map of fewer
-            keyframes, by all of them).
+        n_reference: number of these that at least three keyframes observe (in a map with fewer
+            keyframes, all of them).
         patches: image patches of the local landmarks that the newest keyframes observe.
     """
 

@@ -1,9 +1,10 @@
 """Local mapping in parallel with tracking, with the same result on every machine.
 
-``Mapper`` owns the map. Each keyframe is mapped by a job in another thread. Tracking sees the job's
-result from a fixed frame index on, however long the job took; this is called the merge. Between
-two merges tracking reads a ``MapView``, a copy that the last merge made. Every method that needs
-the merged map merges by itself, and held frames are updated when a merge moves the map.
+``Mapper`` owns the map. Each keyframe is mapped by a job in another thread. The *merge*, which
+makes the job's result visible to tracking, happens at a fixed frame index, however long the job
+takes. Between two merges tracking reads a ``MapView``, a copy that the last merge made. Every
+method that needs the merged map performs the merge itself, and a merge also updates the frames that
+are held.
 """
 
 from __future__ import annotations
@@ -123,7 +124,8 @@ class Mapper:
         return self._shared.map
 
     def keyframe_pose(self, keyframe: int) -> Matrix:
-        """``T_cw`` of a keyframe at the last merge; while a job runs, only of the reference."""
+        """``T_cw`` of a keyframe at the last merge; while a job runs, it is available only for the
+        reference keyframe."""
         if not self._is_merged and keyframe == self.view.reference:
             return self.view.T_reference
         return self.map.keyframe_pose(keyframe)
@@ -140,7 +142,7 @@ class Mapper:
         Raises:
             RuntimeError: as ``map``.
         """
-        self.map  # noqa: B018
+        self.map  # noqa: B018 (raises if it cannot be read)
         return self.frames.trajectory()
 
     # The schedule
@@ -152,7 +154,7 @@ class Mapper:
 
     def admit(self, frame: Frame, last: Frame | None, twist: Matrix | None) -> None:
         """Prepare the next frame for tracking: merge if a merge is due at its index, and correct
-        its columns in the right image by what is known about the rig.
+        its columns in the right image by the measured offset and delay of the rig.
 
         Until the next frame is admitted, merges update this frame and the last tracked one.
 
@@ -229,7 +231,7 @@ class Mapper:
         that shares no landmark with the map begins a sub-map.
 
         Args:
-            predicted: if the frame begins a sub-map, whether its pose is at least a prediction.
+            predicted: whether the pose was predicted, if the frame begins a sub-map.
         """
         with self._changing() as map_:
             self._make_room(map_, frame)
@@ -265,11 +267,12 @@ class Mapper:
     def begin(self, start: TwoViewStart, twist: Callable[[], Matrix | None]) -> None:
         """Begin a monocular map or sub-map with two keyframes; the second is the newest frame.
 
-        Its twist becomes that of the two views, and it tracks all landmarks that it observes.
+        The newest frame gets the twist between the two views, and tracks all landmarks that it
+        observes.
 
         Args:
-            twist: called after the merge, returns the ``(6,)`` twist of the camera before, per
-                second, or None if unknown. The unit of a sub-map is derived from it.
+            twist: called after the merge, returns the ``(6,)`` twist of the camera before it was
+                lost, per second, or None if unknown. It determines the unit of a sub-map.
         """
         with self._changing() as map_:
             start = start.at_speed(twist(), self._config.initialization.max_rescaling)
@@ -285,7 +288,7 @@ class Mapper:
             start.second.twist = start.twist
 
     def find_old_place(self, frame: Frame) -> OldPlace | None:
-        """The old place to which the frame has returned, or None (``find_old_place``)."""
+        """The old place that the frame has returned to, or None (``find_old_place``)."""
         return find_old_place(self.merge(), frame, self._config.keyframes.known_after_s)
 
     def use_existing_keyframe(self, place: OldPlace, frame: PlacedFrame) -> None:
@@ -340,7 +343,7 @@ class Mapper:
 
     @contextmanager
     def _changing(self) -> Iterator[Map]:
-        """Yield the merged map for changes; after an exception it cannot be used any more."""
+        """Yield the merged map for changes. After an exception, the map cannot be used any more."""
         self.merge()
         with self._shared.change() as map_:
             yield map_
@@ -366,19 +369,19 @@ class Mapper:
             self._move(frame, before)
 
     def _move(self, frame: Frame, before: MapView) -> None:
-        """Update a frame after the map moved. A frame whose pose is recorded follows its keyframe,
-        any other the reference keyframe."""
-        grown = self.view.unit_scale / before.unit_scale
+        """Update a frame after the map moved. A frame whose pose is recorded moves with its
+        keyframe, any other frame with the reference keyframe."""
+        growth = self.view.unit_scale / before.unit_scale
         self.rig.correct_offset(frame)
         update_landmarks(frame, self.map)
         if frame.index < len(self.frames):
             frame.T_cw = self.frames.pose(frame.index)
         else:
             T_c_reference = frame.T_cw @ inverse(before.T_reference)
-            T_c_reference[:3, 3] *= grown
+            T_c_reference[:3, 3] *= growth
             frame.T_cw = orthonormalised(T_c_reference @ self.view.T_reference)
         if frame.twist is not None:
-            frame.twist[:3] *= grown
+            frame.twist[:3] *= growth
 
     def _map_keyframe(
         self, keyframe: int, features: Features, image: NDArray[np.uint8] | None, map_: Map
@@ -387,6 +390,6 @@ class Mapper:
         self._closing.process(map_, keyframe, features, image)
 
     def _start(self, job: Callable[[Map], None]) -> None:
-        """Start a mapping job; tracking continues with the present view."""
+        """Start a mapping job; until the merge, tracking continues with the present view."""
         self._shared.start(job)
         self._is_merged = False

@@ -1,9 +1,9 @@
-"""Merging the maps of several drives by loops between them, which are found and verified as usual.
+"""Merging the maps of several drives by loops between them.
 
-A map is appended to another as a sub-map at an unknown place, and the other map's detector proposes
-candidates for each of its keyframes. From there on everything is loop closing: the first loop moves
-the sub-map to its place, later loops correct drift and fuse landmarks, and a global bundle
-adjustment ends the merge.
+A map is appended to another one as a sub-map at an unknown place, and the other map's detector
+proposes candidates for each of its keyframes. They are verified and closed as usual: the first loop
+moves the sub-map to its place, later loops correct drift and fuse landmarks, and a global bundle
+adjustment concludes the merge.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class MergedMaps:
     Attributes:
         stored: the first map together with all maps that were joined to it.
         joined: the joined maps, in the order in which they were joined.
-        left_out: the maps that no verified loop connects to the others.
+        left_out: the maps that no verified loop connects to the first one.
         loops: for each joined map, the loops that connect it to the maps before it.
     """
 
@@ -54,8 +54,8 @@ def merge_maps(
 
     Args:
         maps: two or more maps with the same camera, pyramid and detector.
-        create: creates an empty detector of that kind, and the store of its images.
-        on_keyframe: called for each keyframe that was compared.
+        create: creates an empty detector like that of the maps, and the store of its images.
+        on_keyframe: called after each keyframe for which loops were searched.
 
     Raises:
         ValueError: the maps cannot be merged; the message gives the reason in a few words.
@@ -89,7 +89,7 @@ def join(
     """Join two compact maps; the world frame is that of the first.
 
     Args:
-        memory: an empty detector, and the store of its images.
+        memory: an empty detector like that of the maps, and the store of its images.
 
     Returns:
         The joined map and the loops that were closed between the two, or None if there are none.
@@ -102,7 +102,7 @@ def join(
     both = appended(one, other)
     if images is not None and both.images is not None:
         images.restore(both.images, one.camera.width)
-    # With one thread, the global adjustment runs only in finish(), after the last loop.
+    # With threads=1, global bundle adjustment runs only in finish(), after the last loop.
     verifier = verifier_for(config, one.camera, images)
     closing = LoopClosing(detector, verifier, one.camera, config, threads=1)
     closing.closed = list(both.loops)
@@ -125,8 +125,8 @@ def _candidates(
     images: KeyframeImages | None,
     config: Config,
 ) -> list[LoopCandidate]:
-    """Keyframes of the first map that resemble a keyframe of the second and do not share landmarks
-    with it yet."""
+    """Keyframes of the first map that resemble a keyframe of the second one and do not share enough
+    landmarks with it yet."""
     image = images.image(keyframe) if images is not None and keyframe in images else None
     found = detector.locate(image, features_of(map_, keyframe), map_)
     joined = set(map_.covisible(keyframe, config.consistency.min_shared)[0].tolist())
@@ -142,10 +142,14 @@ def features_of(map_: Map, keyframe: int) -> Features:
 
 def _require_alike(one: StoredMap, other: StoredMap) -> None:
     if not same_camera(one.camera, other.camera):
-        raise ValueError("of another camera")
+        raise ValueError("one was made with another camera")
     if not np.array_equal(one.map.scales, other.map.scales):
-        raise ValueError("of another pyramid")
+        raise ValueError("one was made with another image pyramid")
     if other.detector.name != one.detector.name:
-        raise ValueError(f"of the detector {other.detector.name}, not {one.detector.name}")
+        raise ValueError(
+            f"one was made with the detector {other.detector.name}, not {one.detector.name}"
+        )
     if other.detector.fingerprint != one.detector.fingerprint:
-        raise ValueError(f"of another vocabulary or other weights of {one.detector.name}")
+        raise ValueError(
+            f"one was made with another vocabulary or other weights of {one.detector.name}"
+        )

@@ -1,4 +1,4 @@
-"""The two modes of SLAM: build a map from the frames, or localise in a map that stays as it is."""
+"""The two modes of SLAM: build a map from the frames, or localise in a map without changing it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vslam.states import PolicyState
 
 
 class Mode:
-    """How frames change the map. This base class leaves it as it is, and only localises in it.
+    """How frames change the map. This base class only localises in the map and never changes it.
 
     Attributes:
         changes_map: whether a drive in this mode changes the map.
@@ -32,11 +32,11 @@ class Mode:
 
     def begin(self, frame: PlacedFrame) -> bool:
         """Try to begin a map or sub-map with a frame that has a pose but was not tracked; returns
-        whether it did."""
+        whether one was begun."""
         return False
 
     def begin_after_loss(self, frame: PlacedFrame) -> bool:
-        """``begin``, but only if the camera has been lost for long enough."""
+        """As ``begin``, but only if the camera has been lost for enough frames."""
         return False
 
     def map_far_points(self) -> bool:

@@ -1,20 +1,20 @@
-"""Odometry beside the map: poses that never jump, and how sure each pose is.
+"""Odometry: poses that drift but never jump, and the uncertainty of each pose.
 
-The pose of the camera in the map jumps where a loop is closed or the camera is found again. A robot
-that controls itself by poses needs some that do not: ``odom`` follows the motion from frame to
-frame, and drifts (ROS REP 105).
+The pose of the camera in the map jumps when a loop is closed or the camera is relocalised. The
+controller of a robot needs poses that do not jump: the frame ``odom`` follows the motion from frame
+to frame, and drifts (ROS REP 105).
 
-A pose has two errors. The *local* one is that of the camera relative to the landmarks around it,
-and is drawn anew in every frame. The *drift* is that of these landmarks relative to the start of
-the drive. It grows with every keyframe, because new landmarks inherit the error of the keyframe
-that maps them. Keyframes that follow each other share landmarks, so that their errors are
-correlated: the drift grows like a random walk whose steps have a correlation (a first-order
-autoregressive process).
+The error of a pose has two parts. The *local* error is that of the camera relative to the landmarks
+around it, and is independent in every frame. The *drift* is the error of these landmarks relative
+to the start of the drive. It grows with every keyframe, because new landmarks inherit the error of
+the keyframe that maps them. Consecutive keyframes share landmarks, so that their errors are
+correlated: the drift grows like a random walk with correlated steps (a first-order autoregressive
+process).
 
 Covariances are those of ``xi = [v, w]``, metres and radians, in the frame of the camera: with an
-estimated pose ``T_cw``, the true one is ``exp(xi) T_cw``. A loop closure makes the drift smaller,
-which is not modelled: the covariance describes odometry. Neither is the scale of a monocular map,
-nor an error of the calibration.
+estimated pose ``T_cw``, the true one is ``exp(xi) T_cw``. The covariance describes odometry: that
+loop closures reduce the drift is not modelled, nor are the unknown scale of a monocular map and
+errors of the calibration.
 """
 
 from __future__ import annotations
@@ -26,24 +26,25 @@ from numpy.typing import NDArray
 
 from vslam.geometry import Matrix, inverse, orthonormalised
 
-# Chosen on four rendered drives so that the squared errors over 1 s and 10 s are those that the
-# covariances predict, and checked on four others (docs/research/uncertainty.md).
+# Chosen on four rendered drives so that the squared errors over 1 s and 10 s match the covariances,
+# and tested on four others (docs/research/uncertainty.md).
 LOCAL, DRIFT, CORRELATION = 1.8, 3.3, 0.5
-# Standard deviation of the acceleration of a camera that is lost, in m/s^2 and rad/s^2.
+# Standard deviations of the acceleration of a lost camera, in m/s^2 and rad/s^2.
 ACCELERATION, TURNING = 2.0, 1.0
 
-N_NUMBERS = 43  # of ``PoseUncertainty.numbers``
-N_STATE = 16 + N_NUMBERS + 1  # of ``Odometry.state``
+N_NUMBERS = 43  # length of ``PoseUncertainty.numbers``
+N_STATE = 16 + N_NUMBERS + 1  # length of ``Odometry.state``
 _UPPER = np.triu_indices(6)
 
 
 @dataclass(frozen=True, eq=False)
 class PoseUncertainty:
-    """How sure a pose is.
+    """The uncertainty of a pose.
 
     Attributes:
-        local: ``(6, 6)`` covariance of ``pose_covariance``, relative to the landmarks.
-        drift: ``(6, 6)`` sum of these covariances of all keyframes since the start of the drive.
+        local: ``(6, 6)`` covariance relative to the landmarks, from ``pose_covariance``.
+        drift: ``(6, 6)`` sum of the local covariances of all keyframes since the start of the
+            drive.
         n_keyframes: number of these keyframes.
     """
 
@@ -58,7 +59,7 @@ class PoseUncertainty:
 
     @classmethod
     def of_numbers(cls, numbers: NDArray[np.float64]) -> PoseUncertainty:
-        """The uncertainty whose ``numbers`` these are."""
+        """The uncertainty that ``numbers`` was called on."""
         both = np.zeros((2, 6, 6))
         for matrix, values in zip(both, numbers[:-1].reshape(2, -1), strict=True):
             matrix[_UPPER] = values
@@ -85,8 +86,8 @@ def relative_covariance(
     at the last one: the true motion is ``exp(xi) T_last_first``.
 
     Args:
-        T_last_first: ``(4, 4)`` the estimated motion: maps points from the first camera to the
-            last.
+        T_last_first: ``(4, 4)`` the estimated motion, which maps points from the first camera to
+            the last.
     """
     n = last.n_keyframes - first.n_keyframes
     A = adjoint(T_last_first)
@@ -110,8 +111,8 @@ def _symmetric(matrix: Matrix) -> Matrix:
 
 
 def _growth(n: int) -> float:
-    """By how much the variance of a sum of n steps with the correlation exceeds that of independent
-    steps: variance of the sum of an AR(1) process (Hamilton, Time Series Analysis, 1994, 7.2)."""
+    """Ratio of the variance of a sum of n correlated steps to that of n independent steps, for an
+    AR(1) process (Hamilton, Time Series Analysis, 1994, 7.2)."""
     if n == 0:
         return 1.0
     r = CORRELATION
@@ -135,12 +136,11 @@ class Odometry:
         """Advance to the next frame.
 
         Args:
-            T_now_last: ``(4, 4)`` motion from the last frame to this one: maps points from the last
-                camera to this one.
-            elapsed: seconds between them.
+            T_now_last: ``(4, 4)`` motion, which maps points from the last camera to this one.
+            elapsed: seconds between the two frames.
             covariance: ``(6, 6)`` of the optimised pose (``pose_covariance``); None if the pose is
-                only predicted, with a constant velocity: its error then grows with the square of
-                the time.
+                only predicted with constant velocity. Its error then grows with the square of the
+                time.
         """
         self.T_odom_camera = orthonormalised(self.T_odom_camera @ inverse(T_now_last))
         A = adjoint(T_now_last)
@@ -156,7 +156,7 @@ class Odometry:
         self.now = PoseUncertainty(local, drift, self.now.n_keyframes)
 
     def keyframe(self) -> None:
-        """Note that the last frame became a keyframe, so that new landmarks inherit its error."""
+        """Record that the last frame became a keyframe, whose error new landmarks inherit."""
         now = self.now
         self.now = PoseUncertainty(now.local, now.drift + now.local, now.n_keyframes + 1)
 
@@ -165,7 +165,7 @@ class Odometry:
         self.T_odom_camera, self.now = T_odom_camera, uncertainty
 
     def state(self) -> tuple[float, ...]:
-        """The state between two frames, for a checkpoint."""
+        """The state, for a checkpoint."""
         return (*self.T_odom_camera.ravel(), *self.now.numbers().tolist(), self._lost_s)
 
     def restore(self, state: tuple[float, ...]) -> None:

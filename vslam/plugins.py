@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from importlib.metadata import Distribution, EntryPoint, distributions
 from pathlib import Path
@@ -49,27 +49,27 @@ class PlugIn:
         )
 
     def call(self, *arguments: object, **named: object) -> Any:
-        """Import what the entry point names and call it.
+        """Import the function or class that the entry point names, and call it.
 
         Raises:
-            InputError: it cannot be imported, is not callable, fails, or is offered by two
-                packages.
+            InputError: it cannot be imported, is not callable or fails, or several packages offer
+                this name.
         """
         if len(self.packages) > 1:
-            raise InputError(f"{self}: two packages offer this name; uninstall one of them.")
+            raise InputError(f"{self}: several packages offer this name; uninstall all but one.")
         try:
-            made = self.entry_point.load()
+            target = self.entry_point.load()
         except Exception as error:  # importing foreign code may raise anything
             raise InputError(
                 f"{self}: {self.entry_point.value} cannot be imported ({reason(error)}); repair "
                 "or uninstall the package."
             ) from error
-        if not callable(made):
+        if not callable(target):
             raise InputError(
-                f"{self}: {self.entry_point.value} is no function and no class; repair or "
+                f"{self}: {self.entry_point.value} is neither a function nor a class; repair or "
                 "uninstall the package."
             )
-        return self.guarded(made, *arguments, **named)
+        return self.guarded(target, *arguments, **named)
 
     def guarded(self, function: Callable[..., Any], *arguments: object, **named: object) -> Any:
         """Call a function of the package.
@@ -88,7 +88,7 @@ class PlugIn:
             ) from error
 
     def _line(self, error: Exception) -> str:
-        """The line of the package at which it failed, empty if the call did not get that far."""
+        """The source line of the package at which it failed; empty if no line of it was running."""
         package = self.entry_point.module.partition(".")[0]
         lines = [
             f"; {Path(frame.f_code.co_filename).name}, line {line}"
@@ -115,7 +115,7 @@ def find_plugins(group: str) -> dict[str, PlugIn]:
         name = entry_point.name
         if not _NAME.fullmatch(name):
             _log.warning(
-                "%s: its plug-in '%s' is ignored; a name may only have letters, digits and ._-",
+                "%s: its plug-in '%s' is ignored; a name may contain only letters, digits and ._-",
                 package,
                 name,
             )
@@ -125,6 +125,12 @@ def find_plugins(group: str) -> dict[str, PlugIn]:
             first = found[name].entry_point if name in found else entry_point
             found[name] = PlugIn(group, name, (*others, package), first)
     return dict(sorted(found.items()))
+
+
+def packages_of(names: Collection[str]) -> dict[str, str]:
+    """The packages, with versions, of those ``names`` that are plug-ins, by name."""
+    found = {name: plugin for group in KINDS for name, plugin in find_plugins(group).items()}
+    return {name: " and ".join(found[name].packages) for name in names if name in found}
 
 
 def _entry_points(group: str) -> list[tuple[str, EntryPoint]]:
@@ -137,7 +143,7 @@ def _entry_points(group: str) -> list[tuple[str, EntryPoint]]:
         package = _package(distribution)
         try:
             points = list(distribution.entry_points.select(group=group))
-        except (TypeError, ValueError) as error:  # a line that is no "name = module:object"
+        except (TypeError, ValueError) as error:  # a line is not "name = module:object"
             _log.warning("%s: its entry points cannot be read (%s)", package, reason(error))
             continue
         found += [(package, point) for point in points]

@@ -1,7 +1,7 @@
 """Reprojection errors: the layout of observations and the inlier test.
 
-An observation is a row ``u, v, u_right`` in pixels; ``u_right`` is NaN without a stereo match, and
-only this tells kernels whether the observation is monocular or stereo.
+An observation is a row ``u, v, u_right`` in pixels. ``u_right`` is NaN without a stereo match, by
+which kernels distinguish monocular from stereo observations.
 
 Kernels that only test for inliers call ``chi_square_ratio``; optimisers, which also need the
 ``residual``, test it with ``chi_square``.
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from vslam.geometry import Matrix
 from vslam.kernels import inner_kernel
 
-# 95 % quantiles of chi-square with 2 and 3 degrees of freedom: the largest squared error, in
-# variances, of an inlier seen by one camera (u, v) or by both (u, v, u_right). ORB-SLAM2, III-C.
+# 95 % quantiles of chi-square with 2 and 3 degrees of freedom: the largest squared error, divided
+# by the variance, of a monocular (u, v) or stereo (u, v, u_right) inlier. ORB-SLAM2, III-C.
 CHI2_MONO = 5.991
 CHI2_STEREO = 7.815
 
@@ -30,7 +30,8 @@ def stack_uvr(xy: NDArray[np.floating], u_right: NDArray[np.floating]) -> Matrix
 
 @inner_kernel
 def unpacked(intrinsics):
-    """``Camera.intrinsics`` as a tuple: its values stay in registers, those of an array do not."""
+    """``Camera.intrinsics`` as a tuple, whose values, unlike those of an array, stay in
+    registers."""
     return (
         intrinsics[0],
         intrinsics[1],
@@ -47,7 +48,8 @@ def chi_square_ratio(x, y, z, u, v, u_right, inverse_sigma2, pinhole):
     chi-square limit: at most 1 for an inlier. The point must lie in front of the camera.
 
     Args:
-        u, v, u_right: float64 observation; inverse_sigma2: inverse variance of a pixel coordinate.
+        u, v, u_right: float64 observation.
+        inverse_sigma2: inverse variance of a pixel coordinate.
         pinhole: intrinsics as ``unpacked`` returns them.
     """
     fx, fy, cx, cy, bf, disparity_weight = pinhole
@@ -73,7 +75,7 @@ def residual(x, y, z, u, v, u_right, pinhole):
 
 @inner_kernel
 def chi_square(r_u, r_v, r_disparity, stereo, inverse_sigma2):
-    """Squared error of a ``residual`` in variances, and the limit for an inlier, which is also
-    where the Huber loss becomes linear."""
+    """Squared error of a ``residual`` divided by its variance, and the upper limit of an inlier,
+    beyond which the Huber loss is linear."""
     chi2 = (r_u * r_u + r_v * r_v + r_disparity * r_disparity) * inverse_sigma2
     return chi2, CHI2_STEREO if stereo else CHI2_MONO

@@ -31,7 +31,7 @@ class OpenedMap:
     """The map, new or stored, in which a drive begins.
 
     Attributes:
-        map: None for a new one.
+        map: the stored map; None for a new one.
         frames: poses of the drive's earlier frames; None for a new drive.
         checkpoint: state from which the drive continues with identical results, or None.
         drives: sources of the images of the earlier drives, such as "kitti 06".
@@ -53,10 +53,11 @@ def open_map(
     localize: bool,
     resume: bool,
 ) -> OpenedMap:
-    """Restore detector, images and closed loops from a stored map, or begin a new map (None).
+    """Restore detector, images and closed loops from a stored map, or begin a new map if ``stored``
+    is None.
 
     Args:
-        localize: leave the map as it is; otherwise a new drive begins in it.
+        localize: do not change the map; otherwise a new drive begins in it.
         resume: continue the map's last drive instead of starting a new one.
 
     Raises:
@@ -69,8 +70,8 @@ def open_map(
     map_, images = stored.map, closing.verifier.images
     if not np.array_equal(map_.scales, context.scales):
         raise ValueError(
-            f"made with another pyramid, of {len(map_.scales)} levels by "
-            f"{map_.scales[1] / map_.scales[0]:g}"
+            f"made with another image pyramid ({len(map_.scales)} levels, scale factor "
+            f"{map_.scales[1] / map_.scales[0]:g})"
         )
     if not same_camera(stored.camera, context.camera):
         raise ValueError("made with another camera")
@@ -88,7 +89,7 @@ def open_map(
 
 @dataclass(frozen=True)
 class Session:
-    """The parts of SLAM that have a state, and the map in which the drive began."""
+    """The parts of SLAM that have a state, and the map that the drive began in."""
 
     context: TrackingContext
     closing: LoopClosing
@@ -122,7 +123,7 @@ class Session:
     def state(self) -> Checkpoint | None:
         """The state of all parts between two frames, or None if no checkpoint is possible now.
 
-        That is so before the first frame is tracked, when only localising, while a keyframe is
+        It is None before the first frame is tracked, when only localising, while a keyframe is
         being mapped, while a monocular map begins, and during a global bundle adjustment.
         """
         tracker, policy = self.tracker.state(), self.mode.state()
@@ -162,8 +163,8 @@ class Session:
     def resume(self) -> None:
         """Continue after the last frame of a resumed drive, if there is one.
 
-        With a checkpoint the results are identical to those of an uninterrupted run; without one,
-        only the pose and the speed of the last frames are known.
+        With a checkpoint, the results are identical to those of an uninterrupted run. Without one,
+        tracking continues from the last pose and speed.
         """
         frames = self.opened.frames
         if frames is None:
@@ -176,8 +177,8 @@ class Session:
             return
         if self.mapper.n_keyframes:
             _log.warning(
-                "the map was saved without the state of tracking (resumable=True): the drive "
-                "continues, but its poses will differ from those of an uninterrupted one"
+                "the map was saved without the state of tracking (resumable=True), so the poses of "
+                "the continued drive will differ from those of an uninterrupted one"
             )
         if len(frames.tracked) > 1 and frames.tracked[-2:].all():
             self.mapper.refer_to(int(frames.reference[-1]))

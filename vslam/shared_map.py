@@ -57,7 +57,7 @@ class SharedMap:
             self._job = self._future.result
 
     def wait(self) -> Map:
-        """Wait for the job and return the map.
+        """Wait for the job, if there is one, and return the map.
 
         Raises:
             RuntimeError: an earlier job failed, or this process is a fork. An error of this job is
@@ -74,7 +74,7 @@ class SharedMap:
 
     @contextmanager
     def change(self) -> Iterator[Map]:
-        """Wait for the job, then yield the map for changes.
+        """Wait for the job, if there is one, and yield the map for changes.
 
         Raises:
             RuntimeError: as ``wait``.
@@ -85,7 +85,7 @@ class SharedMap:
 
     @contextmanager
     def _invalidated_on_error(self) -> Iterator[None]:
-        """An exception leaves the map incomplete, so every later access raises an error."""
+        """After an exception, which leaves the map incomplete, make every access raise an error."""
         try:
             yield
         except BaseException as error:
@@ -96,9 +96,10 @@ class SharedMap:
             raise
 
     def _refuse_fork(self) -> None:
-        """A fork lacks the thread that runs the jobs, and would wait for it forever."""
+        """Raise an error in a forked process: it lacks the thread that runs the jobs, and would
+        wait for it forever."""
         if self._executor is not None and os.getpid() != self._process:
             raise RuntimeError(
-                "this Slam was made by another process, whose threads a fork does not copy; make "
-                "one after the fork, or use threads=1"
+                "this Slam was created before the process was forked, which does not copy its "
+                "threads; create it after the fork, or use threads=1"
             )

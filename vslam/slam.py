@@ -1,4 +1,4 @@
-"""SLAM on a stereo, RGB-D or monocular stream: ``Slam.step`` is the method section."""
+"""SLAM on a stereo, RGB-D or monocular stream; ``Slam.step`` processes one frame."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from vslam.trajectory import Trajectory
 
 
 class Slam:
-    """Stereo, RGB-D or monocular SLAM; a monocular map has a unit of its own instead of metres.
+    """Stereo, RGB-D or monocular SLAM; a monocular map has an arbitrary unit instead of metres.
 
     >>> slam = Slam(camera)
     >>> for left, right, timestamp in frames:
@@ -52,16 +52,16 @@ class Slam:
     >>> slam.trajectory().T_wc
     >>> slam.save(path)
 
-    ``Slam.load(path)`` continues in that map: the camera is searched for in the whole map, and new
-    places are added. If the camera is not found, a new sub-map begins, which a loop may join to the
-    map later. With ``localize=True`` the map is not changed.
+    ``Slam.load(path)`` continues in that map: the camera is relocalised in it, and new places are
+    added. If relocalisation fails, a new sub-map begins, which a loop may join to the map later.
+    With ``localize=True`` the map is not changed.
 
     Attributes:
         context: camera, thresholds and pyramid scales, for ``FrameImages``.
         detector: proposes loop candidates and places for relocalisation.
-        rig: what has been measured of the stereo pair, such as the delay of its right camera.
-        next_extraction: index of a coming frame whose features will probably be needed, so that
-            its ``FrameImages.find_corners`` may be called ahead, in another thread; -1 if none.
+        rig: measurements of the stereo pair, such as the delay of its right camera.
+        next_extraction: index of a later frame whose features will probably be needed, so that
+            another thread may call its ``FrameImages.find_corners`` in advance; -1 if none.
     """
 
     def __init__(
@@ -82,12 +82,12 @@ class Slam:
                 monocular SLAM.
             config: thresholds, also as a dictionary such as ``{"orb": {"n_features": 1000}}``;
                 those left out keep their defaults.
-            detector: proposes loop candidates and places for relocalisation: a name
-                (``vslam.loopclosure.registry``; ``both`` is the capsule network together with the
-                bag of words, ``none`` is odometry only) or an object.
+            detector: proposes loop candidates and places for relocalisation; an object or a name
+                (``vslam.loopclosure.registry``). ``both`` combines the capsule network with the bag
+                of words; ``none`` closes no loops.
             threads: with 1, a keyframe is mapped when its result is needed instead of in parallel
                 with tracking. The results are the same.
-            images: if ``detector`` is an object: store of the keyframe images for learned
+            images: only if ``detector`` is an object: store of the keyframe images for learned
                 descriptors, which verify loops where ORB fails; None verifies with ORB only.
             start: a map to continue in, made with the same camera, detector and pyramid; it is
                 changed in place. ``Slam.load`` reads one from a file.
@@ -138,7 +138,7 @@ class Slam:
             path: the map file, or the folder of a run.
             config: as for a new map; None uses the thresholds that the map was made with.
             detector: the detector that the map was made with, as a name or an object; None uses
-                the shipped detector of that name.
+                the shipped detector of the name in the file.
             resume: as for a new map.
             options: ``threads``, ``images`` and ``localize``, as for a new map.
 
@@ -157,14 +157,15 @@ class Slam:
             raise InputError(f"{path}: {error}; use the options of that run.") from error
 
     def save(self, path: Path | str, drive: str = "", *, resumable: bool = False) -> None:
-        """Write everything that ``load`` needs to a file; an existing file is replaced.
+        """Write the map, and everything else that ``load`` needs, to a file; an existing file is
+        replaced.
 
         Args:
             path: the file.
             drive: source of the images of this drive, such as "kitti 06".
-            resumable: include the state of tracking and the culled parts of the map. A run that
-                loads such a file with ``resume=True`` gives the same poses, to the byte, as a run
-                that was not interrupted.
+            resumable: include the state of tracking and the culled parts of the map, so that a run
+                that loads the file with ``resume=True`` gives the same poses, byte for byte, as an
+                uninterrupted run.
 
         Raises:
             RuntimeError: mapping failed, so that the map is incomplete.
@@ -173,8 +174,8 @@ class Slam:
         save_map(path, self.stored_map(drive), resumable=resumable)
 
     def stored_map(self, drive: str = "") -> StoredMap:
-        """What ``save`` writes. It shares the map's arrays, so call ``compact()``, which copies
-        them, before the next step.
+        """The map as ``save`` writes it. It shares the arrays of the map that is being built; call
+        ``compact()``, which copies them, before the next step.
 
         Raises:
             RuntimeError: mapping failed, so that the map is incomplete.
@@ -192,8 +193,8 @@ class Slam:
         """Track one rectified stereo pair, RGB-D image or monocular image, and insert it as a
         keyframe if it shows something new.
 
-        The images are copied where they are kept, so that a camera may write the next ones into the
-        same arrays.
+        Images that are kept are copied, so that a camera may write the next images into the same
+        arrays.
 
         Args:
             left: ``(H, W)`` uint8.
@@ -201,8 +202,8 @@ class Slam:
                 image's pixels, ``(H, W)`` float32 metres, 0 where unknown; None for a monocular
                 camera.
             timestamp: seconds, later than that of the last call.
-            mask: ``(H, W)`` uint8 or bool, 0 where the left image is not to be used, for example
-                where it shows the hood of the car; None uses all of it.
+            mask: ``(H, W)`` uint8 or bool, 0 where the left image must not be used, for example
+                where it shows the hood of the car; None uses the whole image.
 
         Raises:
             ValueError: the images have another size or type, or the timestamp is not finite or not
@@ -220,10 +221,10 @@ class Slam:
     def step_images(
         self, images: FrameImages, timestamp: float, stage_ms: dict[str, float] | None = None
     ) -> TrackResult:
-        """``step`` for images that were prepared before, in another thread for example.
+        """As ``step``, for images that were prepared before, for example in another thread.
 
         Args:
-            images: they are not copied: do not write to them afterwards.
+            images: the images, which are not copied: do not write to them afterwards.
             timestamp, stage_ms: as for ``step_features``.
         """
         frame = self._next_frame(Extracted.nothing(), timestamp, None)
@@ -238,14 +239,16 @@ class Slam:
         image: Image | None = None,
         stage_ms: dict[str, float] | None = None,
     ) -> TrackResult:
-        """``step`` for a frame whose features were extracted before (``FrameImages.extracted``).
+        """As ``step``, for a frame whose features were extracted before
+        (``FrameImages.extracted``).
 
         Args:
             extracted: the features.
             timestamp: as for ``step``.
-            image: ``(H, W)`` uint8 that the features were extracted from, for loop detectors that
-                need it. It is not copied: do not write to it afterwards.
-            stage_ms: wall time of the stages so far in milliseconds, which the result includes.
+            image: ``(H, W)`` uint8, the image of the features, for loop detectors that need it. It
+                is not copied: do not write to it afterwards.
+            stage_ms: wall time of the stages before this call, in milliseconds, to be included in
+                the result.
         """
         frame = self._next_frame(extracted, timestamp, image)
         return self._step(frame, StageClock(dict(stage_ms or {})))
@@ -294,7 +297,7 @@ class Slam:
             placed = mapper.append_pose(frame, tracked=True, near=found.keyframe)
             is_keyframe = self._mode.update_map(placed, found)
             self.rig.observe(frame, frame.twist)
-        # Where patches failed, they probably fail again.
+        # If patches failed for this frame, they will probably fail for the next ones.
         self.next_extraction = self._mode.due if by_patches else frame.index + 2
         if is_keyframe:
             self._odometry.keyframe()
@@ -302,8 +305,8 @@ class Slam:
         return result_of(frame, found, is_keyframe, clock.ms, self._odometry)
 
     def skip(self, timestamp: float, *, dropped: bool = False) -> TrackResult:
-        """Add a frame without images at the predicted pose: it is LOST, or DROPPED if there was
-        merely no time to process it."""
+        """Add a frame without images at the predicted pose. Its state is LOST, or DROPPED if there
+        was no time to process it."""
         frame = self._next_frame(Extracted.nothing(), timestamp, None)
         frame.T_cw = self._tracker.predict(timestamp, self._mapper.frames, self._mapper.view)
         self._follow(frame, frame.T_cw, None)
@@ -317,7 +320,8 @@ class Slam:
         """Advance the odometry to the next frame, before its pose is recorded.
 
         Args:
-            T_cw: ``(4, 4)`` where its motion from the last frame leads.
+            T_cw: ``(4, 4)`` pose of the frame by continuous motion from the last one; it differs
+                from the pose in the map if the camera was relocalised.
         """
         frames = self._mapper.frames
         T_now_last, elapsed = np.eye(4), 0.0
@@ -327,12 +331,12 @@ class Slam:
         self._odometry.move(T_now_last, elapsed, covariance)
 
     def resume_odometry(self, last: TrackResult) -> None:
-        """Continue ``T_odom_camera`` and the uncertainty after the last result of a drive that was
-        resumed from a map without the state of tracking; otherwise they begin anew."""
+        """Continue ``T_odom_camera`` and the uncertainty from the last result of a drive that was
+        resumed from a map without the state of tracking; without this call they begin anew."""
         self._session.resume_odometry(last)
 
     def finish(self) -> None:
-        """Complete all mapping, so that map and trajectory stay as they are until the next step."""
+        """Complete all mapping, so that map and trajectory do not change until the next step."""
         self._mapper.finish()
 
     def _next_frame(self, extracted: Extracted, timestamp: float, image: Image | None) -> Frame:
@@ -389,8 +393,8 @@ class Slam:
         return self._closing.corrections
 
     def trajectory(self) -> Trajectory:
-        """The pose of every frame according to the present map. Where the camera was lost, its
-        motion is interpolated between the frames tracked before and after."""
+        """The pose of every frame according to the present map. The poses of lost frames are
+        interpolated between the tracked frames before and after them."""
         return self._mapper.trajectory()
 
     def keyframe_trajectory(self) -> Trajectory:

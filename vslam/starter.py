@@ -1,7 +1,7 @@
 """The start of a map, and of a sub-map after the camera was lost.
 
-One frame of a stereo or RGB-D camera with enough points begins a map. A monocular map needs two
-frames: a frame is kept until a later one forms a pair with it.
+A stereo or RGB-D map begins with one frame that has enough points. A monocular map needs two
+frames: the first one is kept until a later frame forms a pair with it.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ class TwoViewStart:
     Attributes:
         first, second: the frames; the first has the pose at which the map begins.
         T_2_1: ``(4, 4)`` maps points of the first camera to the second.
-        features: for each frame, ``(N,)`` int64 features; the i-th of both see the same point.
-        points: ``(N, 3)`` these points in the first camera.
-        predicted: whether the map's unit was derived from the camera's speed before the loss.
+        features: matched features of the first and of the second frame, ``(N,)`` int64 each.
+        points: ``(N, 3)`` the points that they show, in the first camera.
+        predicted: whether the unit of the map was derived from the speed before the camera was
+            lost.
     """
 
     first: Frame
@@ -43,12 +44,13 @@ class TwoViewStart:
         return se3_log(self.T_2_1) / (self.second.timestamp - self.first.timestamp)
 
     def at_speed(self, twist: Matrix | None, max_rescaling: float) -> TwoViewStart:
-        """Scale the start of a sub-map such that the camera has kept its speed, which gives the
-        sub-map approximately the unit of the map before it.
+        """Scale the start of a sub-map so that the camera has the same speed as before it was lost.
+        The sub-map then has approximately the unit of the map before.
 
         Args:
             twist: ``(6,)`` twist of the camera per second before it was lost; None if unknown.
-            max_rescaling: if the factor is larger than this, the start remains as it is.
+            max_rescaling: if the scale factor is above this or below its inverse, the start remains
+                unchanged.
         """
         if twist is None:
             return self
@@ -95,7 +97,8 @@ class Starter:
         return OneViewStart(frame) if enough else None
 
     def _offer_monocular(self, frame: PlacedFrame) -> TwoViewStart | None:
-        """Try to pair a frame with the kept one; if they share too little, keep the new one."""
+        """Try to pair a frame with the kept one; if they have too few matches or are too far apart
+        in time, keep the new frame instead."""
         config = self._context.config.initialization
         if self._first is None or frame.timestamp - self._first.timestamp > config.max_seconds:
             self._keep(frame)

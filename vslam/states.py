@@ -28,7 +28,7 @@ class TrackerState:
         twist: ``(6,)`` twist of the camera at that time, per second; None if unknown.
         lost_frames: number of lost frames since then.
         n_tracked: number of landmarks that the frame tracked.
-        coarse: ``(Q,)`` uint8, the pixels of its ``coarse_levels``; empty if there are none.
+        coarse: ``(Q,)`` uint8, the pixels of its ``coarse_levels``; empty if it has none.
     """
 
     index: int
@@ -65,7 +65,8 @@ class PolicyState:
     """State of the keyframe policy.
 
     Attributes:
-        gained_close: mean number of close points that the first frame after a keyframe tracks.
+        gained_close: running mean of the number of close points that the first frame after a
+            keyframe tracks.
         gain_awaited: whether the next frame is the first after a keyframe.
         first_close: how many close points the first frame after the last keyframe tracked.
         first_frame: index of that frame; -1 before the first keyframe.
@@ -85,7 +86,8 @@ class ConsistencyState:
 
     Attributes:
         places: places that recent keyframes resembled.
-        verified: verified loops that others must confirm, each with the ``turn`` of its keyframe.
+        verified: verified loops that other keyframes must confirm, each with the ``turn`` of its
+            keyframe.
         turn: number of keyframes tested so far.
     """
 
@@ -113,7 +115,7 @@ class ClosingState:
 
     Attributes:
         consistency, verifier: the states of its parts.
-        followed: how often an old keyframe was reused instead of a new one.
+        followed: how often an old keyframe was reused instead of inserting a new one.
     """
 
     consistency: ConsistencyState = field(default_factory=ConsistencyState)
@@ -123,11 +125,11 @@ class ClosingState:
 
 @dataclass(frozen=True)
 class RigState:
-    """What was measured of a stereo rig.
+    """Measurements of a stereo rig.
 
     Attributes:
         delay: the estimate of the delay between the two cameras (``DelayState``).
-        sides: what the comparisons of the two images showed (``ComparedSides``).
+        sides: the results of comparing the two images (``ComparedSides``).
     """
 
     delay: tuple[float, ...] = ()

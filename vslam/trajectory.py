@@ -1,9 +1,10 @@
 """Trajectories: one pose for each frame, read and written in the field's text formats.
 
-A line holds, in KITTI's format, the upper 3x4 part of ``T_wc``, row by row, without time (Geiger et
-al., CVPR 2012); in TUM's, ``t x y z qx qy qz qw`` in seconds and metres (Sturm et al., IROS 2012);
-in EuRoC's, which is only written, ``t,x,y,z,qw,qx,qy,qz`` with t in nanoseconds (Burri et al., IJRR
-2016).
+Each line holds one pose:
+
+- KITTI (Geiger et al., CVPR 2012): the upper 3x4 part of ``T_wc``, row by row, without time.
+- TUM (Sturm et al., IROS 2012): ``t x y z qx qy qz qw`` in seconds and metres.
+- EuRoC (Burri et al., IJRR 2016), only written: ``t,x,y,z,qw,qx,qy,qz`` with t in nanoseconds.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from vslam.geometry import compose, inverse, orthonormalised, se3_exp, se3_log
 
 _FORMAT_OF_COLUMNS: dict[int, Literal["kitti", "tum"]] = {12: "kitti", 8: "tum"}
 
-# Published poses are rounded to about 7 digits; a larger error means that it is not a rotation.
+# Published poses are rounded to about 7 digits; a matrix with a larger error is not a rotation.
 _ROTATION_TOLERANCE = 1e-3
 
 
@@ -136,12 +137,12 @@ def read_trajectory(path: Path | str, timestamps: NDArray[np.float64] | None = N
 
     Args:
         path: file to read.
-        timestamps: ``(N,)`` seconds of the poses of a KITTI file; None uses the frame number. A
-            TUM file has its own timestamps and ignores these.
+        timestamps: ``(N,)`` seconds, the times of the poses of a KITTI file; None uses the frame
+            number. A TUM file has its own timestamps, and these are ignored.
 
     Raises:
-        InputError: the file is malformed, the numbers of poses and timestamps differ, a pose has
-            no rotation, or TUM times do not increase.
+        InputError: the file is malformed, the numbers of poses and timestamps differ, a rotation is
+            invalid, or TUM times do not increase.
     """
     rows = read_table(path, (12, 8), "a pose")
     if _FORMAT_OF_COLUMNS[rows.shape[1]] == "kitti":
@@ -162,7 +163,7 @@ def read_trajectory(path: Path | str, timestamps: NDArray[np.float64] | None = N
             "sort the poses by time."
         )
     if not np.allclose(np.linalg.norm(rows[:, 4:], axis=1), 1.0, atol=_ROTATION_TOLERANCE):
-        raise InputError(f"{path}: a quaternion is not of length 1; normalise qx qy qz qw.")
+        raise InputError(f"{path}: the length of a quaternion is not 1; normalise qx qy qz qw.")
     T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
     T_wc[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
     T_wc[:, :3, 3] = rows[:, 1:4]
@@ -171,7 +172,7 @@ def read_trajectory(path: Path | str, timestamps: NDArray[np.float64] | None = N
 
 def write_kitti(path: Path | str, T_wc: NDArray[np.float64]) -> None:
     """Write ``(N, 4, 4)`` poses in KITTI's format with 13 significant digits."""
-    rows = T_wc[:, :3, :].reshape(-1, 12) + 0.0  # turns -0 into 0: equal poses give equal bytes
+    rows = T_wc[:, :3, :].reshape(-1, 12) + 0.0  # turns -0 into 0, so equal poses give equal bytes
     lines = (" ".join([f"{x:.12e}" for x in row]) + "\n" for row in rows.tolist())
     Path(path).write_text("".join(lines))
 
@@ -197,7 +198,8 @@ def _tum_lines(timestamps: NDArray[np.float64], T_wc: NDArray[np.float64]) -> st
 def write_euroc(path: Path | str, trajectory: Trajectory) -> None:
     """Write a trajectory in the format of EuRoC's ground truth, without velocities and biases.
 
-    Times are written in nanoseconds, but float64 seconds resolve only 0.2 us of Unix time.
+    Times are written in nanoseconds, but Unix time in float64 seconds has a resolution of only
+    0.2 us.
     """
     names = ("x [m]", "y [m]", "z [m]"), ("w []", "x []", "y []", "z []")
     columns = [*(f"p_RS_R_{name}" for name in names[0]), *(f"q_RS_{name}" for name in names[1])]
@@ -212,9 +214,9 @@ def write_euroc(path: Path | str, trajectory: Trajectory) -> None:
 def quaternions(R: NDArray[np.float64]) -> NDArray[np.float64]:
     """``(N, 4)`` float64 quaternions x, y, z, w with w >= 0 of ``(N, 3, 3)`` rotations.
 
-    They equal those of ``scipy.spatial.transform.Rotation`` to the last bit; importing it would
-    take longer than writing all files of a run. A matrix whose error is above 1e-12 is replaced by
-    the nearest rotation.
+    They equal those of ``scipy.spatial.transform.Rotation`` to the last bit, but SciPy takes longer
+    to import than all files of a run take to write. A matrix whose error is above 1e-12 is replaced
+    by the nearest rotation.
     """
     error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3))
     off = (error > 1e-12 + 1e-5 * np.eye(3)).any(axis=(1, 2))
@@ -224,8 +226,8 @@ def quaternions(R: NDArray[np.float64]) -> NDArray[np.float64]:
         R[off] = U @ Vt
     diagonal = R[:, [0, 1, 2], [0, 1, 2]]
     trace = diagonal[:, 0] + diagonal[:, 1] + diagonal[:, 2]
-    # Dividing by the largest of the four components loses no digits (Markley, Journal of Guidance,
-    # Control and Dynamics, 2008).
+    # Dividing by the largest of the four components preserves precision (Markley, Journal of
+    # Guidance, Control and Dynamics, 2008).
     largest = np.argmax(np.column_stack([diagonal, trace]), axis=1)
     q = np.empty((len(R), 4))
     for i in range(3):

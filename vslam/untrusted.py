@@ -1,7 +1,7 @@
 """Limits on the memory that untrusted files can make this process allocate.
 
-A small file can announce a huge one, such as an image of 100,000 x 100,000 pixels or a zip member
-that unpacks to 100 GB. The announced size is checked before memory is allocated.
+A small file can declare huge content, such as an image of 100,000 x 100,000 pixels or a zip member
+that unpacks to 100 GB. The declared size is checked before memory is allocated.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ if TYPE_CHECKING:  # `vslam --help` loads this module and must not load NumPy
     from numpy.typing import NDArray
 
 MOST_PIXELS = 2**27
-"""Most pixels of an image file (11,585 x 11,585); OpenCV itself allows eight times as many."""
+"""Largest number of pixels of an image file (11,585 x 11,585); OpenCV itself allows eight times as
+many."""
 
 _OPENCV_LIMIT = "OPENCV_IO_MAX_IMAGE_PIXELS"
 _ANY_SIZE = 2**27  # bytes; every archive may unpack to this size
@@ -28,17 +29,18 @@ ARCHIVE_ERRORS = (
     EOFError, ValueError, KeyError, RuntimeError, OverflowError, zlib.error,
     zipfile.BadZipFile, zipfile.LargeZipFile,
 )  # fmt: skip
-"""What NumPy, zipfile and zlib raise for a file that is not an archive of arrays, or a damaged,
-encrypted or unusually compressed one."""
+"""Exceptions of NumPy, zipfile and zlib for a file that is not an archive of arrays, or that is
+damaged, encrypted or compressed with an unsupported method."""
 
 
 def limit_images() -> None:
-    """Make OpenCV refuse larger images by their header; it reads this limit when it is imported."""
+    """Make OpenCV reject images whose header declares more than ``MOST_PIXELS``. OpenCV reads this
+    limit when it is imported, so call this before."""
     os.environ.setdefault(_OPENCV_LIMIT, str(MOST_PIXELS))
 
 
 def require_utf8(path: Path) -> None:
-    """Refuse a file name that text files such as reports cannot contain.
+    """Check that a file name can be written into text files such as reports.
 
     Raises:
         InputError: the name is not UTF-8.
@@ -51,7 +53,7 @@ def require_utf8(path: Path) -> None:
 
 
 def read_npz(path: Path, what: str, fix: str = "name another file") -> dict[str, NDArray[Any]]:
-    """Read all arrays of an npz file; Python objects (pickles) are refused.
+    """Read all arrays of an npz file; Python objects (pickles) are rejected.
 
     Args:
         what: what the file should be, with an article, for the error messages.
@@ -84,7 +86,7 @@ def read_json(array: NDArray[Any]) -> Any:
         ValueError: the array does not hold bytes, or these are not JSON.
     """
     if array.dtype != "uint8" or array.ndim != 1:  # bytes() of a number n would be n zeros
-        raise ValueError("the header is no text")
+        raise ValueError("the header is not text")
     return json.loads(array.tobytes())
 
 
@@ -107,14 +109,14 @@ def _check_size(path: Path, archive: zipfile.ZipFile, what: str) -> None:
     packed = path.stat().st_size
     if needed > max(_ANY_SIZE, _MOST_PACKED * packed):
         raise InputError(
-            f"{path}: {packed / 2**20:.1f} MB unpack to {needed / 2**20:.0f} MB; this is hardly "
-            f"{what}."
+            f"{path}: unpacks from {packed / 2**20:.1f} MB to {needed / 2**20:.0f} MB, so it is "
+            f"probably not {what}; name another file."
         )
     there = psutil.virtual_memory().available
     if needed > there:
         raise InputError(
-            f"{path}: unpacks to {needed / 2**30:.1f} GB and {there / 2**30:.1f} GB of memory are "
-            f"free; this is hardly {what}."
+            f"{path}: unpacks to {needed / 2**30:.1f} GB, but only {there / 2**30:.1f} GB of "
+            f"memory are free; free some memory, or name another file if this is not {what}."
         )
 
 

@@ -24,17 +24,17 @@ _UNDISTORT_COLUMNS = (8, 9)
 def read_fabmap(folder: Path, truth: str = "", side: str = "left") -> list[ImageSource]:
     """Read a FAB-MAP collection: a folder of images and a ground-truth matrix.
 
-    The matrix has a row for each image, or a row for each pair of a left and a right image (odd and
-    even numbers); in the latter case only the images of one camera are used. If the folder has a
-    ``calibration.txt`` (fx fy cx cy k1 k2 p1 p2 [k3] on one line), the images are undistorted.
+    The matrix has a row for each image, or a row for each pair of a left image (odd number) and a
+    right image (even number); with pairs, only the images of one camera are used. If the folder has
+    a ``calibration.txt`` (fx fy cx cy k1 k2 p1 p2 [k3] on one line), the images are undistorted.
 
     Args:
         folder: folder of the images.
-        truth: ``.mat`` file of the matrix; by default the first one in the folder.
+        truth: ``.mat`` file of the matrix; by default, the first one in the folder.
         side: "left" or "right", the camera to use if the matrix has a row for each pair.
 
     Raises:
-        InputError: there are no images or no matrix, or their sizes do not fit together.
+        InputError: there are no images or no matrix, or the matrix has another number of rows.
     """
     files = images_in(folder)
     if not files:
@@ -49,14 +49,14 @@ def read_fabmap(folder: Path, truth: str = "", side: str = "left") -> list[Image
         files = files[0 if side == "left" else 1 :: 2]
     if n != len(files):
         raise InputError(
-            f"{path}: a matrix of {n} rows does not belong to {len(files)} images in {folder}; "
-            "take the matrix of this collection."
+            f"{path}: the matrix has {n} rows, but {folder} has {len(files)} images; name the "
+            "matrix of this collection."
         )
     relation = np.where(loops | loops.T, SAME, DIFFERENT).astype(np.int8)
     index = np.arange(n)
-    # The matrices do not mark the images just before and after, although they overlap.
-    beside = np.abs(index[:, None] - index[None]) <= 20
-    relation[beside & (relation == DIFFERENT)] = UNKNOWN
+    # The matrices do not mark an image's predecessors and successors, although their views overlap.
+    near_in_time = np.abs(index[:, None] - index[None]) <= 20
+    relation[near_in_time & (relation == DIFFERENT)] = UNKNOWN
     np.fill_diagonal(relation, SAME)
     calibration = folder / "calibration.txt"
     model = (

@@ -15,8 +15,8 @@ from vslam.loopclosure.siamese.images import Fit, Size, read_grey, to_size
 SAME, UNKNOWN, DIFFERENT = 1, 0, -1
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".ppm", ".pgm"}
 _NO_TRUTH = (
-    "{}: no ground truth in it (no square matrix with a match); name the loop matrix of these "
-    "images."
+    "{}: contains no ground truth (a square matrix with at least one match); name the loop matrix "
+    "of these images."
 )
 
 
@@ -33,11 +33,11 @@ class ImageSource:
             diagonal is 1, because an image shows the same place as its augmentations.
         unit: ``(N,)`` int32; images of the same unit (a folder, a stretch of road) are not split
             between training and validation.
-        calibration: ``(8,)`` or ``(9,)`` fx fy cx cy k1 k2 p1 p2 [k3], None if the images are
+        calibration: ``(8,)`` or ``(9,)`` fx fy cx cy k1 k2 p1 p2 [k3]; None if the images are
             rectified.
-        is_query: ``(N,)`` bool, the queries of a benchmark, which are searched for among the other
-            images; None for a drive, where each image is searched for among much earlier ones.
-        times: ``(N,)`` times at which the images were taken, seconds; None if unknown.
+        is_query: ``(N,)`` bool, images that a benchmark compares with all other images; None for a
+            drive, where each image is compared with much earlier ones.
+        times: ``(N,)`` capture times, seconds; None if unknown.
     """
 
     name: str
@@ -54,7 +54,7 @@ class ImageSource:
         return len(self.images)
 
     def read(self, index: int, size: Size, fit: Fit) -> NDArray[np.uint8]:
-        """Read an image, undistorted and resized, as uint8.
+        """Read an image as uint8, undistorted and resized to ``size``.
 
         Raises:
             UnreadableImageError: the image is missing or damaged.
@@ -62,7 +62,7 @@ class ImageSource:
         return to_size(self.grey(index), size, fit)
 
     def grey(self, index: int) -> NDArray[np.uint8]:
-        """Read an image, undistorted, as ``(H, W)`` uint8.
+        """Read an image as ``(H, W)`` uint8, undistorted.
 
         Raises:
             UnreadableImageError: the image is missing or damaged.
@@ -84,7 +84,8 @@ class ImageSource:
 
 
 def undistorted(image: NDArray[np.uint8], calibration: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Remove radial and tangential distortion (Brown's model); size and camera matrix are kept."""
+    """Remove radial and tangential distortion (Brown's model); the size and the camera matrix stay
+    the same."""
     import cv2
 
     fx, fy, cx, cy = calibration[:4]
@@ -105,11 +106,12 @@ def names_of(files: Iterable[Path]) -> tuple[str, ...]:
 
 
 def read_loop_matrix(path: Path) -> NDArray[np.bool_]:
-    """``(N, N)`` bool, which images close a loop: the largest square matrix of a ``.mat`` file.
+    """Read a loop matrix: the largest square matrix of a ``.mat`` file, as ``(N, N)`` bool, True
+    where two images close a loop.
 
-    The matrix may be dense or sparse, and may have any name (``truth`` in those of Oxford and Lip6,
-    the name of the sequence in those for KITTI). Most matrices mark each pair once, in the row of
-    the later image.
+    The matrix may be dense or sparse, and may have any name (``truth`` in the files of Oxford and
+    Lip6, the name of the sequence in those for KITTI). Most matrices mark each pair once, in the
+    row of the later image.
 
     Raises:
         InputError: there is no such file, or it contains no such matrix.
@@ -128,7 +130,7 @@ def read_loop_matrix(path: Path) -> NDArray[np.bool_]:
     if not matrices:
         raise InputError(_NO_TRUTH.format(path))
     largest = max(matrices, key=lambda m: m.shape[0])
-    found = largest.toarray() if hasattr(largest, "toarray") else largest
-    if not found.any():
+    dense = largest.toarray() if hasattr(largest, "toarray") else largest
+    if not dense.any():
         raise InputError(_NO_TRUTH.format(path))
-    return np.asarray(found != 0)
+    return np.asarray(dense != 0)

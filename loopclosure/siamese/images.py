@@ -39,8 +39,8 @@ def parse_size(text: str) -> Size:
 def to_size(image: NDArray[np.uint8], size: Size, fit: Fit = "squash") -> NDArray[np.uint8]:
     """Resize an ``(H, W)`` uint8 image to ``size``.
 
-    ``squash`` keeps the whole view but changes the aspect ratio; ``crop`` keeps the aspect ratio
-    but uses only the largest central rectangle with the aspect ratio of ``size``.
+    ``squash`` keeps the whole view but changes the aspect ratio. ``crop`` preserves the aspect
+    ratio by cutting out the largest central rectangle with the aspect ratio of ``size``.
     """
     import cv2
 
@@ -52,8 +52,8 @@ def to_size(image: NDArray[np.uint8], size: Size, fit: Fit = "squash") -> NDArra
     if image.shape == size:
         return image
     shrinking = image.shape[0] > size[0] or image.shape[1] > size[1]
-    way = cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(image, size[::-1], interpolation=way), np.uint8)
+    interpolation = cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, size[::-1], interpolation=interpolation), np.uint8)
 
 
 def read_grey(source: Path | NDArray[np.uint8], name: str = "") -> NDArray[np.uint8]:
@@ -81,10 +81,10 @@ def read_grey(source: Path | NDArray[np.uint8], name: str = "") -> NDArray[np.ui
 
 def turn_homography(width: int, height: int, degrees: float) -> NDArray[np.float64]:
     """``(3, 3)`` homography from the pixels of an image to those after the camera has turned to the
-    right on the spot.
+    right without moving.
 
-    The horizontal field of view is taken to be 80 degrees, as is common on cars. Vertical
-    coordinates are only scaled, so the homography also holds for squashed images.
+    The horizontal field of view is assumed to be 80 degrees, as is common on cars. The homography
+    only scales vertical coordinates, so it also holds for squashed images.
     """
     focal = width / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])

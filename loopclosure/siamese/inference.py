@@ -33,7 +33,7 @@ class OnnxNetwork:
         name: one of ``NETWORKS``.
         size: height and width of its input images.
         dimensions: length D of its descriptors.
-        fingerprint: identifies the file, see ``fingerprint_of``.
+        fingerprint: hash of the file, see ``fingerprint_of``.
         about: how the weights were trained; ``parameters`` is the number of learned parameters.
     """
 
@@ -68,7 +68,7 @@ class OnnxNetwork:
             raise InputError(f"{path}: {_FOREIGN}; {_FIX}.") from error
 
     def embed(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """``(D,)`` float32 descriptor of norm 1 of an ``(H, W)`` uint8 image of the size
+        """``(D,)`` float32 descriptor of norm 1 of a uint8 image with the height and width
         ``size``."""
         (descriptor,) = self._embedding.run(None, {"image": image})
         return np.asarray(descriptor, np.float32)
@@ -76,10 +76,10 @@ class OnnxNetwork:
     def compare(
         self, query: NDArray[np.float32], gallery: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """``(N,)`` probabilities in (0, 1) that the image of a descriptor ``(D,)`` shows the same
-        place as that of each descriptor of a gallery ``(N, D)``."""
+        """``(N,)`` probabilities in (0, 1) that the images of a query descriptor ``(D,)`` and of
+        each gallery descriptor ``(N, D)`` show the same place."""
         views = gallery.reshape(-1, *self._views)
-        # NumPy computes the lengths four times as fast as onnxruntime.
+        # NumPy computes the lengths four times as fast as onnxruntime does.
         lengths = np.sqrt(np.einsum("nvd,nvd->nv", views, views))
         given = {"query": query.reshape(self._views), "gallery": views, "lengths": lengths}
         (similarity,) = self._comparison.run(None, given)
@@ -87,14 +87,16 @@ class OnnxNetwork:
 
 
 class LateNetwork:
-    """A network that is loaded when the first image comes, because many drives never need it.
+    """A shipped network that is loaded with the first image, because many drives never need it.
 
     Attributes:
         name, fingerprint: as in :class:`OnnxNetwork`.
     """
 
     def __init__(self, name: str) -> None:
-        """``name`` is that of a network that vslam ships.
+        """
+        Args:
+            name: one of ``NETWORKS``.
 
         Raises:
             InputError: the name is unknown, vslam ships no weights for it, or ONNX Runtime is not
@@ -127,7 +129,7 @@ class LateNetwork:
 
 
 def fingerprint_of(path: Path) -> str:
-    """A hash that identifies the contents of a file."""
+    """A hash of the contents of a file: the first 16 hexadecimal digits of SHA-256."""
     return sha256(path.read_bytes()).hexdigest()[:16]
 
 
@@ -136,10 +138,10 @@ def open_network(name: str, weights: Path | None = None) -> OnnxNetwork:
 
     Args:
         name: one of ``NETWORKS``.
-        weights: ONNX file; None takes the one that vslam ships.
+        weights: ONNX file; None uses the one that vslam ships.
 
     Raises:
-        InputError: the name is unknown, or there are no weights, or those of another network.
+        InputError: the name is unknown, or the weights are missing or belong to another network.
     """
     path = find_weights(name, weights)
     network = OnnxNetwork(path)
@@ -155,11 +157,11 @@ def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
     Args:
         path: path of the file, for error messages.
         model: the file, or its bytes.
-        first_input: expected name of the first input; a graph with another one is refused.
+        first_input: expected name of the first input; other graphs are refused.
 
     Raises:
-        InputError: the file cannot be read or is not such a graph, or ONNX Runtime is not
-            installed.
+        InputError: the file cannot be read, is not such a graph, or needs too much time or memory;
+            or ONNX Runtime is not installed.
     """
     try:
         import onnxruntime
@@ -172,12 +174,12 @@ def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
             f"{path}: the weights cannot be read ({error.strerror}); name another file."
         ) from error
     if path.parent != SHIPPED:
-        _refuse_beyond_limits(path, given)
+        _check_limits(path, given)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4  # errors are raised as exceptions anyway
     options.enable_mem_pattern = False  # it would take 10 MB and save no time here
-    options.enable_cpu_mem_arena = False  # free the memory of activations after each image
+    options.enable_cpu_mem_arena = False  # so that activations are freed after each image
     try:
         session = onnxruntime.InferenceSession(given, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises a dozen types
@@ -187,13 +189,14 @@ def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
     return session
 
 
-def _refuse_beyond_limits(path: Path, file: bytes) -> None:
+def _check_limits(path: Path, file: bytes) -> None:
+    """Refuse a file that is not shipped with vslam if it exceeds the limits of ``onnx_limits``."""
     try:
         from vslam.loopclosure.siamese.onnx_limits import check_graph
     except ImportError as error:
         raise InputError(
-            f"{path}: weights that vslam does not ship must be checked with the package onnx, "
-            "which is not installed; pip install 'vslam[train]'."
+            f"{path}: the package onnx, which checks weights that vslam does not ship, is not "
+            "installed; run pip install 'vslam[train]'."
         ) from error
     try:
         check_graph(file)

@@ -18,20 +18,20 @@ from vslam.loopclosure.siamese.weights import SHIPPED
 from vslam.loops import PerKeyframe
 
 SHIPPED_LOCAL = SHIPPED / "local.onnx"
-WIDTH = 640  # width of the network's input, pixels; compared in docs/research/loops.md
+WIDTH = 640  # width of the network's input, pixels; docs/research/loops.md compares widths
 GLANCE_WIDTH = 320  # width of the input for a quick comparison ("glance"), pixels
 _QUALITY = 90  # JPEG quality of the keyframe images in memory
 _JPEG = b"\xff\xd8"  # the first bytes of a JPEG file
-_KEPT = 4  # number of cached descriptor maps, the most recently used ones
+_CACHED = 4  # number of descriptor maps in the least-recently-used cache
 
 
 class LocalDescriptors:
-    """The network of local descriptors, which is loaded when the first image comes."""
+    """The network of local descriptors, which is loaded with the first image."""
 
     def __init__(self, path: Path = SHIPPED_LOCAL) -> None:
         """
         Args:
-            path: ONNX file of a network from an image to coarse and fine descriptors.
+            path: ONNX file of a network that maps an image to coarse and fine descriptors.
 
         Raises:
             InputError: there is no such file.
@@ -53,8 +53,7 @@ class LocalDescriptors:
         return session
 
     def describe(self, image: NDArray[np.uint8], width: int = WIDTH) -> DescriptorMaps:
-        """Local descriptors of an ``(H, W)`` uint8 image, which is first resized to ``width``
-        pixels.
+        """Resize an ``(H, W)`` uint8 image to ``width`` pixels and compute its local descriptors.
 
         Raises:
             InputError: the file is damaged or not such a network, or ONNX Runtime is not installed.
@@ -70,13 +69,13 @@ def resized(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
     size = width, max(64, round(image.shape[0] * scale))
     if size == image.shape[::-1]:
         return image
-    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(image, size, interpolation=way), np.uint8)
+    interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, size, interpolation=interpolation), np.uint8)
 
 
 class KeyframeImages:
-    """Images of keyframes as JPEG files in memory, about 40 kB each. Local descriptors, which take
-    thirty times as much, are computed when they are needed, because few of them ever are."""
+    """Images of keyframes as JPEG files in memory, about 40 kB each. Local descriptors take thirty
+    times as much memory and are computed on demand, because most of them are never needed."""
 
     def __init__(self, network: LocalDescriptors) -> None:
         self.network = network
@@ -126,17 +125,17 @@ class KeyframeImages:
         return keyframe in self._files
 
     def maps(self, keyframe: int) -> DescriptorMaps:
-        """Local descriptors of a keyframe that was added."""
+        """Local descriptors of the image of a keyframe that was added."""
         if keyframe not in self._maps:
             self._maps[keyframe] = self._described(keyframe, WIDTH)
-            while len(self._maps) > _KEPT:
+            while len(self._maps) > _CACHED:
                 self._maps.popitem(last=False)
         self._maps.move_to_end(keyframe)
         return self._maps[keyframe]
 
     def glance(self, keyframe: int) -> DescriptorMaps:
-        """Coarse descriptors of the image of a keyframe at half the width, which take a quarter of
-        the time; they are kept in memory."""
+        """Coarse descriptors of the image of a keyframe at half the width. They take a quarter of
+        the time and stay in memory."""
         if keyframe not in self._glances:
             maps = self._described(keyframe, GLANCE_WIDTH)
             self._glances[keyframe] = maps.coarse_alone()

@@ -1,8 +1,8 @@
-"""Checks that an ONNX file from an untrusted source uses limited time and memory.
+"""Checks that an ONNX file from an untrusted source needs limited time and memory.
 
 A graph of a few hundred bytes can loop forever or create tensors of any size, and ONNX Runtime sets
-no limits. The graphs of vslam use a few dozen operators, and all tensor sizes follow from those of
-the inputs. A file with anything else is refused before it is run.
+no limits. The graphs of vslam use only a few dozen operators, and the sizes of all tensors follow
+from the sizes of the inputs. Any other graph is refused before it is run.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from onnx import GraphProto, ModelProto, NodeProto, TensorProto, numpy_helper, s
 from onnx.reference import ReferenceEvaluator
 
 MOST_NUMBERS = 2**27
-"""Most numbers that a graph may compute, over all tensors; VGG-16 computes 104 million."""
+"""Most numbers that a graph may compute in all its tensors; VGG-16 computes 104 million."""
 MOST_PRODUCTS = 2**38
 """Most multiplications in all convolutions and matrix products of a graph."""
 _MOST_NODES = 10_000
-_SMALL = 64  # most numbers in a tensor that is a shape or part of one
-_SIDE = 512  # assumed for each dimension of an input that the graph leaves open
+_SMALL = 64  # tensors with more numbers cannot be shapes
+_SIDE = 512  # assumed size of each input dimension that the graph leaves open
 
 # The operators that the networks of vslam use. None of them contains another graph.
 _OPERATORS = {
@@ -31,21 +31,23 @@ _OPERATORS = {
     "ScatterElements", "Shape", "Sigmoid", "Slice", "Split", "Sqrt", "Squeeze", "Sub", "Transpose",
     "Unsqueeze",
 }  # fmt: skip
-_OF_SHAPES = {"Add", "Cast", "Concat", "Div", "Mul", "Reshape", "Shape", "Squeeze", "Sub"}
-_KINDS = {
+# Operators that compute shapes from shapes.
+_SHAPE_OPERATORS = {"Add", "Cast", "Concat", "Div", "Mul", "Reshape", "Shape", "Squeeze", "Sub"}
+_DTYPES = {
     TensorProto.FLOAT, TensorProto.FLOAT16, TensorProto.UINT8, TensorProto.INT32,
     TensorProto.INT64, TensorProto.BOOL,
 }  # fmt: skip
 
 
 def check_graph(file: bytes) -> None:
-    """Check that a graph uses only operators of vslam and stays within the limits.
+    """Check that a graph uses only the operators of vslam and stays within the limits.
 
     Args:
-        file: bytes of the ONNX file.
+        file: contents of the ONNX file.
 
     Raises:
-        ValueError: the file is not an ONNX file, or its graph is refused; the message says why.
+        ValueError: the file is not an ONNX file, or its graph is refused for the reason in the
+            message.
     """
     try:
         model = onnx.load_model_from_string(file)
@@ -78,19 +80,19 @@ def check_graph(file: bytes) -> None:
 def _check_nodes(model: ModelProto) -> None:
     graph = model.graph
     if len(graph.node) > _MOST_NODES or model.functions or graph.sparse_initializer:
-        raise ValueError("its graph differs from those that vslam writes")
+        raise ValueError("its graph has too many nodes, functions or sparse weights")
     for node in graph.node:
         if node.domain or node.op_type not in _OPERATORS:
             raise ValueError(f"vslam does not use the operator {node.op_type[:40]!r}")
 
 
 def _shapes(model: ModelProto) -> dict[str, tuple[int, ...]]:
-    """Shapes of all tensors, inferred from those of the inputs. Shapes that the file itself states
+    """Shapes of all tensors, inferred from the shapes of the inputs. Shapes that the file states
     for other tensors are ignored.
 
     Raises:
-        Exception: a shape does not follow from those of the inputs, or a tensor has a type that
-            vslam does not use.
+        Exception: a shape does not follow from the shapes of the inputs, or a tensor has a type
+            that vslam does not use.
     """
     graph = model.graph
     for value in graph.input:
@@ -107,7 +109,7 @@ def _shapes(model: ModelProto) -> dict[str, tuple[int, ...]]:
     shapes = {tensor.name: tuple(tensor.dims) for tensor in graph.initializer}
     for value in (*inferred.input, *inferred.value_info, *inferred.output):
         kind = value.type.tensor_type
-        if kind.elem_type not in _KINDS or not kind.HasField("shape"):
+        if kind.elem_type not in _DTYPES or not kind.HasField("shape"):
             raise ValueError(value.name)
         if not all(length.dim_value > 0 for length in kind.shape.dim):
             raise ValueError(value.name)
@@ -116,8 +118,8 @@ def _shapes(model: ModelProto) -> dict[str, tuple[int, ...]]:
 
 
 def _compute_shapes(graph: GraphProto) -> None:
-    """Replace nodes that compute with the shapes of the inputs by their results, because onnx's
-    shape inference does not evaluate divisions."""
+    """Replace the nodes that compute shapes by their results, because onnx's shape inference does
+    not evaluate divisions."""
     known = {
         tensor.name: numpy_helper.to_array(tensor)
         for tensor in graph.initializer
@@ -130,11 +132,10 @@ def _compute_shapes(graph: GraphProto) -> None:
         for value in graph.input
     }
     for node in list(graph.node):
-        there = images if node.op_type == "Shape" else known
-        if node.op_type not in _OF_SHAPES or not all(name in there for name in node.input):
+        values = images if node.op_type == "Shape" else known
+        if node.op_type not in _SHAPE_OPERATORS or not all(name in values for name in node.input):
             continue
-        given = {name: there[name] for name in node.input}
-        (result,) = ReferenceEvaluator(node).run(None, given)
+        (result,) = ReferenceEvaluator(node).run(None, {name: values[name] for name in node.input})
         value = np.asarray(result)
         if value.size <= _SMALL:
             known[node.output[0]] = value
@@ -144,7 +145,7 @@ def _compute_shapes(graph: GraphProto) -> None:
 
 def _products(node: NodeProto, shapes: dict[str, Any]) -> int:
     """Number of multiplications of a convolution or a matrix product; 0 for other nodes, which need
-    only a few for each number of their result."""
+    only a few operations for each number of their result."""
     if node.op_type == "Conv":
         return math.prod(shapes[node.output[0]]) * math.prod(shapes[node.input[1]][1:])
     if node.op_type == "MatMul":

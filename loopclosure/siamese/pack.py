@@ -1,4 +1,4 @@
-"""Writes and reads image sources as one small file, for machines without room for the original
+"""Writes and reads image sources as one small file, for machines without space for the original
 images."""
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from vslam.untrusted import read_npz
 
 
 def write_pack(sources: list[ImageSource], path: Path, size: Size, fit: Fit) -> None:
-    """Write sources as one file: images at the input size of a network, encoded as JPEG, and their
-    relations (docs/research/training.md).
+    """Write sources as one npz file: their relations, and their images as JPEG files at the input
+    size of a network (docs/howto/training.md).
 
     Raises:
         UnreadableImageError: an image is missing or damaged.
@@ -41,7 +41,7 @@ def write_pack(sources: list[ImageSource], path: Path, size: Size, fit: Fit) -> 
 
 
 def read_pack(path: Path) -> list[ImageSource]:
-    """Read the sources from a file that ``write_pack`` wrote.
+    """Read the sources that ``write_pack`` wrote.
 
     Raises:
         InputError: the file is missing or damaged.

@@ -1,5 +1,5 @@
-"""Reads pairs of images that ``vslam synth --pairs`` rendered; the poses of the cameras relate
-images of different pairs."""
+"""Reads pairs of images that ``vslam synth --pairs`` rendered. The camera poses determine whether
+images of different pairs show the same place."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from vslam.errors import InputError
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, ImageSource, names_of
 
 _VIEW = ("x_a", "z_a", "yaw_a", "x_b", "z_b", "yaw_b")
-# Side of the cells of a rendered town that are not split between training and validation, metres.
+# Rendered towns are divided into square cells with this side in metres; the images of one cell are
+# not split between training and validation.
 _CELL = 80.0
 
 
@@ -31,31 +32,32 @@ def read_pairs(folder: Path) -> list[ImageSource]:
     try:
         with path.open(newline="") as file:
             rows = [(row["a"], row["b"], int(row["same"]), row) for row in csv.DictReader(file)]
-        placed = bool(rows) and set(_VIEW) <= set(rows[0][3])
-        found = [[float(row[key]) for key in _VIEW] for *_, row in rows] if placed else []
+        has_poses = bool(rows) and set(_VIEW) <= set(rows[0][3])
+        poses = [[float(row[key]) for key in _VIEW] for *_, row in rows] if has_poses else []
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise InputError(
-            f"{path}: no list of pairs (columns a, b, same); write it with 'vslam synth --pairs'."
+            f"{path}: missing or not a list of pairs with the columns a, b and same; write it with "
+            "'vslam synth --pairs'."
         ) from error
     if not rows:
-        raise InputError(f"{path}: no pair in it; write it again with 'vslam synth --pairs'.")
+        raise InputError(f"{path}: contains no pair; write it again with 'vslam synth --pairs'.")
     number: dict[str, int] = {}
     for a, b, *_ in rows:
         number.setdefault(a, len(number))
         number.setdefault(b, len(number))
     relation = np.zeros((len(number), len(number)), np.int8)
     unit = np.zeros(len(number), np.int32)
-    if placed:
+    if has_poses:
         views = np.zeros((len(number), 3))
-        for (a, b, *_), view in zip(rows, found, strict=True):
-            views[[number[a], number[b]]] = np.array(view).reshape(2, 3)
+        for (a, b, *_), pose in zip(rows, poses, strict=True):
+            views[[number[a], number[b]]] = np.array(pose).reshape(2, 3)
         relation = relation_of_views(views)
         cell = np.floor(views[:, :2] / _CELL).astype(np.int64)
         unit = np.unique(cell, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
     for k, (a, b, same, _) in enumerate(rows):
         i, j = number[a], number[b]
         relation[i, j] = relation[j, i] = SAME if same else DIFFERENT
-        if not placed:
+        if not has_poses:
             unit[i] = unit[j] = k
     np.fill_diagonal(relation, SAME)
     files = tuple(folder / name for name in number)
@@ -71,21 +73,23 @@ def relation_of_views(views: NDArray[np.float64]) -> NDArray[np.int8]:
     """``(N, N)`` int8 relation of images by their poses.
 
     Two images show the same place if they are less than 5 m and 35 degrees apart. They show
-    different places if they are more than 40 m apart, unless both look along the same street, in
-    the same or in opposite directions, less than 160 m apart and less than 25 m to the side.
-    Otherwise the relation is unknown.
+    different places if they are more than 40 m apart and do not look along the same street; two
+    images look along the same street if their directions are similar or opposite, they are less
+    than 160 m apart, and one is less than 25 m beside the line of sight of the other. Otherwise the
+    relation is unknown.
 
     Args:
         views: ``(N, 3)`` x and z in metres, yaw in degrees from z towards x.
     """
     xz, yaw = views[:, :2], np.radians(views[:, 2])
-    ahead = np.stack([np.sin(yaw), np.cos(yaw)], 1)
-    away = xz[None] - xz[:, None]
-    distance = np.linalg.norm(away, axis=2)
-    aside = np.abs(away[..., 0] * ahead[:, None, 1] - away[..., 1] * ahead[:, None, 0])
-    cosine = ahead @ ahead.T
-    along = (np.abs(cosine) > 0.7) & (aside < 25.0) & (distance < 160.0)
+    direction = np.stack([np.sin(yaw), np.cos(yaw)], 1)
+    offset = xz[None] - xz[:, None]
+    distance = np.linalg.norm(offset, axis=2)
+    x, z = direction[:, None, 0], direction[:, None, 1]
+    lateral = np.abs(offset[..., 0] * z - offset[..., 1] * x)
+    cosine = direction @ direction.T
+    same_street = (np.abs(cosine) > 0.7) & (lateral < 25.0) & (distance < 160.0)
     relation = np.zeros(distance.shape, np.int8)
     relation[(distance < 5.0) & (cosine > np.cos(np.radians(35.0)))] = SAME
-    relation[(distance > 40.0) & ~(along | along.T)] = DIFFERENT
+    relation[(distance > 40.0) & ~(same_street | same_street.T)] = DIFFERENT
     return relation

@@ -1,4 +1,4 @@
-"""Reads sets of photographs; their folders and a NOTES.txt define which show the same place."""
+"""Reads sets of photographs. Their folders and a NOTES.txt determine which show the same place."""
 
 from __future__ import annotations
 
@@ -19,16 +19,17 @@ from vslam.loopclosure.siamese.image_source import (
     names_of,
 )
 
-_STRETCH = 25  # frames of a video that are not split between training and validation
+_STRETCH = 25  # consecutive video frames that are not split between training and validation
+_UNLIMITED = 1_000_000
 
 
 @dataclass(frozen=True)
 class _SpecialSet:
-    """Properties of a set that its kind does not determine, from its notes.
+    """Properties of a set that do not follow from its kind; they come from its notes.
 
     Attributes:
-        reach: photographs of a folder that are more than this many apart in its order may show
-            different places.
+        reach: photographs of a folder show the same place if their positions in its order differ by
+            at most this number; None for all photographs.
         region: maps the name of a folder to a region; relations between folders of the same region
             are unknown.
         family: family of the set, see ``ImageSource``.
@@ -42,15 +43,15 @@ class _SpecialSet:
 
 
 _SPECIAL_SETS = {
-    # Rotation about one standpoint: photographs far apart show different things.
+    # The camera rotates on the spot, so photographs far apart in the order do not overlap.
     "pano_rotation": _SpecialSet(reach=1, family="landmarks"),
-    # Opposite walls of the same yard.
+    # Photographs of one folder show opposite walls of a yard.
     "strecha": _SpecialSet(reach=3, family="landmarks"),
-    # Folders are headings of the same walk and overlap at their ends.
+    # Each folder has the views of one walk in one direction; the folders overlap at their ends.
     "pano360": _SpecialSet(reach=2, region=lambda folder: folder.split("_")[0]),
-    # Several passes of the same floor.
+    # Folders are several passes along the same floor.
     "ie_tower": _SpecialSet(reach=1, region=lambda folder: folder.split("__")[0]),
-    # Views cut from one panorama.
+    # Folders are views cut from one panorama.
     "webcams": _SpecialSet(region=lambda folder: folder.split("_")[0]),
     "multiview": _SpecialSet(reach=4, family="landmarks"),
     "wxbs_evd": _SpecialSet(family="landmarks"),
@@ -70,9 +71,9 @@ _SPECIAL_SETS = {
 def read_photos(folder: Path) -> list[ImageSource]:
     """Read sets of photographs, ``folder/SET/SUBFOLDER/*`` with ``folder/SET/NOTES.txt``.
 
-    The first line of the notes states the kind of the set: (a) each subfolder shows one place, (b)
-    each subfolder is a video, in which consecutive frames overlap, (c) the photographs are
-    unrelated. ``_SPECIAL_SETS`` adds further properties from the notes of some sets.
+    The first line of the notes states the kind of the set: (a) each subfolder shows one place; (b)
+    each subfolder is a video, in which consecutive frames overlap; (c) the photographs are
+    unrelated. ``_SPECIAL_SETS`` has further properties of some sets.
 
     Raises:
         InputError: there is no such set, or the notes state no kind.
@@ -89,17 +90,19 @@ def _read_photo_set(folder: Path) -> ImageSource:
     first_line = (folder / "NOTES.txt").read_text(errors="replace").partition("\n")[0]
     found = re.search(r"kind \((a/b|a|b|c)\)", first_line)
     if found is None:
-        raise InputError(f"{folder}/NOTES.txt: the first line names no kind (a), (b) or (c).")
+        raise InputError(
+            f"{folder}/NOTES.txt: the first line must state the kind of the set: (a), (b) or (c)."
+        )
     kind = found[1]
     special = _SPECIAL_SETS.get(folder.name, _SpecialSet())
-    of_set = special.reach if special.reach is not None else 1_000_000
+    reach_of_set = special.reach if special.reach is not None else _UNLIMITED
     files: list[Path] = []
     rows: list[tuple[int, int, int, int]] = []  # folder, position, reach, unit
     regions: list[str] = []
     for number, subfolder in enumerate(sorted(p for p in folder.iterdir() if p.is_dir())):
         single = kind == "c" or subfolder.name in special.singles
-        reach = 0 if single else of_set if kind == "a" else 1
-        stretch = 1 if single else 1_000_000 if kind == "a" else _STRETCH
+        reach = 0 if single else reach_of_set if kind == "a" else 1
+        stretch = 1 if single else _UNLIMITED if kind == "a" else _STRETCH
         for k, file in enumerate(images_in(subfolder)):
             files.append(file)
             rows.append((number, k, reach, number * 10_000 + k // stretch))
@@ -107,15 +110,15 @@ def _read_photo_set(folder: Path) -> ImageSource:
     if not files:
         raise InputError(f"{folder}: no photographs in its subfolders; restore them.")
     number, position, reach, unit = np.array(rows).T
-    together = number[:, None] == number[None]
-    relation = np.full(together.shape, DIFFERENT, np.int8)
+    same_folder = number[:, None] == number[None]
+    relation = np.full(same_folder.shape, DIFFERENT, np.int8)
     if special.region is not None:
         _, region = np.unique(regions, return_inverse=True)
         relation[region[:, None] == region[None]] = UNKNOWN
     if kind != "c":
-        relation[together] = UNKNOWN
-    apart = np.abs(position[:, None] - position[None])
-    relation[together & (apart <= reach)] = SAME
+        relation[same_folder] = UNKNOWN
+    difference = np.abs(position[:, None] - position[None])
+    relation[same_folder & (difference <= reach)] = SAME
     family = special.family or folder.name
     return ImageSource(
         folder.name, family, names_of(files), tuple(files), relation, unit.astype(np.int32)

@@ -1,9 +1,9 @@
 """Opens sources of images by name, for training networks and comparing detectors.
 
 A source is a set of images with a matrix that states for each pair whether the images show the same
-place (1) or different places (-1), or that this is unknown (0); unknown pairs are never used.
+place (1) or different places (-1) or whether this is unknown (0). Unknown pairs are never used.
 Images of different sources show different places, unless the sources belong to the same family (for
-example the same region photographed twice); then their relation is unknown.
+example two sets of photographs of one region); then their relation is unknown.
 
 On the command line, a source is named ``KIND:PATH`` or ``KIND:PATH[option=value,...]``. The kinds
 and their options are:
@@ -12,13 +12,13 @@ and their options are:
     ``seq``: the sequence; default 00.
     ``first``, ``last``: numbers of the first and the last image; default all images.
     ``every``: step between images; 2 takes every second one.
-    ``frames``: ranges of numbers instead of first and last, ``frames=0-249+1500-1699``.
+    ``frames``: ranges of numbers instead of first and last, as in ``frames=0-249+1500-1699``.
     ``near``: distance in metres within which two images show the same place; default 5.
-    ``truth``: ``.mat`` file with a loop matrix, which then defines the same places.
+    ``truth``: ``.mat`` file with a loop matrix that marks the pairs of the same place.
 ``fabmap:DIR``: Oxford CityCentre or NewCollege (Cummins and Newman 2008), or another ordered set of
     images with a loop matrix, for example those of Lip6 (``fabmap_source``).
     ``truth``: ``.mat`` file with the loop matrix; default the first one in the folder.
-    ``side``: ``left`` or ``right`` camera, if the matrix has one row for both; default left.
+    ``side``: ``left`` or ``right`` camera, if the matrix has one row for each pair; default left.
 ``pairs:DIR``: output of ``vslam synth --pairs`` (``pairs_source``); no options.
 ``photos:DIR``: folders of photographs with a NOTES.txt (``photo_source``); no options.
 ``pack:FILE.npz``: output of ``vslam export places`` (``pack``); no options.
@@ -49,8 +49,8 @@ _READERS: dict[str, tuple[Callable[..., list[ImageSource]], tuple[str, ...]]] = 
 
 
 def split_spec(spec: str) -> tuple[str, str, dict[str, str]]:
-    """Split ``kind:path[key=value,...]`` into kind, path and options; the path is empty if the text
-    has another form."""
+    """Split ``kind:path[key=value,...]`` into its kind, path and options. The path is empty if the
+    text has another form."""
     kind, _, rest = spec.partition(":")
     found = re.fullmatch(r"(.+?)(?:\[(.*)\])?", rest)
     if found is None:
@@ -60,7 +60,7 @@ def split_spec(spec: str) -> tuple[str, str, dict[str, str]]:
 
 
 def open_source(spec: str) -> list[ImageSource]:
-    """Open ``kind:path[options]``; the module's documentation lists the kinds.
+    """Open the source ``kind:path[options]``; see the kinds above.
 
     Raises:
         InputError: the kind or an option is unknown, or data is missing or malformed.
@@ -72,9 +72,9 @@ def open_source(spec: str) -> list[ImageSource]:
             f"{', '.join(_READERS)}."
         )
     reader, known = _READERS[kind]
-    if wrong := [key for key in options if key not in known]:
-        choice = f"choose from {', '.join(known)}" if known else "this kind takes none"
-        raise InputError(f"--data {spec}: unknown option '{wrong[0]}'; {choice}.")
+    if unknown := [key for key in options if key not in known]:
+        choice = f"choose from {', '.join(known)}" if known else "this kind has no options"
+        raise InputError(f"--data {spec}: unknown option '{unknown[0]}'; {choice}.")
     try:
         return reader(Path(path).expanduser(), **options)
     except ValueError as error:

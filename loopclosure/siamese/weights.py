@@ -1,4 +1,4 @@
-"""The names of the networks, and the files of their weights."""
+"""The names of the networks and the files of their weights."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ NETWORKS = ("capsule", "capsule-pruned", "capsule-paper")
 PRUNED = ("capsule-pruned", "capsule-paper")
 """Networks made from trained weights of ``capsule`` by removing primary capsules."""
 TO_THE_LETTER = "capsule-paper"
-"""The method of the paper without additions: no keyframe images are kept, so that neither odometry
-nor learned local descriptors influence which loops it finds."""
+"""The method of the paper without additions. No keyframe images are stored for it, so neither
+odometry nor learned local descriptors influence which loops it finds."""
 SHIPPED = Path(__file__).parent / "weights"
 
 
@@ -20,7 +20,7 @@ def find_weights(name: str, weights: Path | None = None) -> Path:
 
     Args:
         name: one of ``NETWORKS``.
-        weights: the file that the user has named; None takes the one that vslam ships.
+        weights: the file that the user named; None uses the one that vslam ships.
 
     Raises:
         InputError: the name is unknown, or there is no such file.
@@ -28,11 +28,13 @@ def find_weights(name: str, weights: Path | None = None) -> Path:
     if name not in NETWORKS:
         raise InputError(f"--detector {name}: unknown; choose one of {', '.join(NETWORKS)}.")
     path = weights or SHIPPED / f"{name}.onnx"
-    if path.suffix == ".safetensors" and path.exists():
+    if not path.exists():
+        raise InputError(
+            f"--weights {path}: no such file; name the .onnx file of a trained network."
+        )
+    if path.suffix == ".safetensors":
         raise InputError(
             f"--weights {path}: a run needs an ONNX file; write one with 'vslam export onnx "
             f"--weights {path}'."
         )
-    if path.exists():
-        return path
-    raise InputError(f"--weights {path}: no such file; name the .onnx file of a trained network.")
+    return path

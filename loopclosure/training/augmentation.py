@@ -1,4 +1,4 @@
-"""Random changes of an image that keep its place: viewpoint, light, occlusion, sensor."""
+"""Random changes of an image that preserve its place: viewpoint, light, occlusion, sensor."""
 
 from __future__ import annotations
 
@@ -8,36 +8,35 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from vslam.loopclosure.siamese.images import turn_homography
 
-_TURNED = 0.5  # share of the images that turn, where any do
-_ZOOMED = 0.5  # likewise
+_TURNED, _ZOOMED = 0.5, 0.5  # shares of the images that are turned and zoomed, if enabled
 
 
 class Augmentation(BaseModel):
-    """Strengths of the changes; 0 disables one. The paper uses projective changes, luminance and
-    masks."""
+    """Strengths of the changes; 0 disables a change. The paper uses projective changes, luminance
+    and masks."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     homography: float = Field(
-        0.10, ge=0, le=0.4, description="Largest move of a corner, relative to each side."
+        0.10, ge=0, le=0.4, description="Largest shift of a corner, relative to each side."
     )
     shift: float = Field(0.10, ge=0, le=0.5, description="Largest shift, relative to the width.")
     turn: float = Field(0.0, ge=0, le=45, description="Largest turn of the camera, degrees.")
-    zoom: float = Field(0.0, ge=0, le=1, description="Largest log of a zoom, as by driving on.")
+    zoom: float = Field(0.0, ge=0, le=1, description="Largest log of a zoom, as when driving on.")
     log_gain: float = Field(0.35, ge=0, description="Standard deviation of the log gain.")
     bias: float = Field(20.0, ge=0, description="Standard deviation of the bias, grey levels.")
     log_gamma: float = Field(0.25, ge=0, description="Standard deviation of log gamma.")
     masks: int = Field(3, ge=0, description="Largest number of masks.")
     mask_area: float = Field(
-        0.10, ge=0, le=0.5, description="Largest share of a mask in the image."
+        0.10, ge=0, le=0.5, description="Largest share of the image that one mask covers."
     )
     noise: float = Field(6.0, ge=0, description="Largest standard deviation of noise, grey levels.")
     blur: float = Field(1.0, ge=0, description="Largest sigma of a Gaussian blur, pixels.")
     mirror: bool = Field(True, description="Mirror both images of every second pair.")
 
 
-# Stronger light and occlusion, the same sensor: at the network's resolution, a camera's noise and
-# blur are averaged out, and rendered pairs already differ in viewpoint.
+# Stronger changes of light and occlusion only: rendered pairs already differ in viewpoint, and the
+# noise and blur of a camera average out at the network's resolution.
 STRONG = Augmentation(
     homography=0.08, shift=0.12, log_gain=0.5, bias=30.0, log_gamma=0.5, masks=3, mask_area=0.15,
 )  # fmt: skip
@@ -46,31 +45,30 @@ STRONG = Augmentation(
 def augment(
     image: NDArray[np.uint8], strength: Augmentation, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Change an image ``(H, W)`` at random.
+    """Change an ``(H, W)`` image at random.
 
-    The changes follow the order of image formation: viewpoint, occlusion, light, lens, sensor, and
-    quantisation to 8 bits.
+    The changes are applied in the order of image formation: viewpoint, occlusion, light, lens,
+    sensor, quantisation to 8 bits.
     """
     import cv2
 
     height, width = image.shape
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
-    reach = np.array([width, height], np.float32) * np.float32(strength.homography)
-    moved = corners + rng.uniform(-1, 1, (4, 2)).astype(np.float32) * reach
+    largest = np.array([width, height], np.float32) * np.float32(strength.homography)
+    moved = corners + rng.uniform(-1, 1, (4, 2)).astype(np.float32) * largest
     moved[:, 0] += rng.uniform(-1, 1) * strength.shift * width
     H = cv2.getPerspectiveTransform(corners, moved)
-    edge = cv2.BORDER_REFLECT_101
+    border = cv2.BORDER_REFLECT_101
     if strength.turn > 0 and rng.random() < _TURNED:
         H = H @ turn_homography(width, height, rng.uniform(-1, 1) * strength.turn)
-        # What lies beyond the border is unknown; it becomes black or a mirror image.
-        edge = cv2.BORDER_CONSTANT if rng.random() < 0.5 else edge
+        # The scene beyond the border is unknown; it becomes black or a mirror image.
+        border = cv2.BORDER_CONSTANT if rng.random() < 0.5 else border
     if strength.zoom > 0 and rng.random() < _ZOOMED:
-        # Driving on is approximated by enlarging the image around its middle.
+        # Enlarging the image around its centre approximates driving on.
         factor = np.exp(rng.uniform(0, strength.zoom))
         x, y = (1.0 - factor) * width / 2, (1.0 - factor) * height / 2
         H = H @ np.array([[factor, 0, x], [0, factor, y], [0, 0, 1.0]])
-    warped = cv2.warpPerspective(image, H, (width, height), flags=cv2.INTER_LINEAR, borderMode=edge)
-    out = np.asarray(warped, np.uint8)
+    out = np.asarray(cv2.warpPerspective(image, H, (width, height), borderMode=border), np.uint8)
     for _ in range(int(rng.integers(strength.masks + 1))):
         _cover(out, strength.mask_area, rng)
     grey = np.arange(256) / 255.0
@@ -78,7 +76,7 @@ def augment(
     curve = np.exp(strength.log_gain * rng.standard_normal()) * curve
     curve += strength.bias * rng.standard_normal()
     out = np.asarray(cv2.LUT(out, np.clip(np.rint(curve), 0, 255).astype(np.uint8)), np.uint8)
-    # Every second image stays sharp and clean, as most real ones are.
+    # Negative draws have no effect, so that half of the images stay sharp or free of noise.
     blur, noise = rng.uniform(-1, 1, 2) * (strength.blur, strength.noise)
     if blur > 0.2:
         out = np.asarray(cv2.GaussianBlur(out, (0, 0), float(blur)), np.uint8)

@@ -1,4 +1,4 @@
-"""Layouts in which networks read images, and the capsule branch, which computes a descriptor."""
+"""The layout in which a network reads an image, and the branch that computes its descriptor."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from vslam.loopclosure.training.lite import (
 )
 from vslam.loopclosure.training.preprocessing import Unrolling, standardised, textured
 
-_LEAST_SHARE = 0.02  # of texture in a view, so that views without any texture count equally
+_LEAST_SHARE = 0.02  # smallest weight of a view; without texture, all views of an image have it
 
 
 class Layout(NamedTuple):
@@ -39,9 +39,10 @@ class Layout(NamedTuple):
 
     Attributes:
         size: height and width of the image.
-        views: number of parts with a descriptor each, evenly spaced from left to right.
+        views: number of parts, evenly spaced from left to right; each gets its own descriptor.
         view_width: columns of a part; None if the whole image is the only part.
-        half_angle, middle: see :class:`preprocessing.Unrolling`; half_angle 0 leaves it flat.
+        half_angle, middle: see :class:`preprocessing.Unrolling`; with half_angle 0, the image is
+            not unrolled.
     """
 
     size: Size
@@ -52,7 +53,7 @@ class Layout(NamedTuple):
 
 
 class CapsuleShape(BaseModel):
-    """The structure of a capsule branch; stored beside its weights."""
+    """The structure of a capsule branch. It is stored beside the weights."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -62,7 +63,7 @@ class CapsuleShape(BaseModel):
     views: int = Field(1, ge=1, le=16, description="Parts of the image, from left to right.")
     view_width: int | None = Field(None, ge=32, description="Columns of a part; None: all.")
     half_angle: float = Field(
-        0.0, ge=0, le=60, description="Degrees from middle to side when unrolled; 0: flat."
+        0.0, ge=0, le=60, description="Degrees from middle to side for unrolling; 0: no unrolling."
     )
     middle: float = Field(
         1.0, gt=0, le=1, description="Share of the height that the middle column keeps."
@@ -74,7 +75,7 @@ class CapsuleShape(BaseModel):
     depth: int = Field(16, ge=1, description="Dimension of an output capsule.")
     iterations: int = Field(3, ge=1, description="Iterations of the routing.")
     over: Literal["primary", "output"] = "primary"
-    kept: int | None = Field(None, description="Places kept of each type; None before pruning.")
+    kept: int | None = Field(None, description="Places kept for each type; None before pruning.")
 
     @model_validator(mode="after")
     def _flat_images_keep_their_height(self) -> CapsuleShape:
@@ -86,28 +87,30 @@ class CapsuleShape(BaseModel):
     def _views_lie_on_columns(self) -> CapsuleShape:
         width, view = self.input[1], self.view_width
         if self.views == 1 and view is not None:
-            raise ValueError(f"view_width {view}: one view is the whole image; leave it out")
+            raise ValueError(f"view_width {view}: a single view is the whole image; leave it out")
         if self.views == 1:
             return self
         if view is None:
-            raise ValueError(f"views {self.views}: needs view_width, the columns of one")
+            raise ValueError(
+                f"views {self.views}: needs view_width, the number of columns of a view"
+            )
         if view >= width:
-            raise ValueError(f"view_width {view}: must be less than the {width} of the image")
+            raise ValueError(f"view_width {view}: must be less than the image width {width}")
         if (width - view) % (self.cut_stride * (self.views - 1)):
             raise ValueError(
-                f"view_width {view}: {self.views} views in {width} columns must be a multiple of "
-                f"{self.cut_stride} columns apart"
+                f"view_width {view}: {self.views} views in {width} columns must be spaced by a "
+                f"multiple of {self.cut_stride} columns"
             )
         return self
 
     @property
     def input(self) -> Size:
-        """Height and width of its input images."""
+        """Height and width of the input images."""
         return self.pixels, self.width or self.pixels
 
     @property
     def layout(self) -> Layout:
-        """The input size and the views that the branch cuts from an image."""
+        """The layout in which the branch reads an image."""
         return Layout(self.input, self.views, self.view_width, self.half_angle, self.middle)
 
     @property
@@ -119,22 +122,22 @@ class CapsuleShape(BaseModel):
     def cut_stride(self) -> int:
         """Stride, in pixels, of the array from which the views are cut.
 
-        For lite0, these are its early features, computed once for all views; for other extractors,
-        the pixels themselves.
+        For lite0, views are cut from the early features, which are computed once for all views; for
+        other extractors, from the pixels.
         """
         return EARLY_STRIDE if self.extractor == "lite0" else 1
 
     @property
     def cuts(self) -> list[slice]:
-        """Columns of the views in that array."""
+        """Columns of the views in the array with :attr:`cut_stride`."""
         width, view = self.input[1], self.view[1]
-        apart = (width - view) // self.cut_stride // max(1, self.views - 1)
+        step = (width - view) // self.cut_stride // max(1, self.views - 1)
         columns = (view - 1) // self.cut_stride + 1
-        return [slice(k * apart, k * apart + columns) for k in range(self.views)]
+        return [slice(k * step, k * step + columns) for k in range(self.views)]
 
     def for_images_of(self, size: Size) -> CapsuleShape:
-        """The same branch for images of another height and width. Views keep their share of the
-        width as nearly as possible.
+        """The shape for images of another height and width. The views keep approximately their
+        share of the width.
 
         Raises:
             InputError: the views become too narrow.
@@ -142,13 +145,13 @@ class CapsuleShape(BaseModel):
         view = None
         if self.view_width is not None:
             unit, width = self.cut_stride * (self.views - 1), size[1]
-            unseen = width * (1 - self.view_width / self.input[1])
-            view = width - unit * max(1, round(unseen / unit))
+            outside_view = width * (1 - self.view_width / self.input[1])
+            view = width - unit * max(1, round(outside_view / unit))
         return self.with_layout(self.layout._replace(size=size, view_width=view))
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Rows and columns of places of a view."""
+        """Rows and columns of the grid of places in a view."""
         height, width = self.view
         if self.extractor == "lite0":
             return lite_grid_side(height), lite_grid_side(width)
@@ -156,18 +159,18 @@ class CapsuleShape(BaseModel):
 
     @property
     def places(self) -> int:
-        """Number of places in the grid."""
+        """Number of places in the grid of a view."""
         rows, columns = self.grid
         return rows * columns
 
     def with_layout(self, layout: Layout) -> CapsuleShape:
-        """The same branch with another layout.
+        """The shape with another layout.
 
         Raises:
             InputError: the views do not fit the image.
         """
         height, width = layout.size
-        given = {
+        fields = {
             "pixels": height,
             "width": None if width == height else width,
             "views": layout.views,
@@ -176,19 +179,19 @@ class CapsuleShape(BaseModel):
             "middle": layout.middle,
         }
         try:
-            return CapsuleShape(**{**self.model_dump(), **given})
+            return CapsuleShape(**{**self.model_dump(), **fields})
         except ValidationError as error:
-            raise InputError(f"{height}x{width} pixels: {_first(error)}.") from error
+            raise InputError(f"{height}x{width} pixels: {_first_fault(error)}.") from error
 
 
 class CapsuleBranch(nn.Module):
     """Extractor, primary capsules and routing; the flattened output capsules are the descriptor.
 
-    With several views, those of the leftmost view come first. The part of each view is scaled by
-    the share of the view that shows texture, because fog or a covered lens does not distinguish
-    places. For lite0, views are cut from the early features of the whole image. They are thus
-    computed once, with the surroundings of a view instead of padding, and only later layers depend
-    on the position in the view.
+    With several views, the descriptor is the concatenation of the views' descriptors from left to
+    right. Each is scaled by the share of its view that shows texture, because fog or a covered lens
+    does not distinguish places. For lite0, the views are cut from the early features of the whole
+    image. These are computed only once, and at the border of a view they depend on its surroundings
+    instead of padding.
     """
 
     def __init__(self, shape: CapsuleShape) -> None:
@@ -200,7 +203,8 @@ class CapsuleBranch(nn.Module):
         lite = shape.extractor == "lite0"
         self.extractor = LiteExtractor() if lite else LightExtractor(shape.blocks)
         self.primary = PrimaryCapsules(self.extractor.out_channels, shape.types, shape.size)
-        # With channels last, depthwise convolutions take a third less forward, a quarter backward.
+        # With channels last, depthwise convolutions take a third less time forward and a quarter
+        # less backward.
         for module in (self.extractor, self.primary):
             module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.capsules = CapsuleLayer(
@@ -209,49 +213,50 @@ class CapsuleBranch(nn.Module):
         )  # fmt: skip
 
     def forward(self, images: Tensor) -> Tensor:
-        """``(N, 3, H, W)`` float32 in [0, 1] to ``(N, D)``, not yet of length 1."""
+        """``(N, 3, H, W)`` float32 images in [0, 1] to ``(N, D)`` descriptors, not normalised."""
         grey = self._unrolled(images)
-        shown = textured(grey)
-        v = self.capsules(self._primary_capsules(grey, shown)).flatten(1)
+        texture = textured(grey)
+        v = self.capsules(self._primary_capsules(grey, texture)).flatten(1)
         views = functional.normalize(torch.stack(v.chunk(self.views), 1), dim=2)
-        return (views * self._textured_share(shown)[:, :, None]).flatten(1)
+        return (views * self._textured_share(texture)[:, :, None]).flatten(1)
 
     def routed(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Output capsules ``(V N, J, D)``, couplings ``(V N, J, I)``: all leftmost views first."""
+        """Output capsules ``(V N, J, D)`` and couplings ``(V N, J, I)``; the leftmost views of all
+        images come first."""
         grey = self._unrolled(images)
         return self.capsules.routed(self._primary_capsules(grey, textured(grey)))
 
     def _unrolled(self, images: Tensor) -> Tensor:
-        """``(N, 1, H, W)`` grey of ``(N, 3, H, W)``."""
+        """``(N, 3, H, W)`` images to ``(N, 1, H, W)`` unrolled grey images."""
         grey: Tensor = self.unrolling(images.mean(1, keepdim=True))
         return grey
 
-    def _primary_capsules(self, grey: Tensor, shown: Tensor) -> Tensor:
-        """``(V N, T, P, A)`` from ``(N, 1, H, W)`` images and their :func:`textured` masks."""
+    def _primary_capsules(self, grey: Tensor, texture: Tensor) -> Tensor:
+        """Primary capsules ``(V N, T, P, A)`` of ``(N, 1, H, W)`` images with :func:`textured`
+        masks."""
         if isinstance(self.extractor, LiteExtractor):
-            x = standardised(grey, shown).contiguous(memory_format=torch.channels_last)
+            x = standardised(grey, texture).contiguous(memory_format=torch.channels_last)
             x = self.extractor.late(self._views(self.extractor.early(x)))
         else:
             x = self.extractor(standardised(self._views(grey)))
         capsules: Tensor = self.primary(x)
         return capsules
 
-    def _textured_share(self, shown: Tensor) -> Tensor:
+    def _textured_share(self, texture: Tensor) -> Tensor:
         """``(N, V)`` share of each view that shows texture."""
-        firsts = [cut.start * self.shape.cut_stride for cut in self.shape.cuts]
+        starts = [cut.start * self.shape.cut_stride for cut in self.shape.cuts]
         width = self.shape.view[1]
-        shares = [shown[..., k : k + width].mean((1, 2, 3)) for k in firsts]
+        shares = [texture[..., k : k + width].mean((1, 2, 3)) for k in starts]
         return torch.stack(shares, 1).clamp_min(_LEAST_SHARE)
 
     def _views(self, x: Tensor) -> Tensor:
-        """``(N, C, h, w)`` to ``(V N, C, h, v)``."""
+        """Cut ``(N, C, h, w)`` arrays into views, ``(V N, C, h, v)``."""
         if self.views > 1:
             x = torch.cat([x[..., columns] for columns in self.shape.cuts])
         return x.contiguous(memory_format=torch.channels_last)
 
 
-def _first(error: ValidationError) -> str:
-    """The first error, as a clause."""
+def _first_fault(error: ValidationError) -> str:
+    """The first fault of a validation, as a clause."""
     first = error.errors()[0]
-    said = plain_reason(first["msg"])
-    return ": ".join([*map(str, first["loc"]), said])
+    return ": ".join([*map(str, first["loc"]), plain_reason(first["msg"])])

@@ -2,10 +2,10 @@
 
 Zhou and Sun, Sci Rep 15, 7644 (2025), equations 4 to 9, after Sabour et al., NIPS 2017. There are N
 images, I primary capsules of dimension A, and J output capsules of dimension D. Primary capsules
-have T types (channels of the extractor) at P places of a grid: i = t P + p.
+have T types (channel groups of the extractor) at P places of a grid: i = t P + p.
 
-The places of a type share their matrices, so ``route`` sums over places first and never forms the
-prediction vectors. ``tests/reference_routing.py`` implements the paper's equations literally.
+All places of a type share their matrices, so ``route`` sums over the places first and never forms
+the prediction vectors. ``tests/reference_routing.py`` implements the paper's equations literally.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import torch
 from torch import Tensor, nn
 
 Over = Literal["primary", "output"]
-_DEVIATION = 0.12  # initial deviation of a prediction vector, divided by sqrt(capsules)
-TINY = 1e-12  # keeps the square root differentiable at 0
+_DEVIATION = 0.12  # initial standard deviation of prediction vectors over sqrt(number of capsules)
+TINY = 1e-12  # added so that the square root is differentiable at 0
 
 
 def squash(s: Tensor) -> Tensor:
@@ -36,21 +36,23 @@ def route(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Dynamic routing; gradients flow through the last iteration only.
 
-    ``s_j = Σ_t W_tj (Σ_p c_tpj u_tp)`` and ``û_j|i · v_j = u_tp · (W_tjᵀ v_j)``: sums of A numbers
-    over places replace ``I J D`` numbers that would be written once and read five times.
+    With ``s_j = Σ_t W_tj (Σ_p c_tpj u_tp)`` and ``û_j|i · v_j = u_tp · (W_tjᵀ v_j)``, sums of
+    vectors of size A over the places replace the ``I J D`` numbers of the prediction vectors, which
+    would be written once and read five times.
 
     Args:
         u: ``(N, T, P, A)`` primary capsules.
         W: ``(J, T, A, D)``, shared by the places of a type.
         iterations: at least 1.
-        over: normalisation of the coupling coefficients: ``primary``, their sum over i is 1, as in
-            the paper; ``output``, their sum over j is 1, as in Sabour et al.
-        alive: ``(I,)`` bool; capsules that are False are ignored, as if they were removed.
+        over: axis of the softmax. With ``primary``, the coupling coefficients sum to 1 over i, as
+            in the paper; with ``output``, over j, as in Sabour et al.
+        alive: ``(I,)`` bool; the other capsules are ignored, as if they were removed.
 
     Returns:
-        Output capsules ``v`` ``(N, J, D)``, and their coupling coefficients as ``e / total`` with
-        ``e`` ``(N, T, J, P)`` and ``total`` ``(N, 1, J, 1)`` or ``(1,)``; see :func:`couplings`.
-        Dividing sums over P instead of ``e`` takes a sixth of the divisions.
+        Output capsules ``v`` ``(N, J, D)``, and the coupling coefficients as numerators ``e``
+        ``(N, T, J, P)`` and denominators ``total`` ``(N, 1, J, 1)`` or ``(1,)``; see
+        :func:`couplings`. It takes a sixth of the divisions to divide the sums over P instead of
+        ``e``.
     """
     n, types, places, size = u.shape
     outputs, _, _, depth = W.shape
@@ -58,52 +60,50 @@ def route(
     rows = u.reshape(n * types, places, size)
     present = None if alive is None else alive.view(types, 1, places)
 
-    def combined(e: Tensor, total: Tensor) -> Tensor:
-        """``s`` ``(N, J, D)``."""
+    def weighted_sums(e: Tensor, total: Tensor) -> Tensor:
+        """``s`` ``(N, J, D)`` with the coupling coefficients ``e / total``."""
         pooled = torch.bmm(e.view(n * types, outputs, places), rows)
         pooled = pooled.view(n, types, outputs, size) / total
         pooled = pooled.permute(2, 0, 1, 3).reshape(outputs, n, types * size)
         return torch.bmm(pooled, W_j).transpose(0, 1)
 
     def agreements(v: Tensor) -> Tensor:
-        """Outputs ``(N, J, D)`` to agreements ``(N, T, J, P)``."""
+        """Agreements ``(N, T, J, P)`` of the prediction vectors with the outputs ``(N, J, D)``."""
         back = torch.bmm(v.transpose(0, 1), W_j.transpose(1, 2)).view(outputs, n, types, size)
         back = back.permute(1, 2, 0, 3).reshape(n * types, outputs, size)
         return torch.bmm(back, rows.transpose(1, 2)).view(n, types, outputs, places)
 
-    def undivided(b: Tensor) -> tuple[Tensor, Tensor]:
-        """Eq. 6 for logits ``(N, T, J, P)``.
-
-        Works in place and subtracts a constant from each output, which does not change a softmax.
-        """
+    def softmax_parts(b: Tensor) -> tuple[Tensor, Tensor]:
+        """Numerators and denominator of Eq. 6 for logits ``(N, T, J, P)``, which it overwrites."""
         if over == "output":
             c = torch.softmax(b, dim=2)
             return c if present is None else c * present, b.new_ones(1)
         if present is not None:
             b.masked_fill_(~present, -torch.inf)
-        # Reducing one axis at a time is several times faster than two that are not adjacent.
+        # Subtracting the maximum avoids overflow and does not change a softmax. Reducing one axis
+        # at a time is several times faster than reducing two axes that are not adjacent.
         b -= b.amax(3, keepdim=True).amax(1, keepdim=True)
         e = torch.exp(b)
         return e, e.sum(3, keepdim=True).sum(1, keepdim=True)
 
     with torch.no_grad():
         if iterations == 1:
-            e, total = undivided(u.new_zeros((n, types, outputs, places)))
+            e, total = softmax_parts(u.new_zeros((n, types, outputs, places)))
         else:
-            # With b = 0, all couplings are equal: the first sums are means, the same for all
-            # outputs, and need no softmax.
-            here = rows
+            # With b = 0, all couplings are equal. The first sums are therefore means, which are the
+            # same for all outputs and need no softmax.
+            counted = rows
             if present is not None:
-                here = rows * present.view(types, places, 1).repeat(n, 1, 1)
+                counted = rows * present.view(types, places, 1).repeat(n, 1, 1)
             count = places * types if alive is None else alive.sum()
             share = 1.0 / (count if over == "primary" else outputs)
-            means = here.sum(1).view(n, types * size) * share
+            means = counted.sum(1).view(n, types * size) * share
             s = torch.bmm(means.expand(outputs, -1, -1), W_j).transpose(0, 1)
             b = agreements(squash(s))
             for _ in range(iterations - 2):
-                b += agreements(squash(combined(*undivided(b))))
-            e, total = undivided(b)
-    return squash(combined(e, total)), e, total
+                b += agreements(squash(weighted_sums(*softmax_parts(b))))
+            e, total = softmax_parts(b)
+    return squash(weighted_sums(e, total)), e, total
 
 
 def couplings(e: Tensor, total: Tensor) -> Tensor:
@@ -112,19 +112,19 @@ def couplings(e: Tensor, total: Tensor) -> Tensor:
 
 
 class CapsuleLayer(nn.Module):
-    """From primary to output capsules.
+    """The layer from primary to output capsules.
 
-    ``W_ij = W_t(i)j diag(g_i)``: a matrix for each type and output, and a gain vector of size A for
-    each primary capsule, which distinguishes its place. (A matrix for each i and j would need tens
-    of millions of parameters.) A pruned capsule has no row in ``gains`` and ``place`` and takes no
-    part in any product or softmax.
+    The transforms are ``W_ij = W_t(i)j diag(g_i)``: a matrix for each type and output, and a gain
+    vector of size A for each primary capsule, which distinguishes the places. (A matrix for each i
+    and j would need tens of millions of parameters.) A pruned capsule has no row in ``gains`` and
+    ``place`` and takes no part in any product or softmax.
 
     Attributes:
-        W: ``(J, T, A, D)``.
+        W: ``(J, T, A, D)`` matrices.
         gains: ``(T, K, A)`` for the K kept places of each type (all places before pruning).
-        place: ``(T, K)`` int64 buffer, the kept places.
-        alive: ``(T K,)`` bool buffer, capsules that are not masked. Masking is the reference by
-            which physical removal is tested.
+        place: ``(T, K)`` int64 buffer, indices of the kept places.
+        alive: ``(T K,)`` bool buffer, capsules that are not masked. Tests compare removal with
+            masking.
     """
 
     place: Tensor
@@ -144,8 +144,9 @@ class CapsuleLayer(nn.Module):
         super().__init__()
         kept = places if kept is None else kept
         self.iterations, self.over, self.places = iterations, over, places
-        # A mean over thousands of capsules is a short vector, and short outputs have no agreement:
-        # with half this deviation, couplings stay equal; with twice, a few capsules take all.
+        # A mean over thousands of capsules is a short vector, and short outputs give no agreement.
+        # With half of this deviation, the couplings stay equal; with twice this deviation, a few
+        # capsules get nearly all of the coupling.
         deviation = _DEVIATION * (types * places / size) ** 0.5 if over == "primary" else 1.0
         self.W = nn.Parameter(torch.randn(outputs, types, size, depth) * deviation)
         self.gains = nn.Parameter(torch.ones(types, kept, size))
@@ -169,7 +170,7 @@ class CapsuleLayer(nn.Module):
             rows = u.flatten(1, 2).index_select(1, (first + self.place).flatten())
             u = rows.unflatten(1, (types, kept))  # torch.gather takes five times as long
         alive = self.alive if self.masked else None
-        # Never in half precision, because it sums thousands of products.
+        # Routing sums thousands of products and therefore never runs in half precision.
         with torch.autocast(u.device.type, enabled=False):
             u = u.float() * self.gains
             return route(u, self.W, self.iterations, self.over, alive)

@@ -19,7 +19,7 @@ CHECKPOINT = "checkpoint.pt"
 
 @dataclass
 class TrainingProgress:
-    """The progress of a training: the content of a checkpoint besides weights and moments."""
+    """The progress of a training. Checkpoints contain it beside the weights and Adam's moments."""
 
     epoch: int = 0
     step: int = 0
@@ -39,13 +39,13 @@ def save_checkpoint(
     progress: TrainingProgress,
     pairs: Pairs | None,
 ) -> None:
-    """Write everything needed to resume a killed training.
+    """Write everything that resuming a killed training needs.
 
     Args:
-        pairs: pairs of the current epoch; None between epochs.
+        pairs: the pairs of the current epoch; None between epochs.
 
     Raises:
-        ResultsError: the file cannot be written; the previous one is kept.
+        ResultsError: the file cannot be written; an older file stays as it is.
     """
     content = {
         "settings": settings.model_dump_json(),
@@ -65,20 +65,23 @@ def load_checkpoint(
     network: SiameseNetwork,
     optimiser: torch.optim.Optimizer,
 ) -> tuple[TrainingProgress, Pairs | None]:
-    """Load a checkpoint into the network and the optimiser; returns the pairs of its epoch.
+    """Load a checkpoint into the network and the optimiser; returns the progress, and the pairs of
+    the current epoch or None between epochs.
 
     Raises:
-        InputError: the file is damaged, or from another version or other settings.
+        InputError: the file is damaged, or comes from another version of vslam or other settings.
     """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
         written = TrainSettings.model_validate_json(content["settings"])
     except ValidationError as error:
-        raise InputError(f"{path}: from another version of vslam; use another --out.") from error
-    except Exception as error:  # torch raises many kinds of errors
+        raise InputError(
+            f"{path}: written by another version of vslam; use another --out."
+        ) from error
+    except Exception as error:  # torch raises many types
         raise InputError(f"{path}: not a readable checkpoint; remove it to start anew.") from error
-    # The learning rate may change, to resume a diverged training, and so may settings that apply
-    # only at the end.
+    # The learning rate may change, so that a diverged training can be resumed. So may settings that
+    # are used only at the end.
     free = {key: getattr(settings, key) for key in ("learning_rate", "patience", "learned_share")}
     if written.model_copy(update=free) != settings:
         raise InputError(
@@ -90,7 +93,7 @@ def load_checkpoint(
         optimiser.load_state_dict(content["optimiser"])
     except (RuntimeError, ValueError) as error:
         raise InputError(
-            f"{path}: from another network or another version of vslam; use another --out."
+            f"{path}: belongs to another network or another version of vslam; use another --out."
         ) from error
     stored = content["pairs"]
     pairs = None if stored is None else Pairs(*(x.numpy() for x in stored))

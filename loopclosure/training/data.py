@@ -1,4 +1,4 @@
-"""Training data: loading images of all sources, dividing them, and drawing pairs."""
+"""Training data: loads the images of all sources, divides them, and draws pairs."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from vslam.errors import InputError, write_file
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN, ImageSource
 from vslam.loopclosure.siamese.images import Fit, Size
 
-# Frames of each sequence that training may use; loop detectors are tested on the others.
+# First and last frame of each sequence that training may use; detectors are tested on the others.
 TRAINING_FRAMES = {"kitti00": (250, 1499)}
-# Training uses one of them, the test the other.
+# Collections of which training may use only one, because the test needs the other.
 _EITHER = ({"citycentre", "newcollege"},)
 
 
@@ -30,9 +30,9 @@ class Collection:
     Attributes:
         names: ``source/folder/file`` of each of N images.
         images: ``(N, H, W)`` uint8.
-        relation: ``(N, N)`` int8: 1 same place, -1 another place, 0 unknown.
-        unit: ``(N,)`` int64; images of one unit stay together in a division.
-        sources: name of each source and its number of images.
+        relation: ``(N, N)`` int8: 1 same place, -1 different places, 0 unknown.
+        unit: ``(N,)`` int64; images of one unit are not split between training and validation.
+        sources: name and number of images of each source.
     """
 
     names: tuple[str, ...]
@@ -47,7 +47,12 @@ class Collection:
 
 @dataclass(frozen=True)
 class Pairs:
-    """``a``, ``b`` ``(M,)`` int64 images and ``same`` ``(M,)`` bool."""
+    """Pairs of images with labels.
+
+    Attributes:
+        a, b: ``(M,)`` int64 indices of the images in the collection.
+        same: ``(M,)`` bool, whether both show the same place.
+    """
 
     a: NDArray[np.int64]
     b: NDArray[np.int64]
@@ -58,7 +63,7 @@ class Pairs:
 
 
 def refuse_test_data(sources: list[ImageSource]) -> None:
-    """Check that no trajectory is used for both training and testing.
+    """Check that training on the sources leaves the test data unused.
 
     Raises:
         InputError: the sources include test frames of KITTI, or both FAB-MAP collections.
@@ -68,7 +73,7 @@ def refuse_test_data(sources: list[ImageSource]) -> None:
         frames = [int(Path(name).stem) for name in source.names if source.name in TRAINING_FRAMES]
         if frames and not (first <= min(frames) and max(frames) <= last):
             raise InputError(
-                f"{source.name}: frames {min(frames)} to {max(frames)} contain test data; "
+                f"{source.name}: frames {min(frames)} to {max(frames)} include test data; "
                 f"train on [first={first},last={last}]."
             )
     names = {source.name.lower().replace("_", "") for source in sources}
@@ -100,9 +105,9 @@ def load(sources: list[ImageSource], size: Size, fit: Fit, threads: int = 2) -> 
     starts = np.cumsum([0, *map(len, sources)])
     spans = [slice(a, b) for a, b in pairwise(starts.tolist())]
     for source, span in zip(sources, spans, strict=True):
-        for other, beside in zip(sources, spans, strict=True):
+        for other, other_span in zip(sources, spans, strict=True):
             if other.family == source.family:
-                relation[span, beside] = UNKNOWN
+                relation[span, other_span] = UNKNOWN
         relation[span, span] = source.relation
     unit = np.concatenate([s.unit + k * 10_000_000 for k, s in enumerate(sources)])
     return Collection(
@@ -119,8 +124,8 @@ def divide(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Divide the images by whole units into training and validation images.
 
-    Training images that show a place of a validation image (the ends of a stretch of road) are
-    left out of both.
+    The other images that show the same place as a validation image, for example at the ends of a
+    stretch of road, belong to neither part.
 
     Raises:
         InputError: there are too few images.
@@ -139,7 +144,8 @@ def divide(
 
 
 def validation_images(validation: NDArray[np.int64], most: int, seed: int) -> NDArray[np.int64]:
-    """Choose at most ``most`` validation images, the same for every training with this seed."""
+    """Choose at most ``most`` of the ``(M,)`` validation images; a seed gives the same choice for
+    every training."""
     if len(validation) <= most:
         return validation
     picked = np.random.default_rng([seed, 2]).choice(len(validation), most, replace=False)
@@ -147,14 +153,16 @@ def validation_images(validation: NDArray[np.int64], most: int, seed: int) -> ND
 
 
 def check_emphasis(collection: Collection, emphasis: Mapping[str, float]) -> None:
-    """Check that the sources in ``emphasis`` exist.
+    """Check that the collection has the sources that ``emphasis`` names.
 
     Raises:
         InputError: a source does not exist.
     """
     known = [name for name, _ in collection.sources]
-    if wrong := [name for name in emphasis if name not in known]:
-        raise InputError(f"emphasis: no source {wrong[0]}; there are {', '.join(known)}.")
+    if unknown := [name for name in emphasis if name not in known]:
+        raise InputError(
+            f"emphasis: there is no source {unknown[0]}; choose from {', '.join(known)}."
+        )
 
 
 def draw_pairs(
@@ -175,18 +183,18 @@ def draw_pairs(
         chosen: ``(M,)`` images to draw from.
         count: number of pairs.
         hard: ``(M, K)`` similar images of other places, -1 for none; see :func:`mine`.
-        hard_share: share of the pairs of two places that are drawn from ``hard``.
-        same_share: share of the pairs that show one place, spread evenly.
-        together: number of consecutive pairs whose first images are from one source, which is
-            drawn by its number of images.
-        emphasis: relative frequency, by source, with which an image is drawn first; default 1.
+        hard_share: share of the pairs of different places that are drawn from ``hard``.
+        same_share: share of the pairs that show the same place; they are spread evenly.
+        together: number of consecutive pairs whose first images come from the same source.
+        emphasis: relative frequency, by source, with which an image is drawn as the first of a
+            pair; default 1.
     """
     relation = collection.relation[np.ix_(chosen, chosen)]
     sizes = [size for _, size in collection.sources]
     source = np.repeat(np.arange(len(sizes)), sizes)[chosen]
     if emphasis:
-        often = np.array([emphasis.get(name, 1.0) for name, _ in collection.sources])[source]
-        a = rng.choice(len(chosen), count, p=often / often.sum())
+        frequency = np.array([emphasis.get(name, 1.0) for name, _ in collection.sources])[source]
+        a = rng.choice(len(chosen), count, p=frequency / frequency.sum())
     else:
         a = rng.integers(len(chosen), size=count)
     if together > 1:
@@ -194,29 +202,32 @@ def draw_pairs(
             members = np.flatnonzero(source == source[a[k]])
             a[k : k + together] = rng.choice(members, len(a[k : k + together]))
     b = np.empty(count, np.int64)
-    same = np.diff(np.ceil(same_share * np.arange(count + 1) - 1e-9)) > 0  # evenly, the first too
+    same = np.diff(np.ceil(same_share * np.arange(count + 1) - 1e-9)) > 0  # evenly spread
     for k in range(count):
-        wanted = np.flatnonzero(relation[a[k]] == (SAME if same[k] else DIFFERENT))
+        partners = np.flatnonzero(relation[a[k]] == (SAME if same[k] else DIFFERENT))
         use_hard = rng.random() < hard_share
         if not same[k] and hard is not None and use_hard:
-            offered = hard[a[k]][hard[a[k]] >= 0]
-            if offered.size:
-                b[k] = np.searchsorted(chosen, rng.choice(offered))
+            hard_partners = hard[a[k]][hard[a[k]] >= 0]
+            if hard_partners.size:
+                b[k] = np.searchsorted(chosen, rng.choice(hard_partners))
                 continue
-        if not wanted.size:  # no image is known to show another place
-            wanted, same[k] = np.array([a[k]]), True
-        b[k] = rng.choice(wanted)
+        if not partners.size:  # no image is known to show another place
+            partners, same[k] = np.array([a[k]]), True
+        b[k] = rng.choice(partners)
     return Pairs(chosen[a], chosen[b], same)
 
 
 def mine(
     collection: Collection, chosen: NDArray[np.int64], alike: NDArray[np.float32], k: int = 10
 ) -> NDArray[np.int64]:
-    """The ``k`` most similar images of other places, ``(M, k)``, -1 if there are fewer.
+    """Find the ``k`` most similar images of other places for each image.
 
     Args:
         chosen: ``(M,)`` images.
         alike: ``(M, M)`` similarities.
+
+    Returns:
+        ``(M, k)`` int64 images, most similar first, -1 where there are fewer.
     """
     out = np.full((len(chosen), k), -1, np.int64)
     for row, image in enumerate(chosen):

@@ -1,4 +1,4 @@
-"""Export of a trained network as one ONNX file, for runs and for programs in other languages."""
+"""Exports a trained network as one ONNX file, for runs and for programs in other languages."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from vslam.loopclosure.siamese.inference import (
 )
 from vslam.loopclosure.training.siamese import SiameseNetwork, for_inference
 
-TOLERANCE = 1e-4  # of a descriptor of length 1
-SIMILARITY_TOLERANCE = 0.02  # because the square root magnifies rounding at distance 0
-_SMALL = 64  # a tensor with fewer numbers is not worth storing in half precision
+TOLERANCE = 1e-4  # for the elements of descriptors of length 1
+SIMILARITY_TOLERANCE = 0.02  # large, because the square root magnifies rounding at distance 0
+_SMALL = 64  # storing tensors with fewer numbers in half precision gains nothing
 
 
 class _Embedding(nn.Module):
@@ -45,8 +45,8 @@ class _Embedding(nn.Module):
 
 
 class _Comparison(nn.Module):
-    """Similarities ``(N,)`` of a query ``(V, d)`` and a gallery ``(N, V, d)``, both by view, with
-    the lengths ``(N, V)`` of the gallery's views."""
+    """Descriptors by view of a query ``(V, d)`` and a gallery ``(N, V, d)``, with the lengths
+    ``(N, V)`` of the gallery's views, to similarities ``(N,)``."""
 
     def __init__(self, network: SiameseNetwork) -> None:
         super().__init__()
@@ -59,19 +59,20 @@ class _Comparison(nn.Module):
 def export_onnx(network: SiameseNetwork, path: Path, about: dict[str, Any] | None = None) -> float:
     """Write a network in the format that :class:`inference.OnnxNetwork` reads.
 
-    The graph maps ``image``, grey ``(H, W)`` uint8 of the network's size, to ``descriptor``
-    ``(D,)`` float32 of norm 1. The metadata contains a second graph in base64. It maps ``query``
-    ``(V, d)`` and ``gallery`` ``(N, V, d)``, descriptors by view with ``V d = D``, and ``lengths``
-    ``(N, V)`` of the gallery's views to ``similarity`` ``(N,)``.
+    The graph maps ``image``, a grey ``(H, W)`` uint8 image of the network's size, to
+    ``descriptor``, ``(D,)`` float32 of norm 1. The metadata contains a second graph in base64. It
+    computes ``similarity`` ``(N,)`` from ``query`` ``(V, d)``, ``gallery`` ``(N, V, d)`` and
+    ``lengths`` ``(N, V)``: the descriptors of V views with ``V d = D``, and the lengths of the
+    gallery's views.
 
     Args:
         about: origin of the weights.
 
     Returns:
-        The largest difference between descriptors of torch and onnxruntime for random images.
+        The largest difference between the descriptors of torch and ONNX Runtime for random images.
 
     Raises:
-        ResultsError: the file cannot be written, or its results differ from torch's.
+        ResultsError: the file cannot be written, or its results differ from those of torch.
     """
     parameters = network.n_parameters()
     network = for_inference(copy.deepcopy(network).cpu())
@@ -101,7 +102,10 @@ def export_onnx(network: SiameseNetwork, path: Path, about: dict[str, Any] | Non
     difference = float(np.abs(descriptors - expected.numpy()).max())
     apart = float(np.abs(written.compare(descriptors[0], descriptors) - alike).max())
     if not (difference < TOLERANCE and apart < SIMILARITY_TOLERANCE):
-        raise ResultsError(f"{path}: differs from torch by {difference:.1e}; do not use it.")
+        raise ResultsError(
+            f"{path}: its descriptors differ from torch by {difference:.1e} and its similarities "
+            f"by {apart:.1e}; do not use it."
+        )
     return difference
 
 
@@ -109,11 +113,11 @@ def to_onnx(
     module: nn.Module, inputs: tuple[Tensor, ...], names: list[str], outputs: list[str],
     dynamic_shapes: Any = None,
 ) -> onnx.ModelProto:  # fmt: skip
-    """Convert a module to an ONNX graph. Tensors that half precision
-    represents exactly are stored in it."""
+    """Convert a module to an ONNX graph. Tensors are stored in half precision where it represents
+    them exactly."""
     log = logging.getLogger("torch.onnx")
     level = log.level
-    log.setLevel(logging.ERROR)  # it warns of missing torchvision and of needless renaming
+    log.setLevel(logging.ERROR)  # hides warnings about missing torchvision and renamed inputs
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -126,7 +130,7 @@ def to_onnx(
     assert program is not None
     model = program.model_proto
     _halve(model.graph)
-    for node in model.graph.node:  # remove the source paths of this machine
+    for node in model.graph.node:  # they contain paths of this machine
         del node.metadata_props[:]
     del model.graph.metadata_props[:]
     return model
@@ -143,8 +147,8 @@ def write_onnx(model: onnx.ModelProto, path: Path, metadata: dict[str, str]) -> 
 
 
 def _halve(graph: onnx.GraphProto) -> None:
-    """Store tensors in half precision if that is exact; they are converted back on loading."""
-    widened = []
+    """Store tensors in half precision where this is exact; the graph converts them back."""
+    casts = []
     for tensor in graph.initializer:
         if tensor.data_type != TensorProto.FLOAT:
             continue
@@ -154,7 +158,7 @@ def _halve(graph: onnx.GraphProto) -> None:
             continue
         name, stored = tensor.name, f"{tensor.name}.half"
         tensor.CopyFrom(numpy_helper.from_array(half, stored))
-        widened.append(helper.make_node("Cast", [stored], [name], to=TensorProto.FLOAT))
-    nodes = [*widened, *graph.node]
+        casts.append(helper.make_node("Cast", [stored], [name], to=TensorProto.FLOAT))
+    nodes = [*casts, *graph.node]
     del graph.node[:]
     graph.node.extend(nodes)

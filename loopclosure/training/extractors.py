@@ -1,4 +1,4 @@
-"""Extractors of primary capsules: the paper's light one."""
+"""The paper's light feature extractor, and the layer of primary capsules."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from vslam.loopclosure.training.capsules import squash
 
 Block = tuple[int, int, int]
-"""Channels, stride and dilation of a separable convolution; the first is the stem."""
+"""Channels, stride and dilation of a separable convolution; the first block is the stem."""
 
 LIGHT_BLOCKS: tuple[Block, ...] = (
-    (32, 4, 1),  # 57 places a side for 227 pixels
-    (64, 2, 1),  # 29
+    (32, 4, 1),  # 57x57 places for 227 pixels
+    (64, 2, 1),  # 29x29
     (128, 1, 2),
-    (192, 2, 3),  # 15
+    (192, 2, 3),  # 15x15
     (256, 1, 2),
 )
 
@@ -50,14 +50,14 @@ class Separable(nn.Module):
         return torch.relu(x) if self.active else x
 
     def fold(self) -> None:
-        """Fold the normalisation into the preceding convolution, which saves time."""
+        """Fold the normalisation into the preceding convolution to save time."""
         if isinstance(self.norm, nn.BatchNorm2d):
             self.pointwise = fuse_conv_bn_eval(self.pointwise, self.norm)
             self.norm = nn.Identity()
 
 
 class Stem(nn.Module):
-    """An ordinary 7x7 convolution, because a single grey channel has nothing to separate."""
+    """An ordinary 7x7 convolution, because separation saves nothing with a single grey channel."""
 
     def __init__(self, outputs: int, stride: int) -> None:
         super().__init__()
@@ -107,14 +107,14 @@ class LightExtractor(nn.Sequential):
 
 
 def grid_side(pixels: int, blocks: Collection[Block] = LIGHT_BLOCKS) -> int:
-    """Number of places along a side of the grid for an image side of ``pixels``."""
+    """Number of places along one side of the grid, for an image side of ``pixels``."""
     for _, stride, _ in blocks:
         pixels = (pixels - 1) // stride + 1
     return pixels
 
 
 def fold_batch_norms(network: nn.Module) -> None:
-    """Fold every normalisation of an extractor, in place; the network must be in eval mode."""
+    """Fold all normalisations of a network in place; the network must be in eval mode."""
     for module in network.modules():
         if isinstance(module, Separable | Stem):
             cast(Separable, module).fold()

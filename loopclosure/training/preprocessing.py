@@ -12,33 +12,34 @@ from torch.nn import functional
 
 from vslam.loopclosure.siamese.images import Size
 
-_TEXTURE = 1.5 / 255.0  # a difference of one grey level is noise, of two is texture
+_TEXTURE = 1.5 / 255.0  # a difference of one grey level is noise, a difference of two is texture
 
 
 def to_tensor(images: NDArray[np.uint8]) -> Tensor:
-    """``(N, H, W)`` grey images to ``(N, 3, H, W)`` float32 in [0, 1], the grey replicated."""
+    """``(N, H, W)`` grey images to ``(N, 3, H, W)`` float32 in [0, 1] with three equal channels."""
     x = torch.from_numpy(np.ascontiguousarray(images)).float().div_(255.0)
     return x[:, None].expand(-1, 3, -1, -1)
 
 
 class Unrolling(nn.Module):
-    """Cylindrical projection, in which turning the camera shifts the image.
+    """Cylindrical projection, in which a turn of the camera shifts the image.
 
     Szeliski, Image Alignment and Stitching: A Tutorial, 2006, section 2.3. In a flat image, objects
-    become wider and taller towards the sides, so that turning by 30 degrees does not merely shift
+    become wider and taller towards the sides. A turn by 30 degrees therefore does not merely shift
     the image, and no alignment of views fits all of it. (Not in the paper.)
 
-    Column ``x`` in [-1, 1] shows the direction ``x half_angle``. There, row ``y`` shows the flat
-    row ``middle y / cos(x half_angle)``; the sides of the flat image are at ``tan(half_angle)``.
-    Pixels outside the flat image are black.
+    Column ``x`` in [-1, 1] shows the direction ``x half_angle``. In this column, row ``y`` shows
+    the row ``middle y / cos(x half_angle)`` of the flat image, whose sides are at
+    ``tan(half_angle)``. Pixels outside the flat image are black.
 
     Args:
         size: height and width of the images.
-        half_angle: degrees from the middle to either side; 0 leaves images flat. The same value is
-            used for all cameras, because some are not calibrated. Turning is exactly a shift if it
-            is the camera's own half angle, and nearly so otherwise.
-        middle: share of the height that the middle column keeps. With the cosine of ``half_angle``,
-            the sides keep their whole height and nothing is black; with 1, the middle keeps it.
+        half_angle: degrees from the middle to either side; 0 leaves images flat. All cameras use
+            the same value, because some are not calibrated. A turn is exactly a shift if the value
+            is the camera's own half angle, and approximately otherwise.
+        middle: share of the height that the middle column keeps. If it is the cosine of
+            ``half_angle``, the sides keep their whole height and no pixel is black; if it is 1, the
+            middle keeps its whole height.
     """
 
     grid: Tensor | None
@@ -49,10 +50,10 @@ class Unrolling(nn.Module):
         grid = None
         if half > 0:
             height, width = size
-            x = ((torch.arange(width, dtype=torch.float64) + 0.5) / width * 2 - 1) * half
+            angle = ((torch.arange(width, dtype=torch.float64) + 0.5) / width * 2 - 1) * half
             y = (torch.arange(height, dtype=torch.float64) + 0.5) / height * 2 - 1
-            across = (x.tan() / math.tan(half)).expand(height, width)
-            grid = torch.stack([across, middle * y[:, None] / x.cos()], 2).float()[None]
+            column = (angle.tan() / math.tan(half)).expand(height, width)
+            grid = torch.stack([column, middle * y[:, None] / angle.cos()], 2).float()[None]
         self.register_buffer("grid", grid, persistent=False)
 
     def forward(self, images: Tensor) -> Tensor:
@@ -64,25 +65,25 @@ class Unrolling(nn.Module):
 
 
 def textured(images: Tensor) -> Tensor:
-    """Mask of ``(N, 1, H, W)`` images in [0, 1]: 1.0 where a pixel differs by more than one grey
-    level from its right or lower neighbour, else 0, as in black, white or covered areas."""
-    beside = functional.pad((images[..., 1:] - images[..., :-1]).abs(), (0, 1))
-    below = functional.pad((images[..., 1:, :] - images[..., :-1, :]).abs(), (0, 0, 0, 1))
-    return (torch.maximum(beside, below) > _TEXTURE).to(images.dtype)
+    """Texture mask of ``(N, 1, H, W)`` images in [0, 1]: 1.0 where a pixel differs by more than one
+    grey level from its right or lower neighbour, else 0.0, as in black, white or covered areas."""
+    right = functional.pad((images[..., 1:] - images[..., :-1]).abs(), (0, 1))
+    lower = functional.pad((images[..., 1:, :] - images[..., :-1, :]).abs(), (0, 0, 0, 1))
+    return (torch.maximum(right, lower) > _TEXTURE).to(images.dtype)
 
 
-def standardised(images: Tensor, shown: Tensor | None = None) -> Tensor:
+def standardised(images: Tensor, texture: Tensor | None = None) -> Tensor:
     """Scale each image to mean 0 and standard deviation 1 over its textured pixels.
 
-    This removes the camera's gain and bias, and overexposed or covered areas do not change the
-    rest.
+    This removes the camera's gain and bias, and overexposed or covered areas do not affect the
+    other pixels.
 
     Args:
         images: ``(N, 1, H, W)``.
-        shown: result of :func:`textured`, if already computed.
+        texture: result of :func:`textured`, if already computed.
     """
-    shown = textured(images) if shown is None else shown
-    weight = shown + 1e-3  # in an image without texture, all pixels count
+    texture = textured(images) if texture is None else texture
+    weight = texture + 1e-3  # in an image without texture, all pixels count equally
     weight = weight / weight.sum((1, 2, 3), keepdim=True)
     centred = images - (images * weight).sum((1, 2, 3), keepdim=True)
     deviation = torch.sqrt((centred * centred * weight).sum((1, 2, 3), keepdim=True))

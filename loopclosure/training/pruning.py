@@ -1,7 +1,7 @@
 """Pruning: removal of the primary capsules with the lowest coupling coefficients.
 
 The paper ranks primary capsules by their coupling coefficients and sets the W_ij of the lowest 20 %
-to 0. Since a zero costs as much time as any number, they are removed here.
+to 0. Multiplying by zeros takes as much time as before, so these capsules are removed here.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from vslam.loopclosure.training.siamese import SiameseNetwork
 
 @torch.no_grad()
 def mean_couplings(network: SiameseNetwork, batches: Iterable[Tensor]) -> Tensor:
-    """Activity of each primary capsule, ``(T, K)``: mean of c_ij over images and outputs j.
+    """Activity of each primary capsule, ``(T, K)``: the mean of c_ij over images and outputs j.
 
     Args:
-        network: the network, in eval mode.
-        batches: images of the training set, ``(N, 3, H, W)`` each.
+        network: the network in eval mode.
+        batches: batches of training images, ``(N, 3, H, W)`` each.
 
     Raises:
         InputError: there are no images.
@@ -43,8 +43,8 @@ def mean_couplings(network: SiameseNetwork, batches: Iterable[Tensor]) -> Tensor
 def lowest(activity: Tensor, fraction: float = 0.2) -> Tensor:
     """``(T, K)`` bool, the least active ``fraction`` of the capsules of each type.
 
-    The number is the same for each type (the paper leaves this open), so that the rest is still one
-    dense product for all types. Of equal capsules, those with lower indices are chosen.
+    The paper does not say how many capsules to remove from each type. The number is the same here,
+    so that one dense product still computes all types. Ties are broken by lower index.
     """
     dropped = round(fraction * activity.shape[1])
     order = torch.argsort(activity, dim=1, stable=True)
@@ -53,7 +53,7 @@ def lowest(activity: Tensor, fraction: float = 0.2) -> Tensor:
 
 
 def masked(network: SiameseNetwork, drop: Tensor) -> SiameseNetwork:
-    """A copy in which the capsules of ``drop`` ``(T, K)`` are masked but still computed."""
+    """A copy in which the capsules ``drop`` ``(T, K)`` are computed but masked."""
     copied = copy.deepcopy(network)
     layer = copied.branch.capsules
     layer.alive.copy_(~drop.flatten())
@@ -62,7 +62,7 @@ def masked(network: SiameseNetwork, drop: Tensor) -> SiameseNetwork:
 
 
 def pruned(network: SiameseNetwork, drop: Tensor, name: str = "capsule-pruned") -> SiameseNetwork:
-    """A copy without the capsules of ``drop`` ``(T, K)``, which has the same number in each type.
+    """A copy without the capsules ``drop``, ``(T, K)`` bool with the same number for each type.
 
     Args:
         name: name of the copy, one of ``PRUNED``.

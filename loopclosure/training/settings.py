@@ -1,4 +1,4 @@
-"""The settings of a training."""
+"""The settings of a training, and presets."""
 
 from __future__ import annotations
 
@@ -13,41 +13,57 @@ from vslam.loopclosure.training.branches import CapsuleShape
 
 
 class TrainSettings(BaseModel):
-    """Written to ``settings.json`` of a training, read by ``--settings``."""
+    """The settings of a training; ``settings.json`` stores them and ``--settings`` reads them."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     network: str = Field("capsule", description="Network to train.")
     shape: CapsuleShape = Field(CapsuleShape(), description="Shape of the capsule branch.")
     fit: Literal["squash", "crop"] = Field(
-        "squash", description="Whole view, or its middle with the input's aspect ratio."
+        "squash",
+        description="Squash the whole image, or crop its middle to the input's aspect ratio.",
     )
-    seed: int = Field(0, ge=0, description="Seed of weights, division, pairs, augmentation.")
-    loss: Literal["bce", "bce+contrast"] = Field("bce", description="Eq. 3, or plus contrast.")
+    seed: int = Field(0, ge=0, description="Seed of weights, division, pairs and augmentation.")
+    loss: Literal["bce", "bce+contrast"] = Field(
+        "bce", description="Eq. 3 alone, or with the contrast."
+    )
     temperature: float = Field(0.07, gt=0, description="Temperature of the contrast.")
     learning_rate: float = Field(3e-4, gt=0, description="Learning rate of Adam. [paper]")
-    extractor_rate: float = Field(1.0, ge=0, description="Factor for the extractor's rate.")
-    learned_share: float = Field(
-        1.0, gt=0, le=1, description="Share of the change by training; 1 keeps all of it."
+    extractor_rate: float = Field(
+        1.0, ge=0, description="Factor for the learning rate of the extractor."
     )
-    frozen: int = Field(0, ge=0, description="First blocks of lite0 that stay fixed.")
+    learned_share: float = Field(
+        1.0, gt=0, le=1, description="Share of the trained change of the weights that is kept."
+    )
+    frozen: int = Field(0, ge=0, description="Number of first blocks of lite0 that stay fixed.")
     schedule: Literal["constant", "cosine"] = "constant"
     mixed_precision: bool | None = Field(
-        None, description="bfloat16 except for routing; null: if the GPU supports it."
+        None,
+        description="bfloat16 everywhere except in the routing; null: if a GPU supports it.",
     )
-    batch: int = Field(64, ge=2, description="Pairs. [paper]")
-    epochs: int = Field(40, ge=1, description="At most.")
+    batch: int = Field(64, ge=2, description="Pairs per batch. [paper]")
+    epochs: int = Field(40, ge=1, description="Largest number of epochs.")
     pairs: int = Field(4096, ge=2, description="Pairs per epoch.")
-    same_share: float = Field(0.5, gt=0, le=1, description="Share of pairs of one place. [paper]")
-    together: int = Field(1, ge=1, description="Consecutive pairs from one source.")
-    emphasis: dict[str, Annotated[float, Field(gt=0)]] = Field(
-        {}, description="By source: relative frequency of its images; default 1."
+    same_share: float = Field(
+        0.5, gt=0, le=1, description="Share of the pairs that show the same place. [paper]"
     )
-    patience: int = Field(6, ge=1, description="Epochs without a better validation AP.")
-    hard_share: float = Field(0.5, ge=0, le=1, description="Share of mined pairs of two places.")
-    mined_images: int = Field(4000, ge=2, description="Images embedded for mining, at most.")
-    validation_share: float = Field(0.15, gt=0, lt=1, description="Share of each source's units.")
-    validation_images: int = Field(800, ge=2, description="At most.")
+    together: int = Field(
+        1, ge=1, description="Number of consecutive pairs whose first images share a source."
+    )
+    emphasis: dict[str, Annotated[float, Field(gt=0)]] = Field(
+        {}, description="Relative frequency of the images, by source; default 1."
+    )
+    patience: int = Field(
+        6, ge=1, description="Epochs without a better validation AP before training stops."
+    )
+    hard_share: float = Field(
+        0.5, ge=0, le=1, description="Share of the pairs of different places that are mined."
+    )
+    mined_images: int = Field(
+        4000, ge=2, description="Largest number of images embedded for mining."
+    )
+    validation_share: float = Field(0.15, gt=0, lt=1, description="Share of the units.")
+    validation_images: int = Field(800, ge=2, description="Largest number of validation images.")
     augmentation: Augmentation = Augmentation()
     prune_share: float = Field(
         0.2, gt=0, lt=1, description="Share of the capsules that pruning removes. [paper]"
@@ -71,15 +87,15 @@ _BEST = TrainSettings(
     validation_images=400,
 )
 PRESETS = {
-    # As in the paper, except for augmentation strengths and mining, which it does not give.
+    # The settings of the paper, which does not state the augmentation strengths and the mining.
     "paper": TrainSettings(),
     # Every image of a batch is compared with every other, under stronger changes. Most pairs show
-    # one place, since the contrast uses the other places in the batch. Half of a batch is from one
-    # source, because other places look most similar there. Small batches, short epochs and little
-    # mining and validation suit the two cores on which it was trained.
+    # the same place, since the contrast takes different places from the other pairs. Half of a
+    # batch comes from one source, because different places look most similar within a source. Small
+    # batches, short epochs and little mining and validation suit the two cores of its training.
     "best": _BEST,
     # The same from ImageNet weights (--weights). Filters for edges and corners stay fixed, and the
-    # rest of the extractor learns slowly. For the 129 pixels see docs/research/training.md.
+    # rest of the extractor learns slowly.
     "pretrained": _BEST.model_copy(
         update={
             "shape": CapsuleShape(extractor="lite0", pixels=129),

@@ -25,12 +25,12 @@ _SOFTNESS = 0.04  # temperature of the soft maximum over alignments, in cosines
 def aligned(alike: Tensor, most: Tensor) -> Tensor:
     """Cosine of two images under the best alignment of their views.
 
-    A camera that has turned sees the same objects in another view. Therefore all alignments are
-    considered in which the views of one image are shifted to the left or right and at least half of
-    them overlap. The cosine of an alignment is taken over its overlapping views. The result is the
-    soft maximum over the alignments, since a camera that has turned by half the spacing of the
-    views, or has driven on, nearly fits two of them; it can slightly exceed 1. (Not in the paper,
-    which compares whole images only.)
+    After a turn of the camera, the same objects appear in another view. Therefore, the views of one
+    image are shifted to the left or right by up to half of their number, and each of these
+    alignments has a cosine over the views that overlap. The result is the soft maximum of these
+    cosines, because two alignments fit about equally well if the camera has turned by half the
+    spacing of the views or has driven on. It can slightly exceed 1. (Not in the paper, which
+    compares whole images only.)
 
     Args:
         alike: ``(..., V, V)`` scalar products of the views.
@@ -38,54 +38,55 @@ def aligned(alike: Tensor, most: Tensor) -> Tensor:
     """
     views = alike.shape[-1]
     v = torch.arange(views, device=alike.device)
-    moves = torch.arange(-(views // 2), views // 2 + 1, device=alike.device)
-    meet = (v[None, :] - v[:, None] == moves[:, None, None]).to(alike.dtype).flatten(1).T
-    moved = (alike.flatten(-2) @ meet) / (most.flatten(-2) @ meet + TINY)
-    return _SOFTNESS * torch.logsumexp(moved / _SOFTNESS, -1)
+    shifts = torch.arange(-(views // 2), views // 2 + 1, device=alike.device)
+    overlap = (v[None, :] - v[:, None] == shifts[:, None, None]).to(alike.dtype).flatten(1).T
+    cosine = (alike.flatten(-2) @ overlap) / (most.flatten(-2) @ overlap + TINY)
+    return _SOFTNESS * torch.logsumexp(cosine / _SOFTNESS, -1)
 
 
 def cosines(a: Tensor, b: Tensor, views: int = 1) -> Tensor:
-    """Cosines ``(N, M)`` of ``(N, D)`` and ``(M, D)``; those of several views :func:`aligned`."""
+    """Cosines ``(N, M)`` of descriptors ``(N, D)`` and ``(M, D)``, :func:`aligned` if they have
+    several views."""
     if views == 1:
         return a @ b.T
     a, b = _by_view(a, views), _by_view(b, views)
-    # b comes first because it is a map of thousands of keyframes, and a is the query.
+    # b comes first because it may have the thousands of keyframes of a map.
     alike = (b.flatten(0, 1) @ a.flatten(0, 1).T).view(len(b), views, len(a), views)
     most = _lengths(a)[:, None, :, None] * _lengths(b)[None, :, None, :]
     return aligned(alike.permute(2, 0, 3, 1), most)
 
 
 def _by_view(descriptors: Tensor, views: int) -> Tensor:
-    """``(N, V D)`` to ``(N, V, D)``."""
+    """Split descriptors ``(N, V D)`` into those of their views, ``(N, V, D)``."""
     return descriptors.view(len(descriptors), views, descriptors.shape[1] // views)
 
 
 def _lengths(views: Tensor) -> Tensor:
-    """``(N, V, D)`` to ``(N, V)``."""
+    """Lengths ``(N, V)`` of the descriptors ``(N, V, D)`` of views."""
     return torch.linalg.vector_norm(views, dim=2)
 
 
 class DistanceHead(nn.Module):
     """``p = sigmoid(a - b d)`` (Eq. 2) with the distance d of two descriptors (Eq. 10), a, b > 0.
 
-    With several views, d follows from their :func:`aligned` cosine.
+    With several views, d is computed from their :func:`aligned` cosine.
     """
 
     def __init__(self, views: int = 1) -> None:
         super().__init__()
         self.views = views
-        # p = 0.5 at d = 1.1, which separates pairs of one and of two places with random weights.
+        # p = 0.5 at d = 1.1, which separates the same from different places with random weights.
         self.log_a = nn.Parameter(torch.tensor(1.5))
         self.log_b = nn.Parameter(torch.tensor(1.4))
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
-        """Logits ``(N,)`` of pairs of ``(N, D)`` unit descriptors."""
+        """Logits ``(N,)`` of N pairs of unit descriptors, ``(N, D)`` each."""
         a, b = _by_view(a, self.views), _by_view(b, self.views)
         most = _lengths(a)[:, :, None] * _lengths(b)[:, None]
         return self.of_cosine(aligned(a @ b.transpose(1, 2), most))
 
     def of_cosine(self, cosine: Tensor) -> Tensor:
-        """Logit of the cosine of unit descriptors, at distance ``sqrt(2 - 2 cos)``."""
+        """Logits from the cosines of unit descriptors, whose distance is ``sqrt(2 - 2 cos)``."""
         d = torch.sqrt((2.0 - 2.0 * cosine).clamp_min(0.0) + TINY)
         return self.log_a.exp() - self.log_b.exp() * d
 
@@ -120,7 +121,7 @@ class SiameseNetwork(nn.Module):
         self.size, self.dimensions = branch.size, branch.dimensions
 
     def embed(self, images: Tensor) -> Tensor:
-        """``(N, 3, H, W)`` float32 in [0, 1] to ``(N, D)`` float32 descriptors of L2 norm 1."""
+        """``(N, 3, H, W)`` float32 images in [0, 1] to ``(N, D)`` float32 descriptors of norm 1."""
         return functional.normalize(self.branch(images).float(), dim=1)
 
     def cosines(self, a: Tensor, b: Tensor) -> Tensor:
@@ -128,34 +129,35 @@ class SiameseNetwork(nn.Module):
         return cosines(a, b, self.branch.views)
 
     def logits(self, a: Tensor, b: Tensor) -> Tensor:
-        """Logits of ``similarity``, which training uses."""
+        """Logits ``(N,)`` of ``similarity``, which the loss needs."""
         return self.head(a, b)
 
     def similarity(self, a: Tensor, b: Tensor) -> Tensor:
-        """Probability ``(N,)`` in (0, 1) that pairs of ``(N, D)`` descriptors show one place."""
+        """Probabilities ``(N,)`` in (0, 1) that the images of N pairs of descriptors, ``(N, D)``
+        each, show the same place."""
         return torch.sigmoid(self.head(a, b))
 
     def compare(self, query: Tensor, gallery: Tensor) -> Tensor:
-        """Similarity ``(M,)`` of one ``(D,)`` descriptor with each of a ``(M, D)`` gallery."""
+        """Similarities ``(M,)`` of a descriptor ``(D,)`` with the descriptors ``(M, D)``."""
         by_view = _by_view(gallery, self.branch.views)
         query = _by_view(query[None], self.branch.views)[0]
         return torch.sigmoid(self.head.compare(query, by_view, _lengths(by_view)))
 
     def forward(self, images: Tensor) -> Tensor:
-        """As :meth:`embed`."""
+        """Same as :meth:`embed`."""
         return self.embed(images)
 
     def n_parameters(self) -> int:
-        """Learned numbers."""
+        """Number of learned parameters."""
         return sum(p.numel() for p in self.parameters())
 
 
 def build_network(name: str, shape: CapsuleShape | None = None) -> SiameseNetwork:
-    """A network with random weights, drawn from torch's global generator.
+    """Create a network with random weights from torch's global generator.
 
     Args:
         name: one of ``NETWORKS``.
-        shape: shape of the capsule branch; None for that of the paper.
+        shape: shape of the capsule branch; None uses the shape of the paper.
 
     Raises:
         InputError: the name is unknown.
@@ -169,10 +171,10 @@ def build_network(name: str, shape: CapsuleShape | None = None) -> SiameseNetwor
 def save_network(
     network: SiameseNetwork, path: Path, about: dict[str, Any], *, half: bool = False
 ) -> None:
-    """Write weights as safetensors; the metadata has the structure of the network and ``about``.
+    """Write weights as safetensors with metadata: the structure of the network and ``about``.
 
     Args:
-        half: store in half precision, for shipping.
+        half: whether to store the weights in half precision, for shipping.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -186,12 +188,12 @@ def save_network(
         "shape": network.branch.shape.model_dump_json(),
         "about": json.dumps(about),
     }
-    # Files of save_file would be readable only by their owner.
+    # write_file replaces the file atomically, and others can read it, unlike a file of save_file.
     write_file(path, save({k: v.cpu().contiguous() for k, v in tensors.items()}, metadata))
 
 
 def load_network(path: Path) -> tuple[SiameseNetwork, dict[str, Any]]:
-    """Read a file of :func:`save_network`; returns the network in eval mode and ``about``.
+    """Read a file that :func:`save_network` wrote; returns the network in eval mode and ``about``.
 
     Raises:
         InputError: the file is missing, damaged or not from this version of vslam.
@@ -214,7 +216,7 @@ def load_network(path: Path) -> tuple[SiameseNetwork, dict[str, Any]]:
 
 
 def for_inference(network: SiameseNetwork) -> SiameseNetwork:
-    """Prepare a network in place: eval mode, no gradients, normalisations folded in."""
+    """Prepare a network for inference in place: eval mode, no gradients, folded normalisations."""
     network.eval().requires_grad_(False)
     fold_batch_norms(network)
     return network

@@ -1,8 +1,8 @@
-"""Training in epochs of pairs, with checkpoints from which a killed training resumes.
+"""Trains a network in epochs of pairs, with checkpoints from which a killed training can resume.
 
-All random numbers depend only on the seed, the epoch and the number of the step or pair. A
-checkpoint therefore needs no generator states, and a resumed training gives the same bits as an
-uninterrupted one (on the same machine with the same number of threads).
+All random numbers depend only on the seed, the epoch and the number of the pair. A checkpoint
+therefore needs no generator states, and a resumed training gives the same bits as an uninterrupted
+one (on the same machine with the same number of threads).
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ OnStep = Callable[[int, int, int, float], None]
 """``(epoch, step, steps of the epoch, loss)``"""
 
 _CHECKPOINT_EVERY_S = 300.0
-_HEAD_RATE = 30.0  # factor for a and b, single logarithms for which Adam's steps are too small
+_HEAD_RATE = 30.0  # factor for the scalars log a and log b, for which Adam's steps are too small
 
 
 @dataclass(frozen=True)
@@ -70,9 +70,9 @@ class TrainingOutcome:
     """The outcome of a training.
 
     Attributes:
-        finished: False if it was stopped early; a call with ``resume`` continues it.
-        figures: validation figures of the best epoch, after calibration.
-        progress: progress with the figures of every epoch.
+        finished: False if the training was stopped early; a call with ``resume`` continues it.
+        figures: validation figures of the best network after calibration.
+        progress: the progress, with the figures of every epoch.
         weights: file of the best network.
         train, validation: indices of the training and validation images.
     """
@@ -104,29 +104,30 @@ def train(
         settings: settings of the training.
         folder: output folder; ``settings.network`` names the file of the weights.
         device: ``cpu`` or ``cuda``.
-        threads: threads for the augmentation of images.
-        resume: continue from the folder's checkpoint, if there is one.
+        threads: number of threads that augment images.
+        resume: whether to continue from the folder's checkpoint, if there is one.
         start: network to start from instead of random weights (fine-tuning).
         on_step: called after each step.
-        should_stop: called after each step; if True, a checkpoint is written and training stops.
+        should_stop: called after each step; if it returns True, a checkpoint is written and the
+            training stops.
 
     Raises:
-        InputError: there is too little data, the device or a source is unknown, the settings need
-            bfloat16 but the device lacks it, the checkpoint has other settings, or
-            ``learned_share`` is set without a network to start from.
+        InputError: there is too little data, the device or a source is unknown, the device does not
+            support the required bfloat16, the checkpoint has other settings, or ``learned_share``
+            is set without a network to start from.
         ResultsError: the loss is not finite (the last good checkpoint is kept), or the results
             cannot be written.
     """
     if settings.learned_share < 1 and start is None:
-        raise InputError("learned_share: needs a network to start from; give --weights.")
-    where = open_device(device)
-    half = _mixed_precision(settings, where)
+        raise InputError("learned_share: needs a network to start from; name it with --weights.")
+    torch_device = open_device(device)
+    half = _mixed_precision(settings, torch_device)
     check_emphasis(collection, settings.emphasis)
     train_images, validation = divide(collection, settings.seed, settings.validation_share)
     validation = validation_images(validation, settings.validation_images, settings.seed)
     torch.manual_seed(settings.seed)
     network = start or build_network(settings.network, settings.shape)
-    network = network.to(where)
+    network = network.to(torch_device)
     before = copy.deepcopy(network.state_dict()) if settings.learned_share < 1 else None
     optimiser = _optimiser(network, settings)
     progress, pairs = TrainingProgress(), None
@@ -136,13 +137,14 @@ def train(
         progress, pairs = load_checkpoint(checkpoint, settings, network, optimiser)
     else:  # so that a good checkpoint exists even if the first steps diverge
         save_checkpoint(checkpoint, settings, network, optimiser, progress, None)
-    saved = time.monotonic()
+    last_saved = time.monotonic()
     with ThreadPoolExecutor(threads) as pool:
         run = _Training(
-            collection, settings, network, optimiser, progress, train_images, where, half, pool
-        )
+            collection, settings, network, optimiser, progress, train_images, torch_device, half,
+            pool,
+        )  # fmt: skip
         while progress.epoch < settings.epochs and progress.stale < settings.patience:
-            began = time.monotonic()
+            start_time = time.monotonic()
             if pairs is None:
                 pairs = run.pairs_of_epoch()
                 file = folder / "pairs" / f"epoch_{progress.epoch:03d}.csv"
@@ -152,31 +154,31 @@ def train(
                 if not math.isfinite(loss):
                     raise ResultsError(
                         f"{folder}: the loss is {loss} in epoch {progress.epoch}, step "
-                        f"{progress.step}; the last good checkpoint is kept, resume it with a "
+                        f"{progress.step}; the last good checkpoint is kept; resume it with a "
                         "lower learning rate."
                     )
                 if on_step:
                     on_step(progress.epoch, progress.step, run.steps, loss)
                 stop = should_stop is not None and should_stop()
-                if stop or time.monotonic() - saved > _CHECKPOINT_EVERY_S:
-                    progress.seconds += time.monotonic() - began
-                    began = saved = time.monotonic()
+                if stop or time.monotonic() - last_saved > _CHECKPOINT_EVERY_S:
+                    progress.seconds += time.monotonic() - start_time
+                    start_time = last_saved = time.monotonic()
                     save_checkpoint(checkpoint, settings, network, optimiser, progress, pairs)
                 if stop:
                     return TrainingOutcome(False, {}, progress, weights, train_images, validation)
             run.end_epoch(validation, weights)
-            progress.seconds += time.monotonic() - began
+            progress.seconds += time.monotonic() - start_time
             progress.history[-1]["seconds"] = progress.seconds
             pairs = None
             save_checkpoint(checkpoint, settings, network, optimiser, progress, None)
-            saved = time.monotonic()
+            last_saved = time.monotonic()
             write_log(folder / "log.csv", progress.history)
     best, about = load_network(weights)
-    best.to(where)
-    if before is not None and "learned_share" not in about:  # not yet blended before resuming
+    best.to(torch_device)
+    if before is not None and "learned_share" not in about:  # else an earlier call blended it
         blend(best, before, settings.learned_share)
         about["learned_share"] = settings.learned_share
-    figures = calibrated(best, about, collection, validation, settings, weights, where)
+    figures = calibrated(best, about, collection, validation, settings, weights, torch_device)
     return TrainingOutcome(True, figures, progress, weights, train_images, validation)
 
 
@@ -189,7 +191,7 @@ def calibrated(
     weights: Path,
     device: torch.device,
 ) -> dict[str, float]:
-    """Calibrate a network, write it and return its validation figures.
+    """Calibrate a network, write its weights and return its validation figures.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -203,8 +205,8 @@ def calibrated(
 
 @dataclass(frozen=True)
 class _Training:
-    """The state of a training: the data that steps read, and the network, optimiser and progress
-    that they change."""
+    """The data that training steps read, and the state that they change (network, optimiser and
+    progress)."""
 
     collection: Collection
     settings: TrainSettings
@@ -222,7 +224,8 @@ class _Training:
         return max(1, self.settings.pairs // self.settings.batch)
 
     def step(self, pairs: Pairs) -> float:
-        """One step of Adam; weights and progress stay unchanged if the loss is not finite."""
+        """Make one step of Adam and return the loss. If the loss is not finite, weights and
+        progress do not change."""
         settings, network, progress = self.settings, self.network, self.progress
         first = progress.step * settings.batch
         a, b, same_place = (x[first : first + settings.batch] for x in vars(pairs).values())
@@ -251,33 +254,38 @@ class _Training:
         return value
 
     def _augmented(self, a: NDArray[np.int64], b: NDArray[np.int64], first: int) -> torch.Tensor:
+        """Augmented images of the pairs, ``(2 N, 3, H, W)``; ``first`` is the number of the first
+        pair in the epoch."""
         settings, epoch = self.settings, self.progress.epoch
 
-        def one(job: tuple[int, int, int]) -> NDArray[np.uint8]:
-            image, pair, side = job
-            picture = self.collection.images[image]
+        def augmented(job: tuple[int, int, int]) -> NDArray[np.uint8]:
+            index, pair, side = job
+            image = self.collection.images[index]
             if settings.augmentation.mirror and (pair + epoch) // 2 % 2:
-                picture = np.ascontiguousarray(picture[:, ::-1])
+                image = np.ascontiguousarray(image[:, ::-1])
             rng = np.random.default_rng([settings.seed, 3, epoch, pair, side])
-            return augment(picture, settings.augmentation, rng)
+            return augment(image, settings.augmentation, rng)
 
         jobs = [
-            (int(image), first + k, side)
+            (int(index), first + k, side)
             for side, chosen in enumerate((a, b))
-            for k, image in enumerate(chosen)
+            for k, index in enumerate(chosen)
         ]
-        return to_tensor(np.stack(list(self.pool.map(one, jobs))))
+        return to_tensor(np.stack(list(self.pool.map(augmented, jobs))))
 
     def pairs_of_epoch(self) -> Pairs:
-        """The pairs of the current epoch."""
+        """Draw the pairs of the current epoch."""
         settings, network, images, hard = self.settings, self.network, self.images, None
         rng = np.random.default_rng([settings.seed, 4, self.progress.epoch])
-        # With random weights, mining would not find hard pairs.
+        # In the first epoch, random weights would find no hard pairs.
         if self.progress.epoch > 0 and settings.hard_share > 0:
             if len(images) > settings.mined_images:
                 images = np.sort(rng.choice(images, settings.mined_images, replace=False))
-            d = torch.from_numpy(embed_all(network, self.collection.images[images], self.device))
-            alike = torch.cat([network.cosines(rows, d) for rows in d.split(512)])
+            embedded = embed_all(network, self.collection.images[images], self.device)
+            descriptors = torch.from_numpy(embedded)
+            alike = torch.cat(
+                [network.cosines(rows, descriptors) for rows in descriptors.split(512)]
+            )
             hard = mine(self.collection, images, alike.numpy())
         return draw_pairs(
             self.collection, images, settings.pairs, rng, hard, settings.hard_share,
@@ -286,7 +294,7 @@ class _Training:
         )  # fmt: skip
 
     def end_epoch(self, validation: NDArray[np.int64], weights: Path) -> None:
-        """Validate; write the weights if they are the best so far."""
+        """Validate the network, and write its weights if they are the best so far."""
         network, progress = self.network, self.progress
         augmentation = self.settings.augmentation
         figures = validate(network, self.collection, validation, augmentation, self.device)[0]
@@ -308,25 +316,26 @@ class _Training:
 
 
 def _optimiser(network: SiameseNetwork, settings: TrainSettings) -> torch.optim.Optimizer:
+    """Adam with separate learning rates for extractor and head; frozen blocks are excluded."""
     extractor = network.branch.extractor
     if isinstance(extractor, LiteExtractor):
         extractor.freeze(settings.frozen)
-    given = [p for p in extractor.parameters() if p.requires_grad]
-    single = [p for p in network.head.parameters() if p.ndim == 0]
-    apart = {id(p) for p in (*given, *single)}
-    others = [p for p in network.parameters() if p.requires_grad and id(p) not in apart]
-    sets = [(others, 1.0), (given, settings.extractor_rate), (single, _HEAD_RATE)]
+    of_extractor = [p for p in extractor.parameters() if p.requires_grad]
+    of_head = list(network.head.parameters())
+    separate = {id(p) for p in (*of_extractor, *of_head)}
+    others = [p for p in network.parameters() if p.requires_grad and id(p) not in separate]
+    sets = [(others, 1.0), (of_extractor, settings.extractor_rate), (of_head, _HEAD_RATE)]
     groups: list[dict[str, Any]] = [{"params": p, "factor": f} for p, f in sets if p]
     return torch.optim.Adam(groups, lr=settings.learning_rate, fused=True)
 
 
 def set_threads(threads: int) -> None:
-    """Set the number of threads with which torch computes."""
+    """Set the number of threads that torch uses."""
     torch.set_num_threads(threads)
 
 
 def open_device(name: str) -> torch.device:
-    """The device of that name.
+    """The torch device of that name.
 
     Raises:
         InputError: the device is unknown or not available.
@@ -340,11 +349,11 @@ def open_device(name: str) -> torch.device:
 
 def _mixed_precision(settings: TrainSettings, device: torch.device) -> bool:
     """Whether to compute in bfloat16."""
-    can = device.type == "cpu" or torch.cuda.is_bf16_supported()
-    if settings.mixed_precision and not can:
+    supported = device.type == "cpu" or torch.cuda.is_bf16_supported()
+    if settings.mixed_precision and not supported:
         raise InputError("mixed_precision: this GPU does not support bfloat16; leave it out.")
     if settings.mixed_precision is None:
-        return can and device.type == "cuda"
+        return supported and device.type == "cuda"
     return settings.mixed_precision
 
 

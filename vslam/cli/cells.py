@@ -1,4 +1,4 @@
-"""What ``vslam bench`` and ``vslam stress`` share: the systems and data of their cells."""
+"""The systems and the data of the cells of ``vslam bench`` and ``vslam stress``."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def choose_systems(
     """The systems that the options name.
 
     Raises:
-        InputError: there is none, one is unknown, or something that it needs is missing.
+        InputError: no system is named, one is unknown, or a file that it needs is missing.
     """
     from vslam.loopclosure.registry import parse_weights, require_detector
 
@@ -64,9 +64,11 @@ def choose_systems(
     for name in chosen or [""] * ("vslam" in wanted):
         require_detector(name, files.get(name), option="--detectors")
     if clash := [name for name in chosen if name in others]:
-        raise InputError(f"--system {clash[0]}: a detector of this test has that name; rename it.")
+        raise InputError(
+            f"--system {clash[0]}: a detector of this test has the same name; choose another."
+        )
     if not chosen and not others:
-        raise InputError("--systems: names no system; name vslam, orbslam3 or one of --system.")
+        raise InputError("--systems: names no system; give vslam, orbslam3 or a name of --system.")
     return Systems(chosen, files, others)
 
 
@@ -87,7 +89,7 @@ def _others(
     if _ORBSLAM3 in wanted and _ORBSLAM3 not in templates:
         if vocabulary is None or not vocabulary.is_file():
             raise InputError(
-                "--systems orbslam3: name its vocabulary, DBoW2's text format, with --vocabulary."
+                "--systems orbslam3: name its vocabulary in DBoW2's text format with --vocabulary."
             )
         interpreter = python or Path(sys.executable)
         if not interpreter.exists():
@@ -105,15 +107,19 @@ def _others(
 
 @dataclass(frozen=True)
 class Cells:
-    """The sequences and settings of the cells of one command, which are run in the folder ``out``.
+    """The sequences and settings of the cells of one command.
 
     Attributes:
         kind: kind of data.
         given: options of the data, with absolute paths, because each run has its own folder.
+        systems: the systems to test.
         sequences: the opened sequences by name.
         options: settings that all cells share.
-        jobs: runs at a time on this machine.
-        scheduler: address of the Dask scheduler whose workers do the runs instead.
+        jobs: number of runs at a time on this machine.
+        scheduler: address of a Dask scheduler whose workers run the cells instead; None for this
+            machine.
+        out: folder of the results.
+        console: shows the progress.
     """
 
     kind: str
@@ -124,7 +130,7 @@ class Cells:
     jobs: int
     scheduler: str | None
     out: Path
-    told: Console
+    console: Console
 
     def grid(self, perturbations: Collection[str], seeds: int) -> list[Cell]:
         """The cells of all sequences and systems; see :func:`vslam.lab.bench.grid.make_grid`."""
@@ -154,7 +160,7 @@ class Cells:
         from vslam.run.warmup import compile_kernels, is_cold
 
         if cells and is_cold():  # once, not in each run
-            self.told.announce("first run: compiling the kernels, about a minute ...")
+            self.console.announce("first run: compiling the kernels, about a minute ...")
             compile_kernels(processes=min(available_cores(), 2))
         return run_here(cells, self.options, self.jobs, self.out)
 
@@ -174,7 +180,7 @@ def open_cells(
     """Open all sequences.
 
     Args:
-        seqs: list of sequences; None for the only one that the data has.
+        seqs: list of sequences; None for data that has only one.
 
     Raises:
         InputError: data is missing or cannot be used.
@@ -183,11 +189,11 @@ def open_cells(
     from vslam.machine import available_cores
 
     if given.sensor == "mono" and systems.others:
-        raise InputError("--sensor mono: only vslam supports it; other systems need both cameras.")
-    out, told = out.absolute(), Console(shown=shown)
+        raise InputError("--sensor mono: other systems need both cameras; test vslam alone.")
+    out, console = out.absolute(), Console(shown=shown)
     kind = kind_of_source(given)
     given = _absolute(given)
-    opened = _open_all(kind, given, seqs, told)
+    opened = _open_all(kind, given, seqs, console)
     if systems.others and not all(source.seekable for source in opened.values()):
         raise InputError(
             f"--systems {next(iter(systems.others))}: other systems read KITTI's format, which "
@@ -203,7 +209,7 @@ def open_cells(
         others={name: (*program, name, command) for name, command in systems.others.items()},
         source=tuple(_words_of(given)),
     )
-    return Cells(kind, given, systems, opened, options, jobs, scheduler, out, told)
+    return Cells(kind, given, systems, opened, options, jobs, scheduler, out, console)
 
 
 def _absolute(given: SourceOptions) -> SourceOptions:
@@ -220,7 +226,7 @@ def _absolute(given: SourceOptions) -> SourceOptions:
 
 
 def _words_of(given: SourceOptions) -> list[str]:
-    """Options of ``vslam run`` that all cells share; the others are in the cells."""
+    """The options of ``vslam run`` for the data, except those that are part of a cell."""
     words = ["--side-by-side"] if given.side_by_side else []
     values = {
         "--right": given.right,
@@ -242,22 +248,22 @@ def _identity(kind: str, given: SourceOptions) -> str:
 
 
 def _open_all(
-    kind: str, given: SourceOptions, seqs: str | None, told: Console
+    kind: str, given: SourceOptions, seqs: str | None, console: Console
 ) -> dict[str, Source]:
     """Open every sequence by name, so that missing data is reported before the first run.
 
-    Synthetic sequences are rendered here, because two runs cannot render one at the same time.
+    Synthetic sequences are rendered here, because two runs must not render the same one.
     """
     from vslam.datasets.sources import LIVE
     from vslam.lab.bench.grid import parse_sequences
 
     named = f"--data {given.data}" if given.data else f"--dataset {kind}"
-    once = f"{named}: a live camera gives each image once; record a video or a bag."
+    once = f"{named}: a live camera cannot be repeated; record a video or a bag."
     if kind in LIVE:
         raise InputError(once)
     opened = {}
     for name in [None] if seqs is None else parse_sequences(seqs):
-        source = open_given(given.model_copy(update={"dataset": kind, "seq": name}), told)
+        source = open_given(given.model_copy(update={"dataset": kind, "seq": name}), console)
         if source.live:
             raise InputError(once)
         opened[name or source.name] = source

@@ -1,7 +1,7 @@
-"""``python -m vslam.cli.child run ...``: the command line of vslam, ending with its parent process.
+"""``python -m vslam.cli.child run ...``: the command line of vslam, which ends with its parent.
 
-The parent holds the other end of our standard input. When the parent ends, even if it is killed,
-the pipe closes. Nobody then reads the results, so this process ends and frees the processor.
+The parent process holds the other end of our standard input. When it ends, even if it is killed,
+the pipe closes, and this process ends because nobody would read its results.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import threading
 
 
 def _end_with_parent() -> None:
-    while os.read(0, 1):  # not sys.stdin: its lock would be held when the interpreter ends
+    while os.read(0, 1):  # sys.stdin would hold a lock when the interpreter ends
         pass
     os._exit(1)
 

@@ -1,4 +1,4 @@
-"""Progress of a command, drawn on stderr so that stdout stays for results."""
+"""Show the progress of a command on stderr; stdout is for results."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 class Console:
     """Draws progress bars and prints messages, or does nothing if it is not ``shown``.
 
-    It imports rich only to show something, which takes as long as tracking forty frames. A bar
-    appears with its first step.
+    rich is imported only to show something, because its import takes as long as tracking forty
+    frames. A bar appears at its first step.
     """
 
     def __init__(self, *, shown: bool) -> None:
@@ -29,7 +29,8 @@ class Console:
 
     @contextmanager
     def progress_bar(self, total: int | None) -> Iterator[Callable[[TrackResult], None]]:
-        """Show frames, fps, tracking state and time left; yield the callable that takes each frame.
+        """Show frames, fps, tracking state and time left; yield a function to be called with the
+        result of each frame.
 
         Args:
             total: approximate number of frames, None if unknown.
@@ -40,13 +41,13 @@ class Console:
 
     @contextmanager
     def render_bar(self) -> Iterator[Callable[[int, int], None]]:
-        """Yield the callable that takes the number of rendered frames and of all frames."""
+        """Yield a function to be called with the numbers of rendered frames and of all frames."""
         with self._bar("rendering", fps=True) as update:
             yield lambda done, total: update(total=total, completed=done)
 
     @contextmanager
     def training_bar(self) -> Iterator[Callable[[int, int, int, float], None]]:
-        """Yield the callable that takes epoch, step, steps per epoch and loss of a training."""
+        """Yield a function to be called with epoch, step, steps per epoch and loss."""
         with self._bar("epoch {task.fields[epoch]}", ("loss {task.fields[loss]:.3f}",)) as update:
             yield lambda epoch, step, steps, loss: update(
                 anew=step == 1, total=steps, completed=step, epoch=epoch, loss=loss
@@ -54,7 +55,7 @@ class Console:
 
     @contextmanager
     def count_bar(self, what: str, total: int) -> Iterator[Callable[[], None]]:
-        """Yield the callable that counts one of ``total`` items as done."""
+        """Yield a function to be called when one of ``total`` items is done."""
         with self._bar(what) as update:
             update(total=total)
             yield lambda: update(advance=1)
@@ -63,8 +64,8 @@ class Console:
     def _bar(
         self, before: str = "", after: tuple[str, ...] = (), *, fps: bool = False
     ) -> Iterator[Callable[..., None]]:
-        """Yield a function that takes the arguments of rich's ``Progress.update``, and whether the
-        bar begins ``anew``."""
+        """Yield a function with the arguments of rich's ``Progress.update``; ``anew`` restarts the
+        bar."""
         if not self._shown:
             yield lambda **changes: None
             return

@@ -44,12 +44,13 @@ def doctor(
         option(
             OUTPUT,
             "FILE",
-            "HTML page to write; replaces an earlier one.",
+            "HTML page to write; an existing file is replaced.",
             unset="doctor.html, or doctor-2.html and so on",
         ),
     ] = None,
 ) -> None:
-    """Check images, calibration and times before a run; exit code 1 if there is a fault."""
+    """Check images, calibration and time stamps before a run; the exit code is 1 if there is a
+    fault."""
     from vslam.datasets.frames import first_frames
     from vslam.doctor.examine import Diagnosis, examine
     from vslam.doctor.findings import Finding, lines
@@ -65,7 +66,7 @@ def doctor(
     for line in lines(diagnosis.findings):
         typer.echo(line)
     page = out or _free(Path("doctor.html"))
-    # The page comes after the findings, because a disk may be full.
+    # The findings are printed first, because the disk may be full.
     write_page(diagnosis, f"Doctor: {given.data or given.dataset}", page)
     n = len(diagnosis.faults)
     typer.echo(f"{page}: {counted(n, 'fault') if n else 'no faults'}")
@@ -74,6 +75,6 @@ def doctor(
 
 
 def _free(path: Path) -> Path:
-    """The path itself, or the first one with a number that does not exist yet."""
+    """The path itself, or with the first number that gives a path that does not exist."""
     numbered = (path.with_stem(f"{path.stem}-{n}") for n in count(2))
     return next(one for one in chain((path,), numbered) if not one.exists())

@@ -1,4 +1,4 @@
-"""What ``vslam run`` does after it has checked its options."""
+"""The work of ``vslam run`` after it has checked its options."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Output:
-    """What a run shows and writes. A run that is resumed can have another one."""
+    """What a run shows and writes; a resumed run may change these options."""
 
     record: bool
     view: Literal["native", "web"] | None
@@ -49,16 +49,16 @@ def drive(
 
     Args:
         out: the folder in which the folder of the run is created.
-        resume: the folder of an interrupted run to continue, in place of a new one.
+        resume: the folder of an interrupted run to continue; None starts a new run.
     """
     if options.localize and output.save_map is not None:
         raise InputError("--save-map: localising does not change the map; leave it out.")
-    told = Console(shown=not output.quiet)
-    source, perturbation = _open(options, told)
-    _refuse_camera(source, resume)
+    console = Console(shown=not output.quiet)
+    source, perturbation = _open(options, console)
+    _refuse_live_source(source, resume)
     fixes = None if options.gps is None else _fixes(options.gps, source)
 
-    # These imports take a second, so they come after bad input has been refused.
+    # These imports take a second, so bad input is refused before them.
     from vslam.cli.tables import print_summary
     from vslam.doctor.nothing_tracked import why_nothing_was_tracked
     from vslam.report.folder import write_results
@@ -66,29 +66,29 @@ def drive(
     from vslam.run.moments import LoopPictureRecorder, MomentRecorder
     from vslam.run.pipeline import begin, run_sequence
 
-    as_applied = {"perturb": perturbation.name, "realtime": options.realtime or source.live}
-    settings = options.model_copy(update=as_applied)
+    effective = {"perturb": perturbation.name, "realtime": options.realtime or source.live}
+    settings = options.model_copy(update=effective)
     with ExitStack() as lock:
         unfinished = _unfinished(options, source, resume, lock)
-        _compile(settings, told)
+        _compile(settings, console)
         slam = begin(source.camera, settings, None if unfinished is None else unfinished.map)
-        viewer = _viewer(output, told)
+        viewer = _viewer(output, console)
         if unfinished is not None:
-            told.announce(f"continuing at frame {len(unfinished.progress.tracks)} ...")
+            console.announce(f"continuing at frame {len(unfinished.progress.tracks)} ...")
         folder = resume or _new_folder(options, source, perturbation.name, out, lock)
         moments, pictures = MomentRecorder(), LoopPictureRecorder()
         recorder = _recorder(folder, output, unfinished, viewer, moments, pictures)
-        # Localising changes no map, so there are only poses to save.
+        # Localising does not change the map, so there is nothing to save during the run.
         period = 0.0 if options.localize else options.autosave
         autosave = FolderAutosave(folder, period, f"{source.dataset} {source.name}")
-        with told.progress_bar(source.n_expected) as on_frame:
+        with console.progress_bar(source.n_expected) as on_frame:
             outcome = run_sequence(
                 source, perturbation, settings, recorder,
                 on_frame=on_frame, autosave=autosave, resume=unfinished, slam=slam,
             )  # fmt: skip
-        no_gps = ""
+        gps_error = ""
         if fixes is not None:
-            outcome, no_gps = _located(outcome, fixes)
+            outcome, gps_error = _georeferenced(outcome, fixes)
         if why := why_nothing_was_tracked(outcome):
             outcome = replace(outcome, warnings=[why, *outcome.warnings])
         report = write_results(
@@ -100,32 +100,34 @@ def drive(
     if not output.quiet:
         print_summary(report, folder)
     if viewer is not None and output.keep_open and outcome.interrupted != "Ctrl-C":
-        told.announce(f"{viewer.address} stays open until Ctrl-C")
+        console.announce(f"{viewer.address} stays open until Ctrl-C")
         with suppress(KeyboardInterrupt):
             Event().wait()
-    if why and output.quiet:  # otherwise the summary has said it
+    if why and output.quiet:  # otherwise the summary contains it
         raise ResultsError(f"{why}.")
     if outcome.interrupted and outcome.interrupted != "Ctrl-C":
-        go_on = f"; vslam run --resume {folder} continues it" if (folder / MAP).exists() else ""
-        raise ResultsError(f"{folder}: ended early: {outcome.interrupted}{go_on}.")
-    if no_gps and not why:
-        raise ResultsError(f"{folder}: no trajectory by GPS, all other results are there: {no_gps}")
+        fix = f"; vslam run --resume {folder} continues it" if (folder / MAP).exists() else ""
+        raise ResultsError(f"{folder}: ended early: {outcome.interrupted}{fix}.")
+    if gps_error and not why:
+        raise ResultsError(
+            f"{folder}: no trajectory by GPS, all other results are there: {gps_error}"
+        )
     if why or outcome.interrupted:
         raise typer.Exit(1)
 
 
-def _open(options: RunOptions, told: Console) -> tuple[Source, Perturbation]:
+def _open(options: RunOptions, console: Console) -> tuple[Source, Perturbation]:
     """Open the images and bind the perturbation to them; refuse laws that need other data."""
     from vslam.datasets.perturbation import parse_perturbation
 
     perturbation = parse_perturbation(options.perturb, options.seed)
-    source = open_given(options, told)
+    source = open_given(options, console)
     perturbation.bound_to(source)
     return source, perturbation
 
 
 def _fixes(path: Path, source: Source) -> Fixes:
-    """The GPS fixes of ``--gps``, which must be of the time of the images."""
+    """The GPS fixes of ``--gps``; they must overlap with the images in time."""
     from vslam.datasets.fixes import read_fixes, require_overlap
 
     fixes = read_fixes(path)
@@ -133,8 +135,8 @@ def _fixes(path: Path, source: Source) -> Fixes:
     return fixes
 
 
-def _located(outcome: RunOutcome, fixes: Fixes) -> tuple[RunOutcome, str]:
-    """The outcome with the drive on the Earth, or why it could not be put there."""
+def _georeferenced(outcome: RunOutcome, fixes: Fixes) -> tuple[RunOutcome, str]:
+    """The outcome with the georeferenced trajectory, and an error message, empty on success."""
     from vslam.plugins import reason
     from vslam.run.gps import locate
 
@@ -144,16 +146,16 @@ def _located(outcome: RunOutcome, fixes: Fixes) -> tuple[RunOutcome, str]:
         track = locate(outcome.stored, fixes, outcome.settings.thresholds.pose_graph)
     except InputError as error:
         return outcome, str(error)
-    except Exception as error:  # the results of the run must not be lost with it
+    except Exception as error:  # the other results of the run must be written
         return outcome, f"{reason(error)}."
     return replace(outcome, gps_track=track), ""
 
 
-def _refuse_camera(source: Source, resume: Path | None) -> None:
-    """Refuse to resume a run of a live camera, whose images are gone."""
+def _refuse_live_source(source: Source, resume: Path | None) -> None:
+    """Refuse to resume a run of a live camera, because its images cannot be read again."""
     if source.live and resume is not None:
         raise InputError(
-            f"--resume {resume}: the images of a live camera are gone; continue its map with "
+            f"--resume {resume}: a run of a live camera cannot be resumed; continue its map with "
             "--map FOLDER/autosave.npz."
         )
 
@@ -163,7 +165,9 @@ def _unfinished(
 ) -> Unfinished | None:
     """The saved state of the run to resume, None for a new run.
 
-    Images of another camera than that of the map that is continued are refused.
+    Raises:
+        InputError: the images are of another camera than the map that is continued, or there is no
+            saved state.
     """
     from vslam.run.autosave import find_unfinished, lock_run
     from vslam.run.pipeline import require_camera
@@ -178,22 +182,22 @@ def _unfinished(
     return unfinished
 
 
-def _viewer(output: Output, told: Console) -> Viewer | None:
+def _viewer(output: Output, console: Console) -> Viewer | None:
     if output.view is None:
         return None
     from vslam.run.recorder import open_viewer
 
     viewer = open_viewer(output.view)
     if viewer.address:
-        told.announce(f"live at {viewer.address}")
+        console.announce(f"live at {viewer.address}")
     return viewer
 
 
-def _compile(settings: RunOptions, told: Console) -> None:
+def _compile(settings: RunOptions, console: Console) -> None:
     from vslam.run.warmup import compile_kernels, is_cold
 
     if is_cold():
-        told.announce("first run: compiling the kernels, about a minute ...")
+        console.announce("first run: compiling the kernels, about a minute ...")
     compile_kernels(processes=min(settings.threads, 2), load=settings.realtime)
 
 
@@ -220,7 +224,7 @@ def _recorder(
     moments: Recorder,
     pictures: LoopPictureRecorder,
 ) -> Recorder:
-    """A recorder for the file, the viewer and the report of a run."""
+    """A recorder for the recording file, the viewer and the report of a run."""
     from vslam.run.recorder import Recorder, RerunRecorder, SeveralRecorders
 
     recorders: list[Recorder] = []
@@ -235,4 +239,4 @@ def _recorder(
         recorders.append(moments)
     if not recorders:
         return Recorder()
-    return SeveralRecorders((pictures, *recorders))  # the others use the pictures
+    return SeveralRecorders((pictures, *recorders))  # pictures first, because the others use them

@@ -68,8 +68,8 @@ def evaluate_files(
         alignment = align or of_run
     elif gt is None:
         raise InputError(
-            f"{estimate}: name its ground truth with --gt, or the folder of a run that had one, "
-            "such as runs/latest; a video or images need vslam run first."
+            f"{estimate}: name its ground truth with --gt, or name the folder of a run that had "
+            "one, such as runs/latest; for a video or images, use vslam run first."
         )
     trajectory, ground_truth = read_pair(estimate, gt, times)
     evaluation = evaluate_trajectory(trajectory, ground_truth, alignment)
@@ -80,8 +80,8 @@ def evaluate_files(
     rows = [
         ("frames", matched),
         ("alignment", alignment),
-        ("ATE RMSE", f"{evaluation.ate_rmse_m:.3f} m"),
-        ("ATE mean, max", f"{evaluation.ate_mean_m:.3f} m, {evaluation.ate_max_m:.3f} m"),
+        ("ATE RMSE", f"{evaluation.ate_rmse_m:.4f} m"),
+        ("ATE mean, max", f"{evaluation.ate_mean_m:.4f} m, {evaluation.ate_max_m:.4f} m"),
         ("RPE per frame", f"{evaluation.rpe_m:.4f} m, {evaluation.rpe_deg:.4f} deg"),
     ]
     if evaluation.t_rel_percent is None:
@@ -89,7 +89,7 @@ def evaluate_files(
     else:
         rows.append(("t_rel", f"{evaluation.t_rel_percent:.3f} %"))
         rows.append(("r_rel", f"{evaluation.r_rel_deg_per_100m:.3f} deg/100 m"))
-    # evo compares files of one format, and no straight lines.
+    # evo compares only files of the same format, and it cannot align straight lines.
     format_ = trajectory_format(gt)
     if format_ == trajectory_format(estimate) and not evaluation.on_one_line:
         rows.append(("reproduce", evo_command(estimate, gt, alignment, format_)))
@@ -97,7 +97,7 @@ def evaluate_files(
 
 
 def _files_of_run(folder: Path, gt: Path | None, times: Path | None) -> tuple[Path, Path, str]:
-    """The trajectory of a run, a ground truth that it can be compared with, and the alignment."""
+    """The trajectory of a run, the ground truth in a matching format, and the alignment."""
     from vslam.report.schema import ReportJson
     from vslam.run.outcome import alignment_of
     from vslam.trajectory import trajectory_format
@@ -106,7 +106,7 @@ def _files_of_run(folder: Path, gt: Path | None, times: Path | None) -> tuple[Pa
     written = (folder / name for name in ("ground_truth_kitti.txt", "ground_truth.tum"))
     gt = gt or next((file for file in written if file.exists()), None)
     if gt is None:
-        raise InputError(f"{folder}: the run had no ground truth; name one with --gt.")
+        raise InputError(f"{folder}: this run had no ground truth; name one with --gt.")
     with_times = times is not None or trajectory_format(gt) == "tum"
     name = "trajectory.tum" if with_times else "trajectory_kitti.txt"
     return folder / name, gt, alignment_of(report.sensor)

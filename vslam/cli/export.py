@@ -1,4 +1,4 @@
-"""The commands ``vslam export ...`` of maps; ``train.py`` adds those of networks."""
+"""The commands ``vslam export ...`` for maps; ``train.py`` adds those for networks."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="export",
-    help="Export maps for other programs (docs/howto/exports.md), trained networks, and images to "
-    "train on.",
+    help="Export maps for other programs (docs/howto/exports.md), trained networks, and training "
+    "images.",
     no_args_is_help=True,
 )
 
@@ -37,10 +37,10 @@ RunOrFile = Annotated[
 ]
 Data = Annotated[
     str | None,
-    option(INPUT, "DATA", "Where the images of the run are now.", unset="where the run read them"),
+    option(INPUT, "DATA", "The run's images, if they have moved.", unset="where the run read them"),
 ]
 Link = Annotated[
-    bool, flag(OUTPUT, "Link the images of the data set in place of copies.", "--link")
+    bool, flag(OUTPUT, "Link to the images of the data set instead of copying them.", "--link")
 ]
 
 
@@ -61,7 +61,7 @@ def colmap(
     data: Data = None,
     out: Annotated[Path | None, _out("colmap")] = None,
     text: Annotated[
-        bool, flag(OUTPUT, "Write text files in place of binary ones.", "--text")
+        bool, flag(OUTPUT, "Write text files instead of binary ones.", "--text")
     ] = False,
     link: Link = False,
     quiet: Quiet = False,
@@ -103,13 +103,13 @@ def ply(
         bool,
         flag(
             OUTPUT,
-            "Colour the landmarks from the images, which are otherwise not needed.",
+            "Whether to colour the landmarks, which needs the images of the run.",
             "--colours/--no-colours",
         ),
     ] = True,
     quiet: Quiet = False,
 ) -> None:
-    """Write the landmarks with the colours that they have in the images."""
+    """Write the landmarks as a point cloud, coloured from the images."""
     from vslam.maps.formats import landmark_colours, save_ply
     from vslam.maps.new_output import new_output
 
@@ -133,7 +133,7 @@ def g2o(
     out: Annotated[Path | None, _out("pose_graph.g2o")] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Write keyframe poses with odometry and loop edges and their information matrices."""
+    """Write the pose graph: keyframe poses, odometry and loop edges, and information matrices."""
     import numpy as np
 
     from vslam.backend.pose_graph import LOOP
@@ -159,9 +159,9 @@ def euroc(
     out: Annotated[Path | None, _out("trajectory_euroc.csv")] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Write the trajectory in EuRoC's csv format.
+    """Write the trajectory in EuRoC's CSV format.
 
-    Every run writes it in the formats of TUM and KITTI.
+    Every run already writes it in the formats of TUM and KITTI.
     """
     from vslam.maps.new_output import new_output
     from vslam.trajectory import read_trajectory, write_euroc
@@ -182,8 +182,8 @@ def ros(
         bool,
         flag(
             OUTPUT,
-            "Take the poses in the map as they were first estimated, so that map -> odom jumps at "
-            "loops as it did during the drive, in place of the final ones.",
+            "Use the poses as first estimated instead of the final ones, so that map -> odom jumps "
+            "at loops as it did during the drive.",
             "--online",
         ),
     ] = False,
@@ -200,11 +200,11 @@ def ros(
 
     target = out or run / "ros.mcap"
     if target.suffix != ".mcap":
-        raise InputError(f"--out {target}: ROS knows the format by the name; end it in .mcap.")
+        raise InputError(f"--out {target}: must end in .mcap, by which ROS recognises the format.")
     trajectory = read_trajectory(run / f"trajectory{'_causal' * online}.tum")
     odometry = read_trajectory(run / "trajectory_odom.tum")
     if not np.array_equal(odometry.timestamps, trajectory.timestamps):
-        raise InputError(f"{run}: its trajectories are of different frames; run again.")
+        raise InputError(f"{run}: its trajectories have different frames; repeat the run.")
     poses = frame_poses(odometry, trajectory, read_covariances(run / "covariance.csv"))
     xyz = np.empty((0, 3))
     if (run / "map.npz").is_file():  # a run that only localises has no map of its own
@@ -217,7 +217,7 @@ def ros(
 
 
 def _beside(run: Path, name: str) -> Path:
-    """A file in the folder of a run, or beside a map file under the name of the map."""
+    """A file in the folder of a run; for a map file, a file beside it with the same stem."""
     return run / name if run.is_dir() else run.with_suffix(Path(name).suffix)
 
 
@@ -254,10 +254,10 @@ def _keyframes(finished: FinishedRun, data: str | None, *, quiet: bool) -> Itera
     from vslam.cli.console import Console
     from vslam.report.finished_run import keyframe_frames, open_images
 
-    told = Console(shown=not quiet)
-    with told.render_bar() as on_render:
+    console = Console(shown=not quiet)
+    with console.render_bar() as on_render:
         source = open_images(finished, data, on_render)
-    with told.count_bar("images", len(finished.map.frames)) as advance:
+    with console.count_bar("images", len(finished.map.frames)) as advance:
         for frame in keyframe_frames(finished, source):
             yield frame
             advance()
@@ -272,8 +272,10 @@ def _export_images(
     link: bool,
     quiet: bool,
 ) -> None:
-    """Write the keyframe images of a run into a new folder, and ``save`` a model beside them, given
-    the names of the images and the colours of the landmarks."""
+    """Write the keyframe images of a run into a new folder, then let ``save`` write the model.
+
+    ``save`` gets the folder, the map, the names of the images and the colours of the landmarks.
+    """
     from vslam.maps.formats import landmark_colours, save_image
     from vslam.maps.new_output import new_output
 
@@ -285,7 +287,7 @@ def _export_images(
         for index, frame in zip(reconstruction.frames.tolist(), frames, strict=True):
             image = _image_of(frame)
             if link:
-                file = _own_file(frame, finished)
+                file = _file_of(frame, finished)
                 names.append(f"{index:06d}{file.suffix}")
                 (images / names[-1]).symlink_to(file.resolve())
             else:
@@ -305,11 +307,11 @@ def _image_of(frame: TimedFrame) -> NDArray[np.uint8]:
     return frame.read(map)[0] if frame.colour is None else frame.colour()
 
 
-def _own_file(frame: TimedFrame, finished: FinishedRun) -> Path:
+def _file_of(frame: TimedFrame, finished: FinishedRun) -> Path:
     if frame.file is None:
         raise InputError(
-            f"--link: vslam changes the images of {finished.report.dataset}, so they cannot be "
-            "linked; leave it out."
+            f"--link: the images of {finished.report.dataset} are converted when they are read, so "
+            "they cannot be linked; leave it out."
         )
     return frame.file
 

@@ -1,4 +1,4 @@
-"""The ``--help`` of a command: a panel for each group of options, without a column of types."""
+"""Print the ``--help`` of a command, with a panel for each group of options."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _THEME = Theme({"option": "bold cyan"})
 
 
 class _Options(RegexHighlighter):
-    """Option names stand out in the descriptions."""
+    """Highlights option names in descriptions."""
 
     highlights = [r"(?P<option>(?<![\w-])--[a-z][a-z-]*)"]  # noqa: RUF012  # as rich declares it
 
 
 def show_help(command: Any, context: Any) -> None:
-    """Print the help of a command, or of a group of commands, on stdout.
+    """Print the help of a command or of a group of commands on stdout.
 
     Args:
         command: a ``TyperCommand`` or ``TyperGroup``; the ``rich_help_panel`` of a parameter names
@@ -55,6 +55,18 @@ def show_help(command: Any, context: Any) -> None:
         console.print(Padding(Text.from_markup(command.epilog.strip()), (1, 1)))
 
 
+def describe_parameters(command: Any, context: Any) -> str:
+    """Sentences that say what the arguments of a command are, and list its options."""
+    arguments, options = [], []
+    for parameter in command.get_params(context):
+        if parameter.param_type_name == "option":
+            options.append("/".join((*parameter.opts, *parameter.secondary_opts)))
+        else:
+            about = Text.from_markup(parameter.help or "").plain
+            arguments.append(f"{context.command_path} takes {_name(parameter)}: {about}")
+    return " ".join([*arguments, f"Its options are {', '.join(options)}."])
+
+
 def _name(parameter: Any) -> str:
     """``--record/--no-record``, ``--map FILE`` or ``RUN``."""
     if parameter.param_type_name == "argument":
@@ -65,7 +77,7 @@ def _name(parameter: Any) -> str:
 
 
 def _described(parameter: Any) -> Text:
-    """What a parameter is for, then its default or that it must be given."""
+    """The description of a parameter, then its default or that it is required."""
     text = Text.from_markup(parameter.help or "")
     default = parameter.default
     if isinstance(parameter.show_default, str):

@@ -26,7 +26,7 @@ def info(
         ),
     ] = None,
 ) -> None:
-    """Show versions, cores, compiled kernels, and the KITTI data that is found."""
+    """Show versions, cores, compiled kernels, installed plug-ins, and the KITTI data found."""
     from vslam import machine, plugins
     from vslam.datasets.kitti import list_kitti
 
@@ -57,7 +57,7 @@ def info(
 
 
 def _numba_caches() -> dict[Path, int]:
-    """Folders with compiled kernels, and the bytes in each."""
+    """Folders with compiled kernels, and their sizes in bytes."""
     import platformdirs
 
     import vslam

@@ -1,4 +1,4 @@
-"""The commands ``vslam loops ...``: loop detectors compared on images."""
+"""The commands ``vslam loops ...``, which compare loop detectors on images."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def bench(
         option(
             METHOD,
             "retrieval|online",
-            "[b]retrieval[/b] searches a gallery for every query; [b]online[/b] decides once "
-            "per image of a drive, searching the images before it.",
+            "[b]retrieval[/b] searches a gallery for every query; [b]online[/b] searches, for "
+            "every image of a drive, the images before it, and decides once.",
         ),
     ] = "retrieval",
     data: Annotated[
@@ -59,7 +59,7 @@ def bench(
             "Images: rendered places, [b]town:ROUTE\\[seed=101,aliased=1,places=150][/b], "
             "or a source of [b]vslam train[/b]. With online: a rendered drive, "
             "[b]drive:ROUTE\\[seed=101,aliased=1,change=0.5,every=10][/b], kitti:DIR or "
-            "fabmap:DIR. Repeat for more.",
+            "fabmap:DIR. Repeat the option for several.",
             unset="three towns, or two drives",
         ),
     ] = None,
@@ -83,8 +83,8 @@ def bench(
         option(
             METHOD,
             "AGE",
-            "With online: search images that are at least this much older than the query, in "
-            "seconds (20s) or images (200).",
+            "With online: smallest age of the images to search, in seconds (20s) or images (200) "
+            "before the query.",
         ),
     ] = WINDOW,
     seed: Seed = 0,
@@ -126,9 +126,9 @@ def bench(
 
     vocabulary = read_vocabulary(files.get("bow", SHIPPED))
     scorers = [open_scorer(name, files.get(name), vocabulary) for name in names]
-    threads, told = threads or available_cores(), Console(shown=not quiet)
-    cache, bar = store.cache_folder(), told.count_bar
-    # The report is written after every set, so that a command that is stopped keeps its results.
+    threads, console = threads or available_cores(), Console(shown=not quiet)
+    cache, bar = store.cache_folder(), console.count_bar
+    # The report is written after every set, so that stopping the command loses little.
     if protocol == "online":
         drives = [
             drive
@@ -146,7 +146,7 @@ def bench(
             for spec in data or DATA
             for found in open_set(spec, cache, threads=threads, progress_bar=bar)
         ]
-        told.announce("time and memory of each detector ...")
+        console.announce("time and memory of each detector ...")
         costs = [cost(name, files.get(name)) for name in names]
         scores: list[Score] = []
         gains: list[Gain] = []
@@ -176,7 +176,7 @@ def _require_writable(out: Path) -> None:
 
 
 def _write(out: Path, seed: int, **found: object) -> None:
-    """Write the report of what was found so far."""
+    """Write the report of the results so far."""
     from vslam.lab.loopbench.report import write_report
     from vslam.lab.loopbench.schema import LoopsJson
     from vslam.machine import versions

@@ -1,4 +1,4 @@
-"""The application and its entry point."""
+"""The command line application and its entry point."""
 
 from __future__ import annotations
 
@@ -45,8 +45,11 @@ _GROUPS: tuple[ModuleType, ...] = (
 )  # fmt: skip
 
 
+_UsageError: Any = typer.BadParameter.__base__  # typer does not export it
+
+
 class _Command(TyperCommand):
-    """A command with our own help, which suggests a name for a misspelt choice."""
+    """A command with our own help, which says what to use instead of a wrong choice or option."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         from vslam.cli.help import show_help
@@ -58,6 +61,12 @@ class _Command(TyperCommand):
             return super().parse_args(ctx, args)
         except typer.BadParameter as error:
             error.message = _plain(error.message)
+            raise
+        except _UsageError as error:
+            if getattr(error, "possibilities", None) == []:  # nothing is spelt like the option
+                from vslam.cli.help import describe_parameters
+
+                error.message += f". {describe_parameters(self, ctx)}"
             raise
 
 
@@ -71,7 +80,7 @@ class _Group(TyperGroup):
 
 
 def _plain(message: str) -> str:
-    """What the parser says of a value, in our words and with a suggestion for a misspelt name."""
+    """The parser's message in plain words, with a suggestion for a misspelt name."""
     message = plain_reason(message)
     word, found, choices = message.partition(" is not one of ")
     if not found:
@@ -82,7 +91,7 @@ def _plain(message: str) -> str:
 
 
 def application(groups: Collection[ModuleType]) -> typer.Typer:
-    """The commands of some modules."""
+    """An application with the commands of some modules."""
     made = typer.Typer(
         help="Visual SLAM in pure Python.",
         cls=_Group,
@@ -113,7 +122,7 @@ app = application(_GROUPS)
 
 
 def _treat_as_ctrl_c(signal_number: int, stack: FrameType | None) -> None:
-    """Let SIGTERM, which a machine sends when it shuts down, end a run as Ctrl-C does."""
+    """Treat SIGTERM, which a machine sends when it shuts down, as Ctrl-C."""
     handler = signal.getsignal(signal.SIGINT)
     if not callable(handler):  # background jobs of a shell ignore Ctrl-C
         raise KeyboardInterrupt
@@ -121,13 +130,14 @@ def _treat_as_ctrl_c(signal_number: int, stack: FrameType | None) -> None:
 
 
 def main() -> None:
-    """Entry point: bad input becomes one line on stderr and exit code 2."""
+    """Run the command line; bad input gives one line on stderr and exit code 2."""
     # Imports and cached kernels create a million objects that stay alive. Searching them for
-    # garbage takes a tenth of the start-up, and another 0.16 s at the exit unless they are frozen.
+    # garbage would take a tenth of the start-up time, and another 0.16 s at the exit.
     gc.set_threshold(200_000, 20, 100)
     atexit.register(gc.freeze)
     keep_memory()
-    # OpenBLAS threads spin while they wait, and no matrix of a run is large enough to share.
+    # Idle OpenBLAS threads burn CPU time, and no matrix of a run is large enough to profit from
+    # several threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     signal.signal(signal.SIGTERM, _treat_as_ctrl_c)
     try:
@@ -135,7 +145,7 @@ def main() -> None:
             require_utf8(Path(word))
         with suppress(FileNotFoundError):  # the folder was removed
             require_utf8(Path.cwd())
-        # typer prepares the options of every command that it knows, which takes 30 ms.
+        # For vslam run, the other commands are left out: to prepare their options takes 30 ms.
         (application((run,)) if sys.argv[1:2] == ["run"] else app)()
     except InputError as error:
         typer.echo(f"error: {error}", err=True)
@@ -148,7 +158,7 @@ def main() -> None:
             raise
         typer.echo(
             f"error: {reason(error)}: this is a fault of vslam or of the machine; please report "
-            "it with the output that PYTHONDEVMODE=1 adds.",
+            "it with the output that you get with PYTHONDEVMODE=1.",
             err=True,
         )
         sys.exit(1)

@@ -67,7 +67,7 @@ def _contents(map_: Map, reconstruction: Reconstruction) -> Rows:
     r = reconstruction
     path = np.linalg.norm(np.diff(r.T_wc[:, :3, 3], axis=0), axis=1).sum()
     unit = "units" if r.camera.monocular else "m"
-    observations = f"{len(r.xy)}, {map_.n_rows} keypoints in all"
+    observations = f"{len(r.xy)}, {map_.n_rows} keypoints in total"
     if len(r.xy):
         observations += (
             f", {len(r.xy) / len(r.xyz):.1f} per landmark, "
@@ -84,15 +84,16 @@ def _contents(map_: Map, reconstruction: Reconstruction) -> Rows:
 
 
 def _weakest_place(map_: Map) -> Rows:
-    """The keyframe that the fewest landmarks connect to earlier ones."""
+    """The keyframe that shares the fewest landmarks with earlier keyframes."""
     from vslam.backend.pose_graph import connectivity
 
     living = map_.living_keyframes()[1:]
     if not len(living):
         return []
-    held = connectivity(map_)[living]
-    at = int(held.argmin())
-    return [("weakest place", f"frame {map_.frames[living[at]]}, held by {held[at]} landmarks")]
+    shared = connectivity(map_)[living]
+    at = int(shared.argmin())
+    landmarks = f"{shared[at]} landmarks shared with earlier keyframes"
+    return [("weakest place", f"frame {map_.frames[living[at]]}, {landmarks}")]
 
 
 def _extent(T_wc: NDArray[np.float64]) -> list[str]:
@@ -105,22 +106,22 @@ def merge(
     maps: Annotated[
         list[Path],
         typer.Argument(
-            metavar="MAP", help="Maps, or folders of runs; the first one gives the world frame."
+            metavar="MAP", help="Maps or folders of runs; the first one defines the world frame."
         ),
     ],
     out: Out,
     config: Thresholds = None,
     weights: Annotated[
         Path | None,
-        option(METHOD, "FILE", "Weights or vocabulary of the detector that made the maps."),
+        option(METHOD, "FILE", "Weights or vocabulary of the maps' detector, if not the shipped."),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Merge several maps into one by verified loops between them.
+    """Merge several maps into one, using verified loops between them.
 
-    A map without a loop to the others is left out and named. If no map has a loop to the first
-    one, nothing is written and the exit code is 1. The files of the maps are not changed. Without
-    --config, the thresholds are those that the first map was made with.
+    Maps without a loop to the others are left out and listed. If no map has a loop to the first
+    one, nothing is written and the exit code is 1. The input files are not changed. Without
+    --config, the thresholds of the first map are used.
     """
     from vslam.cli.console import Console
     from vslam.loopclosure.registry import detector_with_images
@@ -128,23 +129,24 @@ def merge(
     from vslam.merging import Memory, merge_maps
 
     if len(maps) < 2:
-        raise InputError(f"{maps[0]}: this is one map; name two or more to merge.")
+        raise InputError(f"{maps[0]}: a single map cannot be merged; name two or more.")
     _require_place(out)
     files = [map_file_of(path) for path in maps]
     for number, file in enumerate(files):
         if file.resolve() in [other.resolve() for other in files[:number]]:
-            raise InputError(f"{file}: named twice; a map cannot be merged with itself.")
+            raise InputError(f"{file}: named twice; name each map only once.")
     stored = [load_map(file) for file in files]
     thresholds = _thresholds_of(stored, files) if config is None else read_thresholds(config)
-    # No camera waits for the network, which may see all keyframes at once.
-    seen = thresholds.siamese.model_copy(update={"embedded_at_once": sys.maxsize})
-    thresholds = thresholds.model_copy(update={"siamese": seen})
+    # Nothing has to run in real time here, so the network may embed all keyframes at once.
+    siamese = thresholds.siamese.model_copy(update={"embedded_at_once": sys.maxsize})
+    thresholds = thresholds.model_copy(update={"siamese": siamese})
     if not stored[0].map.n_keyframes:
-        raise InputError(f"{files[0]}: the map is empty; name one that others can be merged into.")
+        raise InputError(f"{files[0]}: the map is empty; name another map first.")
     name = stored[0].detector.name
     if name == "none":
         raise InputError(
-            f"{files[0]}: made with the detector none, which finds no loops; name another map."
+            f"{files[0]}: was made with the detector none, which finds no loops; name another map "
+            "first."
         )
 
     def create() -> Memory:
@@ -159,15 +161,15 @@ def merge(
     for number in merged.joined:
         typer.echo(f"{files[number]}: joined by {counted(len(merged.loops[number]), 'loop')}")
     for number in merged.left_out:
-        typer.echo(f"{files[number]}: left out, no verified loop leads to it")
+        typer.echo(f"{files[number]}: left out, because it has no verified loop to the others")
     if not merged.joined:
-        typer.echo("no map has a loop to the first one: nothing was written")
+        typer.echo("no map has a loop to the first one; nothing was written")
         raise typer.Exit(1)
     _save(out, merged.stored)
 
 
 def _thresholds_of(stored: list[StoredMap], files: list[Path]) -> Config:
-    """The thresholds that the first map was made with; other maps with different ones are named."""
+    """The thresholds of the first map; a message lists the maps that were made with other ones."""
     from vslam.config import as_config
 
     thresholds = stored[0].thresholds
@@ -177,7 +179,7 @@ def _thresholds_of(stored: list[StoredMap], files: list[Path]) -> Config:
     if others:
         typer.echo(
             f"{', '.join(others)}: made with other thresholds than {files[0]}, whose thresholds "
-            "are used; --config gives others."
+            "are used; --config can set others."
         )
     return as_config(thresholds, str(files[0]))
 
@@ -192,17 +194,17 @@ def crop(
     out: Out,
     box: Annotated[
         str,
-        typer.Option(metavar="X,X,Z,Z", help="Keep the keyframes between two x and two z."),
+        typer.Option(metavar="X,X,Z,Z", help="Keep keyframes in this range of x and of z."),
     ] = "",
     point: Annotated[
         str,
-        typer.Option(metavar="X,Z", help="Keep the keyframes --within a distance of this point."),
+        typer.Option(metavar="X,Z", help="Keep keyframes --within a distance of this point."),
     ] = "",
     frames: Annotated[
         str,
         typer.Option(
             metavar="FIRST:LAST",
-            help="Keep the keyframes --within a distance of the keyframes made in these frames.",
+            help="Keep keyframes --within a distance of the keyframes of these frames.",
         ),
     ] = "",
     drive: Annotated[
@@ -216,19 +218,19 @@ def crop(
         typer.Option(
             min=0.0,
             metavar="NUMBER",
-            help="Distance in metres, or in the units of a monocular map.",
+            help="Distance in metres, or in map units for a monocular map.",
         ),
     ] = 0.0,
 ) -> None:
-    """Cut out a part of a map: some keyframes and the landmarks that they see.
+    """Cut out a part of a map: some keyframes and the landmarks that they observe.
 
-    x points to the right of the first camera and z ahead; the height does not matter.
+    x points to the right of the first camera, z ahead; the height is ignored.
     """
     from vslam.maps.storage import load_map, map_file_of
     from vslam.maps.stored_map import in_box, near_frames, near_point
 
     if sum(map(bool, (box, point, frames))) != 1:
-        raise InputError("--box, --point, --frames: give exactly one, which says what is kept.")
+        raise InputError("--box, --point, --frames: give exactly one of them.")
     _require_place(out)
     file = map_file_of(map_file)
     stored = load_map(file)
@@ -240,7 +242,7 @@ def crop(
         first, last = _numbers("--frames", frames, 2, separator=":")
         kept = near_frames(stored.map, drive, first, last, within)
     if not len(kept):
-        raise InputError(f"{file}: no keyframe lies there; 'vslam map info' shows its extent.")
+        raise InputError(f"{file}: has no keyframe there; 'vslam map info' shows its extent.")
     _save(out, stored.select(kept))
 
 

@@ -1,4 +1,4 @@
-"""Options that several commands share, and the data source that they describe."""
+"""Options that several commands share, and the source that the options for data describe."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def _with_plugins(names: tuple[str, ...], group: str) -> tuple[str, ...]:
-    """vslam's own names, then those of other packages (docs/howto/plugins.md)."""
+    """vslam's own names, then those of plug-ins (docs/howto/plugins.md)."""
     return (*names, *(name for name in plugins.find_plugins(group) if name not in names))
 
 
@@ -34,7 +34,7 @@ DETECTOR_NAMES = _with_plugins(
 if TYPE_CHECKING:
     SourceName = str
     DetectorName = str
-else:  # installed packages add names
+else:  # plug-ins add names
     SourceName = Literal[(*_DATASETS, *_SOURCES)]
     DetectorName = Literal[DETECTOR_NAMES]
 # Panels of --help.
@@ -44,7 +44,7 @@ INPUT, METHOD, MAP, OUTPUT, EXECUTION = "Input", "Method", "Map", "Output", "Exe
 def option(
     panel: str, metavar: str, text: str, *names: str, unset: str | bool = True, **more: Any
 ) -> Any:
-    """An option in a panel of ``--help``; ``unset`` says what it means to leave it out."""
+    """An option in a panel of ``--help``; ``unset`` describes the default."""
     return typer.Option(
         *names, metavar=metavar, help=text, show_default=unset, rich_help_panel=panel, **more
     )
@@ -55,7 +55,7 @@ def flag(panel: str, text: str, *names: str) -> Any:
     return typer.Option(*names, help=text, rich_help_panel=panel)
 
 
-def threads(unset: str, text: str = "Threads; they do not change the result.") -> Any:
+def threads(unset: str, text: str = "Number of threads, which does not change the result.") -> Any:
     """The option ``--threads`` of a command whose default is ``unset``."""
     return option(EXECUTION, "N", text, min=1, unset=unset)
 
@@ -65,8 +65,8 @@ Perturb = Annotated[
     option(
         METHOD,
         "LAWS",
-        "Perturbations, each with a strength, such as [b]fog:60,blur:0.5[/b]; [b]vslam "
-        "perturb --list[/b] shows them all.",
+        "Perturbations with strengths, such as [b]fog:60,blur:0.5[/b]; [b]vslam perturb "
+        "--list[/b] shows all.",
     ),
 ]
 Seed = Annotated[int, option(METHOD, "N", "Seed of the random numbers.", min=0)]
@@ -83,35 +83,33 @@ Thresholds = Annotated[
 Weights = Annotated[
     list[str] | None,
     option(
-        METHOD, "NAME=FILE", "Weights of a detector in place of the shipped ones; repeat for more."
+        METHOD, "NAME=FILE", "Weights for a detector; repeat for several.", unset="the shipped ones"
     ),
 ]
 Detectors = Annotated[
     str,
     option(METHOD, "NAMES", "Loop detectors, separated by commas; the first is the baseline."),
 ]
-Seeds = Annotated[int, option(METHOD, "N", "Seeds of each random perturbation.", min=1)]
+Seeds = Annotated[int, option(METHOD, "N", "Number of seeds per random perturbation.", min=1)]
 Jobs = Annotated[
     int,
-    option(
-        EXECUTION, "N", "Runs at a time. Only with 1 are the frames per second comparable.", min=1
-    ),
+    option(EXECUTION, "N", "Number of runs at a time; only with 1, speeds can be compared.", min=1),
 ]
 Threads = Annotated[int | None, threads("all cores, at most 4")]
 AllThreads = Annotated[int | None, threads("all cores")]
 ThreadsOfRun = Annotated[
-    int | None, threads("the cores shared by --jobs, at most 4", "Threads of each run.")
+    int | None, threads("cores / jobs, at most 4", "Number of threads of each run.")
 ]
 Scheduler = Annotated[
     str | None,
     option(
-        EXECUTION, "ADDRESS", "Dask scheduler, such as tcp://HOST:8786, whose workers do the runs."
+        EXECUTION, "ADDRESS", "Dask scheduler whose workers do the runs, such as tcp://HOST:8786."
     ),
 ]
 SystemNames = Annotated[
     str,
     option(
-        METHOD, "NAMES", "Systems to test: [b]vslam[/b], [b]orbslam3[/b] and those of --system."
+        METHOD, "NAMES", "Systems to test: [b]vslam[/b], [b]orbslam3[/b] and names of --system."
     ),
 ]
 OtherSystems = Annotated[
@@ -119,8 +117,8 @@ OtherSystems = Annotated[
     option(
         METHOD,
         "NAME=COMMAND",
-        "Another system: a command that reads {folder}, in KITTI's format, and writes "
-        "{out} (docs/howto/stress.md).",
+        "Another system: a command that reads {folder} in KITTI's format and writes {out} "
+        "(docs/howto/stress.md).",
         "--system",
     ),
 ]
@@ -131,7 +129,7 @@ OrbSlam3Python = Annotated[
         "FILE",
         "Python interpreter that has pyorbslam3.",
         "--orbslam3-python",
-        unset="this one",
+        unset="that of vslam",
     ),
 ]
 OrbSlam3Vocabulary = Annotated[
@@ -145,19 +143,19 @@ AlignmentName = Literal["se3", "sim3", "none"]
 
 KITTI_ROOT = "data/kitti"  # unless $KITTI_ROOT names another folder
 
-_WITHOUT_DATA = """there is nothing to read; name your images, or use rendered ones:
+_WITHOUT_DATA = """there is no data to read; name your data, or use rendered images:
   --dataset synthetic    rendered drives, which need no download
   DATA --calib FILE      images, video, bag or camera (docs/howto/sources.md)
   --data FOLDER          KITTI; or set $KITTI_ROOT to its folder (datasets.md)"""
 
 
 def names_in(text: str) -> list[str]:
-    """The names in a list with commas, without repetitions, in their order."""
+    """The names in a comma-separated list, in order and without repetitions."""
     return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
 def kitti_root() -> str:
-    """The folder of KITTI's data if no option names one."""
+    """The default folder of KITTI's data."""
     return os.environ.get("KITTI_ROOT") or KITTI_ROOT
 
 
@@ -167,7 +165,7 @@ def sequences(default: str) -> Any:
         INPUT,
         "LIST",
         "Sequences of a data set, such as 00-05 or 00,demo.",
-        unset=f"{default}; the only one of EuRoC and TUM",
+        unset=f"{default}; not needed for EuRoC and TUM",
     )
 
 
@@ -175,7 +173,7 @@ def _source_options(
     source: Annotated[
         str | None,
         typer.Argument(
-            help="What to read; the same as [b]--data[/b].",
+            help="The data to read, the same as [b]--data[/b].",
             show_default=False,
             rich_help_panel=INPUT,
         ),
@@ -185,7 +183,7 @@ def _source_options(
         option(
             INPUT,
             "DATA",
-            "Data set, folder of images, video, bag, or a camera's number or URL "
+            "Data set, folder of images, video, bag, or the number or URL of a camera "
             "(docs/howto/sources.md).",
             unset="$KITTI_ROOT, else data/kitti",
         ),
@@ -201,35 +199,35 @@ def _source_options(
     ] = None,
     seq: Annotated[
         str | None,
-        option(INPUT, "NAME", "Sequence of a data set.", unset="00; the only one of EuRoC and TUM"),
+        option(INPUT, "NAME", "Sequence of a data set.", unset="00; not needed for EuRoC and TUM"),
     ] = None,
     calib: Annotated[
         list[Path] | None,
         option(
             INPUT,
             "FILE",
-            "Calibration of the cameras (docs/howto/cameras.md). Give it twice for one file "
-            "per camera, the left one first.",
+            "Calibration file (docs/howto/cameras.md). If each camera has its own file, give the "
+            "option twice, the left camera first.",
         ),
     ] = None,
     right: Annotated[
         Path | None,
-        option(INPUT, "FOLDER", "Right images; [b]--data[/b] then names the left ones."),
+        option(INPUT, "FOLDER", "Right images; [b]--data[/b] names the left ones."),
     ] = None,
     depth: Annotated[
         Path | None,
-        option(INPUT, "FOLDER", "Depth images; [b]--data[/b] then names the grey or colour ones."),
+        option(INPUT, "FOLDER", "Depth images; [b]--data[/b] names the grey or colour ones."),
     ] = None,
     fps: Annotated[
         float | None,
-        option(INPUT, "NUMBER", "Frames per second where the data has no time stamps."),
+        option(INPUT, "NUMBER", "Frames per second, for data without time stamps."),
     ] = None,
     side_by_side: Annotated[
-        bool, flag(INPUT, "Each image holds the left and the right one.", "--side-by-side")
+        bool, flag(INPUT, "Each image contains the left and the right one.", "--side-by-side")
     ] = False,
     topics: Annotated[
         str,
-        option(INPUT, "LEFT,RIGHT", "Image topics of a bag: one for mono, COLOUR,DEPTH for RGB-D."),
+        option(INPUT, "LEFT,RIGHT", "Image topics of a bag; one for mono, COLOUR,DEPTH for RGB-D."),
     ] = "",
     depth_scale: Annotated[
         float | None,
@@ -245,7 +243,7 @@ def _source_options(
         option(
             INPUT,
             "stereo|mono|rgbd",
-            "Images to use. With [b]mono[/b], the left ones alone, the scale is arbitrary.",
+            "Images to use. [b]mono[/b] uses the left ones only and has an arbitrary scale.",
             unset="all that the data has",
         ),
     ] = None,
@@ -254,12 +252,12 @@ def _source_options(
         option(
             INPUT,
             "FILE|FOLDER",
-            "Image that is black where the left images are not to be used, or a folder of one for "
+            "Mask image, black where the left images must not be used, or a folder with a mask for "
             "each image (docs/howto/masks.md).",
         ),
     ] = None,
     start: Annotated[int, option(INPUT, "N", "First frame.", min=0)] = 0,
-    every: Annotated[int, option(INPUT, "N", "Use every N-th frame only.", min=1)] = 1,
+    every: Annotated[int, option(INPUT, "N", "Use only every N-th frame.", min=1)] = 1,
     max_frames: Annotated[
         int | None, option(INPUT, "N", "Stop after N frames.", min=1, unset="all")
     ] = None,
@@ -268,7 +266,7 @@ def _source_options(
     from vslam.datasets.sources import SourceOptions
 
     if source is not None and data is not None:
-        raise InputError(f"{source}: --data also names what to read; leave one of them out.")
+        raise InputError(f"{source}: --data also names data; leave one of the two out.")
     data = source if source is not None else data
     if data is None and dataset in (None, "kitti"):
         data = kitti_root()
@@ -288,10 +286,10 @@ _NAMES = {"SourceOptions": object}  # annotations whose types are slow to import
 def reads_source(
     *, without: tuple[str, ...] = ()
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Replace the parameter ``given`` of a command by the options of a source.
+    """Replace the parameter ``given`` of a command by the options that describe a source.
 
     Args:
-        without: options that the command does not take.
+        without: options that the command does not have.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
@@ -320,20 +318,20 @@ def _parameters(function: Callable[..., object]) -> list[inspect.Parameter]:
 
 
 def require_data(options: SourceOptions) -> None:
-    """Refuse a command that names no data if there is no KITTI data either.
+    """Refuse a command that names no data, unless the default folder of KITTI's data exists.
 
     Raises:
-        InputError: there is nothing to read.
+        InputError: there is no data to read.
     """
     if options.dataset is None and options.data == KITTI_ROOT and not Path(KITTI_ROOT).exists():
         raise InputError(_WITHOUT_DATA)
 
 
 def kind_of_source(options: SourceOptions) -> str:
-    """The kind of data that the options name, or that is detected.
+    """The kind of data that the options name, or else the one that the files show.
 
     Raises:
-        InputError: there is nothing to read, or its kind is unknown.
+        InputError: there is no data to read, or its kind is unknown.
     """
     from vslam.datasets.detection import detect_dataset
 
@@ -342,10 +340,10 @@ def kind_of_source(options: SourceOptions) -> str:
 
 
 def read_thresholds(given: str | None) -> Config:
-    """The thresholds of ``--config``, a file or values; the defaults for None.
+    """The thresholds of ``--config``, which is a file, values, or None for the defaults.
 
     Raises:
-        InputError: as `vslam.config.load_config`.
+        InputError: the file cannot be read, or a name or value is not valid.
     """
     from vslam.config import Config, as_config, load_config
 
@@ -358,14 +356,14 @@ def read_thresholds(given: str | None) -> Config:
     return as_config(values, f"--config {given}")
 
 
-def open_given(options: SourceOptions, told: Console) -> Source:
-    """Open the source that the options name; a bar shows the rendering of a town.
+def open_given(options: SourceOptions, console: Console) -> Source:
+    """Open the source that the options name, and show progress while a town is rendered.
 
     Raises:
-        InputError: as `vslam.datasets.sources.open_source`, or there is nothing to read.
+        InputError: there is no data to read, or it cannot be read.
     """
     from vslam.datasets.sources import open_source
 
     require_data(options)
-    with told.render_bar() as on_render:
+    with console.render_bar() as on_render:
         return open_source(options, on_render)

@@ -31,18 +31,18 @@ def preview(
     given: SourceOptions,
     perturb: Perturb = "brightness",
     seed: Seed = 0,
-    frames: Annotated[int, option(OUTPUT, "N", "Number of frames, evenly spaced.", min=1)] = 8,
+    frames: Annotated[int, option(OUTPUT, "N", "Number of evenly spaced frames.", min=1)] = 8,
     out: Annotated[Path, option(OUTPUT, "FILE", "PNG file to write.")] = Path("perturbation.png"),
     list_: Annotated[
         bool,
         flag(
             OUTPUT,
-            "List the perturbations with their default strengths, and do nothing else.",
+            "Only list the perturbations with their default strengths.",
             "--list",
         ),
     ] = False,
 ) -> None:
-    """Show a perturbation in pictures: the left image, and both images perturbed.
+    """Write a picture of a perturbation: left images, and beside them both images perturbed.
 
     [b]--perturb all[/b] shows one frame under every perturbation at its default strength.
     """

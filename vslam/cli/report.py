@@ -33,15 +33,15 @@ def report(
         typer.Option(
             metavar="NAME=FILE",
             help="Trajectory of another system, in the format of KITTI or TUM. "
-            "NAME@SEQ@PERTURB also names its sequence and perturbation. It is aligned like the "
-            "runs of its sequence; a name that ends in ', mono' also fits the scale.",
+            "NAME@SEQ@PERTURB=FILE also names its sequence and perturbation. It is aligned like "
+            "the runs of its sequence; if its name ends in ', mono', the scale is fitted, too.",
         ),
     ] = None,
     baseline: Annotated[
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Detector or system that the others are compared with.",
+            help="Detector or system with which the others are compared.",
             show_default="the simplest detector",
         ),
     ] = None,
@@ -50,12 +50,12 @@ def report(
         bool,
         flag(
             OUTPUT,
-            "Write nothing, but serve a page of all runs on this machine until Ctrl-C.",
+            "Write no report; serve a page of all runs, for this machine only, until Ctrl-C.",
             "--serve",
         ),
     ] = False,
     port: Annotated[
-        int, option(OUTPUT, "N", "Port of [b]--serve[/b].", min=0, max=65535, unset="any free one")
+        int, option(OUTPUT, "N", "Port of [b]--serve[/b].", min=0, max=65535, unset="a free one")
     ] = 0,
     quiet: Quiet = False,
 ) -> None:
@@ -86,7 +86,7 @@ def write_overview_of(
     baseline: str | None = None,
     quiet: bool,
 ) -> None:
-    """Write the report of finished runs; unless ``quiet``, print its first tables and its path."""
+    """Write the report of finished runs and, unless ``quiet``, print its first tables and path."""
     from vslam.cli.tables import show_sections
     from vslam.lab.overview.render import write_overview
     from vslam.lab.overview.versus import versus

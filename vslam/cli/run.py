@@ -60,8 +60,8 @@ def run(
         option(
             INPUT,
             "FILE",
-            "GPS fixes, which put the trajectory on the Earth: CSV, a bag, or the folder oxts of "
-            "KITTI raw (docs/howto/gps.md).",
+            "GPS fixes to georeference the trajectory: CSV, a bag, or the folder oxts of KITTI raw "
+            "(docs/howto/gps.md).",
         ),
     ] = None,
     perturb: Perturb = "none",
@@ -71,7 +71,7 @@ def run(
         option(
             METHOD,
             "NAME",
-            "Loop detector: [b]both[/b] joins the capsule network and the bag of words, "
+            "Loop detector: [b]both[/b] combines the capsule network and the bag of words, "
             f"[b]none[/b] closes no loops. Others: {_OTHER_DETECTORS}.",
             unset="both, or that of --map",
         ),
@@ -81,8 +81,9 @@ def run(
         option(
             METHOD,
             "FILE",
-            "ONNX file of the detector's network, written by [b]vslam train[/b], or the "
-            "vocabulary of [b]bow[/b], written by [b]vslam vocabulary[/b].",
+            "ONNX file of the detector's network, from [b]vslam train[/b], or the vocabulary of "
+            "[b]bow[/b], from [b]vslam vocabulary[/b].",
+            unset="the shipped ones",
         ),
     ] = None,
     local_weights: Annotated[
@@ -94,20 +95,24 @@ def run(
         option(
             METHOD,
             "NAMES",
-            "Other loop detectors to run on the same frames, separated by commas, and to "
-            "compare in one table.",
+            "Other loop detectors, separated by commas, to run on the same frames and compare in a "
+            "table.",
         ),
     ] = "",
-    map_file: Annotated[Path | None, option(MAP, "FILE", "Continue this map.", "--map")] = None,
+    map_file: Annotated[
+        Path | None,
+        option(MAP, "FILE|FOLDER", "Continue this map, or the map of this run.", "--map"),
+    ] = None,
     localize: Annotated[
-        bool, flag(MAP, "Track in the map without changing it.", "--localize")
+        bool, flag(MAP, "Localise in the map without changing it.", "--localize")
     ] = False,
     save_map: Annotated[
         Path | None,
-        option(MAP, "FILE", "Save the map to this file too, and replace what is there."),
+        option(MAP, "FILE", "Also save the map to this file; an existing file is replaced."),
     ] = None,
     autosave: Annotated[
-        float, option(MAP, "SECONDS", "Save the map this often; 0 saves it at the end only.", min=0)
+        float,
+        option(MAP, "SECONDS", "Time between saves of the map; 0 saves only at the end.", min=0),
     ] = 60.0,
     resume: Annotated[
         Path | None, option(MAP, "FOLDER", "Continue a run that was interrupted.")
@@ -117,7 +122,7 @@ def run(
         bool,
         flag(
             EXECUTION,
-            "Play the frames in real time and drop those that come too fast.",
+            "Play the frames in real time; drop those that tracking is too slow for.",
             "--realtime",
         ),
     ] = False,
@@ -133,14 +138,14 @@ def run(
         bool, flag(OUTPUT, "Keep the page of [b]--view web[/b] open until Ctrl-C.", "--keep-open")
     ] = False,
     out: Annotated[
-        Path, option(OUTPUT, "FOLDER", "Folder that gets a folder for each run.")
+        Path, option(OUTPUT, "FOLDER", "Folder in which each run creates its own folder.")
     ] = Path("runs"),
     record: Annotated[
-        bool, flag(OUTPUT, "Write a Rerun recording, or none.", "--record/--no-record")
+        bool, flag(OUTPUT, "Whether to write a Rerun recording.", "--record/--no-record")
     ] = True,
     pages: Annotated[
         bool,
-        flag(OUTPUT, "Write a report with figures, or report.json alone.", "--report/--no-report"),
+        flag(OUTPUT, "Write a report with figures, or only report.json.", "--report/--no-report"),
     ] = True,
     ply: Annotated[bool, flag(OUTPUT, "Write the landmarks as map.ply.", "--ply")] = False,
     quiet: Quiet = False,
@@ -159,10 +164,10 @@ def run(
         quiet=quiet,
     )  # fmt: skip
     if resume is not None:
-        _refuse_beside_resume(context)
+        _refuse_with_resume(context)
         from vslam.run.options import resumed_options
 
-        if resume.is_symlink():  # runs/latest names another run after the next one
+        if resume.is_symlink():  # the next run changes the target of runs/latest
             resume = resume.parent / resume.readlink()
         options = resumed_options(resume)
         require_detector(options.detector, options.weights, f"--resume {resume}: detector")
@@ -173,18 +178,20 @@ def run(
     if localize and map_file is None:
         raise InputError("--localize: name the map to localise in with --map.")
     if localize and gps is not None:
-        raise InputError("--gps: localising does not change the map; leave --localize out.")
+        raise InputError(
+            "--gps: changes the map, which --localize does not; leave one of them out."
+        )
     of_map: dict[str, object] = {}
     if map_file is not None:
         if compare:
             raise InputError(
-                "--compare: a run that continues a map has the detector of that map; leave it out."
+                "--compare: a run that continues a map uses the detector of the map; leave it out."
             )
         map_file, detector, of_map = _map_to_continue(map_file, detector)
     detector = detector or DEFAULT_DETECTOR
     require_detector(detector, weights)
-    beside = _compared(compare, detector)
-    if beside and realtime:
+    compared = _compared(compare, detector)
+    if compared and realtime:
         raise InputError(
             "--compare: in real time, each detector would make the others drop frames; leave "
             "out --realtime."
@@ -206,22 +213,22 @@ def run(
         thresholds=as_config(of_map, str(map_file)) if config is None else read_thresholds(config),
         map_file=map_file,
         localize=localize,
-        compare=beside,
+        compare=compared,
         realtime=realtime,
         autosave=autosave,
     )
     drive(options, output, out=out)
 
 
-_BESIDE_RESUME = {"resume", "record", "view", "keep_open", "pages", "ply", "save_map", "quiet"}
+_WITH_RESUME = {"resume", "record", "view", "keep_open", "pages", "ply", "save_map", "quiet"}
 
 
-def _refuse_beside_resume(context: typer.Context) -> None:
-    """Refuse options beside ``--resume``: the run continues with its own."""
+def _refuse_with_resume(context: typer.Context) -> None:
+    """Refuse options that cannot be combined with ``--resume``: the run continues with its own."""
     for one in context.command.params:
         source = context.get_parameter_source(one.name or "")
         given = source is not None and source.name == "COMMANDLINE"
-        if given and one.name not in _BESIDE_RESUME:
+        if given and one.name not in _WITH_RESUME:
             raise InputError(
                 f"{one.opts[0]}: a resumed run continues with its own options; leave it out."
             )
@@ -235,17 +242,14 @@ def _compared(names: str, detector: str) -> tuple[str, ...]:
     for name in found:
         require_detector(name, option="--compare")
     if detector in found:
-        raise InputError(
-            f"--compare {detector}: this is the detector of the run itself; name another."
-        )
+        raise InputError(f"--compare {detector}: this is the run's own detector; name another one.")
     return found
 
 
 def _map_to_continue(
     file: Path, detector: DetectorName | None
 ) -> tuple[Path, DetectorName, dict[str, object]]:
-    """The map of a file or of the folder of a run, and the detector and thresholds that it was made
-    with.
+    """The map in a file or in the folder of a run, and its detector and thresholds.
 
     The path is absolute, because ``runs/latest`` changes when this run creates its folder.
     """
@@ -256,5 +260,10 @@ def _map_to_continue(
     if detector not in (None, of_map):
         raise InputError(
             f"--detector {detector}: {file} was made with the detector {of_map}; leave it out."
+        )
+    if of_map not in DETECTOR_NAMES:
+        raise InputError(
+            f"{file} was made with the detector {of_map}, a plug-in that is not installed here; "
+            "install its package."
         )
     return file.resolve(), cast("DetectorName", of_map), thresholds

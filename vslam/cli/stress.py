@@ -58,7 +58,7 @@ def stress(
         option(
             METHOD,
             "NAMES",
-            "Perturbations to test, without strengths ([b]vslam perturb --list[/b]).",
+            "Perturbations to test, without strengths ([b]vslam perturb --list[/b] shows all).",
         ),
     ] = "all",
     detectors: Annotated[
@@ -73,7 +73,7 @@ def stress(
         option(
             METHOD,
             "kitti-c",
-            "Test the fixed severities of a published benchmark in place of --laws.",
+            "Test the fixed severities of a published benchmark instead of --laws.",
         ),
     ] = None,
     baseline: Annotated[
@@ -81,7 +81,7 @@ def stress(
         option(
             METHOD,
             "NAME",
-            "Detector or system whose errors are the unit of the errors with --preset.",
+            "With --preset: the detector or system to whose errors the others are compared.",
             unset="the first",
         ),
     ] = None,
@@ -103,12 +103,12 @@ def stress(
         option(
             _FAILURE,
             "NUMBER",
-            "A run fails if its ATE exceeds that of the clean run by this factor.",
+            "A run fails if its ATE is more than this times that of the clean run.",
             min=1.0,
         ),
     ] = 3.0,
     ate_least: Annotated[
-        float, option(_FAILURE, "METRES", "An ATE below this one is never a failure.", min=0.0)
+        float, option(_FAILURE, "METRES", "An ATE up to this value is no failure.", min=0.0)
     ] = 0.25,
     config: Thresholds = None,
     jobs: Jobs = 1,
@@ -131,32 +131,32 @@ def stress(
     names = chosen.names
     if baseline is not None and baseline not in names:
         raise InputError(
-            f"--baseline {baseline}: not tested{did_you_mean(baseline, names)}; choose from "
+            f"--baseline {baseline}: is not tested{did_you_mean(baseline, names)}; choose from "
             f"{', '.join(names)}."
         )
     wanted = parse_laws(laws)
-    asked = open_cells(given, seqs, chosen, config, threads, jobs, scheduler, out, shown=not quiet)
-    out = asked.out
-    fitting, notes = _fitting(wanted, asked.sequences) if preset is None else ([], [])
+    setup = open_cells(given, seqs, chosen, config, threads, jobs, scheduler, out, shown=not quiet)
+    out = setup.out
+    fitting, notes = _fitting(wanted, setup.sequences) if preset is None else ([], [])
     plan = Plan(
-        asked.grid(["none"], 1), tuple(fitting), seeds, steps, baseline or names[0],
+        setup.grid(["none"], 1), tuple(fitting), seeds, steps, baseline or names[0],
         Criterion(max_lost, ate_factor, ate_least), tuple(chosen.others), preset,
     )  # fmt: skip
-    asked.prepare()
-    searches, results = plan.searches(), Results(out, asked.options.config)
-    asked.told.announce(plan.criterion.words)
+    setup.prepare()
+    searches, results = plan.searches(), Results(out, setup.options.config)
+    setup.console.announce(plan.criterion.words)
     stopped = False
     try:
         run_all(
-            plan.clean, searches, plan.preset_cells(), results, plan.criterion, asked.run,
-            asked.told.announce,
+            plan.clean, searches, plan.preset_cells(), results, plan.criterion, setup.run,
+            setup.console.announce,
         )  # fmt: skip
     except KeyboardInterrupt:
         stopped = True
     finally:
         execute.tidy(out)
     report = summarise(plan, searches, results, notes)
-    write_report(out, report, {n: first_frames(one) for n, one in asked.sequences.items()})
+    write_report(out, report, {n: first_frames(one) for n, one in setup.sequences.items()})
     if not quiet:
         show_sections(boundary_sections(report))
         ended = f"finished {len(report.boundaries)} of {len(searches)} searches"
@@ -183,7 +183,7 @@ def foreign(
     no_report: Annotated[bool, typer.Option("--no-report")] = False,
     quiet: Annotated[bool, typer.Option("--quiet")] = False,
 ) -> None:
-    """Run another system on a sequence and write a run's report, for bench and stress."""
+    """Run another system on a sequence and write its report, for bench and stress."""
     from vslam.cli.console import Console
     from vslam.config import load_config
     from vslam.datasets.perturbation import parse_perturbation
@@ -203,7 +203,7 @@ def foreign(
 
 
 def _fitting(laws: list[str], opened: Mapping[str, Source]) -> tuple[list[str], list[str]]:
-    """The laws that every sequence has the data for, and a note on each of the others."""
+    """The laws that can be applied to every sequence, and a note on each of the others."""
     from vslam.datasets.perturbation import laws_for
 
     notes: dict[str, None] = {}
@@ -212,5 +212,5 @@ def _fitting(laws: list[str], opened: Mapping[str, Source]) -> tuple[list[str], 
         notes |= {why: None for law, why in unfit.items() if law in laws}
         laws = [law for law in laws if law in fit]
     if not laws:
-        raise InputError(f"--laws: none of them can be tested here. {next(iter(notes))}")
+        raise InputError(f"--laws: none can be applied to this data. {next(iter(notes))}")
     return laws, [f"left out: {why}" for why in notes]

@@ -30,16 +30,16 @@ app = typer.Typer()
 @app.command(epilog=_EXAMPLES)
 def synth(
     route: Annotated[
-        str, typer.Argument(help="Built-in route, or a name for that of --trajectory.")
+        str, typer.Argument(help="Built-in route, or a name for the route of --trajectory.")
     ] = "",
     trajectory: Annotated[
         Path | None,
-        option(_DRIVE, "FILE", "Poses in KITTI's format, 10 per second, to drive along."),
+        option(_DRIVE, "FILE", "Drive along these poses (KITTI's format, 10 per second)."),
     ] = None,
     calibration: Annotated[
         str,
         option(
-            _DRIVE, "00-02|03|04-12", "Use the cameras of these KITTI sequences with --trajectory."
+            _DRIVE, "00-02|03|04-12", "With --trajectory: the KITTI sequences whose cameras to use."
         ),
     ] = "00-02",
     max_frames: Annotated[
@@ -62,7 +62,7 @@ def synth(
         option(
             _TOWN,
             "0-1",
-            "How much the town changes between two passes; above 0.7 it grows dark.",
+            "How much the town changes between two passes; above 0.7 it gets dark.",
             min=0,
             max=1,
         ),
@@ -90,14 +90,14 @@ def synth(
         bool,
         flag(
             OUTPUT,
-            "Write images with depth in TUM's layout, and the stereo pairs beside them.",
+            "Write images with depth in TUM's layout, and also the stereo pairs.",
             "--rgbd",
         ),
     ] = False,
     pairs: Annotated[
         int,
         option(
-            _PAIRS, "N", "Render N labelled pairs of images to train on, and no sequence.", min=0
+            _PAIRS, "N", "Render N labelled pairs of training images instead of a drive.", min=0
         ),
     ] = 0,
     lateral: Annotated[
@@ -105,24 +105,25 @@ def synth(
         option(
             _PAIRS,
             "LOW:HIGH",
-            "Metres that the second view is moved to the right; -3.2 is the other lane.",
+            "Range of the second view's offset to the right in metres; -3.2 is the other lane.",
         ),
     ] = "-1.4:1.4",
     heading: Annotated[
-        str, option(_PAIRS, "LOW:HIGH", "Degrees that the second view is turned to either side.")
+        str,
+        option(_PAIRS, "LOW:HIGH", "Range of the second view's turn to either side in degrees."),
     ] = "0:14",
     out: Annotated[
         Path | None, option(OUTPUT, "FOLDER", "Folder to write to.", unset="the user's cache")
     ] = None,
     list_: Annotated[
         bool,
-        flag(OUTPUT, "List the routes and what has been rendered, and do nothing else.", "--list"),
+        flag(OUTPUT, "Only list the routes and what has been rendered.", "--list"),
     ] = False,
     clean: Annotated[
-        bool, flag(OUTPUT, "Remove what has been rendered, of ROUTE or of all routes.", "--clean")
+        bool, flag(OUTPUT, "Delete rendered images, of ROUTE or of all routes.", "--clean")
     ] = False,
     verify: Annotated[
-        bool, flag(OUTPUT, "Compare all checksums and render damaged frames again.", "--verify")
+        bool, flag(OUTPUT, "Verify all checksums and render damaged frames again.", "--verify")
     ] = False,
     threads: Threads = None,
     quiet: Quiet = False,
@@ -151,7 +152,7 @@ def synth(
         for name, drive_of in DRIVES.items():
             typer.echo(f"{name:<6}the drive {drive_of}")
         for found in store.list_stored(cache):
-            state = "complete" if found.complete else "in part"
+            state = "complete" if found.complete else "incomplete"
             folder = found.root / "sequences" / found.name
             typer.echo(
                 f"{folder}: {counted(found.frames, 'frame')}, {found.size / 1e6:.0f} MB, {state}"
@@ -225,5 +226,5 @@ def _range(option: str, given: str, least: float) -> tuple[float, float]:
     except ValueError as error:
         raise InputError(f"{option} {given}: must be LOW:HIGH, two numbers.") from error
     if not least <= found[0] <= found[1] <= 45.0:
-        raise InputError(f"{option} {given}: must be two rising numbers from {least:g} to 45.")
+        raise InputError(f"{option} {given}: must be two ascending numbers from {least:g} to 45.")
     return found

@@ -1,4 +1,4 @@
-"""Results in a terminal."""
+"""Print results in a terminal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _LOOK_AT = (("report", "report.html"), ("recording", "recording*.rrd"))
 
 
 def show_sections(sections: Iterable[Section]) -> None:
-    """Print sections of a report on stdout, without breaking lines where it is not a terminal."""
+    """Print sections of a report on stdout; lines are not broken if it is not a terminal."""
     from rich.console import Console
 
     from vslam.report.render import show
@@ -31,7 +31,7 @@ def print_rows(rows: Rows) -> None:
 
 
 def print_summary(report: ReportJson, folder: Path) -> None:
-    """Print the first sections of the report of a finished run, whose results are in ``folder``."""
+    """Print the first sections of a run's report, and the files in its folder to look at."""
     from vslam.report.run_page import run_page
     from vslam.run.autosave import MAP
 
@@ -46,10 +46,10 @@ def print_summary(report: ReportJson, folder: Path) -> None:
 
 
 def _how_to_compare(report: ReportJson) -> Rows:
-    """How to compare detectors, if the run has a ground truth to judge them."""
-    refused = report.realtime or report.map is not None  # by the command line
+    """A hint on how to compare detectors, if there is a ground truth."""
+    refused = report.realtime or report.map is not None  # --compare is not possible
     if report.detectors or report.compare or report.alignment is None or refused:
         return []
     if report.detector in ("bow", "none"):
-        return [("compare", "add --compare both to set the capsule network beside it")]
-    return [("compare", "add --compare bow to set the bag of words beside it")]
+        return [("compare", "add --compare both to compare with the capsule network")]
+    return [("compare", "add --compare bow to compare with the bag of words")]

@@ -1,6 +1,6 @@
-"""The commands ``vslam train`` and ``vslam export`` of networks.
+"""The commands ``vslam train`` and, for networks and training images, ``vslam export``.
 
-The libraries of the extra ``train`` are imported inside the commands, because ``vslam`` must start
+The libraries of the extra ``train`` are imported inside the commands, because ``vslam`` must work
 without them.
 """
 
@@ -48,7 +48,7 @@ DataSources = Annotated[
         INPUT,
         "KIND:PATH",
         "Source of images: kitti, fabmap, pairs, photos or pack, with options in brackets "
-        "(docs/howto/training.md). Repeat for more.",
+        "(docs/howto/training.md). Repeat the option for several.",
         "--data",
     ),
 ]
@@ -75,26 +75,26 @@ def train(
         ),
     ] = "paper",
     settings: Annotated[
-        Path | None, option(METHOD, "FILE", "JSON file with settings in place of a preset.")
+        Path | None, option(METHOD, "FILE", "JSON file with settings instead of a preset.")
     ] = None,
     epochs: Annotated[
         int | None,
-        option(METHOD, "N", "Greatest number of epochs.", min=1, unset="of the settings"),
+        option(METHOD, "N", "Largest number of epochs.", min=1, unset="from the settings"),
     ] = None,
     pairs: Annotated[
         int | None,
-        option(METHOD, "N", "Pairs of images in each epoch.", min=2, unset="of the settings"),
+        option(METHOD, "N", "Pairs of images in each epoch.", min=2, unset="from the settings"),
     ] = None,
     seed: Annotated[
         int | None,
-        option(METHOD, "N", "Seed of the random numbers.", min=0, unset="of the settings"),
+        option(METHOD, "N", "Seed of the random numbers.", min=0, unset="from the settings"),
     ] = None,
     weights: Annotated[
         Path | None,
         option(
             METHOD,
             "FILE",
-            "Network to start from; for capsule-pruned and capsule-paper, the one to prune.",
+            "Network to start from; for capsule-pruned and capsule-paper, the network to prune.",
         ),
     ] = None,
     pixels: Annotated[
@@ -108,12 +108,12 @@ def train(
             "Share of the capsules that pruning removes.",
             min=0.01,
             max=0.99,
-            unset="of the settings",
+            unset="from the settings",
         ),
     ] = None,
     allow_test_data: Annotated[
         bool,
-        flag(METHOD, "Also train on the frames that are kept for testing.", "--allow-test-data"),
+        flag(METHOD, "Also train on frames that are reserved for tests.", "--allow-test-data"),
     ] = False,
     device: Annotated[DeviceName, option(EXECUTION, "cpu|cuda", "Where to train.")] = "cpu",
     threads: AllThreads = None,
@@ -121,7 +121,8 @@ def train(
         bool, flag(EXECUTION, "Continue from the checkpoint in [b]--out[/b].", "--resume")
     ] = False,
     max_minutes: Annotated[
-        float | None, option(EXECUTION, "NUMBER", "Stop after this time with a checkpoint.", min=0)
+        float | None,
+        option(EXECUTION, "NUMBER", "Stop after this time; --resume continues.", min=0),
     ] = None,
     out: Annotated[
         Path | None,
@@ -131,8 +132,8 @@ def train(
 ) -> None:
     """Train a loop detector.
 
-    Writes weights (.safetensors to continue from, .onnx for runs), a log, the pairs, checkpoints
-    and a model card.
+    The command writes weights (.safetensors for further training, .onnx for runs), a log, the
+    pairs, checkpoints and a model card.
     """
     _require_libraries("train")
     from vslam.cli.console import Console
@@ -195,12 +196,12 @@ def train(
 
 
 def _require_libraries(command: str) -> None:
-    """Refuse a command for which a package is missing.
+    """Refuse a command if a package of the extra ``train`` is missing.
 
-    All are checked before the command starts: a training needs onnxscript only hours later.
+    This is checked at the start, because training needs onnxscript only hours later.
 
     Raises:
-        InputError: one of the packages of the extra ``train`` is not installed.
+        InputError: a package is not installed.
     """
     for name in ("torch", "safetensors", "onnx", "onnxscript"):
         if find_spec(name) is None:
@@ -211,12 +212,12 @@ def _require_libraries(command: str) -> None:
 
 @export.command("onnx", epilog=_EXPORT_EXAMPLES)
 def onnx(
-    weights: Annotated[Path, option(INPUT, "FILE", "Weights of a training, .safetensors.")],
+    weights: Annotated[Path, option(INPUT, "FILE", "Trained weights, .safetensors.")],
     out: Annotated[
         Path | None, option(OUTPUT, "FILE", "File to write.", unset="as --weights, with .onnx")
     ] = None,
 ) -> None:
-    """Write the ONNX file that runs use and compare its output with torch's."""
+    """Write the ONNX file that runs use, and compare its output with that of torch."""
     _require_libraries("export onnx")
     from vslam.loopclosure.training.export import export_onnx
     from vslam.loopclosure.training.siamese import load_network
@@ -233,10 +234,10 @@ def onnx(
 
 @export.command("weights")
 def weights_(
-    weights: Annotated[Path, option(INPUT, "FILE", "Weights of a training, .safetensors.")],
+    weights: Annotated[Path, option(INPUT, "FILE", "Trained weights, .safetensors.")],
     out: Annotated[Path, option(OUTPUT, "FILE", "File to write, .safetensors.")],
 ) -> None:
-    """Write weights as vslam ships them: in half precision, with model card and ONNX file."""
+    """Write weights as vslam ships them: in half precision, with the model card and ONNX file."""
     _require_libraries("export weights")
     from vslam.loopclosure.training.export import export_onnx
     from vslam.loopclosure.training.siamese import load_network, save_network
@@ -255,7 +256,7 @@ def places(
     data: DataSources,
     fit: Annotated[
         FitName,
-        option(OUTPUT, "squash|crop", "Squash the whole image into a square, or crop its middle."),
+        option(OUTPUT, "squash|crop", "Squash the whole image to the size, or crop its middle."),
     ] = "squash",
     pixels: Annotated[str, option(OUTPUT, "SIDE|HxW", "Size of the images.")] = "227",
     out: Annotated[Path, option(OUTPUT, "FILE", "File to write.")] = Path("places.npz"),

@@ -1,4 +1,4 @@
-"""The commands ``vslam vocabulary ...``: train, convert and show visual vocabularies."""
+"""The commands ``vslam vocabulary ...``, which train, convert and show visual vocabularies."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ def train(
     images: Annotated[
         list[str], typer.Argument(metavar="IMAGES", help="Image files, folders or globs.")
     ],
-    k: Annotated[int, typer.Option(min=2, max=20, metavar="N", help="Children of each node.")] = 10,
+    k: Annotated[int, typer.Option(min=2, max=20, metavar="N", help="Children per node.")] = 10,
     levels: Annotated[
         int,
         typer.Option(
-            min=1, max=10, metavar="N", help="Levels of the tree, which gets k^levels words."
+            min=1, max=10, metavar="N", help="Levels of the tree, which has k^levels words."
         ),
     ] = 5,
     seed: Seed = 0,
@@ -52,9 +52,9 @@ def train(
     from vslam.loopclosure import vocabulary_training
     from vslam.loopclosure.vocabulary_text import is_text, write_vocabulary
 
-    is_text(out)  # refuses an unknown ending before the work begins
+    is_text(out)  # refuses an unknown suffix before the work begins
     if not out.parent.is_dir():
-        raise InputError(f"{out}: there is no folder {out.parent}; create it or choose another.")
+        raise InputError(f"{out}: the folder {out.parent} does not exist; create it.")
     paths = _find(images)
     descriptors, unreadable = [], 0
     shown = Console(shown=not quiet)
@@ -123,9 +123,9 @@ def info(
     rows = [
         ("file", f"{file}: {file.stat().st_size / 1e6:.2f} MB, read in {elapsed * 1e3:.0f} ms"),
         ("tree", f"{v.branching} children at most, {v.levels} levels, {len(v.word)} nodes"),
-        ("words", f"{v.n_words}, of which {np.count_nonzero(v.weight == 0)} have no weight"),
+        ("words", f"{v.n_words}, {np.count_nonzero(v.weight == 0)} of them with weight 0"),
         ("by level", ", ".join(f"{k}: {n}" for k, n in enumerate(np.bincount(depth)) if n)),
-        ("idf", "least, 5 %, median, 95 %, most: " + ", ".join(f"{x:.2f}" for x in idf)),
+        ("idf", "min, 5 %, median, 95 %, max: " + ", ".join(f"{x:.2f}" for x in idf)),
     ]
     for name, value in rows:
         typer.echo(f"{name:<10}{value}")
@@ -147,13 +147,13 @@ def _find(images: list[str]) -> list[Path]:
         else:
             files = sorted(Path(p) for p in glob.glob(name, recursive=True))
         if not files:
-            raise InputError(f"{name}: no image there; name files, folders or globs of images.")
+            raise InputError(f"{name}: no images found; name files, folders or globs of images.")
         found.update(dict.fromkeys(files))
     return list(found)
 
 
 def _extract_all(paths: list[Path], config: OrbConfig) -> Iterator[NDArray[np.uint8] | None]:
-    """Yield the ``(n, 32)`` descriptors of each image in turn, None if it cannot be read."""
+    """Yield the ``(n, 32)`` descriptors of each image in order, None if it cannot be read."""
     from concurrent.futures import ThreadPoolExecutor
 
     from vslam.datasets.image_files import read_grey
@@ -168,5 +168,5 @@ def _extract_all(paths: list[Path], config: OrbConfig) -> Iterator[NDArray[np.ui
 
     threads = min(available_cores(), 4)
     with ThreadPoolExecutor(threads) as pool:
-        for start in range(0, len(paths), 16 * threads):  # few descriptors wait
+        for start in range(0, len(paths), 16 * threads):  # limits the results in memory
             yield from pool.map(one, paths[start : start + 16 * threads])

@@ -11,8 +11,8 @@ from vslam import plugins
 from vslam.datasets.frames import Source
 from vslam.errors import InputError, did_you_mean
 
-_FIRST = "00"  # KITTI's, and the town rendered after it
-DATASETS = ("kitti", "euroc", "tum", "synthetic")  # vslam's own
+_DEFAULT_NAME = "00"  # of KITTI and of the rendered towns
+DATASETS = ("kitti", "euroc", "tum", "synthetic")  # without those of plug-ins
 
 
 def open_sequence(
@@ -32,17 +32,17 @@ def open_sequence(
 
     Args:
         dataset: one of `known_datasets`.
-        root: folder of the data set; rendered towns ignore it, since they are rendered into the
+        root: folder of the data set; ignored for rendered towns, which are rendered into the
             user's cache on first use.
-        name: name of the sequence; None opens 00 of KITTI and of the rendered towns, and the only
-            sequence at ``root`` of EuRoC and TUM.
-        monocular: read the left camera alone.
+        name: name of the sequence; None opens 00 of KITTI or of the rendered towns, or the only
+            sequence in ``root`` of EuRoC or TUM.
+        monocular: read only the left camera.
         calib: calibration files (docs/howto/cameras.md), which replace the data set's own.
-        depth_scale: units of the depth images per metre, for RGB-D data alone.
+        depth_scale: depth image units per metre, for RGB-D data only.
         on_render: called with the number of frames rendered so far and the total number.
 
     Raises:
-        InputError: the data set is unknown, a package is broken, or as the reader says.
+        InputError: the data set is unknown, its plug-in is broken, or the reader rejects the data.
     """
     chosen: dict[str, Any] = {
         "start": start, "every": every, "max_frames": max_frames, "monocular": monocular
@@ -50,7 +50,7 @@ def open_sequence(
     if dataset == "kitti":
         from vslam.datasets.kitti import open_kitti
 
-        return open_kitti(root, _FIRST if name is None else name, calib=calib, **chosen)
+        return open_kitti(root, _DEFAULT_NAME if name is None else name, calib=calib, **chosen)
     if dataset == "euroc":
         from vslam.datasets.euroc import open_euroc
 
@@ -59,12 +59,14 @@ def open_sequence(
         from vslam.datasets.tum import open_tum
 
         return open_tum(root, name, calib=calib, depth_scale=depth_scale, **chosen)
-    if dataset == "synthetic" and calib:
-        raise InputError("--calib: a rendered town has its own cameras; leave it out.")
     if dataset == "synthetic":
+        if calib:
+            raise InputError(
+                "--calib: rendered towns have their own calibration; leave the option out."
+            )
         from vslam.datasets.synthetic import open_synthetic
 
-        return open_synthetic(_FIRST if name is None else name, on_frame=on_render, **chosen)
+        return open_synthetic(_DEFAULT_NAME if name is None else name, on_frame=on_render, **chosen)
     others = plugins.find_plugins(plugins.READERS)
     if dataset not in others:
         known = (*DATASETS, *others)
@@ -73,12 +75,14 @@ def open_sequence(
             f"reads {', '.join(known)}."
         )
     if calib:
-        raise InputError(f"--calib: {others[dataset]} brings its own; leave it out.")
+        raise InputError(
+            f"--calib: {others[dataset]} has its own calibration; leave the option out."
+        )
     from vslam.datasets.plugin_reader import open_plugin
 
     return open_plugin(others[dataset], Path(root), name, **chosen)
 
 
 def known_datasets() -> tuple[str, ...]:
-    """Data sets that `open_sequence` reads: vslam's own and those of other packages."""
+    """Data sets that `open_sequence` reads, those of plug-ins included."""
     return (*DATASETS, *plugins.find_plugins(plugins.READERS))

@@ -1,4 +1,4 @@
-"""Association by time: pairs of images, and ground truth at the times of frames."""
+"""Association by time: pairing images, and interpolating ground truth at the times of frames."""
 
 from __future__ import annotations
 
@@ -15,18 +15,21 @@ _log = logging.getLogger(__name__)
 # Ground truth comes at 100 Hz (TUM), 200 Hz (EuRoC) or 10 Hz (vehicles). At an acceleration of
 # 2 m/s^2, linear interpolation is off by 6 mm in the middle of this gap.
 _MAX_GAP_S = 0.15
+_MANY = 0.1  # share of images without a partner; TUM's sequences have up to 7 %
 
 
 def associate(
     first: NDArray[np.float64], second: NDArray[np.float64], max_difference: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pair times that are less than ``max_difference`` apart, the nearest first, each once.
+    """Pair times that are less than ``max_difference`` apart.
+
+    The closest pairs are formed first, and each time is used at most once.
 
     Args:
         first, second: ``(N,)`` and ``(M,)`` seconds, increasing.
 
     Returns:
-        ``(P,)`` indices into each, those into ``first`` increasing.
+        ``(P,)`` increasing indices into ``first``, and ``(P,)`` indices into ``second``.
     """
     low = np.searchsorted(second, first - max_difference, side="right")
     high = np.searchsorted(second, first + max_difference, side="left")
@@ -42,18 +45,29 @@ def associate(
     return pairs[:, 0], pairs[:, 1]
 
 
+def warn_of_unpaired(source: Path, n_pairs: int, n_images: int) -> None:
+    """Warn if many colour images are skipped because no depth image is near them in time."""
+    if n_pairs < (1.0 - _MANY) * n_images:
+        _log.warning(
+            "%s: only %d of %d images have a depth image within 20 ms; the others are skipped.",
+            source,
+            n_pairs,
+            n_images,
+        )
+
+
 def poses_at(
     source: Path, measured: Trajectory, times: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """Interpolated poses: positions linearly, rotations along the shortest arc.
+    """Interpolate poses at given times: positions linearly, rotations by slerp.
 
     Args:
         source: file to name in the log.
-        times: ``(N,)`` seconds of frames.
+        times: ``(N,)`` seconds.
 
     Returns:
-        ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames outside the measured time or in a gap of more
-        than 0.15 s. None, with a warning, if no frame has a pose.
+        ``(N, 4, 4)`` float64 ``T_wc``, NaN outside the measured time and in gaps longer than
+        0.15 s. None, with a warning, if no time has a pose.
     """
     from scipy.spatial.transform import Rotation, Slerp
 

@@ -1,9 +1,9 @@
-"""Bags of ROS 1 and ROS 2 and MCAP files, read by the library rosbags.
+"""ROS 1 bags, ROS 2 bags and MCAP files, read by the library rosbags.
 
-Images are ``sensor_msgs/Image`` or ``CompressedImage`` messages, timed by the stamps in their
+Images are ``sensor_msgs/Image`` or ``CompressedImage`` messages with the time stamps of their
 headers. The images of two topics that are nearest in time form a pair if their stamps differ by at
-most 5 ms, or 20 ms for an image and its depth; images without a partner are left out. The
-calibration is the ``camera_info`` of the image topics, if the bag has it.
+most 5 ms, or 20 ms for an image and its depth; images without a partner are skipped. The
+calibration is read from the ``camera_info`` of the image topics, if the bag has it.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
 Bag = Any  # rosbags.highlevel.AnyReader
 
 _FIX_TYPE = "sensor_msgs/msg/NavSatFix"
-_MOST_METADATA = 1_000_000  # bytes; a hundred topics make 100,000
+_MOST_METADATA = 1_000_000  # bytes; a hundred topics need 100,000
 _TOLERANCE_NS = 5_000_000
 _DEPTH_TOLERANCE_NS = 20_000_000  # as in TUM's associate.py; a Kinect alternates image and depth
 _NEEDED = {
@@ -59,7 +59,8 @@ class BagSource(RawSource):
 
     Attributes:
         path: the bag's file or folder.
-        topics: the topic of the left images, and that of the right images or the depth.
+        topics: the topic of the left images, and the topic of the right images or the depth, if
+            they are used.
     """
 
     path: Path
@@ -77,15 +78,16 @@ def open_bag(
 
     Args:
         path: ``.bag``, ``.mcap`` or ``.db3``, or the folder of a ROS 2 bag.
-        topics: the topic of the left images and that of the right images or the depth. If empty,
-            the bag must have exactly the needed image topics; the first by name is the left one.
-        sensor: ``stereo``, ``rgbd`` or ``mono``, which reads the first of two topics; None decides
-            by the content of the topics.
-        depth_scale: units of the depth images per metre; None follows their encoding.
+        topics: the topic of the left images, and the topic of the right images or the depth. If
+            empty, the bag must have exactly the needed image topics, and their alphabetical order
+            tells left from right.
+        sensor: ``stereo``, ``rgbd`` or ``mono``, which reads only the first of two topics; None
+            decides by the content of the topics.
+        depth_scale: depth image units per metre; None derives it from the encoding.
 
     Raises:
         InputError: rosbags is not installed, the bag is missing or truncated, topics are missing,
-            or the images have no stamps, cannot be decoded or form no pairs.
+            or the images have no time stamps, cannot be decoded or form no pairs.
     """
     path = Path(path)
     if not path.exists():
@@ -93,26 +95,26 @@ def open_bag(
     with _opened(path) as bag:
         chosen, depth = _choose_topics(path, bag, topics, sensor)
         tolerance = _tolerance(depth)
-        begin = list(islice(_together(_messages(bag, path, chosen), chosen, tolerance), 2))
-        if not begin:
+        first_two = list(islice(_synchronised(_messages(bag, path, chosen), chosen, tolerance), 2))
+        if not first_two:
             raise InputError(
                 f"{path}: {' and '.join(chosen)} have no images of the same time (within "
                 f"{tolerance / 1e6:g} ms); name topics of one camera with --topics."
             )
-        if all(stamp_of(messages[0]) == 0 for messages in begin):
+        if all(stamp_of(messages[0]) == 0 for messages in first_two):
             raise InputError(
                 f"{path}: the images of {chosen[0]} have no time stamps (header.stamp is 0); "
                 "record them again with a driver that sets it."
             )
         images = [
-            _decoded(path, topic, message, is_second and depth, depth_scale)
-            for topic, message, is_second in zip(chosen, begin[0], (False, True), strict=False)
+            _decoded(path, topic, message, is_depth, depth_scale)
+            for topic, message, is_depth in zip(chosen, first_two[0], (False, depth), strict=False)
         ]
         if depth and images[0].shape != images[1].shape:
             raise InputError(
                 f"{path}: the depth in {chosen[1]} has {size_text(images[1].shape)} pixels but the "
-                f"images in {chosen[0]} have {size_text(images[0].shape)}; name a topic of depth "
-                "that is registered to the images."
+                f"images in {chosen[0]} have {size_text(images[0].shape)}; name depth that is "
+                "registered to the images."
             )
         sizes = tuple((image.shape[1], image.shape[0]) for image in images)
         return BagSource(
@@ -139,18 +141,18 @@ def _play(
         if image.shape[::-1] != size:
             raise UnreadableImageError(
                 path,
-                f"{topic}: {size_text(image.shape)} pixels where the first image has "
+                f"an image of {topic} has {size_text(image.shape)} pixels but the first image has "
                 f"{size_text(size[::-1])}.",
             )
         return image
 
     with _opened(path) as bag:
         messages = _messages(bag, path, topics)
-        for together in _together(messages, topics, _tolerance(depth)):
+        for pair in _synchronised(messages, topics, _tolerance(depth)):
             yield TimedFrame(
-                stamp_of(together[0]) / 10**9,
-                partial(read, together),
-                colour=partial(_in_colour, path, topics[0], together[0]),
+                stamp_of(pair[0]) / 10**9,
+                partial(read, pair),
+                colour=partial(_in_colour, path, topics[0], pair[0]),
             )
 
 
@@ -164,10 +166,10 @@ def _in_colour(path: Path, topic: str, message: Message) -> NDArray[np.uint8]:
 def find_calibration(source: BagSource) -> Calibration | None:
     """Read the calibration from the ``camera_info`` topics beside the image topics.
 
-    None if a topic is missing or has no focal length, as drivers of uncalibrated cameras write it.
+    None if such a topic is missing, or has no focal length because the camera is not calibrated.
 
     Raises:
-        InputError: a ``camera_info`` cannot be read, or is no calibration.
+        InputError: a ``camera_info`` cannot be read, or is not a valid calibration.
     """
     path = source.path
     documents = []
@@ -189,19 +191,22 @@ def find_calibration(source: BagSource) -> Calibration | None:
 
 
 def read_fixes_of_bag(path: Path) -> NDArray[np.float64]:
-    """``(M, 7)`` float64 GPS fixes, ``sensor_msgs/NavSatFix``: seconds, latitude, longitude,
-    altitude, and the standard deviations to the east, to the north and up, NaN if unknown.
+    """Read the GPS fixes (``sensor_msgs/NavSatFix``) of a bag.
+
+    Returns:
+        ``(M, 7)`` float64 seconds, latitude, longitude, altitude, and the standard deviations east,
+        north and up (NaN if unknown).
 
     Raises:
-        InputError: rosbags is not installed, the bag is damaged, it has no topic of fixes or
-            several, or no message has a position and a time.
+        InputError: rosbags is not installed, the bag is damaged, it does not have exactly one topic
+            of fixes, no message is a fix, or a fix has no time stamp.
     """
     with _opened(path) as bag:
         topics = sorted({c.topic for c in bag.connections if c.msgtype == _FIX_TYPE})
         if len(topics) != 1:
-            there = f"several ({', '.join(topics)})" if topics else "none"
+            found = f"several ({', '.join(topics)})" if topics else "none"
             raise InputError(
-                f"{path}: --gps needs one topic of NavSatFix messages, but the bag has {there}; "
+                f"{path}: --gps needs one topic of NavSatFix messages, but the bag has {found}; "
                 "write the fixes to a CSV file."
             )
         fixes = [nav_sat_fix(message) for _, message in _messages(bag, path, (topics[0],))]
@@ -233,7 +238,7 @@ def _opened(path: Path) -> Iterator[Bag]:
         _check_metadata(path / "metadata.yaml")
         bag = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
         bag.open()
-    except Exception as error:  # rosbags and its parsers raise many kinds for a damaged file
+    except Exception as error:  # for damaged files, rosbags and its parsers raise many kinds
         raise InputError(
             f"{path}: cannot be read as a bag ({_reason(error)}); if the recording was cut off, "
             "repair it with 'rosbag reindex', 'ros2 bag reindex' or 'mcap recover'."
@@ -245,17 +250,17 @@ def _opened(path: Path) -> Iterator[Bag]:
 
 
 def _check_metadata(file: Path) -> None:
-    """Refuse a large file: rosbags needs 30 microseconds and 300 bytes of memory for each byte.
+    """Reject a large file: rosbags needs 30 microseconds and 300 bytes of memory for each byte.
 
     Raises:
-        ValueError: it is too large.
+        ValueError: the file is too large.
     """
     if file.is_file() and file.stat().st_size > _MOST_METADATA:
         raise ValueError(f"{file.name} is larger than {_MOST_METADATA / 1e6:.0f} MB")
 
 
 def _messages(bag: Bag, path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, Message]]:
-    """Messages of these topics, each with its topic, in the order of their recording.
+    """Yield the messages of these topics, each with its topic, in the recorded order.
 
     Raises:
         BrokenSourceError: after the last good message of a damaged bag.
@@ -278,11 +283,13 @@ def _tolerance(depth: bool) -> int:
     return _DEPTH_TOLERANCE_NS if depth else _TOLERANCE_NS
 
 
-def _together(
+def _synchronised(
     messages: Iterator[tuple[str, Message]], topics: tuple[str, ...], tolerance: int
 ) -> Iterator[tuple[Message, ...]]:
-    """Tuples of one message from each topic whose stamps agree. A message is paired only after
-    all messages of the other topic that may be nearer in time have been read."""
+    """Yield one message per topic whose stamps differ by at most ``tolerance`` (ns).
+
+    A message is paired only when no later message of the other topic can be nearer in time.
+    """
     if len(topics) == 1:
         yield from ((message,) for _, message in messages)
         return
@@ -308,7 +315,7 @@ def _together(
 def _choose_topics(
     path: Path, bag: Bag, topics: tuple[str, ...], sensor: str | None
 ) -> tuple[tuple[str, ...], bool]:
-    """The topics of the first and second images, and whether the second ones are depth."""
+    """The topics of the first and second images, and whether the second images are depth."""
     there = sorted({c.topic for c in bag.connections if c.msgtype in IMAGE_TYPES})
     listed = f"image topics are {', '.join(there)}" if there else "there are no image topics"
     for topic in topics:
@@ -325,12 +332,14 @@ def _choose_topics(
             raise InputError(f"{path}: {sensor} needs {_NEEDED[sensor]}; {listed}{instead}.")
         if len(topics) != n:
             wanted = {"mono": "TOPIC", "stereo": "LEFT,RIGHT", "rgbd": "COLOUR,DEPTH"}[sensor]
-            raise InputError(f"{path}: choose with --topics {wanted}; {listed}.")
+            raise InputError(f"{path}: choose topics with --topics {wanted}; {listed}.")
     if not n <= len(topics) <= 2:
         raise InputError(
             f"--topics {','.join(topics)}: name the topic of the left images and the topic of the "
             "right images or of the depth, or run with --sensor mono."
         )
+    if len(set(topics)) < len(topics):
+        raise InputError(f"--topics {','.join(topics)}: names one topic twice; {listed}.")
     if topics[0] in with_depth:
         raise InputError(
             f"--topics {','.join(topics)}: {topics[0]} holds depth; name the topic of the images "
@@ -341,7 +350,7 @@ def _choose_topics(
 
 
 def _count(bag: Bag, topics: tuple[str, ...]) -> int | None:
-    """The approximate number of frames; None if ``metadata.yaml`` does not state it."""
+    """The approximate number of frames; None if the bag does not state it."""
     try:
         n = min(bag.topics[topic].msgcount for topic in topics)
     except TypeError:

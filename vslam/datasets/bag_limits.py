@@ -1,7 +1,7 @@
 """Limits on the decompressed size of bags, because rosbags itself sets none.
 
-A few kilobytes can decompress to gigabytes. rosbags looks its decompression functions up in tables
-of its modules; these entries are replaced by functions that stop at a limit.
+A few kilobytes can decompress to gigabytes. rosbags looks up its decompression functions in tables
+of its modules; here, functions that stop at a limit replace the entries of these tables.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from types import SimpleNamespace
 from typing import Any, Protocol
 
 MOST_BYTES = 2**29
-"""Limit of a chunk or a message: an image of `vslam.untrusted.MOST_PIXELS` with four bytes a
-pixel. Recorders write chunks of 0.8 to 4 MB."""
+"""Limit for a chunk or a message, enough for an image of `vslam.untrusted.MOST_PIXELS` with four
+bytes per pixel. Recorders write chunks of 0.8 to 4 MB."""
 
 _FREE_BYTES = 2**30  # of disk space that must remain when a whole bag is decompressed
 _log = logging.getLogger(__name__)
@@ -30,7 +30,7 @@ class _Decompressor(Protocol):
 
 
 def limit_bags() -> None:
-    """Let rosbags refuse chunks, messages and files beyond the limits. Later calls do nothing."""
+    """Make rosbags reject chunks, messages and files beyond the limits. Later calls do nothing."""
     import lz4.frame
     from rosbags.rosbag1 import reader as ros1
     from rosbags.rosbag2 import reader, storage_mcap
@@ -55,11 +55,15 @@ def limit_bags() -> None:
 
         ros2.zstd = SimpleNamespace(decompress=_limited(kinds["zstd"]), open=opened)
     except AttributeError as error:
-        _log.warning("this rosbags cannot be limited (%s): a bag may take all memory", error)
+        _log.warning(
+            "cannot limit the memory that this version of rosbags uses (%s); a damaged bag may use "
+            "all of it",
+            error,
+        )
 
 
 def unpack(make: Callable[[], _Decompressor], data: bytes, most: int) -> bytes:
-    """Decompress data that consists of one or more compressed frames.
+    """Decompress data that consists of one or more compressed frames, of ``most`` bytes at most.
 
     Raises:
         ValueError: the result exceeds ``most`` bytes, or the data is truncated.
@@ -83,7 +87,7 @@ def _limited(make: Callable[[], _Decompressor]) -> Callable[[bytes], bytes]:
 
 
 def _limited_by_size(make: Callable[[], _Decompressor]) -> Callable[[bytes, int], bytes]:
-    """For chunks that state their size; rosbags checks it."""
+    """Limit the decompression of chunks that state their size, which rosbags checks."""
     return lambda data, size: unpack(make, data, min(size, MOST_BYTES))
 
 
@@ -104,5 +108,5 @@ class _LimitedFile:
         data: bytes = self._file.read(size)
         self._left -= len(data)
         if self._left < 0:
-            raise ValueError(f"unpacked, it does not fit into {tempfile.gettempdir()}")
+            raise ValueError(f"the unpacked bag does not fit into {tempfile.gettempdir()}")
         return data

@@ -16,13 +16,13 @@ from vslam.camera import DepthImage, Image
 
 Message = Any  # classes that rosbags generates from the bag's message definitions
 
-_COMPRESSED_DEPTH = "compressedDepth"  # image_transport's format: a 12-byte header, then a PNG
-_MILLIMETRES = 1000.0  # units of 16-bit depth per metre; 32-bit depth is in metres (REP 118)
+_COMPRESSED_DEPTH = "compressedDepth"  # format of image_transport: a 12-byte header, then a PNG
+_MM_PER_M = 1000.0  # 16-bit depth is in millimetres, 32-bit depth in metres (REP 118)
 _DEPTH_ENCODINGS = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
-# Number of channels, and their order in the names of OpenCV.
+# Number of channels, and name of the colour space in OpenCV's constants.
 _ENCODINGS: dict[str, tuple[int, str | None]] = {
     "mono": (1, None),
     "bgr": (3, "BGR"),
@@ -34,18 +34,18 @@ _ENCODINGS: dict[str, tuple[int, str | None]] = {
     "bayer_gbrg": (1, "BayerGBRG"),
     "bayer_grbg": (1, "BayerGRBG"),
 }
-_SAME = {"8UC1": "mono8", "16UC1": "mono16", "8UC3": "bgr8", "8UC4": "bgra8"}
+_ALIASES = {"8UC1": "mono8", "16UC1": "mono16", "8UC3": "bgr8", "8UC4": "bgra8"}
 
 
 def stamp_of(message: Message) -> int:
-    """Nanoseconds of the header's stamp, 0 if it was not set."""
+    """Time stamp of the header in nanoseconds, 0 if it was not set."""
     stamp = message.header.stamp
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
 def nav_sat_fix(message: Message) -> tuple[float, ...]:
-    """Seconds, latitude, longitude, altitude, and three standard deviations (east, north, up) of a
-    ``NavSatFix``; NaN where there is no fix, or where the covariance is unknown."""
+    """Seconds, latitude, longitude, altitude and three standard deviations (east, north, up) of a
+    ``NavSatFix``; the position is NaN without a fix, and an unknown deviation is NaN."""
     status, covariance = message.status.status, np.asarray(message.position_covariance)
     position = (message.latitude, message.longitude, message.altitude)
     if status < 0:  # STATUS_NO_FIX
@@ -57,32 +57,22 @@ def nav_sat_fix(message: Message) -> tuple[float, ...]:
 
 
 def grey_of(message: Message) -> Image:
-    """``(H, W)`` uint8 image of an ``Image`` or ``CompressedImage``; of 16 bits the upper eight.
+    """Decode an ``Image`` or ``CompressedImage`` to ``(H, W)`` uint8; 16-bit values keep their
+    upper eight bits.
 
     Raises:
-        ValueError: it cannot be decoded; the message gives the reason.
+        ValueError: the image cannot be decoded, for the given reason.
     """
     return _decoded(message, "GRAY")
 
 
 def colour_of(message: Message) -> NDArray[np.uint8]:
-    """As `grey_of`; ``(H, W, 3)`` red, green, blue if the message has colours.
-
-    Raises:
-        ValueError: as `grey_of`.
-    """
+    """Decode as `grey_of`, but to ``(H, W, 3)`` red, green, blue if the message has colours."""
     return _decoded(message, "RGB")
 
 
 def _decoded(message: Message, wanted: str) -> NDArray[np.uint8]:
-    """An image of a message.
-
-    Args:
-        wanted: ``GRAY``, or ``RGB``, which a grey message ignores.
-
-    Raises:
-        ValueError: as `grey_of`.
-    """
+    """Decode an image to ``GRAY`` or ``RGB``; a grey image stays grey."""
     import cv2
 
     from vslam.datasets.png import decode_with_opencv
@@ -97,7 +87,7 @@ def _decoded(message: Message, wanted: str) -> NDArray[np.uint8]:
         if image is None:
             raise ValueError(f"a compressed image of format '{message.format}' cannot be decoded")
         return np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
-    encoding = _SAME.get(message.encoding, message.encoding)
+    encoding = _ALIASES.get(message.encoding, message.encoding)
     name, bits = (encoding[:-2], 16) if encoding.endswith("16") else (encoding[:-1], 8)
     if name not in _ENCODINGS or not encoding.endswith(str(bits)):
         known = ", ".join(f"{known}8" for known in _ENCODINGS)
@@ -116,16 +106,16 @@ def is_depth(message: Message, topic: str) -> bool:
     contains ``depth``."""
     if not hasattr(message, "encoding"):
         return _COMPRESSED_DEPTH in message.format
-    steps = message.encoding == "16UC1" and "depth" in topic.lower()
-    return steps or message.encoding == "32FC1"
+    is_16_bit_depth = message.encoding == "16UC1" and "depth" in topic.lower()
+    return is_16_bit_depth or message.encoding == "32FC1"
 
 
 def depth_of(message: Message, scale: float | None) -> DepthImage:
-    """``(H, W)`` float32 metres, 0 where unknown, of an ``Image``, or of a ``CompressedImage`` of
-    image_transport's plugin ``compressed_depth``.
+    """Decode an ``Image``, or a ``CompressedImage`` by image_transport's plug-in
+    ``compressed_depth``, to ``(H, W)`` float32 metres, 0 where unknown.
 
     Args:
-        scale: units of the image per metre; None follows REP 118: 1000 for 16 bits, 1 for 32 bits.
+        scale: image units per metre; None follows REP 118: 1000 for 16 bits, 1 for 32 bits.
 
     Raises:
         ValueError: as `grey_of`.
@@ -135,14 +125,14 @@ def depth_of(message: Message, scale: float | None) -> DepthImage:
     kind = _DEPTH_ENCODINGS.get(message.encoding)
     if kind is None:
         known = ", ".join(_DEPTH_ENCODINGS)
-        raise ValueError(f"encoding '{message.encoding}' is no depth; known are {known}")
+        raise ValueError(f"encoding '{message.encoding}' is not depth; known are {known}")
     image = _pixels(message, 1, 8 * np.dtype(kind).itemsize, "f" if kind is np.float32 else "u")
     return _metres(image, scale)
 
 
 def _compressed_depth(message: Message, scale: float | None) -> DepthImage:
-    """With 16 bits the PNG holds the depth; with 32 bits it holds the inverse depth, scaled by two
-    numbers of the header (``compressed_depth_image_transport``, ``ConfigHeader``)."""
+    """Decode ``compressed_depth_image_transport``: the PNG holds 16-bit depth, or, for 32-bit
+    depth, the inverse depth quantised by two numbers of the header (``ConfigHeader``)."""
     import cv2
 
     from vslam.datasets.png import decode_with_opencv
@@ -164,13 +154,13 @@ def _compressed_depth(message: Message, scale: float | None) -> DepthImage:
 
 
 def _metres(image: NDArray[Any], scale: float | None) -> DepthImage:
-    scale = scale or (_MILLIMETRES if image.dtype.kind == "u" else 1.0)
+    scale = scale or (_MM_PER_M if image.dtype.kind == "u" else 1.0)
     metres = np.asarray(image, np.float32) * np.float32(1.0 / scale)
     return np.where(np.isfinite(metres), metres, np.float32(0.0))
 
 
 def _pixels(message: Message, channels: int, bits: int, kind: str = "u") -> NDArray[Any]:
-    """The rows of an image without their padding."""
+    """The pixels of an image without the padding of its rows."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.asarray(message.data, np.uint8)
     row = width * channels * bits // 8
@@ -185,15 +175,15 @@ def _pixels(message: Message, channels: int, bits: int, kind: str = "u") -> NDAr
 
 
 def camera_info(message: Message, source: str, rectified: bool) -> Document | None:
-    """A ``CameraInfo`` as input of `vslam.calibration.formats.read_ros`.
+    """Convert a ``CameraInfo`` to the input of `vslam.calibration.formats.read_ros`.
 
     None for an uncalibrated camera, whose K is all zero by the definition of ``CameraInfo``.
 
     Args:
-        source: bag and topic, named in error messages.
+        source: bag and topic to name in error messages.
         rectified: whether the images are rectified, so that the projection matrix applies.
     """
-    # ROS 1 writes K, D, R and P, ROS 2 uses small letters.
+    # The fields are K, D, R and P in ROS 1 and k, d, r and p in ROS 2.
     K, D, R, P = (
         np.asarray(getattr(message, name, getattr(message, name.lower(), None)), np.float64)
         for name in "KDRP"

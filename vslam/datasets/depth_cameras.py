@@ -1,4 +1,4 @@
-"""Live depth cameras, whose makers' packages bring the images and the calibration of the device."""
+"""Live depth cameras; the makers' packages deliver the images and the device's calibration."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ class Grabbed:
 
 @dataclass(frozen=True)
 class DepthCamera:
-    """A device that is filming.
+    """A device that delivers images.
 
     Attributes:
         dataset: kind of source.
         name: serial number.
-        calibration: that of the device, for the images that it delivers. With ``depth_scale``, the
-            second images are the depth of the first images' pixels.
-        grab: waits for the next images; None if none came in time or the device is gone.
+        calibration: calibration of the delivered images, from the device. If it has a
+            ``depth_scale``, the second images are the depth of the first images' pixels.
+        grab: waits for the next images; None after a timeout, or if the device is gone.
         stop: stops the device.
     """
 
@@ -57,7 +57,7 @@ class DepthCamera:
 
 
 def frames_of(device: DepthCamera) -> RawSource:
-    """The frames of a device, which can be read only once."""
+    """Make a source of the frames of a device, which can be read only once."""
     calibration = device.calibration
     models = [model for model in (calibration.left, calibration.right) if model is not None]
     return RawSource(
@@ -74,13 +74,13 @@ def maker_package(name: str, extra: str) -> Any:
     """Import the package of a device's maker.
 
     Raises:
-        InputError: it is not installed, or a library that it needs is not.
+        InputError: the package, or a library that it needs, is not installed.
     """
     try:
         return importlib.import_module(name)
     except ImportError as error:
         missing = isinstance(error, ModuleNotFoundError)
-        fix = f"pip install 'vslam[{extra}]'" if missing else "install what it needs"
+        fix = f"pip install 'vslam[{extra}]'" if missing else "install the libraries that it needs"
         raise InputError(
             f"--dataset {extra}: the package {name} cannot be imported ({error}); {fix} "
             "(docs/howto/cameras.md)."
@@ -99,7 +99,7 @@ def _play(device: DepthCamera) -> Iterator[TimedFrame]:
         with suppress(RuntimeError):  # the device may be gone
             device.stop()
     raise BrokenSourceError(
-        f"{device.dataset} {device.name}: no image came after {n}; check its cable and its power."
+        f"{device.dataset} {device.name}: stopped after {n} images; check its cable and its power."
     )
 
 

@@ -1,4 +1,4 @@
-"""Detection of the kind of a source from its files."""
+"""Detect the kind of a source from its files."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from vslam.datasets.euroc import is_euroc
 from vslam.datasets.image_files import is_image
 from vslam.datasets.image_folders import has_images
+from vslam.datasets.tum import is_tum
 from vslam.errors import InputError
 
 _BAG_SUFFIXES = {".bag", ".mcap", ".db3"}
@@ -38,7 +39,7 @@ _KINDS: tuple[tuple[str, str, Callable[[Path], bool]], ...] = (
     (
         "tum",
         "a file rgb.txt",
-        lambda path: any((folder / "rgb.txt").is_file() for folder in _within(path)),
+        lambda path: any(is_tum(folder) for folder in _within(path)),
     ),
     (
         "bag",
@@ -51,10 +52,10 @@ _KINDS: tuple[tuple[str, str, Callable[[Path], bool]], ...] = (
 
 
 def detect_dataset(data: str) -> str:
-    """The ``--dataset`` that a folder, a file, the number of a device or a URL belongs to.
+    """Find the value of ``--dataset`` for a folder, a file, the number of a device or a URL.
 
     Raises:
-        InputError: nothing exists there, or its kind is not recognised.
+        InputError: there is no such file or folder, or its kind is not recognised.
     """
     if _URL.match(data):
         return "camera"
@@ -65,7 +66,7 @@ def detect_dataset(data: str) -> str:
         raise InputError(f"{data}: an archive; unpack it and name the folder with --data.")
     if path.is_file() and path.suffix.lower() in _TEXTS:
         raise InputError(
-            f"{data}: no images; name the folder or video that holds them with --data."
+            f"{data}: not images; name a folder of images, a video or a bag with --data."
         )
     if path.is_dir() and not any(path.iterdir()):
         raise InputError(f"{data}: the folder is empty; name another one with --data.")
@@ -75,8 +76,8 @@ def detect_dataset(data: str) -> str:
             return kind
         looked = "; ".join(f"{what} ({kind})" for kind, what, _ in _KINDS)
         raise InputError(
-            f"{data}: no known data set{_nearest(path)}; name its kind with --dataset. Looked for "
-            f"{looked}."
+            f"{data}: not a known data set{_nearest(path)}; name its kind with --dataset. Looked "
+            f"for {looked}."
         )
     if data.isdecimal():
         return "camera"
@@ -93,9 +94,9 @@ def _kind_of(path: Path) -> str | None:
 def _nearest(path: Path) -> str:
     """A hint for a folder that is one level too high or too low."""
     if path.resolve().name == "sequences":
-        return f", but {path.resolve().parent} looks like KITTI's (name that)"
+        return f", but {path.resolve().parent} looks like kitti (name that folder)"
     for inside in sorted(path.glob("*")):
         with suppress(OSError):  # a folder that this user may not read
             if inside.is_dir() and (kind := _kind_of(inside)) is not None:
-                return f", but {inside} looks like {kind} (name that)"
+                return f", but {inside} looks like {kind} (name that folder)"
     return ""

@@ -2,7 +2,7 @@
 
 FOLDER/mav0/cam0/{data.csv,sensor.yaml,data/}    left camera: times (ns) and files, calibration
 FOLDER/mav0/cam1/...                             right camera
-FOLDER/mav0/state_groundtruth_estimate0/         ground truth of the body, if there is one
+FOLDER/mav0/state_groundtruth_estimate0/         optional: ground truth of the body
 """
 
 from __future__ import annotations
@@ -17,13 +17,18 @@ from vslam.calibration.documents import read_document
 from vslam.calibration.files import read_calibration
 from vslam.datasets.association import poses_at
 from vslam.datasets.frames import RawSource, Source
-from vslam.datasets.image_files import checked_files, find_sequence, select_frames
+from vslam.datasets.image_files import (
+    checked_files,
+    find_sequence,
+    read_image_list,
+    select_frames,
+)
 from vslam.datasets.rectified import rectified
 from vslam.errors import InputError
 from vslam.trajectory import Trajectory
 
 _HOME = "https://projects.asl.ethz.ch/datasets/euroc-mav/"
-_SAME_NS = 5_000_000  # largest difference of stamps in a pair; both cameras are triggered together
+_MOST_APART_NS = 5_000_000  # of the images of a pair, which are triggered together
 _POSE_COLUMNS = 8  # time, position, quaternion; velocities and biases may follow
 
 
@@ -40,13 +45,14 @@ def open_euroc(
     """Open a sequence; its images are rectified as they are read.
 
     A frame is a left image with the nearest right image within 5 ms; left images without a partner
-    are left out. The ground truth is interpolated, see `vslam.datasets.association.poses_at`.
+    are skipped. The ground truth is interpolated, see `vslam.datasets.association.poses_at`.
 
     Args:
         root: folder of the sequence, or of several sequences.
         name: name of the sequence in ``root``; None for ``root`` itself, or its only sequence.
-        start, every, max_frames: selects every N-th pair, from a first one on, up to a number.
-        monocular: read the left camera alone.
+        start, every, max_frames: read every ``every``-th pair from pair ``start`` on, at most
+            ``max_frames``.
+        monocular: read only the left camera.
         calib: calibration files, which replace the cameras' ``sensor.yaml``.
 
     Raises:
@@ -70,7 +76,7 @@ def open_raw_euroc(
     max_frames: int | None = None,
     monocular: bool = False,
 ) -> RawSource:
-    """The images of a sequence as the cameras took them, without calibration and ground truth; see
+    """Open the unrectified images of a sequence, without calibration and ground truth; see
     `open_euroc`."""
     _, found, stamps, files = _select(root, name, start, every, max_frames, monocular)
     return checked_files("euroc", found, stamps.astype(np.float64) * 1e-9, None, files)
@@ -93,14 +99,14 @@ def _select(
     base, found = _find(Path(root), name)
     cameras = [base / f"cam{side}" for side in range(1 if monocular else 2)]
     listed = [_read_list(camera) for camera in cameras]
-    frames = _pair(cameras, listed)
+    times = [np.array(stamps, np.int64) for stamps, _ in listed]
+    frames = _pair(cameras, times)
     chosen = frames[select_frames(base, len(frames), start, every, max_frames)]
     files = [
         tuple(camera / "data" / names[k] for k in rows)
         for camera, (_, names), rows in zip(cameras, listed, chosen.T, strict=True)
     ]
-    stamps = listed[0][0][chosen[:, 0]]
-    return base, found, stamps, files
+    return base, found, times[0][chosen[:, 0]], files
 
 
 def _find(root: Path, name: str | None) -> tuple[Path, str]:
@@ -117,58 +123,33 @@ def _find(root: Path, name: str | None) -> tuple[Path, str]:
     return base, folder.resolve().name
 
 
-def _read_list(camera: Path) -> tuple[NDArray[np.int64], list[str]]:
+def _read_list(camera: Path) -> tuple[list[int], list[str]]:
     """Times (ns, increasing) and file names of a camera's images."""
-    path = camera / "data.csv"
-    times, names = [], []
-    try:
-        lines = path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        alone = ", or run on the left camera alone with --sensor mono"
-        raise InputError(
-            f"{path}: the list of images is missing or no text; unpack the sequence again"
-            f"{alone if camera.name == 'cam1' else ''}."
-        ) from error
-    for number, line in enumerate(lines, start=1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        stamp, _, name = line.partition(",")
-        if not _is_time(stamp.strip()) or not name.strip() or "/" in name:
-            raise InputError(
-                f"{path}: line {number} is not a time in nanoseconds and a file name; repair it."
-            )
-        times.append(int(stamp))
-        names.append(name.strip())
-        if len(times) > 1 and times[-1] <= times[-2]:
-            raise InputError(
-                f"{path}: line {number} is not later than the one before it; repair the list."
-            )
-    if not times:
-        raise InputError(f"{path}: the list of images is empty; unpack the sequence again.")
-    return np.array(times, np.int64), names
+
+    def parsed(line: str) -> tuple[int, str]:
+        stamp, _, name = map(str.strip, line.partition(","))
+        if not stamp.isdecimal() or "/" in name or int(stamp) > np.iinfo(np.int64).max:
+            raise ValueError
+        return int(stamp), name
+
+    instead = "run on the left camera alone with --sensor mono" if camera.name == "cam1" else ""
+    return read_image_list(camera / "data.csv", parsed, "a time in nanoseconds", instead)
 
 
-def _is_time(stamp: str) -> bool:
-    """Whether a text is a number of nanoseconds that fits into 64 bits."""
-    return stamp.isdecimal() and len(stamp) <= 19 and int(stamp) <= np.iinfo(np.int64).max
-
-
-def _pair(
-    cameras: list[Path], listed: list[tuple[NDArray[np.int64], list[str]]]
-) -> NDArray[np.int64]:
-    """``(N, sides)`` int64 rows of the lists that belong together."""
-    left, right = listed[0][0], listed[-1][0]
+def _pair(cameras: list[Path], times: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """``(N, cameras)`` int64 indices of the images of each frame, from ``(M,)`` times (ns)."""
+    left, right = times[0], times[-1]
     rows = np.arange(len(left))
-    if len(listed) == 1:
+    if len(times) == 1:
         return rows[:, None]
     after = np.searchsorted(right, left).clip(0, len(right) - 1)
     before = (after - 1).clip(0)
     nearest = np.where(left - right[before] <= abs(right[after] - left), before, after)
-    near = abs(right[nearest] - left) <= _SAME_NS
+    near = abs(right[nearest] - left) <= _MOST_APART_NS
     if not near.any():
         raise InputError(
             f"{cameras[1]}: none of its {len(right)} images has the time of an image in "
-            f"{cameras[0]}; take both cameras of one sequence."
+            f"{cameras[0]}; take both cameras from one sequence."
         )
     return np.column_stack([rows, nearest])[near]
 
@@ -196,7 +177,7 @@ def _read_ground_truth(base: Path, stamps: NDArray[np.int64]) -> NDArray[np.floa
 
 
 def _read_states(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Times (ns) and ``(N, 7)`` position and quaternion, w first."""
+    """``(N,)`` times (ns), and ``(N, 7)`` positions and quaternions (w first)."""
     times, rows = [], []
     for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
         if not line.strip() or line.startswith("#"):
@@ -216,6 +197,6 @@ def _read_states(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     if len(rows) < 2 or (np.diff(times) <= 0).any():
         raise InputError(
             f"{path}: the times of the ground truth do not increase; repair it, or remove the "
-            "file to run without."
+            "file to run without ground truth."
         )
     return np.array(times, np.int64), np.array(rows)

@@ -1,8 +1,8 @@
-"""GPS fixes beside the images of a drive, and their local east-north-up frame.
+"""GPS fixes recorded during a drive, and their local east-north-up (ENU) frame.
 
-They come from a CSV file, from the folder ``oxts`` of KITTI raw (Geiger et al., IJRR 2013), or from
-the ``sensor_msgs/NavSatFix`` messages of a ROS bag. Conversions between latitude and longitude
-(WGS84) and metres are those of pymap3d, in the extra ``gps``.
+Fixes are read from a CSV file, from the folder ``oxts`` of KITTI raw (Geiger et al., IJRR 2013), or
+from the ``sensor_msgs/NavSatFix`` messages of a ROS bag. pymap3d, in the extra ``gps``, converts
+between WGS84 coordinates and metres.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from vslam.datasets.frames import Source
 from vslam.errors import InputError
 from vslam.trajectory import read_table
 
-DEFAULT_SIGMA_M = 2.0  # of a receiver that does not state its error: usual under an open sky
+DEFAULT_SIGMA_M = 2.0  # for receivers that do not state their error; typical under an open sky
 _NAMES = {
     "time": ("time", "timestamp", "t"),
     "latitude": ("latitude", "lat"),
@@ -27,7 +27,7 @@ _NAMES = {
     "altitude": ("altitude", "alt"),
     "sigma": ("sigma",),
 }
-_OXTS_COLUMNS, _OXTS_ACCURACY = 30, 23
+_OXTS_COLUMNS, _POS_ACCURACY = 30, 23  # numbers in an OXTS packet, and the index of pos_accuracy
 _BAGS = (".bag", ".mcap", ".db3")
 
 
@@ -38,7 +38,7 @@ class Fixes:
     Attributes:
         times: ``(M,)`` seconds, by the clock of the images.
         geodetic: ``(M, 3)`` latitude and longitude in degrees and altitude in metres.
-        sigma: ``(M, 3)`` standard deviations to the east, to the north and up, in metres.
+        sigma: ``(M, 3)`` standard deviations east, north and up, in metres.
     """
 
     times: NDArray[np.float64]
@@ -50,16 +50,17 @@ class Fixes:
 
     def between(self, first: float, last: float) -> Fixes:
         """The fixes from one time to another, both included."""
-        at = (self.times >= first) & (self.times <= last)
-        return Fixes(self.times[at], self.geodetic[at], self.sigma[at])
+        inside = (self.times >= first) & (self.times <= last)
+        return Fixes(self.times[inside], self.geodetic[inside], self.sigma[inside])
 
 
 def read_fixes(path: Path) -> Fixes:
     """Read all fixes of a file or folder.
 
     Args:
-        path: CSV file whose header names ``time``, ``latitude``, ``longitude``, ``altitude`` and
-            optionally ``sigma`` (m); KITTI's folder ``oxts``, whose times begin at 0; or a bag.
+        path: CSV file with a header of ``time`` (s), ``latitude``, ``longitude`` (degrees),
+            ``altitude`` (m) and optionally ``sigma`` (m); KITTI's folder ``oxts``, whose times
+            begin at 0; or a bag.
 
     Raises:
         InputError: pymap3d is not installed, the file is missing or malformed, it holds no fix or
@@ -93,47 +94,45 @@ def read_fixes(path: Path) -> Fixes:
 
 
 def require_overlap(fixes: Fixes, source: Source, path: Path) -> None:
-    """Refuse fixes of another time than that of the images. Of a stream, only the first frame's
-    time is known in advance.
+    """Check that fixes and images overlap in time, as far as the time of a stream is known.
 
     Raises:
-        InputError: the images are those of a live camera, or no fix is of their time.
+        InputError: the source is a live camera, or no fix was taken during its images.
     """
     if source.live:
         raise InputError(
-            f"--gps {path}: a live camera is not yet where the file says; record the drive first."
+            f"--gps {path}: fixes cannot be used with a live camera; record its images first."
         )
     if source.seekable:
         first, last = source.timestamps[[0, -1]].tolist()
     else:
-        frame = next(source.frames(), None)
+        frame = next(source.frames(), None)  # the last time of a stream is unknown
         first, last = -np.inf if frame is None else frame.timestamp, np.inf
     if not len(fixes.between(first, last)):
-        images = f"from {first:.3f}" + (f" to {last:.3f} s" if np.isfinite(last) else " s on")
+        until = f" to {last:.3f} s" if np.isfinite(last) else " s on"
         raise InputError(
-            f"--gps {path}: its fixes are from {fixes.times[0]:.3f} to {fixes.times[-1]:.3f} s, "
-            f"the images {images}; give the times of both by one clock."
+            f"--gps {path}: the fixes are from {fixes.times[0]:.3f} to {fixes.times[-1]:.3f} s but "
+            f"the images are from {first:.3f}{until}; give the times of both by one clock."
         )
 
 
 def to_enu(geodetic: NDArray[np.float64], datum: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``(N, 3)`` metres east, north and up of the datum ``(3,)``, from ``(N, 3)`` degrees and
-    metres."""
+    """Convert ``(N, 3)`` latitude, longitude (degrees) and altitude (m) to ``(N, 3)`` metres east,
+    north and up of the datum, ``(3,)`` in the same units."""
     from pymap3d import geodetic2enu
 
     return np.column_stack(geodetic2enu(*geodetic.T, *datum))
 
 
 def to_geodetic(enu: NDArray[np.float64], datum: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The inverse of ``to_enu``."""
+    """Invert `to_enu`."""
     from pymap3d import enu2geodetic
 
     return np.column_stack(enu2geodetic(*enu.T, *datum))
 
 
 def _read_csv(path: Path) -> NDArray[np.float64]:
-    """``(M, 7)`` time, latitude, longitude, altitude and three standard deviations, NaN where
-    unknown."""
+    """``(M, 7)`` rows as `vslam.datasets.bag.read_fixes_of_bag` returns them."""
     try:
         lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -143,7 +142,9 @@ def _read_csv(path: Path) -> NDArray[np.float64]:
         name: next((head.index(word) for word in words if word in head), None)
         for name, words in _NAMES.items()
     }
-    missing = [name for name, at in column.items() if at is None and name != "sigma"]
+    sigma_at = column.pop("sigma")
+    required = {name: at for name, at in column.items() if at is not None}
+    missing = [name for name in column if name not in required]
     if missing:
         raise InputError(
             f"--gps {path}: the first line names no {' and no '.join(missing)}; begin the file "
@@ -154,13 +155,9 @@ def _read_csv(path: Path) -> NDArray[np.float64]:
         if not any(word.strip() for word in words):
             continue
         try:
-            row = [
-                float(words[at])
-                for name, at in column.items()
-                if at is not None and name != "sigma"
-            ]
-            at = column["sigma"]
-            sigma = np.nan if at is None or not words[at].strip() else float(words[at])
+            row = [float(words[at]) for at in required.values()]
+            stated = "" if sigma_at is None else words[sigma_at].strip()
+            sigma = float(stated) if stated else np.nan
         except (ValueError, IndexError):
             row = [np.nan]
         if not np.isfinite(row).all():
@@ -170,12 +167,12 @@ def _read_csv(path: Path) -> NDArray[np.float64]:
             )
         rows.append([*row, sigma, sigma, sigma])
     if not rows:
-        raise InputError(f"--gps {path}: holds no fix; give a file with one on each line.")
+        raise InputError(f"--gps {path}: holds no fix; give a file with one fix per line.")
     return np.array(rows)
 
 
 def _read_oxts(folder: Path) -> NDArray[np.float64]:
-    """As `_read_csv`; times are seconds since the first packet, like those of KITTI odometry."""
+    """Rows as `_read_csv`, with seconds since the first packet, as in KITTI odometry."""
     if (folder / "oxts").is_dir():
         folder = folder / "oxts"
     files = sorted((folder / "data").glob("*.txt"))
@@ -194,7 +191,6 @@ def _read_oxts(folder: Path) -> NDArray[np.float64]:
             f"--gps {path}: {len(times)} times for {len(files)} fixes; unpack the drive again."
         )
     seconds = (times - times[0]) / np.timedelta64(1, "s")
-    packets = [read_table(file, (_OXTS_COLUMNS,), "a packet of OXTS", 1)[0] for file in files]
-    rows = np.array(packets)
-    sigma = np.repeat(rows[:, [_OXTS_ACCURACY]], 3, axis=1)
+    rows = np.array([read_table(file, (_OXTS_COLUMNS,), "an OXTS packet", 1)[0] for file in files])
+    sigma = np.repeat(rows[:, [_POS_ACCURACY]], 3, axis=1)
     return np.column_stack([seconds, rows[:, :3], sigma])

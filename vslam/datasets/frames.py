@@ -1,8 +1,8 @@
-"""Sources of frames, which readers open and from which a run takes its images.
+"""Sources of frames: readers open them, and runs take their images from them.
 
-Every source yields its frames in the order of their times. Images in files can also be read in any
-order; a video, a bag or a camera cannot seek. Readers return a `RawSource` if the images need to be
-rectified (`vslam.datasets.rectified`), and a `Source` if they do not.
+Every source yields its frames in the order of their times. Image files can also be read in any
+order; a video, a bag or a camera cannot seek. Readers return a `RawSource` if the images still have
+to be rectified (`vslam.datasets.rectified`), else a `Source`.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ Size = tuple[int, int]
 
 _log = logging.getLogger(__name__)
 
-_FIRST_FRAMES = 120  # a few seconds; a pair of 752x480 takes 0.7 MB
+_FIRST_FRAMES = 120  # a few seconds; a stereo pair of 752x480 pixels takes 0.7 MB
 
 
 @dataclass(frozen=True)
 class TimedFrame:
-    """A frame that is yet to be decoded.
+    """A frame whose images are decoded on demand.
 
     Attributes:
         timestamp: seconds.
@@ -40,16 +40,18 @@ class TimedFrame:
             ``(H, W)`` uint8. The second one is the right image, ``(H, W)`` uint8; or the depth of
             the left image's pixels, ``(H, W)`` float32 metres, 0 if unknown; or None (monocular).
             The argument is a map function over both images, which may decode them in parallel.
-            Raises UnreadableImageError if a file is damaged or not of the calibration's size.
-        sides: decode the left and the right image alone, so that one of them need not be read;
-            they give the images of ``read``, and raise as it does. None if both are decoded
-            together, or if there is no right image.
-        file: the left image's file, if its pixels need no rectification; else None.
-        colour: decodes the left image as it was taken, ``(H, W, 3)`` uint8 red, green, blue, or
-            ``(H, W)`` if it is grey; None for a source without colours. Raises as ``read``.
-        name: file name of the left image; None if it has none.
-        mask: reads the mask of the left image, ``(H, W)`` uint8, 0 where it is not to be used; None
-            if all of it is used. Raises UnreadableImageError.
+            Raises UnreadableImageError if a file is damaged or its size differs from the
+            calibration.
+        sides: two functions, which decode only the left and only the right image of ``read`` and
+            raise the same errors. None if both images are decoded together, or if there is no right
+            image.
+        file: file of the left image if its pixels need no rectification, else None.
+        colour: decodes the left image in colour, ``(H, W, 3)`` uint8 red, green, blue, or
+            ``(H, W)`` if it is grey; None if the source has no colours. Raises the errors of
+            ``read``.
+        name: file name of the left image; None if it is not in a file of its own.
+        mask: reads the mask of the left image, ``(H, W)`` uint8, 0 for pixels to ignore; None if
+            all pixels are used. Raises UnreadableImageError.
     """
 
     timestamp: float
@@ -63,7 +65,7 @@ class TimedFrame:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Frames:
-    """See `Source`."""
+    """The attributes that `Source` and `RawSource` share; see `Source`."""
 
     dataset: str
     name: str
@@ -79,7 +81,7 @@ class _Frames:
         object.__setattr__(self, "n_expected", len(self.stored))
         times = self.timestamps
         if not len(times) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-            raise InputError(f"{self.name}: the times of its frames do not increase; repair them.")
+            raise InputError(f"{self.name}: the times of the frames do not increase; repair them.")
         if self.ground_truth is not None and self.ground_truth.shape != (len(times), 4, 4):
             raise ValueError(f"ground_truth must be of shape ({len(times)}, 4, 4)")
 
@@ -89,7 +91,7 @@ class _Frames:
         return self.play is None
 
     def frames(self) -> Iterator[TimedFrame]:
-        """All frames in order; every call starts at the first one, unless the source is live.
+        """Yield all frames in order, from the first one on unless the source is live.
 
         Only the images of the current frame are held in memory.
 
@@ -112,35 +114,36 @@ class _Frames:
         return len(self._stored())
 
     def read(self, index: int, image_map: ImageMap = map) -> Images:
-        """Left and second image of one frame; see `TimedFrame`.
+        """Read the left and the second image of one frame, see ``TimedFrame.read``.
 
         Raises:
-            UnreadableImageError: a file is damaged or not of the calibration's size.
+            UnreadableImageError: a file is damaged, or its size differs from the calibration.
             TypeError: the source cannot seek.
         """
         return self._stored()[index].read(image_map)
 
     def _stored(self) -> tuple[TimedFrame, ...]:
         if not self.seekable:
-            raise TypeError(f"{self.name}: the frames of a stream come one by one, in order")
+            raise TypeError(f"{self.name}: the frames of a stream can only be read in order")
         return self.stored
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Source(_Frames):
-    """Rectified stereo images, left images alone, or images with depth.
+    """A source of rectified images: stereo pairs, left images only, or images with depth.
 
     Attributes:
-        dataset: kind of source, ``kitti`` or ``video`` for example.
+        dataset: kind of source, for example ``kitti`` or ``video``.
         name: name of the sequence, file or device.
-        camera: calibration; ``camera.sensor`` is the kind of images in the frames.
+        camera: calibration; ``camera.sensor`` tells which images the frames have.
         stored: N frames that can be read in any order; see `stored_frames`.
         play: yields the frames of a stream, which cannot seek; None if they are stored.
-        n_expected: the number of frames, approximate for a stream, or None if unknown.
-        live: frames arrive in real time and are lost if they are not read, as from a camera.
+        n_expected: the number of frames, approximate for a stream; None if unknown.
+        live: whether frames arrive in real time and are lost if they are not read, as from a
+            camera.
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames without a pose, or None.
-        rectify_mask: maps an ``(H, W)`` uint8 mask of the left images as they were taken to one of
-            the rectified images; None if the images were not changed.
+        rectify_mask: rectifies an ``(H, W)`` uint8 mask of the original left images; None if the
+            images are not rectified by vslam.
 
     Raises:
         InputError: the times of stored frames do not increase.
@@ -153,7 +156,7 @@ class Source(_Frames):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RawSource(_Frames):
-    """Images as the cameras took them; see `Source` for the other attributes.
+    """A source of unrectified images; see `Source` for the other attributes.
 
     Attributes:
         sizes: width and height of each camera's images; one entry if the second images are depth.
@@ -169,35 +172,19 @@ _AnySource = TypeVar("_AnySource", Source, RawSource)
 
 
 def stored_frames(
-    timestamps: NDArray[np.float64],
-    read: Callable[[int, ImageMap], Images],
-    files: Several[Path] | None = None,
-    colour: Callable[[Path], NDArray[np.uint8]] | None = None,
+    timestamps: NDArray[np.float64], read: Callable[[int, ImageMap], Images]
 ) -> tuple[TimedFrame, ...]:
-    """Frames that one function reads by their index.
+    """Make stored frames from a function that reads the images of any of them.
 
     Args:
         timestamps: ``(N,)`` float64 seconds, increasing.
-        read: decodes the frame of an index, see `TimedFrame`.
-        files: the files of the left images.
-        colour: decodes a file in colour, see `TimedFrame`.
+        read: decodes the images of the frame with a given index, see `TimedFrame`.
     """
-    frames = [TimedFrame(time, partial(read, k)) for k, time in enumerate(timestamps.tolist())]
-    if files is None:
-        return tuple(frames)
-    return tuple(
-        replace(
-            frame,
-            file=file,
-            colour=None if colour is None else partial(colour, file),
-            name=file.name,
-        )
-        for frame, file in zip(frames, files, strict=True)
-    )
+    return tuple(TimedFrame(time, partial(read, k)) for k, time in enumerate(timestamps.tolist()))
 
 
 def decoded(sides: Several[Callable[[], Image | DepthImage]], image_map: ImageMap = map) -> Images:
-    """The images of a frame, each from a function that decodes one side."""
+    """Decode the images of a frame, with one function per image."""
     left, *second = image_map(_call, sides)
     return np.asarray(left, np.uint8), second[0] if second else None
 
@@ -209,10 +196,10 @@ def _call(decode: Callable[[], Image | DepthImage]) -> Image | DepthImage:
 def selected(
     source: _AnySource, *, start: int = 0, every: int = 1, max_frames: int | None = None
 ) -> _AnySource:
-    """Select every N-th frame of a source from frame ``start`` on.
+    """Select every ``every``-th frame of a source from frame ``start`` on, at most ``max_frames``.
 
     Raises:
-        InputError: options out of range, or a start beyond the last frame.
+        InputError: an option is out of range, or ``start`` is beyond the last frame.
     """
     if start < 0 or every < 1 or (max_frames is not None and max_frames < 1):
         raise InputError("--start must be at least 0, --every and --max-frames at least 1.")
@@ -243,12 +230,12 @@ def _play_selected(source: Source | RawSource, chosen: slice) -> Iterator[TimedF
 
 
 def _increasing(frames: Iterator[TimedFrame], name: str) -> Iterator[TimedFrame]:
-    """Leave out frames that are not later than their predecessor, with a warning for each."""
+    """Skip frames that are not later than the last one yielded, with a warning for each."""
     last = None
     for frame in frames:
         if last is not None and frame.timestamp <= last:
             _log.warning(
-                "%s: the frame at %.6f s is left out because it comes after the one at %.6f s",
+                "%s: the frame at %.6f s is skipped because it comes after the one at %.6f s",
                 name,
                 frame.timestamp,
                 last,
@@ -259,11 +246,9 @@ def _increasing(frames: Iterator[TimedFrame], name: str) -> Iterator[TimedFrame]
 
 
 def frames_at(source: Source, indices: Several[int]) -> Iterator[TimedFrame]:
-    """Yield selected frames of a source; a stream is played up to the last of them. There are
-    fewer frames if the source ends early.
+    """Yield the frames with these increasing indices; a stream is read up to the last of them.
 
-    Args:
-        indices: indices of the frames, increasing.
+    Fewer frames are yielded if the source ends early.
     """
     if source.seekable:
         yield from (source.stored[k] for k in indices if k < len(source))
@@ -274,13 +259,13 @@ def frames_at(source: Source, indices: Several[int]) -> Iterator[TimedFrame]:
 
 
 def first_frames(source: Source) -> Source:
-    """Load the first frames of a stream into memory, so that they can be read in any order. A
-    source that can seek is returned unchanged.
+    """Load the first frames of a stream into memory, so that they can be read in any order.
 
-    A frame that cannot be decoded raises its UnreadableImageError whenever it is read.
+    A source that can seek is returned unchanged. A frame that cannot be decoded raises its
+    UnreadableImageError whenever it is read.
 
     Raises:
-        InputError: there is no frame.
+        InputError: the stream has no frames.
     """
     if source.seekable:
         return source
@@ -288,7 +273,7 @@ def first_frames(source: Source) -> Source:
     problem = "it has no frames"
     try:
         for frame in islice(source.frames(), _FIRST_FRAMES):
-            frames.append(_held(frame))
+            frames.append(_preloaded(frame))
     except BrokenSourceError as error:
         problem = str(error).rstrip(".")
     if not frames:
@@ -296,8 +281,8 @@ def first_frames(source: Source) -> Source:
     return replace(source, stored=tuple(frames), play=None, live=False)
 
 
-def _held(frame: TimedFrame) -> TimedFrame:
-    """Decode a frame now; keep the images, or the error that decoding raised."""
+def _preloaded(frame: TimedFrame) -> TimedFrame:
+    """Decode a frame now, and keep its images or the error that decoding raised."""
     images: Images | UnreadableImageError
     try:
         images = frame.read(map)

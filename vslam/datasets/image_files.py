@@ -1,4 +1,4 @@
-"""Shared code of readers of image files: finding files, and decoding images and depth."""
+"""Code that the readers of image files share: finding files, and decoding images and depth."""
 
 from __future__ import annotations
 
@@ -7,18 +7,20 @@ from collections.abc import Sequence as Several
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.calibration.models import Calibration
-from vslam.camera import Camera, DepthImage, Image, ImageMap
-from vslam.datasets.frames import Images, RawSource, Size, decoded, stored_frames
+from vslam.camera import Camera, DepthImage, Image
+from vslam.datasets.frames import RawSource, Size, TimedFrame, decoded
 from vslam.errors import InputError, UnreadableImageError
 from vslam.untrusted import MOST_PIXELS, require_utf8
 
 # Distance in metres from a Kinect's projector to its camera (ORB-SLAM2, section III-A).
 _VIRTUAL_BASELINE = 0.08
+_Time = TypeVar("_Time", int, float)
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
 
 
@@ -30,43 +32,45 @@ def checked_files(
     sides: Several[Several[Path]],
     depth_scale: float | None = None,
 ) -> RawSource:
-    """Check all files, decode the first images and make a source of image files.
+    """Make a source of image files: check that no file is empty, and decode the first images.
 
     Args:
         timestamps: ``(N,)`` float64 seconds.
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of the left camera, or None.
-        sides: N files of the left camera alone, and N of the right one, or N depth images.
-        depth_scale: units of the depth images per metre; None if there are none.
+        sides: N left images, optionally followed by N right images or N depth images.
+        depth_scale: depth image units per metre; None if there are no depth images.
 
     Raises:
-        UnreadableImageError: a file is empty, the first frame cannot be decoded, or depth has
-            another size than the image or not 16 bits.
+        UnreadableImageError: a file is empty, the first frame cannot be decoded, or its depth does
+            not have 16 bits or the size of the image.
     """
     for path in (path for side in sides for path in side):
         check_not_empty(path)
     depth = depth_scale is not None
     sizes = tuple(image_size(side[0]) for side in (sides[:1] if depth else sides))
-    grey = [partial(_read_grey_of, size) for size in sizes]
-    readers: list[Callable[[Path], Image | DepthImage]] = [*grey]
-    if depth_scale is not None:
-        readers.append(partial(_read_depth, sizes[0], depth_scale))
 
-    def read(index: int, image_map: ImageMap) -> Images:
-        each = [partial(reader, side[index]) for reader, side in zip(readers, sides, strict=True)]
-        return decoded(each, image_map)
-
-    stored = stored_frames(timestamps, read, sides[0], read_colour)
-    if len(sizes) == 2:
-        stored = tuple(
-            replace(frame, sides=(partial(grey[0], left), partial(grey[1], right)))
-            for frame, left, right in zip(stored, *sides, strict=True)
+    def frame(timestamp: float, *files: Path) -> TimedFrame:
+        grey = [
+            partial(_read_grey_of, size, file) for size, file in zip(sizes, files, strict=False)
+        ]
+        decoders: list[Callable[[], Image | DepthImage]] = [*grey]
+        if depth_scale is not None:
+            decoders.append(partial(_read_depth, sizes[0], depth_scale, files[1]))
+        return TimedFrame(
+            timestamp,
+            partial(decoded, decoders),
+            sides=(grey[0], grey[1]) if len(grey) == 2 else None,
+            file=files[0],
+            colour=partial(read_colour, files[0]),
+            name=files[0].name,
         )
+
     source = RawSource(
         dataset=dataset,
         name=name,
         sizes=sizes,
         depth=depth,
-        stored=stored,
+        stored=tuple(map(frame, timestamps.tolist(), *sides)),
         ground_truth=ground_truth,
     )
     if depth:
@@ -75,17 +79,17 @@ def checked_files(
 
 
 def image_size(path: Path) -> Size:
-    """Width and height.
+    """Width and height of an image file.
 
     Raises:
-        UnreadableImageError: missing or damaged.
+        UnreadableImageError: the file is missing or damaged.
     """
     height, width = read_grey(path).shape
     return width, height
 
 
 def list_images(folder: Path) -> dict[str, Path]:
-    """Image files of a folder by stem, in the order of their names; empty if there is no folder.
+    """Image files of a folder by stem, sorted by name; empty if there is no such folder.
 
     Raises:
         InputError: a file name is not UTF-8.
@@ -103,14 +107,57 @@ def is_image(path: Path) -> bool:
     return path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
 
 
-def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bool]) -> Path | None:
-    """Folder of a sequence: one in ``root``, or ``root`` itself; None if there is no sequence.
+def read_image_list(
+    path: Path, parsed: Callable[[str], tuple[_Time, str]], time: str, instead: str
+) -> tuple[list[_Time], list[str]]:
+    """Read the times and file names of images from the lines of a file; # begins a comment.
 
     Args:
-        name: name of the folder; None for ``root`` itself, or the only sequence in it.
+        parsed: time and file name in a line; raises ValueError if it is malformed.
+        time: what the time is, for error messages.
+        instead: what the user can do without the file, for error messages; may be empty.
 
     Raises:
-        InputError: no sequence of this name, or several and no name.
+        InputError: the file is missing, empty or malformed, or the times do not increase.
+    """
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"{path}: the list of images is missing or not a text file; unpack the sequence again"
+            f"{instead and ', or '}{instead}."
+        ) from error
+    times: list[_Time] = []
+    names: list[str] = []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        try:
+            at, name = parsed(line)
+        except ValueError:
+            name = ""
+        if not name:
+            raise InputError(f"{path}: line {number} is not {time} and a file name; repair it.")
+        if times and at <= times[-1]:
+            raise InputError(
+                f"{path}: line {number} is not later than the one before it; sort the list by time."
+            )
+        times.append(at)
+        names.append(name)
+    if not times:
+        raise InputError(f"{path}: the list of images is empty; unpack the sequence again.")
+    return times, names
+
+
+def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bool]) -> Path | None:
+    """Find the folder of a sequence: ``root`` or a folder in it; None if there is no sequence.
+
+    Args:
+        name: name of the sequence's folder; None for ``root`` itself, or the only sequence in it.
+        is_sequence: whether a folder holds a sequence.
+
+    Raises:
+        InputError: no sequence has this name, or there are several and ``name`` is None.
     """
     if name is not None and is_sequence(root / name):
         return root / name
@@ -134,10 +181,13 @@ def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bo
 def select_frames(
     source: Path, n: int, start: int, every: int, max_frames: int | None
 ) -> NDArray[np.int64]:
-    """Numbers of the frames that ``start``, ``every`` and ``max_frames`` select from n > 0 frames.
+    """Indices of the frames that ``start``, ``every`` and ``max_frames`` select from n > 0 frames.
+
+    Args:
+        source: folder to name in error messages.
 
     Raises:
-        InputError: options out of range, or a start beyond the last frame of ``source``.
+        InputError: an option is out of range, or ``start`` is beyond the last frame.
     """
     if start < 0 or every < 1 or (max_frames is not None and max_frames < 1):
         raise InputError("--start must be at least 0, --every and --max-frames at least 1.")
@@ -147,25 +197,26 @@ def select_frames(
 
 
 def check_not_empty(path: Path) -> None:
-    """Refuse a file without contents.
+    """Check that a file has contents.
 
     Raises:
-        UnreadableImageError: the file is empty, or a link to nowhere.
+        UnreadableImageError: the file is missing, empty, or a dangling link.
     """
     try:
         empty = path.stat().st_size == 0
-    except (OSError, ValueError):  # ValueError: a path with a zero byte
-        empty = True
+    except (OSError, ValueError) as error:  # ValueError: a path with a zero byte
+        raise UnreadableImageError(path, "no such file; unpack the data again.") from error
     if empty:
         raise UnreadableImageError(path, "the file is empty; download it again.")
 
 
 def read_grey(path: Path) -> Image:
-    """Decode an image file: ``(H, W)`` uint8. Colours are converted to grey by ITU-R BT.601; of
-    16 bits, the upper eight are used.
+    """Decode an image file to ``(H, W)`` uint8.
+
+    Colours are converted to grey by ITU-R BT.601; 16-bit values keep their upper eight bits.
 
     Raises:
-        UnreadableImageError: missing, damaged or larger than `MOST_PIXELS`.
+        UnreadableImageError: the file is missing, damaged or larger than `MOST_PIXELS`.
     """
     import cv2
 
@@ -190,7 +241,7 @@ def read_grey(path: Path) -> Image:
 
 
 def read_colour(path: Path) -> NDArray[np.uint8]:
-    """Decode an image file: ``(H, W, 3)`` uint8 red, green, blue, or ``(H, W)`` if it is grey.
+    """Decode an image file to ``(H, W, 3)`` uint8 red, green, blue, or ``(H, W)`` if it is grey.
 
     Raises:
         UnreadableImageError: as `read_grey`.
@@ -199,7 +250,7 @@ def read_colour(path: Path) -> NDArray[np.uint8]:
 
     from vslam.datasets.png import decode_with_opencv
 
-    grey = read_grey(path)  # refuses what cannot be decoded
+    grey = read_grey(path)  # raises if the file cannot be decoded
     decoded = decode_with_opencv(path.read_bytes(), cv2.IMREAD_ANYCOLOR)
     if decoded is None or decoded.ndim == 2:
         return grey
@@ -207,13 +258,13 @@ def read_colour(path: Path) -> NDArray[np.uint8]:
 
 
 def _read_grey_of(size: Size, path: Path) -> Image:
-    """As `read_grey`, and check that the image has the size of the first one."""
+    """Decode an image as `read_grey`, and check that it has the size of the first one."""
     image = read_grey(path)
     if image.shape != size[::-1]:
         raise UnreadableImageError(
             path,
-            f"{size_text(image.shape)} pixels where the first image has {size[0]}x{size[1]}; "
-            "replace it by the original.",
+            f"has {size_text(image.shape)} pixels but the first image has {size[0]}x{size[1]}; "
+            "replace it with the original.",
         )
     return image
 
@@ -224,7 +275,7 @@ def size_text(shape: tuple[int, ...]) -> str:
 
 
 def with_depth(camera: Camera, calibration: Calibration) -> Camera:
-    """Give an RGB-D camera the calibration's virtual baseline, or that of a Kinect."""
+    """The camera for RGB-D images, with the calibration's virtual baseline or that of a Kinect."""
     baseline = calibration.virtual_baseline or _VIRTUAL_BASELINE
     return replace(camera, baseline=baseline, depth=True)
 
@@ -244,13 +295,13 @@ def _read_depth(size: Size, scale: float, path: Path) -> DepthImage:
         channels = 1 if image.ndim == 2 else image.shape[2]
         raise UnreadableImageError(
             path,
-            f"depth of {8 * image.dtype.itemsize} bits and {channels} channels, but it must be one "
-            "channel of 16 bits; take the original.",
+            f"the depth has {8 * image.dtype.itemsize} bits and {channels} channels, but must have "
+            "16 bits and one channel; take the original.",
         )
     if image.shape != size[::-1]:
         raise UnreadableImageError(
             path,
-            f"depth has {size_text(image.shape)} pixels but the colour image has "
+            f"the depth has {size_text(image.shape)} pixels but the colour image has "
             f"{size[0]}x{size[1]}; take depth that is registered to the colour images.",
         )
     return np.asarray(image, np.uint16) * np.float32(1.0 / scale)

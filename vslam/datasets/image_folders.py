@@ -1,15 +1,15 @@
 """Folders of images: one folder for a single camera, two for a stereo pair or images with depth.
 
-A pair is two folders beside each other, named as in `PAIRS` or `DEPTH_PAIRS`, or given by
-``--right`` or ``--depth``. Its images are paired by name. If no name occurs on both sides and both
-have the same number of images, they are paired by order; images and depth images whose names are
-different times are paired by time, within 20 ms. Times come from the first available of these:
+A pair is two folders in one folder, named as in `PAIRS` or `DEPTH_PAIRS`, or given by ``--right``
+or ``--depth``. Images with the same name form a pair. If the two folders share no name but have the
+same number of images, these are paired in order. Depth images whose names are times are paired with
+images less than 20 ms apart. Times are taken from the first of these that exists:
 
 1. ``--fps``;
-2. ``times.txt`` or ``timestamps.txt``, in the folder of the images or its parent, with one line
-   per image: its time in seconds;
-3. file names that are times since 1970: seconds with a decimal point, or whole s, ms, us or ns,
-   distinguished by their magnitude; smaller numbers are counters;
+2. ``times.txt`` or ``timestamps.txt`` in the folder of the images or its parent, which holds the
+   time of one image in seconds per line;
+3. file names that are times since 1970: seconds with a decimal point, or integers in s, ms, us or
+   ns, which their magnitude tells apart; smaller integers are counters;
 4. ``DateTimeOriginal`` with ``SubSecTimeOriginal`` in the images' EXIF.
 """
 
@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.datasets.association import associate
+from vslam.datasets.association import associate, warn_of_unpaired
 from vslam.datasets.frames import RawSource
 from vslam.datasets.image_files import (
     checked_files,
@@ -43,15 +43,13 @@ PAIRS = (
     ("cam0/data", "cam1/data"),
 )
 DEPTH_PAIRS = (("rgb", "depth"), ("color", "depth"), ("colour", "depth"), ("image", "depth"))
-_SLOWEST_S = 10.0  # between images; at a longer interval, tracking is impossible
-_NEAR_S = 0.02  # as TUM's associate.py
+_LONGEST_INTERVAL_S = 10.0  # tracking is impossible at longer intervals
+_NEAR_S = 0.02  # as in TUM's associate.py
 _TIME_FILES = ("times.txt", "timestamps.txt")
 _EXIF = 0x8769  # tags of EXIF 2.32
 _DATE_TIME_ORIGINAL, _SUB_SEC_TIME_ORIGINAL = 0x9003, 0x9291
-# The year 2001 in seconds. Smaller whole numbers are counters; the magnitude of larger ones
-# determines their unit.
-_FIRST_TIME = 1e9
-_UNITS = ((1e17, 10**9), (1e14, 10**6), (1e11, 10**3), (_FIRST_TIME, 1))
+# Smallest integer of each unit, and units per second. 1e9 s is in the year 2001.
+_UNITS = ((1e17, 10**9), (1e14, 10**6), (1e11, 10**3), (1e9, 1))
 
 
 def has_images(folder: Path) -> bool:
@@ -66,7 +64,9 @@ class ImageFolders:
 
     Attributes:
         name: name of the folder.
-        sides: N image files each: left and right images, images and depth, or one camera's images.
+        timestamps: ``(N,)`` float64 seconds, increasing.
+        sides: N image files each of the left and right camera, of images and depth, or of one
+            camera.
         depth: whether the second side is the depth of the first one.
         size: width and height of the first image.
     """
@@ -78,23 +78,22 @@ class ImageFolders:
     size: tuple[int, int]
 
     def source(self, depth_scale: float | None) -> RawSource:
-        """The images as a source.
+        """Make a source of the images.
 
         Args:
-            depth_scale: units of the depth images per metre; needed only for depth images.
+            depth_scale: depth image units per metre; needed only for depth images.
 
         Raises:
             InputError: there are depth images but no scale.
             UnreadableImageError: a file is empty, or the first frame cannot be decoded.
         """
-        if not self.depth:
-            return checked_files("images", self.name, self.timestamps, None, self.sides)
-        if depth_scale is None:
+        if self.depth and depth_scale is None:
             raise InputError(
                 f"{self.sides[1][0].parent}: the unit of the depth images is unknown; give "
                 "--depth-scale, 1000 for millimetres, or depth_scale in the calibration."
             )
-        return checked_files("images", self.name, self.timestamps, None, self.sides, depth_scale)
+        scale = depth_scale if self.depth else None
+        return checked_files("images", self.name, self.timestamps, None, self.sides, scale)
 
 
 def open_images(
@@ -114,8 +113,10 @@ def open_images(
         folder: folder of the images, or the folder that holds both folders of a pair.
         right: folder of the right images if ``folder`` holds the left ones.
         depth: folder of the depth images if ``folder`` holds the images.
-        fps: frames per second, instead of time stamps.
-        sensor: ``stereo``, ``rgbd``, or ``mono`` for the left images alone; None reads all images
+        fps: frames per second, which replace the images' time stamps.
+        start, every, max_frames: read every ``every``-th frame from frame ``start`` on, at most
+            ``max_frames``.
+        sensor: ``stereo``, ``rgbd``, or ``mono`` for only the left images; None reads all images
             that are found.
 
     Raises:
@@ -149,11 +150,9 @@ def _find_sides(
         raise InputError(f"{folder}: no such folder; name a folder of images with --data.")
     if right is not None and depth is not None:
         raise InputError(f"--depth {depth}: contradicts --right; leave one of them out.")
-    if right is not None or depth is not None:
-        return [
-            folder,
-            *(place for place in (right, depth) if place is not None),
-        ], depth is not None
+    for second in (right, depth):
+        if second is not None:
+            return [folder, second], second is depth
     wanted = [(names, False) for names in PAIRS if sensor != "rgbd"]
     wanted += [(names, True) for names in DEPTH_PAIRS if sensor != "stereo"]
     n = 1 if sensor == "mono" else 2
@@ -164,14 +163,11 @@ def _find_sides(
     if sensor != "mono":
         kinds = {None: PAIRS + DEPTH_PAIRS[:1], "stereo": PAIRS, "rgbd": DEPTH_PAIRS}[sensor]
         pairs = ", ".join(" and ".join(names) for names in kinds)
-        option = (
-            "that of the depth with --depth"
-            if sensor == "rgbd"
-            else ("that of the right ones with --right")
-        )
+        first, option = ("colour", "--depth") if sensor == "rgbd" else ("left", "--right")
         raise InputError(
-            f"{folder}: images of a pair are looked for in {pairs}{_near_miss(folder)}; name the "
-            f"folder of the first ones with --data and {option}, or run with --sensor mono."
+            f"{folder}: found no pairs of images in {pairs}{_near_miss(folder)}; name the folder "
+            f"of the {first} images with --data and the other folder with {option}, or run with "
+            "--sensor mono."
         )
     return [folder], False
 
@@ -181,7 +177,7 @@ def _near_miss(folder: Path) -> str:
     above = folder.resolve().parent
     for names in PAIRS + DEPTH_PAIRS:
         if all(list_images(above / name) for name in names) and folder.resolve().name in names:
-            return f", and {above} has both (name that with --data)"
+            return f", but {above} has both (name it with --data)"
         sides = [bool(list_images(folder / name)) for name in names]
         if any(sides):
             there, missing = names if sides[0] else names[::-1]
@@ -190,8 +186,7 @@ def _near_miss(folder: Path) -> str:
 
 
 def _sorted_images(folder: Path) -> dict[str, Path]:
-    """Images by stem: in the order of time if all names are times, else in natural order, which
-    puts 2 before 10."""
+    """Images by stem, sorted by time if all names are times, else naturally (2 before 10)."""
     images = list_images(folder)
     if not images:
         raise InputError(f"{folder}: no images in this folder; name another.")
@@ -208,7 +203,7 @@ def _sorted_images(folder: Path) -> dict[str, Path]:
 def _matched(
     sides: list[dict[str, Path]], folders: list[Path], *, by_time: bool
 ) -> list[list[Path]]:
-    """The files of each side in order, the same number on both sides."""
+    """The files of each folder, in the order of the pairs that they form."""
     first, *rest = sides
     for other in rest:
         if first.keys() == other.keys():
@@ -217,14 +212,15 @@ def _matched(
             return pairs
         if len(other) != len(first) or first.keys() & other.keys():
             raise InputError(
-                f"{folders[1]}: {len(other)} images but {len(first)} in {folders[0]}, "
-                f"{min(first.keys() ^ other.keys())} on one side only; remove what has no partner."
+                f"{folders[1]}: {len(other)} images but {len(first)} in {folders[0]}, and "
+                f"{min(first.keys() ^ other.keys())} is in only one of them; remove the images "
+                "without a partner."
             )
     return [list(side.values()) for side in sides]
 
 
 def _near_in_time(first: dict[str, Path], second: dict[str, Path]) -> list[list[Path]] | None:
-    """Files of both sides whose names are times near each other; None if names are not times."""
+    """Files of both folders, paired by the times in their names; None if these are not times."""
     files = [list(side.values()) for side in (first, second)]
     times = [[_time_of_name(path) for path in side] for side in files]
     if any(time is None for side in times for time in side):
@@ -236,6 +232,7 @@ def _near_in_time(first: dict[str, Path], second: dict[str, Path]) -> list[list[
             f"{files[1][0].parent}: by the times in their names, no depth image is within 20 ms of "
             "an image; name folders of one recording."
         )
+    warn_of_unpaired(files[0][0].parent, len(pairs[0]), len(colour))
     return [[side[k] for k in chosen] for side, chosen in zip(files, pairs, strict=True)]
 
 
@@ -244,13 +241,13 @@ def _find_times(folder: Path, files: list[Path]) -> NDArray[np.float64]:
         for name in _TIME_FILES:
             if (place / name).is_file():
                 return _times_of_file(place / name, len(files))
-    ways: tuple[Callable[[Path], float | None], ...] = (_time_of_name, _time_of_exif)
-    for way in ways:
-        if way(files[0]) is not None:
-            times = [way(path) for path in files]
+    readers: tuple[Callable[[Path], float | None], ...] = (_time_of_name, _time_of_exif)
+    for time_of in readers:
+        if time_of(files[0]) is not None:
+            times = [time_of(path) for path in files]
             missing = next((p for p, t in zip(files, times, strict=True) if t is None), None)
             if missing is not None:
-                raise InputError(f"{missing}: no time, unlike {files[0].name}; give --fps.")
+                raise InputError(f"{missing}: has no time, unlike {files[0].name}; give --fps.")
             return np.array(times, np.float64)
     raise InputError(
         f"{folder}: the images have no time stamps (no {' or '.join(_TIME_FILES)}, none in their "
@@ -262,7 +259,7 @@ def _times_of_file(path: Path, n: int) -> NDArray[np.float64]:
     times = read_table(path, (1,), "a time in seconds")[:, 0]
     if len(times) != n:
         raise InputError(f"{path}: {len(times)} times for {n} images; write one line per image.")
-    if n > 1 and (interval := float(np.median(np.diff(times)))) > _SLOWEST_S:
+    if n > 1 and (interval := float(np.median(np.diff(times)))) > _LONGEST_INTERVAL_S:
         raise InputError(
             f"{path}: the images are {interval:g} s apart, as if the times were in milliseconds or "
             "nanoseconds; write seconds, or give --fps."
@@ -283,7 +280,7 @@ def _time_of_name(path: Path) -> float | None:
 
 
 def _time_of_exif(path: Path) -> float | None:
-    """Seconds since 1970 by the camera's clock; None without EXIF."""
+    """Seconds since 1970 by the camera's clock; None if the image has no such EXIF tags."""
     from PIL import Image as PillowImage
 
     try:

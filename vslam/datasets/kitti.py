@@ -1,4 +1,4 @@
-"""KITTI odometry, grey stereo [Geiger et al., CVPR 2012].
+"""Grey stereo sequences of KITTI odometry [Geiger et al., CVPR 2012].
 
 root/sequences/NN/{image_0,image_1}/000000.png   left and right camera, rectified; .jpg, .webp too
 root/sequences/NN/{calib.txt,times.txt}
@@ -36,23 +36,23 @@ def open_kitti(
 ) -> Source:
     """Open a sequence; only the selected frames must be complete.
 
-    Frame k has row k of ``times.txt`` and of the poses. If those files have more rows than there
-    are images, k is the number in the file name, so that an excerpt of a sequence works with the
-    files of the whole one.
+    Row k of ``times.txt`` and of the poses belongs to the k-th image. If a file has more rows than
+    there are images, k is the number in the image's file name, so that an excerpt of a sequence
+    works with the files of the whole sequence.
 
     Args:
         root: folder that holds ``sequences`` (or ``dataset/sequences``, as KITTI's archives unpack)
             and, optionally, ``poses``.
         name: name of the sequence, for example ``00``.
-        start, every, max_frames: selects every N-th of the images present, from a first one on, up
-            to a number.
-        monocular: read the left camera alone; the right camera's images need not exist.
+        start, every, max_frames: read every ``every``-th of the existing frames from frame
+            ``start`` on, at most ``max_frames``.
+        monocular: read only the left camera; the right camera's images need not exist.
         calib: calibration files, which replace ``calib.txt``; the images are then rectified as they
             are read.
 
     Raises:
-        InputError: data is missing, the sides have different images, or calibration, times or poses
-            are unusable.
+        InputError: data is missing, an image lacks its partner, or calibration, times or poses are
+            unusable.
         UnreadableImageError: the first pair cannot be decoded.
     """
     base = _find_root(root)
@@ -74,8 +74,8 @@ def open_kitti(
     if right and right[0] != left:
         raise UnreadableImageError(
             sides[1][0],
-            f"{right[0]} pixels but the left image has {left}; use the rectified images of both "
-            "cameras.",
+            f"has {right[0]} pixels but the left image has {left}; use the rectified images of "
+            "both cameras.",
         )
     if calib:
         return rectified(images, calibration_files.read_calibration(calib, images.sizes[0]))
@@ -94,7 +94,7 @@ def list_kitti(root: Path | str) -> list[tuple[str, int, int]]:
     """The name of each sequence in ``root``, and its numbers of left and right images.
 
     Raises:
-        InputError: no KITTI data there.
+        InputError: ``root`` holds no KITTI data.
     """
     folders = sorted(p for p in (_find_root(root) / "sequences").iterdir() if p.is_dir())
     return [
@@ -108,12 +108,11 @@ def read_calibration(
     """Read P0 and P1 of ``calib.txt``, with or without the ``P0:`` at the beginning of the line.
 
     Args:
-        path: file to read.
         width, height: image size in pixels, which the file does not state.
-        monocular: read P0 alone; P1 need not be there.
+        monocular: read only P0; P1 may be missing.
 
     Raises:
-        InputError: the file is missing or malformed, or its values are not those of a rectified
+        InputError: the file is missing or malformed, or its values do not describe a rectified
             pair.
     """
     fix = "take calib.txt of this sequence from KITTI's calibration files"
@@ -168,7 +167,7 @@ def _find_sequence(base: Path, name: str) -> Path:
     found = sorted(p for p in (base / "sequences").iterdir() if p.is_dir())
     if name not in [p.name for p in found]:
         there = [p.name for p in found if list_images(p / "image_0")]
-        choice = f"choose one of {', '.join(there)}" if there else "there are no images of others"
+        choice = f"choose one of {', '.join(there)}" if there else "no sequence there has images"
         raise InputError(f"{folder}: no such sequence; {choice}.")
     return folder
 
@@ -180,13 +179,14 @@ def _by_number(stem: str) -> tuple[int, str]:
 def _check_frames(
     folder: Path, sides: list[dict[str, Path]], stems: list[str]
 ) -> list[tuple[Path, ...]]:
-    """The files of these stems on each side."""
+    """The files with these stems of each camera."""
     for side, images in enumerate(sides):
         if not images:
             instead = ", or run on the left camera alone with --sensor mono" if side else ""
             raise InputError(
-                f"{folder}/image_{side}: no images of the {('left', 'right')[side]} camera; stereo "
-                f"needs both, download the grayscale images (22 GB) from {_HOME}{instead}."
+                f"{folder}/image_{side}: no images of the {('left', 'right')[side]} camera, but "
+                "stereo needs both cameras; download the grayscale images (22 GB) from "
+                f"{_HOME}{instead}."
             )
     complete = [all(stem in side for side in sides) for stem in stems]
     if not all(complete):
@@ -213,7 +213,7 @@ def _read_times(path: Path) -> NDArray[np.float64]:
 
 
 def _row_numbers(path: Path, stems: list[str], n_rows: int) -> NDArray[np.int64]:
-    """The row of ``times.txt`` or of the poses that belongs to each image."""
+    """``(N,)`` row of ``times.txt`` or of the poses for each image."""
     fix = "take the file of this sequence from KITTI's archives"
     if n_rows < len(stems):
         raise InputError(f"{path}: only {n_rows} rows for {len(stems)} images; {fix}.")
@@ -233,7 +233,7 @@ def _read_ground_truth(
     poses = read_kitti_poses(path)
     if len(poses) not in (n_times, len(stems)):
         raise InputError(
-            f"{path}: has {len(poses)} poses, which fit neither {len(stems)} images nor {n_times} "
+            f"{path}: has {len(poses)} poses, but there are {len(stems)} images and {n_times} "
             "times; take the file of this sequence, or remove it to run without ground truth."
         )
     return poses[_row_numbers(path, stems, len(poses))[chosen]]

@@ -1,7 +1,7 @@
-"""Masks that belong to a source: which pixels of its left images are used.
+"""Masks that select which pixels of the left images of a source are used.
 
-As for COLMAP and OpenCV, a mask is black (0) where the image is not to be used and white (255)
-elsewhere. It has the size of the images as they were taken, and is rectified like them.
+As in COLMAP and OpenCV, a mask is black (0) at pixels to ignore and white (255) elsewhere. It has
+the size of the original images and is rectified together with them.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ ReadMask = Callable[[], Image]
 
 
 def with_masks(source: Source, path: Path, *, start: int = 0, every: int = 1) -> Source:
-    """A source whose frames have masks.
+    """Add masks to the frames of a source.
 
     Args:
-        path: one mask for all images; or a folder with a mask for each image. These are named like
-            the image files, with any suffix or with one more (``7.jpg.png``); if there are no image
-            files, by the number of the frame in the video or bag.
-        start, every: the frames that were selected from the source.
+        path: one mask for all images, or a folder with a mask for each image. A mask in a folder
+            has the name of its image file, with any suffix or with a second one (``7.jpg.png``), or
+            the number of its frame in a video or bag.
+        start, every: the options with which the frames were selected.
 
     Raises:
-        InputError: there is no such file or folder, an image has no mask, or a mask is not black
-            and white, has another size than the images or hides all of them. A mask that is wrong
-            for a single image raises UnreadableImageError when it is read.
+        InputError: there is no such file or folder, or a frame has no mask.
+        UnreadableImageError: the only or the first mask is not black and white, has another size
+            than the images or hides all of them. Other masks raise this error when they are read.
     """
     if not path.exists():
         raise InputError(f"--mask {path}: no such file or folder; name a mask or a folder of them.")
-    find = _in_folder(source, path) if path.is_dir() else _for_all(source, path)
+    find = _masks_in(source, path) if path.is_dir() else _one_mask(source, path)
 
     def masked(index: int, frame: TimedFrame) -> TimedFrame:
         return replace(frame, mask=find(frame.name, start + every * index))
@@ -48,19 +48,15 @@ def with_masks(source: Source, path: Path, *, start: int = 0, every: int = 1) ->
     return replace(source, stored=tuple(starmap(masked, enumerate(source.stored))))
 
 
-def _for_all(source: Source, path: Path) -> Callable[[str | None, int], ReadMask]:
+def _one_mask(source: Source, path: Path) -> Callable[[str | None, int], ReadMask]:
     mask = _read(source, path)
-
-    def read() -> Image:
-        return mask
-
-    return lambda name, number: read
+    return lambda name, number: lambda: mask
 
 
-def _in_folder(source: Source, folder: Path) -> Callable[[str | None, int], ReadMask]:
+def _masks_in(source: Source, folder: Path) -> Callable[[str | None, int], ReadMask]:
     files = list_images(folder)
     if not files:
-        raise InputError(f"--mask {folder}: holds no images; name a folder with a mask for each.")
+        raise InputError(f"--mask {folder}: holds no masks; name a folder with one for each image.")
     _read(source, next(iter(files.values())))
     by_number = {int(stem): file for stem, file in files.items() if stem.isdecimal()}
 
@@ -81,15 +77,15 @@ def _read(source: Source, path: Path) -> Image:
     mask, width, height = read_grey(path), source.camera.width, source.camera.height
     if mask.shape != (height, width):
         size = size_text(mask.shape)
-        why = f"{size} pixels where the images have {width}x{height}; give the mask their size."
+        why = f"has {size} pixels but the images have {width}x{height}; give the mask this size."
         raise UnreadableImageError(path, why)
     grey = np.bincount(mask.ravel(), minlength=256)[1:255]
     if grey.any():
         value = 1 + int(grey.argmax())
-        why = f"has pixels of {value}; make those to be used 255 (white) and the others 0 (black)."
+        why = f"has pixels of value {value}, but may only hold 0 (ignored) and 255 (used)."
         raise UnreadableImageError(path, why)
     if source.rectify_mask is not None:
         mask = source.rectify_mask(mask)
     if not mask.any():
-        raise UnreadableImageError(path, "hides the whole image; make white what is to be used.")
+        raise UnreadableImageError(path, "hides the whole image; paint used pixels white (255).")
     return mask

@@ -1,8 +1,8 @@
 """OAK-D cameras, read by depthai (version 3).
 
-A stereo pair is the two grey images, whose distortion the device removes; vslam rectifies them by
-the calibration in the device. RGB-D is the colour image with the depth of the device's own stereo
-matching, registered to the colour image by the device.
+A stereo pair consists of the two grey images; the device undistorts them, and vslam rectifies them
+with the device's calibration. RGB-D consists of the colour image and the depth from the device's
+stereo matching, which the device registers to the colour image.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from vslam.datasets.depth_cameras import FPS, TIMEOUT_S, DepthCamera, Grabbed, m
 from vslam.errors import InputError
 
 _SIZE = 640, 400
-_UNITS_PER_METRE = 1000.0  # of the depth
+_DEPTH_SCALE = 1000.0  # depth image units per metre
 _CM_PER_METRE = 100.0
 
 
@@ -25,12 +25,12 @@ def open_oakd(serial: str, sensor: str | None) -> DepthCamera:
     """Open a camera and read its calibration.
 
     Args:
-        serial: serial number of the device; empty for the first one.
+        serial: serial number of the device; empty for the first one found.
         sensor: ``stereo``, ``rgbd`` or ``mono``; None is ``stereo``.
 
     Raises:
-        InputError: depthai cannot be imported, or there is no such device, it is busy, or it
-            cannot deliver these images.
+        InputError: depthai cannot be imported, or the device is missing, busy or unable to deliver
+            these images.
     """
     sensor = sensor or "stereo"
     dai = maker_package("depthai", "oakd")
@@ -44,11 +44,11 @@ def open_oakd(serial: str, sensor: str | None) -> DepthCamera:
         pipeline.start()
         first = queue.get(timedelta(seconds=TIMEOUT_S))
         if first is None:
-            raise RuntimeError("it gives no image")
+            raise RuntimeError("it returns no image")
         calibration = _calibration(dai, device, first, sensor)
     except RuntimeError as error:
         raise InputError(
-            f"{name}: {error}; connect an OAK camera, and end other programs that use it."
+            f"{name}: {error}; connect an OAK camera, and close other programs that use it."
         ) from error
 
     def grab() -> Grabbed | None:
@@ -70,7 +70,7 @@ def open_oakd(serial: str, sensor: str | None) -> DepthCamera:
 
 
 def _queue(dai: Any, pipeline: Any, sensor: str) -> Any:
-    """The queue of groups of images of one time, ``left`` and ``second``; the newest waits."""
+    """A queue of synchronised images ``left`` and ``second``, which keeps only the newest ones."""
     create, node, socket = pipeline.create, dai.node, dai.CameraBoardSocket
 
     def output(side: Any, kind: Any = None, *, undistorted: bool = False) -> Any:
@@ -101,7 +101,7 @@ def _queue(dai: Any, pipeline: Any, sensor: str) -> Any:
 
 
 def _calibration(dai: Any, device: Any, images: Any, sensor: str) -> Calibration:
-    """What the first images and the memory of the device say."""
+    """The calibration, from the first images and the memory of the device."""
     socket, memory = dai.CameraBoardSocket, device.readCalibration()
     source = f"the calibration in oakd {device.getDeviceId()}"
     left = _model(images["left"], source)
@@ -112,16 +112,16 @@ def _calibration(dai: Any, device: Any, images: Any, sensor: str) -> Calibration
     if sensor == "stereo":
         return Calibration(left, _model(images["second"], source), T_left_right, source=source)
     baseline = float(np.linalg.norm(T_left_right[:3, 3]))
-    return Calibration(left, depth_scale=_UNITS_PER_METRE, virtual_baseline=baseline, source=source)
+    return Calibration(left, depth_scale=_DEPTH_SCALE, virtual_baseline=baseline, source=source)
 
 
 def _model(image: Any, source: str) -> CameraModel:
-    """The camera of an image whose distortion the device has removed."""
-    seen = image.getTransformation()
-    if any(seen.getDistortionCoefficients()):  # such a device has an old format in its memory
+    """The camera model of an image that the device has undistorted."""
+    transformation = image.getTransformation()
+    if any(transformation.getDistortionCoefficients()):
         raise InputError(
-            f"{source}: it is too old for the device to remove the distortion; calibrate the "
-            "device again with Luxonis' tool."
+            f"{source}: has an old format, with which the device cannot undistort images; "
+            "calibrate the device again with Luxonis' tool."
         )
-    (fx, _, cx), (_, fy, cy), _ = seen.getIntrinsicMatrix()
+    (fx, _, cx), (_, fy, cy), _ = transformation.getIntrinsicMatrix()
     return CameraModel(fx, fy, cx, cy, image.getWidth(), image.getHeight())

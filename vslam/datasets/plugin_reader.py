@@ -1,4 +1,4 @@
-"""Sources opened by readers of other packages, with the same checks as vslam's own sources."""
+"""Sources that plug-ins of other packages read, with the same checks as vslam's own sources."""
 
 from __future__ import annotations
 
@@ -26,13 +26,12 @@ def open_plugin(
     max_frames: int | None,
     monocular: bool,
 ) -> Source:
-    """Let the package open a source, and select frames of it.
+    """Let a plug-in open a source, and select frames of it.
 
-    A later failure in the package costs one frame of a source that can seek, and ends a stream.
+    If the plug-in fails later, a source that can seek loses one frame, and a stream ends.
 
     Raises:
-        InputError: the reader refuses its input, the package is broken, or the result is no
-            `Source`.
+        InputError: the plug-in rejects its input, fails, or returns no valid `Source`.
         UnreadableImageError: the first frame of a source that can seek cannot be read.
     """
     raw = plugin.call(root, name)
@@ -55,9 +54,9 @@ def open_plugin(
 
 
 def _wrong_source(raw: object) -> str:
-    """What is wrong with the object that a package returned; empty if nothing is."""
+    """What is wrong with the object that a plug-in returned; empty if nothing is."""
     if not isinstance(raw, Source):
-        return f"gave {type(raw).__name__}, not vslam.datasets.frames.Source"
+        return f"returned {type(raw).__name__}, not vslam.datasets.frames.Source"
     if not isinstance(raw.camera, Camera):
         return f"camera is {type(raw.camera).__name__}, not vslam.camera.Camera"
     n = raw.n_expected
@@ -80,12 +79,13 @@ def _play(plugin: PlugIn, raw: Source, checked: partial[TimedFrame]) -> Iterator
         except Exception as error:  # other people's packages may raise anything
             raise BrokenSourceError(f"{plugin} failed ({reason(error)}).") from error
         if not np.isfinite(timestamp):
-            raise BrokenSourceError(f"{plugin} gave a frame of {timestamp} s.")
+            raise BrokenSourceError(f"{plugin} returned a frame with the time stamp {timestamp} s.")
         yield found
 
 
 def _checked(plugin: PlugIn, root: Path, camera: Camera, frame: TimedFrame, at: str) -> TimedFrame:
-    """A frame whose images are checked for the camera's size and type when they are read."""
+    """The frame, with a check of its images against the camera's size and type whenever they are
+    read."""
 
     def read(image_map: ImageMap) -> Images:
         try:
@@ -97,13 +97,14 @@ def _checked(plugin: PlugIn, root: Path, camera: Camera, frame: TimedFrame, at: 
             raise UnreadableImageError(root, why) from error
         second = None if camera.monocular else second
         if wrong := _wrong_images(left, second, camera):
-            raise UnreadableImageError(root, f"{plugin} gave {wrong} at {at}.")
+            raise UnreadableImageError(root, f"{plugin} returned {wrong} at {at}.")
         return left, second
 
     return replace(frame, read=read, sides=None)
 
 
 def _wrong_images(left: Image, second: Image | DepthImage | None, camera: Camera) -> str:
+    """The types and shapes of images that do not fit the camera; empty if they fit."""
     kinds: list[np.dtype[Any]] = [np.dtype(np.uint8)]
     if not camera.monocular:
         kinds.append(np.dtype(np.float32 if camera.depth else np.uint8))
@@ -111,4 +112,4 @@ def _wrong_images(left: Image, second: Image | DepthImage | None, camera: Camera
     found = [(getattr(x, "dtype", None), getattr(x, "shape", None)) for x in images]
     if found == [(kind, (camera.height, camera.width)) for kind in kinds]:
         return ""
-    return f"{' and '.join(f'{kind} {shape}' for kind, shape in found)}"
+    return " and ".join(f"{kind} {shape}" for kind, shape in found)

@@ -1,9 +1,9 @@
-"""Decoding PNG files as in rectified stereo sequences: grey, 8 bits, not interlaced.
+"""Fast decoding of 8-bit grey PNG files without interlacing, as in rectified stereo sequences.
 
 OpenCV's decoder spends as much time on undoing the line filters as on decompression, because every
 pixel depends on the one on its left. Here 32 lines are decoded at once, each one pixel behind the
-line above, so that a register holds one pixel of each (a wavefront). If no pixel is predicted from
-two others, as in all files that OpenCV writes, decoding line by line is faster.
+line above, so that one vector register holds a pixel of each line (a wavefront). If no pixel is
+predicted from two others, as in all files that OpenCV writes, decoding line by line is faster.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from vslam.untrusted import MOST_PIXELS
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 GREY_8_BITS = (8, 0, 0, 0, 0)  # depth, colour type, compression, filter method, no interlacing
-# Chunks that do not change pixels. Others may (transparency, orientation, animation).
+# Chunks that do not change pixels; others may do so (transparency, orientation, animation).
 WITHOUT_EFFECT = {b"gAMA", b"cHRM", b"sRGB", b"pHYs", b"tIME", b"tEXt", b"bKGD"}
 LANES = 32  # lines decoded at once
 _CHECK_SUM, _CHUNK, _NEXT_CHUNK = map(struct.Struct, (">I", ">I4s", ">II4s"))
@@ -30,8 +30,8 @@ _WIDEST = 1 << 15  # pixels per line; the buffers need 65 bytes per pixel of a l
 def decode_png(data: bytes) -> NDArray[np.uint8] | None:
     """Decode a PNG file of 8-bit grey levels to ``(H, W)`` uint8, exactly as libpng does.
 
-    Returns None if the file is of another kind, interlaced, or damaged, which all its check sums
-    are tested for. Another decoder may be able to read it.
+    Returns None if the file is of another kind, interlaced, or damaged according to its checksums;
+    another decoder may be able to read it.
     """
     import deflate
 
@@ -49,10 +49,10 @@ def decode_png(data: bytes) -> NDArray[np.uint8] | None:
 
 
 def _contents(data: bytes) -> tuple[tuple[int, int], bytes]:
-    """Height and width, and the joined image data.
+    """Height and width, and the compressed image data.
 
     Raises:
-        ValueError: not a file of this kind, or damaged.
+        ValueError, struct.error: the file is of another kind, or damaged.
     """
     chunks = _chunks(data)
     kind, header = next(chunks, (b"", b""))
@@ -60,26 +60,26 @@ def _contents(data: bytes) -> tuple[tuple[int, int], bytes]:
     if kind != b"IHDR" or tuple(form) != GREY_8_BITS:
         raise ValueError("not a PNG of 8-bit grey levels, not interlaced")
     if not 0 < width * height <= MOST_PIXELS or width > _WIDEST:
-        raise ValueError("too large, or without a pixel")
+        raise ValueError("too large, or empty")
     parts: list[memoryview] = []
     for kind, body in chunks:
         if kind == b"IDAT":
             parts.append(body)
         elif kind not in WITHOUT_EFFECT:
-            raise ValueError(f"chunk {kind!r}")
+            raise ValueError(f"unknown chunk {kind!r}")
     return (height, width), b"".join(parts)
 
 
 def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
-    """Kind and contents of every chunk but the last one.
+    """Yield the kind and the contents of every chunk but the last one.
 
     Raises:
-        ValueError, struct.error: the file is truncated, or a check sum is wrong.
+        ValueError, struct.error: the file is truncated, or a checksum is wrong.
     """
     import deflate
 
     if not data.startswith(SIGNATURE):
-        raise ValueError("no PNG")
+        raise ValueError("not a PNG file")
     view = memoryview(data)
     at = len(SIGNATURE)
     length, kind = _CHUNK.unpack_from(data, at)
@@ -87,18 +87,20 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
         end = at + 8 + length
         if kind == b"IEND":
             if _CHECK_SUM.unpack_from(data, end) != (deflate.crc32(view[at + 4 : end]),):
-                raise ValueError("wrong check sum")
+                raise ValueError("wrong checksum")
             return
         expected, next_length, next_kind = _NEXT_CHUNK.unpack_from(data, end)
         if deflate.crc32(view[at + 4 : end]) != expected:
-            raise ValueError("wrong check sum")
+            raise ValueError("wrong checksum")
         yield kind, view[at + 8 : end]
         at, length, kind = end + 4, next_length, next_kind
 
 
 def is_cut_off(data: bytes) -> bool:
     """Whether a file is a PNG with a chunk whose stated length exceeds the rest of the file.
-    libpng would allocate the stated length, up to 2 GB, before it reads the chunk."""
+
+    libpng would allocate the stated length, up to 2 GB, before it reads the chunk.
+    """
     at = len(SIGNATURE)
     while data.startswith(SIGNATURE) and at + _CHUNK.size <= len(data):
         length, kind = _CHUNK.unpack_from(data, at)
@@ -111,8 +113,8 @@ def is_cut_off(data: bytes) -> bool:
 
 
 def decode_with_opencv(data: bytes, flags: int) -> NDArray[Any] | None:
-    """Decode a file of any format by ``cv2.imdecode``; None if it cannot be decoded. Truncated PNG
-    files (`is_cut_off`) are refused first.
+    """Decode a file of any format by ``cv2.imdecode``; None if it cannot be decoded, or is a
+    truncated PNG file (`is_cut_off`).
 
     Raises:
         cv2.error: the image is too large, or the file is empty.
@@ -126,9 +128,9 @@ def decode_with_opencv(data: bytes, flags: int) -> NDArray[Any] | None:
 def unfilter(lines, image):
     """Undo the filters of ``(H, W + 1)`` uint8 lines, each of which begins with its filter number.
 
-    Lane l of step s decodes pixel s - l of the l-th line of a block. The pixels that it needs are
-    then decoded: the left one by the same lane, the two above by the previous lane, one and two
-    steps before.
+    Lane l of step s decodes pixel s - l of the l-th line of a block. The pixels that it depends on
+    are decoded by then: the left one by the same lane one step earlier, and the one above and its
+    left neighbour by the previous lane one and two steps earlier.
 
     Args:
         image: ``(H, W)`` uint8, output.
@@ -139,8 +141,9 @@ def unfilter(lines, image):
     height, width = image.shape
     n = np.uintp(width)
     steps = width + LANES - 1
-    # All lanes of each step. The decoded pixels follow a lane with the line above the block, and
-    # two steps of zeros, which stand for the pixels left of the image.
+    # Both arrays hold the lanes of each step side by side. ``decoded`` has an additional first lane
+    # with the line above the block, and begins with two steps of zeros for the pixels left of the
+    # image.
     coded = np.zeros(steps * LANES, np.uint8)
     decoded = np.zeros((steps + 2) * (LANES + 1), np.uint8)
     left, above = np.zeros(LANES, np.int16), np.zeros(LANES, np.int16)
@@ -174,7 +177,7 @@ def unfilter(lines, image):
 
 @inner_kernel
 def largest_filter(lines):
-    """The largest filter number of some lines."""
+    """The largest filter number of these lines."""
     largest = np.uint8(0)
     for y in range(len(lines)):
         largest = max(largest, lines[y, 0])

@@ -1,8 +1,9 @@
-"""RealSense cameras of the series D400, read by pyrealsense2.
+"""RealSense cameras of the D400 series, read by pyrealsense2.
 
-RGB-D is the colour image with the depth that the device measures with its pattern projector,
-registered to the colour image by librealsense. A stereo pair is the two infrared images, which the
-device rectifies; the projector is then off, because its dots would move with the camera.
+RGB-D consists of the colour image and the depth that the device measures with its pattern
+projector; librealsense registers the depth to the colour image. A stereo pair consists of the two
+infrared images, which the device rectifies; the projector is then off, because its dots would move
+with the camera.
 """
 
 from __future__ import annotations
@@ -15,19 +16,19 @@ from vslam.calibration.models import Calibration, CameraModel, without_zeros
 from vslam.datasets.depth_cameras import FPS, TIMEOUT_S, DepthCamera, Grabbed, maker_package
 from vslam.errors import InputError
 
-_SIZE = 848, 480  # what Intel recommends for the depth of these cameras
+_SIZE = 848, 480  # recommended by Intel for the depth of these cameras
 
 
 def open_realsense(serial: str, sensor: str | None) -> DepthCamera:
     """Open a camera and read its calibration.
 
     Args:
-        serial: serial number of the device; empty for the first one.
+        serial: serial number of the device; empty for the first one found.
         sensor: ``stereo``, ``rgbd`` or ``mono``; None is ``rgbd``.
 
     Raises:
-        InputError: pyrealsense2 cannot be imported, or there is no such device, it is busy, or it
-            cannot deliver these images.
+        InputError: pyrealsense2 cannot be imported, or the device is missing, busy or unable to
+            deliver these images.
     """
     sensor = sensor or "rgbd"
     rs = maker_package("pyrealsense2", "realsense")
@@ -45,22 +46,23 @@ def open_realsense(serial: str, sensor: str | None) -> DepthCamera:
     pipeline = rs.pipeline()
     try:
         depth_sensor = device.first_depth_sensor()
-        if depth_sensor.supports(rs.option.emitter_enabled):  # set first, so that no image has dots
+        # The projector is set before the stream starts, so that no stereo image shows its dots.
+        if depth_sensor.supports(rs.option.emitter_enabled):
             depth_sensor.set_option(rs.option.emitter_enabled, float(sensor == "rgbd"))
         profile = pipeline.start(config)
         calibration = _calibration(rs, profile, depth_sensor, sensor, serial)
     except RuntimeError as error:
         raise InputError(
-            f"realsense {serial}: {error}; connect it to a USB 3 port, and end other programs that "
-            "use it."
+            f"realsense {serial}: {error}; connect it to a USB 3 port, and close other programs "
+            "that use it."
         ) from error
     align = rs.align(rs.stream.color)
 
     def grab() -> Grabbed | None:
         try:
             while True:
-                came, frames = pipeline.try_wait_for_frames(1000 * TIMEOUT_S)
-                if not came:
+                arrived, frames = pipeline.try_wait_for_frames(1000 * TIMEOUT_S)
+                if not arrived:
                     return None
                 if sensor == "stereo":
                     images = [frames.get_infrared_frame(side) for side in (1, 2)]
@@ -69,7 +71,7 @@ def open_realsense(serial: str, sensor: str | None) -> DepthCamera:
                     images = [frames.get_color_frame(), frames.get_depth_frame()]
                 else:
                     images = [frames.get_color_frame()]
-                if all(images):  # the first sets of frames may lack one
+                if all(images):  # the first sets may lack an image
                     break
             left, *second = (np.array(image.get_data()) for image in images)
             return Grabbed(images[0].get_timestamp() / 1000, left, second[0] if second else None)
@@ -85,7 +87,7 @@ def _device(rs: Any, serial: str) -> Any:
         raise InputError("--dataset realsense: no RealSense camera is connected; connect one.")
     if serial and serial not in devices:
         raise InputError(
-            f"--data {serial}: no RealSense camera has this serial number; there are "
+            f"--data {serial}: no RealSense camera has this serial number; connected are "
             f"{', '.join(devices)}."
         )
     return devices[serial] if serial else next(iter(devices.values()))
@@ -116,10 +118,10 @@ def _calibration(rs: Any, profile: Any, depth_sensor: Any, sensor: str, serial: 
 
 
 def _model(rs: Any, intrinsics: Any, source: str) -> CameraModel:
-    """The intrinsic parameters of a stream.
+    """The camera model of a stream.
 
-    librealsense projects by its two Brown-Conrady models as OpenCV does; the "inverse" one differs
-    from it in terms of second order, 0.01 px for the lens of a D455.
+    Both Brown-Conrady models of librealsense project as OpenCV's model does, except for
+    second-order terms of the "inverse" one, which amount to 0.01 px for the lens of a D455.
     """
     i = intrinsics
     known = rs.distortion.brown_conrady, rs.distortion.inverse_brown_conrady

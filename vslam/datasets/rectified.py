@@ -1,4 +1,4 @@
-"""Rectification of images when they are decoded."""
+"""Rectification of the images of a source as they are decoded."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable
 from collections.abc import Sequence as Several
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,17 +18,18 @@ from vslam.datasets.frames import Images, RawSource, Size, Source, TimedFrame, d
 from vslam.datasets.image_files import with_depth
 from vslam.errors import InputError
 
-_CUT = {(1, 0): "column", (0, 1): "row", (1, 1): "column and row"}  # by missing (columns, rows)
+# Names by the number of missing columns and rows.
+_MISSING = {(1, 0): "column", (0, 1): "row", (1, 1): "column and row"}
 
 
 def rectified(raw: RawSource, calibration: Calibration) -> Source:
-    """A source whose images are rectified as they are read; the maps are computed once.
+    """Rectify the images of a source as they are read.
 
-    Images that are already rectified stay unchanged.
+    The rectification maps are computed once. Images that are already rectified stay unchanged.
 
     Raises:
         InputError: the images do not have the calibrated size, the calibration of the right camera
-            is missing, or as `vslam.calibration.rectification.rectify`.
+            is missing, or `vslam.calibration.rectification.rectify` rejects the calibration.
     """
     if raw.depth:  # depth is registered to the left image
         alone = _rectification_for(calibration, raw.sizes[:1])
@@ -36,7 +38,7 @@ def rectified(raw: RawSource, calibration: Calibration) -> Source:
         rectification = _rectification_for(calibration, raw.sizes)
     frame = partial(_rectified_frame, rectification)
     T_wc = raw.ground_truth
-    if T_wc is not None:  # the rectified left camera is turned but not moved
+    if T_wc is not None:  # rectification rotates the left camera about its centre
         T_wc = T_wc.copy()
         T_wc[:, :3, :3] = T_wc[:, :3, :3] @ rectification.R_left_rectified
     return Source(
@@ -63,15 +65,15 @@ def _rectification_for(calibration: Calibration, sizes: Several[Size]) -> Rectif
     models = [model for model in (calibration.left, calibration.right) if model is not None]
     for model, (width, height) in zip(models, sizes, strict=True):
         if (model.width, model.height) != (width, height):
-            cut = model.width - width, model.height - height
+            missing = model.width - width, model.height - height
             fix = "take the calibration of these images"
-            if max(cut) == 1 and min(cut) >= 0:
+            if missing in _MISSING:
                 fix = (
-                    f"an encoder seems to have cut off the last {_CUT[cut]}; write this size into "
-                    "the calibration and keep its other numbers"
+                    f"an encoder seems to have cut off the last {_MISSING[missing]}; write this "
+                    "size into the calibration and keep its other numbers"
                 )
             elif (2 * model.width, model.height) == (width, height):
-                fix = "use --side-by-side if each holds both images of a stereo pair"
+                fix = "use --side-by-side if each image holds both images of a stereo pair"
             raise InputError(
                 f"{calibration.source}: made for {model.width}x{model.height} pixels but the "
                 f"images have {width}x{height}; {fix}."
@@ -81,20 +83,22 @@ def _rectification_for(calibration: Calibration, sizes: Several[Size]) -> Rectif
 
 def _rectified_frame(rectification: Rectification, frame: TimedFrame) -> TimedFrame:
     file = frame.file if rectification.identity else None
-    colour = None if frame.colour is None else partial(_read_colour, rectification, frame.colour)
+    colour = None
+    if frame.colour is not None:
+        colour = partial(_read_one, frame.colour, rectification.left)
     sides = None
     if frame.sides is not None:
         left, right = frame.sides
         sides = (
-            lambda: np.asarray(rectification.left(left()), np.uint8),
-            lambda: np.asarray(rectification.right(right()), np.uint8),
+            partial(_read_one, left, rectification.left),
+            partial(_read_one, right, rectification.right),
         )
     read = partial(_read, rectification, frame)
     return replace(frame, read=read, sides=sides, file=file, colour=colour)
 
 
 def _read(rectification: Rectification, frame: TimedFrame, image_map: ImageMap) -> Images:
-    """Rectify the images of a frame; depth takes the nearest pixel."""
+    """Read and rectify the images of a frame; depth is not interpolated between pixels."""
     left, second = frame.read(image_map)
     sides: list[Callable[[], Image | DepthImage]] = [partial(rectification.left, left)]
     if second is not None and rectification.camera.depth:
@@ -104,7 +108,7 @@ def _read(rectification: Rectification, frame: TimedFrame, image_map: ImageMap) 
     return decoded(sides, image_map)
 
 
-def _read_colour(
-    rectification: Rectification, colour: Callable[[], NDArray[np.uint8]]
+def _read_one(
+    read: Callable[[], NDArray[np.uint8]], rectify: Callable[[NDArray[np.uint8]], NDArray[Any]]
 ) -> NDArray[np.uint8]:
-    return np.asarray(rectification.left(colour()), np.uint8)
+    return np.asarray(rectify(read()), np.uint8)

@@ -1,4 +1,4 @@
-"""Opening of any source: data sets, folders of images, videos, bags and live cameras."""
+"""Open any source: data sets, folders of images, videos, bags and live cameras."""
 
 from __future__ import annotations
 
@@ -26,24 +26,25 @@ class SourceOptions(BaseModel):
     """The options that select and describe a source of frames.
 
     Attributes:
-        data: folder, file, number of a device, or URL; not needed for rendered towns, and for a
-            depth camera its serial number, or empty for the first one.
+        data: folder, file, device number or URL; for a depth camera, its serial number, or empty
+            for the first one found; ignored for rendered towns.
         dataset: one of `vslam.datasets.known_datasets` or of `SOURCES`; None detects it from
             ``data``.
         seq: name of the sequence of a data set; None as for `vslam.datasets.open_sequence`.
         calib: calibration files, see `vslam.calibration.files.read_calibration`.
         right: folder of the right images.
         depth: folder of the depth images.
-        fps: frames per second, instead of time stamps.
-        side_by_side: each frame holds the left image and, right of it, the right one.
-        topics: topic of a bag's left images and topic of its right images or depth, separated by a
+        fps: frames per second, which replace the source's time stamps.
+        side_by_side: whether each frame holds the left and the right image side by side.
+        topics: a bag's topic of left images and its topic of right images or depth, separated by a
             comma.
-        depth_scale: units of the depth images per metre.
-        sensor: ``stereo``, ``rgbd`` or ``mono``, which reads the left images alone; None reads all
+        depth_scale: depth image units per metre.
+        sensor: ``stereo``, ``rgbd`` or ``mono``, which reads only the left images; None reads all
             images of the source.
-        mask: image that says which pixels of the left images are used, or folder of one for each
-            image, see `vslam.datasets.masks.with_masks`.
-        start, every, max_frames: selects every N-th frame, from a first one on, up to a number.
+        mask: mask of the left images, or folder with a mask for each image, see
+            `vslam.datasets.masks.with_masks`.
+        start, every, max_frames: read every ``every``-th frame from frame ``start`` on, at most
+            ``max_frames``.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -65,7 +66,7 @@ class SourceOptions(BaseModel):
     max_frames: int | None = None
 
 
-_FOR = {
+_APPLIES_TO = {
     "right": ("images",),
     "depth": ("images",),
     "fps": ("images", "video"),
@@ -79,14 +80,14 @@ _NOT_MONOCULAR = ("right", "depth", "depth_scale")
 def open_source(
     options: SourceOptions, on_render: Callable[[int, int], None] | None = None
 ) -> Source:
-    """Open a data set, or images of any camera, which are rectified by the user's calibration.
+    """Open a data set, or images of any camera, which are rectified with the user's calibration.
 
     Args:
         on_render: see `vslam.datasets.open_sequence`.
 
     Raises:
         InputError: an option does not apply to this source, the source has another sensor, the
-            calibration is missing or does not fit the images, or the reader refuses the data.
+            calibration is missing or does not fit the images, or the reader rejects the data.
     """
     o = options
     dataset = o.dataset or detect_dataset(o.data)
@@ -127,14 +128,14 @@ def _open_images(dataset: str, options: SourceOptions) -> Source:
 
 
 def open_raw(options: SourceOptions) -> RawSource:
-    """Open images as the cameras took them, to calibrate these; times play no part.
+    """Open unrectified images to calibrate their cameras; times are not used.
 
-    Without ``sensor``, a video or camera is that of a single camera unless ``side_by_side`` is set,
-    and a folder that holds images itself is that of a single camera unless ``right`` is named.
+    Without ``sensor``, a video or live camera is monocular unless ``side_by_side`` is set, and a
+    folder that itself holds images is monocular unless ``right`` is given.
 
     Raises:
         InputError: an option does not apply to this source, it has no unrectified images of one
-            camera or a pair, or as the reader says.
+            camera or a pair, or the reader rejects the data.
     """
     o = options
     dataset = o.dataset or detect_dataset(o.data)
@@ -156,20 +157,20 @@ def open_raw(options: SourceOptions) -> RawSource:
         )  # fmt: skip
     if dataset not in SOURCES:
         raise InputError(
-            f"{o.data}: {dataset} has a calibration; name a video, a bag, folders of images or "
-            "EuRoC's layout with images of a board."
+            f"{o.data}: {dataset} is already calibrated; name a video, a bag, folders of images or "
+            "EuRoC's layout with images of a calibration board."
         )
     monocular = o.sensor == "mono" or (dataset != "bag" and not o.side_by_side)
     raw, _ = _open_stream(dataset, o, monocular)
     if raw.depth:
-        raise InputError(f"{o.data}: the second images are depth; say --sensor mono.")
+        raise InputError(f"{o.data}: the second images are depth; use --sensor mono.")
     return raw
 
 
 def _open_stream(
     dataset: str, options: SourceOptions, monocular: bool
 ) -> tuple[RawSource, Calibration | None]:
-    """A video, bag or camera, and the calibration in a bag or depth camera."""
+    """Open a video, bag or camera, and read the calibration stored in a bag or depth camera."""
     o = options
     raw: RawSource
     own: Calibration | None = None
@@ -203,7 +204,7 @@ def _open_stream(
 def _check_options(dataset: str, options: SourceOptions) -> None:
     if options.seq and dataset in SOURCES:
         raise InputError(f"--seq {options.seq}: only for data sets, not {dataset}; leave it out.")
-    for name, kinds in _FOR.items():
+    for name, kinds in _APPLIES_TO.items():
         value = getattr(options, name)
         if value is None or value is False or value == "":
             continue
@@ -230,11 +231,10 @@ def _calibration(
         folder = Path(options.data).resolve()
         if dataset == "images" and (folder / "calib.txt").is_file():
             raise InputError(
-                f"{options.data}: a sequence of KITTI; name the folder that holds 'sequences' and "
-                f"the sequence in it, --data {folder.parent.parent} --seq {folder.name}, or a "
-                "calibration with --calib."
+                f"{options.data}: a sequence of KITTI; open it with --data {folder.parent.parent} "
+                f"--seq {folder.name}, or name a calibration with --calib."
             )
-        where = " (nor camera_info in the bag)" if dataset == "bag" else ""
+        where = ", and no camera_info in the bag" if dataset == "bag" else ""
         raise InputError(
             f"--calib: no calibration{where}; name a file with the cameras' focal lengths, "
             "centres, distortion and, for two cameras, baseline (docs/howto/cameras.md)."

@@ -1,9 +1,9 @@
-"""RGB-D sequences of TUM, and all data in their layout [Sturm et al., IROS 2012].
+"""TUM's RGB-D sequences, and all data in their layout [Sturm et al., IROS 2012].
 
-FOLDER/rgb.txt, depth.txt    on each line, a time in seconds and an image file
+FOLDER/rgb.txt, depth.txt    each line holds a time in seconds and an image file
 FOLDER/groundtruth.txt       optional: t tx ty tz qx qy qz qw
-FOLDER/calibration.yaml      optional: the camera (docs/howto/cameras.md); the default is TUM's
-                             camera freiburg1, freiburg2 or freiburg3 by the folder's name
+FOLDER/calibration.yaml      optional: the camera (docs/howto/cameras.md); by default, the name of
+                             the folder tells which of TUM's cameras freiburg1 to 3 it is
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from vslam.calibration.files import read_calibration
 from vslam.calibration.models import Calibration, CameraModel
-from vslam.datasets.association import associate, poses_at
+from vslam.datasets.association import associate, poses_at, warn_of_unpaired
 from vslam.datasets.frames import Source
 from vslam.datasets.image_files import (
     checked_files,
     find_sequence,
     image_size,
+    read_image_list,
     select_frames,
 )
 from vslam.datasets.rectified import rectified
@@ -30,9 +31,9 @@ from vslam.trajectory import read_trajectory
 
 _HOME = "https://cvg.cit.tum.de/data/datasets/rgbd-dataset"
 CALIBRATION = "calibration.yaml"
-_NEAR_S = 0.02  # as TUM's associate.py
-_DEPTH_SCALE = 5000.0  # TUM's "file formats"
-# TUM's "intrinsic camera calibration"; the images of freiburg3 are undistorted already.
+_NEAR_S = 0.02  # as in TUM's associate.py
+_DEPTH_SCALE = 5000.0  # from TUM's page "File Formats"
+# From TUM's page "Intrinsic Camera Calibration"; the images of freiburg3 are already undistorted.
 _CAMERAS = {
     "freiburg1": CameraModel(
         517.3, 516.5, 318.6, 255.3, 640, 480, "pinhole", (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
@@ -57,18 +58,18 @@ def open_tum(
 ) -> Source:
     """Open a sequence; its images are undistorted as they are read.
 
-    A frame is a colour image with the depth image nearest in time, within 20 ms; each is used
-    once, the nearest first, as by TUM's ``associate.py``. The ground truth is interpolated
+    A frame is a colour image and a depth image less than 20 ms apart, paired as by TUM's
+    ``associate.py`` (`vslam.datasets.association.associate`). The ground truth is interpolated
     (`vslam.datasets.association.poses_at`).
 
     Args:
         root: folder of the sequence, or of several sequences.
         name: name of the sequence in ``root``; None for ``root`` itself, or its only sequence.
-        start, every, max_frames: selects every N-th pair, from a first one on, up to a number.
-        monocular: read the colour images alone; depth images need not exist.
+        start, every, max_frames: read every ``every``-th pair from pair ``start`` on, at most
+            ``max_frames``.
+        monocular: read only the colour images; depth images need not exist.
         calib: calibration file, which replaces the folder's own and those of TUM's cameras.
-        depth_scale: units of the depth images per metre; None takes the calibration's value, or
-            5000.
+        depth_scale: depth image units per metre; None takes the calibration's value, or 5000.
 
     Raises:
         InputError: data is missing or malformed, there are no pairs, or the calibration or the
@@ -85,15 +86,16 @@ def open_tum(
         )
     times, colour_files = _read_list(folder / "rgb.txt")
     frames = partners = np.arange(len(times))
-    files_of_depth: list[Path] = []
+    depth_files: list[Path] = []
     if not monocular:
-        depth_times, files_of_depth = _read_list(folder / "depth.txt")
+        depth_times, depth_files = _read_list(folder / "depth.txt")
         frames, partners = associate(times, depth_times, _NEAR_S)
         if not len(frames):
             raise InputError(
                 f"{folder}: no colour image has a depth image within 20 ms; take rgb.txt and "
-                "depth.txt of one recording, or run on the colour images with --sensor mono."
+                "depth.txt from one recording, or run on the colour images with --sensor mono."
             )
+        warn_of_unpaired(folder, len(frames), len(times))
     chosen = select_frames(folder, len(frames), start, every, max_frames)
     times = times[frames[chosen]]
     colour = tuple(colour_files[k] for k in frames[chosen])
@@ -105,7 +107,7 @@ def open_tum(
     if monocular:
         raw = checked_files("tum", found, times, truth, [colour])
     else:
-        depth = tuple(files_of_depth[k] for k in partners[chosen])
+        depth = tuple(depth_files[k] for k in partners[chosen])
         scale = depth_scale or calibration.depth_scale or _DEPTH_SCALE
         raw = checked_files("tum", found, times, truth, [colour, depth], scale)
     return rectified(raw, calibration)
@@ -118,46 +120,22 @@ def is_tum(folder: Path) -> bool:
 
 def _read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
     """Times (s, increasing) and image files."""
-    try:
-        lines = path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        alone = ", or run on the colour images with --sensor mono"
-        raise InputError(
-            f"{path}: the list of images is missing or no text; unpack the sequence again"
-            f"{alone if path.stem == 'depth' else ''}."
-        ) from error
-    times: list[float] = []
-    files: list[Path] = []
-    for number, line in enumerate(lines, start=1):
-        if not line.strip() or line.startswith("#"):
-            continue
+
+    def parsed(line: str) -> tuple[float, str]:
         time, _, name = line.strip().partition(" ")
-        try:
-            times.append(float(time))
-        except ValueError:
-            name = ""
-        if not name or not np.isfinite(times[-1]):
-            raise InputError(
-                f"{path}: line {number} is not a time in seconds and a file; repair it."
-            )
-        if len(times) > 1 and times[-1] <= times[-2]:
-            raise InputError(
-                f"{path}: line {number} is not later than the one before it; sort the list by time."
-            )
-        files.append(path.parent / name.strip())
-    if not times:
-        raise InputError(f"{path}: the list of images is empty; unpack the sequence again.")
-    return np.array(times), files
+        if not np.isfinite(float(time)):
+            raise ValueError
+        return float(time), name.strip()
+
+    instead = "run on the colour images with --sensor mono" if path.stem == "depth" else ""
+    times, names = read_image_list(path, parsed, "a time in seconds", instead)
+    return np.array(times), [path.parent / name for name in names]
 
 
 def _calibration(folder: Path, calib: Several[Path | str], size: tuple[int, int]) -> Calibration:
     own = folder / CALIBRATION
     if calib or own.is_file():
         return read_calibration(calib or [own], size)
-    return _known_camera(folder)
-
-
-def _known_camera(folder: Path) -> Calibration:
     for name, model in _CAMERAS.items():
         if name in folder.resolve().name:
             return Calibration(model, source=f"TUM's camera {name}")

@@ -1,6 +1,6 @@
-"""Video files and live cameras, of one camera or of a stereo pair side by side, through OpenCV.
+"""Video files and live cameras, read by OpenCV: monocular, or stereo pairs side by side.
 
-The time stamp of a frame of a live camera is the machine's monotonic clock when the image arrives.
+Frames of a live camera are stamped with the machine's monotonic clock when they arrive.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ Capture = Any  # cv2.VideoCapture, which has no types
 _TIMEOUT_MS = 10_000  # of a camera at a URL
 _DEVICES = Path("/dev")
 _CONVERT = "convert the video, for example with ffmpeg -i VIDEO -c:v libx264 -crf 12 NEW.mp4"
-_SAME_RATE = 0.02  # 30 and 29.97 frames per second are the same
-_MISSING_SHARE = 0.05  # tolerated at the end, because the file's number of frames is an estimate
+_SAME_RATE = 0.02  # relative; 30 and 29.97 frames per second count as the same rate
+_MISSING_SHARE = 0.05  # tolerated at the end, because containers only estimate their frame count
 
 
 def open_capture(source: str | int, *parameters: int) -> Capture | None:
-    """A capture of a file, URL or device; None if OpenCV cannot open it.
+    """Open a file, URL or device; None if OpenCV cannot open it.
 
     Args:
-        parameters: properties, each followed by its value.
+        parameters: properties of the capture, each followed by its value.
     """
     import cv2
 
-    # FFmpeg and OpenCV would write to the terminal in the middle of the progress bar.
+    # Otherwise, messages of FFmpeg and OpenCV would break the progress bar in the terminal.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -68,7 +68,7 @@ def read_sides(
 
     Args:
         image: ``(H, W, 3)`` uint8 blue, green, red, or ``(H, W)`` grey.
-        monocular: return only the left half.
+        monocular: return only the left image.
     """
     width = image.shape[1] // 2
     halves = [image[:, :width], image[:, width : 2 * width]] if side_by_side else [image]
@@ -85,7 +85,7 @@ def left_in_colour(image: NDArray[np.uint8], side_by_side: bool) -> NDArray[np.u
     import cv2
 
     left = image[:, : image.shape[1] // 2] if side_by_side else image
-    # Decoders return grey videos in three equal channels.
+    # Decoders return grey videos as three equal channels.
     if left.ndim == 2 or (left == left[..., :1]).all():
         return np.ascontiguousarray(left if left.ndim == 2 else left[..., 0])
     return np.asarray(cv2.cvtColor(left, cv2.COLOR_BGR2RGB), np.uint8)
@@ -109,31 +109,49 @@ def open_video(
     """Open a video and decode its first frames.
 
     Args:
-        fps: frames per second, instead of the file's time stamps; None uses the time stamps.
-        side_by_side: each frame holds the left image and, right of it, the right one.
-        monocular: read the left images alone.
+        fps: frames per second, which replace the file's time stamps; None uses these.
+        side_by_side: whether each frame holds the left and the right image side by side.
+        monocular: read only the left images.
 
     Raises:
         InputError: the file is missing or cannot be decoded, there are neither time stamps nor
-            ``fps``, or a frame has one image but two are needed.
+            ``fps``, or stereo is asked for but a frame holds one image.
     """
-    if not side_by_side and not monocular:
-        raise InputError(
-            f"{path}: a video has one image per frame; use --side-by-side if it holds both images "
-            "of a stereo pair, or run with --sensor mono."
-        )
+    import cv2
+
     path = Path(path)
+    _check_sides(f"{path}: a video", side_by_side, monocular)
     capture = _open(path)
-    _check_size(path, capture)
-    n, own = _count(capture), _own_rate(capture)
+    width, height, count, own_fps = (
+        float(capture.get(key))
+        for key in (
+            cv2.CAP_PROP_FRAME_WIDTH,
+            cv2.CAP_PROP_FRAME_HEIGHT,
+            cv2.CAP_PROP_FRAME_COUNT,
+            cv2.CAP_PROP_FPS,
+        )
+    )
+    # Checked before the decoder allocates the memory that the header asks for.
+    if width * height > MOST_PIXELS:
+        raise InputError(
+            f"{path}: frames of {width:.0f}x{height:.0f} exceed the limit of "
+            f"{MOST_PIXELS / 1e6:.0f} million pixels; scale the video down."
+        )
     first = list(islice(_images(capture), 2))
     if not first:
         raise InputError(f"{path}: holds no image that can be decoded; {_CONVERT}.")
-    times = [timestamp for timestamp, _ in first]
-    if fps is None and len(times) == 2 and times[1] <= times[0]:
+    stamped = len(first) < 2 or first[1][0] > first[0][0]
+    if fps is None and not stamped:
         raise InputError(f"{path}: the video has no time stamps; give --fps.")
-    if fps is not None and len(times) == 2 and times[1] > times[0]:
-        _compare_rates(path, fps, own)
+    if fps is not None and stamped and own_fps > 0 and abs(fps / own_fps - 1.0) > _SAME_RATE:
+        _log.warning(
+            "%s: --fps %g contradicts the video's own %.4g frames per second; leave the option out "
+            "unless the video is wrong.",
+            path,
+            fps,
+            own_fps,
+        )
+    n = int(count) if count >= 1 else None
     return RawSource(
         dataset="video",
         name=path.stem,
@@ -141,6 +159,15 @@ def open_video(
         play=partial(_play, path, n, fps, side_by_side, monocular),
         n_expected=n,
     )
+
+
+def _check_sides(source: str, side_by_side: bool, monocular: bool) -> None:
+    """Check that a stereo pair is side by side, because videos have one image per frame."""
+    if not side_by_side and not monocular:
+        raise InputError(
+            f"{source} has one image per frame; use --side-by-side if each frame holds both "
+            "images of a stereo pair, or run with --sensor mono."
+        )
 
 
 def _play(
@@ -172,46 +199,8 @@ def _open(path: Path) -> Capture:
     return capture
 
 
-def _check_size(path: Path, capture: Capture) -> None:
-    """Refuse large frames before decoding allocates the memory that the header asks for."""
-    import cv2
-
-    kinds = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT
-    width, height = (capture.get(kind) for kind in kinds)
-    if width * height > MOST_PIXELS:
-        raise InputError(
-            f"{path}: frames of {width:.0f}x{height:.0f} exceed the limit of "
-            f"{MOST_PIXELS / 1e6:.0f} million pixels; scale the video down."
-        )
-
-
-def _count(capture: Capture) -> int | None:
-    import cv2
-
-    n = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-    return n if n > 0 else None
-
-
-def _own_rate(capture: Capture) -> float:
-    """Frames per second stated in the file, 0 if it states none."""
-    import cv2
-
-    return float(capture.get(cv2.CAP_PROP_FPS))
-
-
-def _compare_rates(path: Path, fps: float, own: float) -> None:
-    if own > 0 and abs(fps - own) > _SAME_RATE * own:
-        _log.warning(
-            "%s: --fps %g contradicts the video's own %.4g frames per second; leave the option out "
-            "unless the video is wrong.",
-            path,
-            fps,
-            own,
-        )
-
-
 def _images(capture: Capture) -> Iterator[tuple[float, Image]]:
-    """Yield times in seconds and decoded images; then close the capture."""
+    """Yield the time in seconds and the image of each frame; then close the capture."""
     import cv2
 
     try:
@@ -228,40 +217,39 @@ def _images(capture: Capture) -> Iterator[tuple[float, Image]]:
 def open_camera(device: str, *, side_by_side: bool = False, monocular: bool = False) -> RawSource:
     """Open a camera and take a first image; its frames can be read only once.
 
-    The source is named by the device's number or by the URL without user name and password.
+    The source is named after the device number, or the URL without user name and password.
 
     Args:
         device: a number, or a URL.
-        side_by_side: each frame holds the left image and, right of it, the right one.
-        monocular: read the left images alone.
+        side_by_side: whether each frame holds the left and the right image side by side.
+        monocular: read only the left images.
 
     Raises:
-        InputError: there is no such device, it is busy or gives no image, or it has one image per
-            frame but two are needed.
+        InputError: there is no such device, it is busy or returns no image, or stereo is asked for
+            but a frame holds one image.
     """
     name = _name(device)
-    if not side_by_side and not monocular:
-        raise InputError(
-            f"camera {name}: a camera has one image per frame; use --side-by-side if it holds both "
-            "images of a stereo pair, or run with --sensor mono."
-        )
+    _check_sides(f"camera {name}: a camera", side_by_side, monocular)
     capture = _open_device(int(device)) if device.isdecimal() else _open_url(device, name)
     decoded, image = capture.read()
     if not decoded:
         capture.release()
         raise InputError(
-            f"camera {name}: gives no image; end other programs that use it, or name another one."
+            f"camera {name}: returns no image; close other programs that use it, or name another "
+            "camera."
         )
     return RawSource(
         dataset="camera",
         name=name,
         sizes=sizes_of(image, side_by_side, monocular),
-        play=partial(_film, capture, name, side_by_side, monocular),
+        play=partial(_play_live, capture, name, side_by_side, monocular),
         live=True,
     )
 
 
-def _film(capture: Capture, name: str, side_by_side: bool, monocular: bool) -> Iterator[TimedFrame]:
+def _play_live(
+    capture: Capture, name: str, side_by_side: bool, monocular: bool
+) -> Iterator[TimedFrame]:
     n = 0
     try:
         while True:
@@ -273,7 +261,7 @@ def _film(capture: Capture, name: str, side_by_side: bool, monocular: bool) -> I
             n += 1
     finally:
         capture.release()
-    raise BrokenSourceError(f"camera {name}: no image came after {n}; check its cable or network.")
+    raise BrokenSourceError(f"camera {name}: stopped after {n} images; check its cable or network.")
 
 
 def _name(device: str) -> str:
@@ -291,8 +279,8 @@ def _open_device(number: int) -> Capture:
         return capture
     if (_DEVICES / f"video{number}").exists():
         raise InputError(
-            f"camera {number}: the device is busy or not a camera; end other programs that use it, "
-            "or name another number with --data."
+            f"camera {number}: the device is busy or not a camera; close other programs that use "
+            "it, or name another number with --data."
         )
     there = sorted(path.name.removeprefix("video") for path in _DEVICES.glob("video*"))
     choice = f"there are {', '.join(there)}" if there else "no camera is connected"

@@ -1,4 +1,4 @@
-"""The verdicts on an estimated calibration, and its page."""
+"""Checks of a calibration from images of a board, and its page."""
 
 from __future__ import annotations
 
@@ -12,25 +12,26 @@ from vslam.calibration.models import Array
 from vslam.calibration.rectification import rectify
 from vslam.calibration.solve import CameraFit, Estimate
 from vslam.doctor.findings import Finding, judge, sections
-from vslam.errors import InputError
+from vslam.errors import InputError, write_file
 from vslam.report.drawing import BLUE, GREY, LOW, RED, Drawing, draw, new_figure
 from vslam.report.page import Code, Page, Section, Tile, Tiles
-from vslam.report.render import html, write_files
+from vslam.report.render import html
 
 _FEW_VIEWS = 10
-_TILT, _FEW_TILTED = 15.0, 3  # degrees; views of a board that faces the camera fix no focal length
-_CELLS = (8, 6)  # of the image, across and down
-_COVERED = 0.6  # share of the cells; corners hardly reach the outermost pixels
-_LARGE_PX = 0.5  # RMS in images up to the common width; in proportion more in wider ones
+# Degrees, and number of views tilted by more. Without tilt, the focal length is not determined.
+_TILT, _FEW_TILTED = 15.0, 3
+_CELLS = (8, 6)  # cells of the image, across and down
+_COVERED = 0.6  # smallest share of cells with corners, which hardly reach the outermost pixels
+_LARGE_PX = 0.5  # largest RMS in images of the common width; grows with the width of wider images
 _COMMON_WIDTH = 640
-_APART_PX = 2.0  # RMS between the cameras
-_SHARED = 0.2  # of the squared residuals, common to neighbouring corners
+_APART_PX = 2.0  # largest RMS between the cameras
+_SHARED = 0.2  # largest share of the squared residuals that neighbouring corners have in common
 _MOST_DROPPED = 0.25
-_ARROW = 0.02  # of the image width: length of an arrow for the RMS error
+_ARROW = 0.02  # length of an arrow of the RMS error, relative to the image width
 
 
 def findings_of(found: Estimate) -> list[Finding]:
-    """The verdicts on each camera, then on the pair."""
+    """Check each camera, and then the pair."""
     findings = [finding for side, fit in _sides(found) for finding in _camera(side, fit)]
     if found.pair is not None:
         error = _rms(found.pair.errors)
@@ -72,7 +73,7 @@ def write_page(
         Section("Calibration file", [Code(text)]),
     ]
     page = html(Page("Calibration", [about], parts))
-    write_files(path.parent, {path.name: page}, "name another file with --out")
+    write_file(path, page, "name another file with --out")
 
 
 def _sides(found: Estimate) -> list[tuple[str, CameraFit]]:
@@ -101,13 +102,13 @@ def _camera(side: str, fit: CameraFit) -> list[Finding]:
     return [
         views,
         judge(
-            f"{side}tilt", tilted < _FEW_TILTED,
+            f"{side}tilt", bool(tilted < _FEW_TILTED),
             f"{tilted} views are tilted by more than {_TILT:.0f} degrees",
             "film the board tilted by 20 to 45 degrees in all directions",
         ),
         judge(
             f"{side}coverage", share < _COVERED, f"corners in {share:.0%} of the image",
-            f"film the board everywhere, above all at the {emptiest} of the image",
+            f"film the board in all parts of the image, above all on the {emptiest}",
         ),
         judge(
             f"{side}residuals", error > _LARGE_PX * max(1.0, m.width / _COMMON_WIDTH),
@@ -116,7 +117,7 @@ def _camera(side: str, fit: CameraFit) -> list[Finding]:
         ),
         judge(
             f"{side}lens", shared > _SHARED,
-            f"{m.lens}; {shared:.0%} of the residuals depend on the place in the image",
+            f"{m.lens}; {shared:.0%} of the residuals depend on the position in the image",
             f"try --lens {'pinhole' if m.lens == 'fisheye' else 'fisheye'}",
         ),
     ]  # fmt: skip

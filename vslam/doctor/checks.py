@@ -1,7 +1,6 @@
 """The checks, as functions of images, matches and timestamps.
 
-They share one file because each is a few lines and their thresholds are easier to compare in one
-place.
+They share one file because each is short, and so that their thresholds are in one place.
 """
 
 from __future__ import annotations
@@ -26,37 +25,39 @@ Depth = NDArray[Any]  # numbers, 0 or NaN where missing
 
 # A run searches for stereo matches within 2 rows; KITTI's rectification is off by 0.3 to 0.5 px.
 ROWS_PX = 0.8
-IN_FRONT = 0.9  # share of matches with positive disparity; distant points scatter about zero
+IN_FRONT = 0.9  # share of matches with positive disparity; that of distant points scatters about 0
 EXPOSURE = 0.25  # relative difference in brightness; stereo matching compares grey values
-LAG_GAIN_PX = 0.25  # another lag must reduce the row error by this much, and to this fraction:
-LAG_FACTOR = 0.6
+# Another lag must reduce the row error by this much, and to this fraction.
+LAG_GAIN_PX, LAG_FACTOR = 0.25, 0.6
 FEATURES = 0.5  # share of the requested features
 # Contrast of pixels with their neighbours, relative to the contrast with a wider neighbourhood:
 # KITTI 0.43, TUM 0.25, EuRoC 0.27; at most 0.17 after a Gaussian blur of 1.5 px.
 SHARP = 0.18
-JITTER = 0.2  # standard deviation, as a share of the interval
+JITTER = 0.2  # standard deviation, relative to the interval
 GAP = 1.75  # a longer step, in intervals, means that a frame is missing
-GAPS = 0.05  # share of intervals with gaps; two standard deviations are added, since few scatter
-LONG_GAP = 3.5  # a longer step, in intervals, means that two or more frames are missing in a row
+# Largest share of steps with a gap; two standard deviations are added, because the share scatters
+# if there are few steps.
+GAPS = 0.05
+LONG_GAP = 3.5  # a longer step, in intervals, means that several frames in a row are missing
 DEPTH_PX = 4.0  # depth edges of structured light are off by 2 to 3 px
-DEPTH_SHARE = 0.3  # of the pixels must have a depth
-# Depth is misregistered only if the fit has one clear peak away from shift 0. Heights are above the
-# median, relative to the highest peak. In nine windows of TUM fr1/desk the height near shift 0 is
-# at least 0.67, or the second peak has 0.85; with depth moved by 20 px, the height near 0 is 0.25
-# to 0.66 and the second peak mostly has 0.65 to 0.77.
+DEPTH_SHARE = 0.3  # smallest share of pixels with a depth
+# Depth is misregistered only if the fit has one clear peak away from shift 0. Heights are measured
+# above the median, relative to the highest peak. In nine parts of TUM fr1/desk, the height near
+# shift 0 is at least 0.67, or that of the second peak is 0.85. With depth moved by 20 px, the
+# height near 0 is 0.25 to 0.66, and that of the second peak is mostly 0.65 to 0.77.
 DEPTH_AT_ZERO = 0.6
 DEPTH_SECOND = 0.8
-_ANOTHER_PX = 8.0  # a peak at this distance from the highest is a second one
-DEPTH_VIEWS = 2  # views with less than half in common; a single scene may fit elsewhere by chance
+_ANOTHER_PX = 8.0  # smallest distance of the second peak from the highest one
+DEPTH_VIEWS = 2  # different views that are needed; one scene may fit at another shift by chance
 NEAREST_M, FARTHEST_M = 0.01, 3.0  # plausible baselines of a stereo pair on a vehicle
-# Motion fits 0.975 to 1.026 of the right focal length (KITTI 00 0.98, three parts of fr1/desk, six
-# rendered drives), and 0.89 to 0.93 of a focal length that is 10 % too long.
+# With the right calibration, the fitted factor is 0.975 to 1.026 (KITTI 00 0.98, three parts of
+# fr1/desk, six rendered drives); with a focal length that is 10 % too long, it is 0.89 to 0.93.
 FOCAL = 0.05
-FOCAL_SIGMA = 0.01  # straight roads give 0.05 and more
-TURNED = 2.0  # degrees; straight roads have up to 1.6 between a frame and the fourth after it
+FOCAL_SIGMA = 0.01  # on straight roads, sigma is 0.05 or more
+TURNED = 2.0  # degrees; on straight roads, up to 1.6 within four frames
 NEAREST_DEPTH_M, FARTHEST_DEPTH_M = 0.05, 100.0  # plausible median depths of a sensor
 _BORDER = 2  # px; a peak this near the end of the search range may lie beyond it
-_REACH = 16, 48  # px, search range down and across, where the two sensors lie side by side
+_REACH = 16, 48  # px, search range down and across; larger across, where the two sensors are apart
 
 
 def check_rectification(matches: Matches) -> Finding:
@@ -78,13 +79,13 @@ def check_sides(matches: Matches) -> Finding:
     measured = f"median disparity {middle:.1f} px, {100 * in_front:.0f} % not negative"
     if float(np.median(np.abs(disparity))) < 0.1:
         return Finding(
-            "sides", "fault", measured, "both sides show the same image: give the right camera's"
+            "sides", "fault", measured, "both images are the same: give the right camera's images"
         )
     return judge(
         "sides",
         in_front < IN_FRONT,
         measured,
-        "left and right are swapped, or the baseline has the wrong sign: exchange the cameras"
+        "left and right are swapped, or the baseline has the wrong sign: swap the cameras"
         if middle < 0
         else "many disparities are negative: the cameras are turned outwards; calibrate again",
     )
@@ -93,8 +94,8 @@ def check_sides(matches: Matches) -> Finding:
 def check_scale(camera: Camera, matches: Matches | None) -> Finding:
     """Report the field of view, the baseline and the median depth.
 
-    The user must compare them with the scene, because images do not reveal a wrong baseline. The
-    check fails only if the baseline seems to be in a wrong unit.
+    The user must compare them with the scene, because images do not reveal a wrong baseline. There
+    is a fault only if the baseline seems to be in a wrong unit.
 
     Args:
         matches: matches of the stereo pair; None for a monocular or RGB-D camera.
@@ -112,7 +113,7 @@ def check_scale(camera: Camera, matches: Matches | None) -> Finding:
         "scale",
         not NEAREST_M <= camera.baseline <= FARTHEST_M,
         measured,
-        "give the baseline in metres: a checkerboard calibration has the unit of the squares",
+        "give the baseline in metres: calibration with a board gives it in the unit of its squares",
     )
 
 
@@ -144,9 +145,9 @@ def check_focal_length(fit: FocalFit | None, camera: Camera) -> Finding:
     return judge(
         "focal length",
         abs(np.log(fit.factor)) > FOCAL,
-        f"turns of up to {fit.turned:.0f} degrees fit {fit.factor * camera.fx:.0f} px, the "
-        f"calibration says {camera.fx:.0f}",
-        "the calibration belongs to another zoom, size or crop of the images: calibrate again",
+        f"turns of up to {fit.turned:.0f} degrees fit {fit.factor * camera.fx:.0f} px; the "
+        f"calibration has {camera.fx:.0f} px",
+        "the calibration is for another zoom, size or crop of the images: calibrate again",
     )
 
 
@@ -169,12 +170,11 @@ def check_exposure(pairs: Sequence[tuple[Image, Image]], several: Sequence[Match
 
 
 def check_synchronisation(rows_of_lag: Mapping[int, float]) -> tuple[Finding, int]:
-    """Check whether an earlier or later right image fits better, because the two cameras are not
-    synchronised.
+    """Check whether the cameras are synchronised, or a right image of another frame fits better.
 
     Args:
-        rows_of_lag: median vertical error (px) for each number of frames by which the right image
-            is later; empty if no frame has matches at all of them.
+        rows_of_lag: median vertical error (px) for each delay of the right image in frames; empty
+            if no frame has matches at all delays.
 
     Returns:
         The finding, and the best lag, which is 0 if the camera hardly moves.
@@ -194,7 +194,8 @@ def check_synchronisation(rows_of_lag: Mapping[int, float]) -> tuple[Finding, in
         wrong,
         measured,
         f"the right image is {counted(abs(best), 'frame')} "
-        f"{'late' if best > 0 else 'early'}: trigger both together, or shift one side's times",
+        f"{'late' if best > 0 else 'early'}: trigger both cameras together, or shift the times of "
+        "one",
     )
     return finding, best if wrong else 0
 
@@ -207,25 +208,26 @@ def check_features(images: Sequence[Image], config: OrbConfig) -> Finding:
         "features",
         middle < FEATURES * config.n_features,
         f"median {middle}, least {min(counts)} of {config.n_features} requested features",
-        "too little texture or light: more light, longer exposure, or a lower threshold "
+        "too little texture or light: use more light, a longer exposure, or a lower threshold "
         "(docs/reference/thresholds.md)",
     )
 
 
 def check_sharpness(images: Sequence[Image]) -> Finding:
-    """Check the contrast of pixels with their neighbours relative to a wider neighbourhood."""
-    shares = [sharpness(image) for image in images]
-    middle = float(np.median(shares))
+    """Check the `sharpness` of images."""
+    values = [sharpness(image) for image in images]
+    middle = float(np.median(values))
     return judge(
         "sharpness",
         middle < SHARP,
-        f"median {middle:.2f}, least {min(shares):.2f}; below {SHARP} features blur",
+        f"median {middle:.2f}, least {min(values):.2f}; features are blurred below {SHARP}",
         "focus the lens, clean it, or use a shorter exposure",
     )
 
 
 def sharpness(image: Image) -> float:
-    """Sharpness of an image: 0 without fine contrast, about 1 for white noise."""
+    """Contrast of pixels with their neighbours, relative to the contrast with a wider
+    neighbourhood: 0 without fine detail, about 1 for white noise."""
     grey = image.astype(np.float32)
     fine, wide = (grey - cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1.0, 4.0))
     return float(np.std(fine) / max(float(np.std(wide)), 1e-6))
@@ -236,16 +238,20 @@ def check_times(timestamps: Times) -> list[Finding]:
     steps = np.diff(timestamps)
     if len(steps) < 3:
         return [Finding("times", "unknown", f"{len(timestamps)} frames are too few")]
-    back = np.flatnonzero(steps <= 0)
+    backwards = np.flatnonzero(steps <= 0)
     interval = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     order = judge(
         "order of times",
-        len(back) > 0,
-        f"{len(back)} of {len(steps)} intervals are not positive"
-        + (f", the first after frame {back[0]}" if len(back) else f", {1 / interval:.1f} Hz"),
+        len(backwards) > 0,
+        f"{len(backwards)} of {len(steps)} intervals are not positive"
+        + (
+            f", the first after frame {backwards[0]}"
+            if len(backwards)
+            else f", {1 / interval:.1f} Hz"
+        ),
         "sort the frames by time and drop repeated ones",
     )
-    if len(back):
+    if len(backwards):
         return [order]
     gaps = steps > GAP * interval
     longest = int(np.argmax(steps))
@@ -254,50 +260,49 @@ def check_times(timestamps: Times) -> list[Finding]:
     gap = judge(
         "gaps",
         bool(gaps.sum() > most or steps[longest] > LONG_GAP * interval),
-        f"{int(gaps.sum())} intervals with frames missing, the longest {steps[longest]:.3f} s "
+        f"{int(gaps.sum())} intervals with missing frames, the longest {steps[longest]:.3f} s "
         f"after frame {longest}",
-        "frames were lost on the way to the disk: record to a faster one, or at a lower rate",
+        "frames were lost during recording, or have no partner of the same time: use a faster "
+        "disk, a lower rate, or synchronised cameras",
     )
     jitter = float(np.std(steps[~gaps])) / interval
     steady = judge(
         "jitter",
         jitter > JITTER,
         f"standard deviation {100 * jitter:.1f} % of the interval of {1e3 * interval:.1f} ms",
-        "use the camera's time of exposure instead of the time of arrival",
+        "stamp frames when they are exposed, not when they arrive",
     )
     return [order, gap, steady]
 
 
 def check_depth(images: Sequence[Image], depths: Sequence[Depth]) -> list[Finding]:
-    """Check whether depth is registered to the images.
+    """Check the range of the depth, and whether it is registered to the images.
 
-    Depth edges coincide with image edges, so the shift at which they fit best is 0 for registered
-    depth.
+    Depth edges coincide with image edges, so they fit best without a shift if depth is registered.
     """
     depths = [np.nan_to_num(depth.astype(np.float32)) for depth in depths]
     share = float(np.mean([np.mean(depth > 0) for depth in depths]))
     middle = float(np.median(np.concatenate([d[d > 0].ravel() for d in depths]))) if share else 0.0
-    measured = f"{100 * share:.0f} % of the pixels have a depth"
+    measured = f"{100 * share:.0f} % of the pixels have a depth, half of them below {middle:.3g} m"
     if share and not NEAREST_DEPTH_M <= middle <= FARTHEST_DEPTH_M:
-        unit = "the depth factor is wrong: give the value of one metre with --depth-scale"
-        half = f"{measured}, half of them nearer than {middle:.3g} m"
-        return [Finding("depth", "fault", half, unit)]
-    there = judge(
+        fix = "the depth scale is wrong: give the value of one metre with --depth-scale"
+        return [Finding("depth", "fault", measured, fix)]
+    in_range = judge(
         "depth",
         share < DEPTH_SHARE,
-        f"{measured}, half of them nearer than {middle:.3g} m",
-        "few points lie within the sensor's range: check the depth factor, or move closer",
+        measured,
+        "few points lie within the sensor's range: check the depth scale, or move closer",
     )
     fit = np.sum([_edge_fit(*pair) for pair in zip(images, depths, strict=True)], axis=0)
     contrast = float((fit.max() - np.median(fit)) / max(float(np.std(fit)), 1e-12))
     if not fit.any() or contrast < 2.0:
-        return [there, Finding("registration", "unknown", "no edges of depth in these images")]
-    return [there, _registration(fit, lambda: count_views(images))]
+        return [in_range, Finding("registration", "unknown", "no depth edges in these images")]
+    return [in_range, _registration(fit, lambda: count_views(images))]
 
 
 def _registration(fit: NDArray[np.float32], views: Callable[[], int]) -> Finding:
-    """Report a fault only if the best shift is a single clear peak inside the search range and more
-    than one view was examined."""
+    """Report a fault only if there is a single clear peak inside the search range, and more than
+    one view was examined."""
     reach = np.array(_REACH)
     best = np.array(np.unravel_index(np.argmax(fit), fit.shape)) - reach
     shifts = np.moveaxis(np.indices(fit.shape), 0, -1) - reach
@@ -305,24 +310,24 @@ def _registration(fit: NDArray[np.float32], views: Callable[[], int]) -> Finding
     at_zero = float(height[np.linalg.norm(shifts, axis=2) <= DEPTH_PX].max())
     second = float(height[np.linalg.norm(shifts - best, axis=2) > _ANOTHER_PX].max())
     off = float(np.linalg.norm(best))
-    measured = f"depth edges fit best {off:.0f} px off ({best[1]:+d}, {best[0]:+d})"
+    measured = f"depth edges fit best when shifted by {off:.0f} px ({best[1]:+d}, {best[0]:+d})"
     clear = at_zero < DEPTH_AT_ZERO and second < DEPTH_SECOND
     if off > DEPTH_PX and not (clear and (np.abs(best) <= reach - _BORDER).all()):
-        return Finding("registration", "unknown", f"{measured}, but no shift fits clearly best")
+        return Finding("registration", "unknown", f"{measured}, but other shifts fit as well")
     if off > DEPTH_PX and views() < DEPTH_VIEWS:
-        few = "but these images show one view, which may fit there by chance"
-        return Finding("registration", "unknown", f"{measured}, {few}")
+        reason = "but the images show only one view, which may fit there by chance"
+        return Finding("registration", "unknown", f"{measured}, {reason}")
     return judge(
         "registration",
         off > DEPTH_PX,
         measured,
-        "the depth is not registered to the image: switch registration on in the driver, or "
+        "the depth is not registered to the image: switch on registration in the driver, or "
         "register the files",
     )
 
 
 def _edge_fit(image: Image, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Mean edge strength of the image at the depth edges, for each shift of the depth."""
+    """``(33, 97)`` mean edge strength of the image at the depth edges, for each shift of them."""
     down, across = _REACH
     grey = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32)
     strength = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))

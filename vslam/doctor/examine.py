@@ -1,4 +1,4 @@
-"""Examining a sequence: all its timestamps, and a few frames spread over it."""
+"""Examination of a sequence: all its timestamps, and a few frames spread over it."""
 
 from __future__ import annotations
 
@@ -18,19 +18,21 @@ from vslam.doctor.matching import Matches, joined, match_images
 from vslam.errors import UnreadableImageError
 
 _FRAMES = 8  # examined frames, spread over the sequence
-_LAGS = range(-2, 3)  # frames by which the right image may be late
-_TURNS, _LATER = 16, 4  # pairs of frames for the focal length; distance of a pair in frames
-_FEWEST, _MOST = 30, 200  # least number of common points of such a pair; most that are used
+_LAGS = range(-2, 3)  # delays of the right image in frames that are tried
+# To check the focal length: pairs of frames, frames from the first to the second of a pair, and the
+# smallest number of common points and the largest number that is used.
+_TURNS, _LATER = 16, 4
+_FEWEST, _MOST = 30, 200
 _PICTURES = 2
 _LEAST_DISPARITY = 1.0  # px
-_DRAWN = 60  # matches in a picture
+_DRAWN = 60  # matches drawn in a picture
 _GAP = 48  # px between the two images of a picture
 _GREEN, _RED = (80, 200, 60), (60, 60, 230)  # BGR
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture of the page: ``image`` is ``(H, W, 3)`` uint8, BGR."""
+    """A picture for the page; ``image`` is ``(H, W, 3)`` uint8, BGR."""
 
     caption: str
     image: Image
@@ -50,9 +52,9 @@ class Diagnosis:
 
 
 def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
-    """Run all checks that apply to the sequence: stereo, RGB-D or monocular.
+    """Run all checks that apply to a stereo, RGB-D or monocular sequence.
 
-    The images are rectified, as in a run.
+    They examine rectified images, as a run uses them.
     """
     frames = np.unique(np.linspace(0, len(sequence) - 1, _FRAMES).round().astype(int)).tolist()
     read: dict[int, tuple[Image, Image | DepthImage | None]] = {}
@@ -83,8 +85,8 @@ def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
     if not seconds:
         return Diagnosis([*findings, checks.check_scale(sequence.camera, None)], hidden)
     if seconds[0].dtype == np.uint8:
-        blind = any(f.check == "features" and f.verdict == "fault" for f in findings)
-        found, pictures = _examine_stereo(sequence, lefts, blind=blind)
+        few_features = any(f.check == "features" and f.verdict == "fault" for f in findings)
+        found, pictures = _examine_stereo(sequence, lefts, few_features=few_features)
     else:
         found = [*checks.check_depth(images, seconds), checks.check_scale(sequence.camera, None)]
         found += _examine_focal_length(sequence, found)
@@ -93,21 +95,21 @@ def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
 
 
 def _examine_mask(sequence: Source, lefts: dict[int, Image]) -> tuple[list[Finding], list[Picture]]:
-    """How much the mask hides, and the first image with what is hidden in red; nothing without a
-    mask."""
-    for frame, left in lefts.items():
-        if (read := sequence.stored[frame].mask) is None:
-            break
-        try:
-            masked = read() == 0
-        except UnreadableImageError as error:
-            return [Finding("mask", "fault", str(error).rstrip("."), "repair this mask")], []
-        drawn = cv2.cvtColor(left, cv2.COLOR_GRAY2BGR)
-        drawn[masked] = (drawn[masked] + np.array(_RED)) // 2
-        measured = f"the mask hides {100.0 * masked.mean():.1f} % of the image"
-        caption = f"Frame {frame}: the mask hides what is red; no feature is taken from there."
-        return [Finding("mask", "good", measured)], [Picture(caption, np.asarray(drawn, np.uint8))]
-    return [], []
+    """Measure which share of the first image the mask hides, and draw this part in red; nothing
+    without a mask."""
+    frame = next(iter(lefts), None)
+    read = None if frame is None else sequence.stored[frame].mask
+    if frame is None or read is None:
+        return [], []
+    try:
+        masked = read() == 0
+    except UnreadableImageError as error:
+        return [Finding("mask", "fault", str(error).rstrip("."), "repair this mask")], []
+    drawn = cv2.cvtColor(lefts[frame], cv2.COLOR_GRAY2BGR)
+    drawn[masked] = (drawn[masked] + np.array(_RED)) // 2
+    measured = f"the mask hides {100.0 * masked.mean():.1f} % of the image"
+    caption = f"Frame {frame}: the mask hides the red part, from which no features are taken."
+    return [Finding("mask", "good", measured)], [Picture(caption, np.asarray(drawn, np.uint8))]
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,7 @@ class _Pair:
 
 
 def _pairs(sequence: Source, lefts: dict[int, Image], lag: int) -> list[_Pair]:
-    """Pairs of left images and the right images ``lag`` frames later, if both can be read."""
+    """Pair each left image with the right image ``lag`` frames later, if this can be read."""
     found = []
     for frame, left in lefts.items():
         try:
@@ -139,17 +141,17 @@ def _pairs(sequence: Source, lefts: dict[int, Image], lag: int) -> list[_Pair]:
 
 
 def _examine_stereo(
-    sequence: Source, lefts: dict[int, Image], *, blind: bool
+    sequence: Source, lefts: dict[int, Image], *, few_features: bool
 ) -> tuple[list[Finding], list[Picture]]:
-    inner = dict(list(lefts.items())[1:-1:2])  # these have frames before and after them
+    inner = dict(list(lefts.items())[1:-1:2])  # with frames before and after them
     by_lag = {lag: _pairs(sequence, inner if lag else lefts, lag) for lag in _LAGS}
     pairs = by_lag[0]
     if not any(len(pair.matches) for pair in pairs):
-        fix = "the two images have no common view: check that they form a pair and are calibrated"
+        fix = "the images do not overlap: check that they form a pair, and their calibration"
         measured = "no pair of images has 12 matches"
         finding = Finding("stereo", "fault", measured, fix)
-        if blind:
-            finding = Finding("stereo", "unknown", f"{measured}; they have few features")
+        if few_features:
+            finding = Finding("stereo", "unknown", f"{measured}, because they have few features")
         return [finding], [_stereo_picture(pair) for pair in pairs[:1]]
     synchronised, lag = checks.check_synchronisation(_rows_by_lag(by_lag))
     pairs = by_lag[lag]  # the other checks need synchronised images
@@ -169,18 +171,18 @@ def _examine_stereo(
 
 
 def _examine_focal_length(sequence: Source, found: list[Finding]) -> list[Finding]:
-    """Check the focal length, unless another fault of the images would distort the result."""
+    """Check the focal length, unless another fault would distort the result."""
     if any(finding.verdict == "fault" for finding in found):
         return []
     last = len(sequence) - 1 - _LATER
     frames = np.unique(np.linspace(0, last, _TURNS if last >= 0 else 0).round().astype(int))
-    several = [moved for k in frames.tolist() if (moved := _moved(sequence, k)) is not None]
+    several = [moved for k in frames.tolist() if (moved := _track(sequence, k)) is not None]
     fit = fit_focal_length(several, sequence.camera) if several else None
     return [checks.check_focal_length(fit, sequence.camera)]
 
 
-def _moved(sequence: Source, frame: int) -> Moved | None:
-    """Points of a frame with their disparities and their positions a few frames later; None if
+def _track(sequence: Source, frame: int) -> Moved | None:
+    """Find points of a frame, their disparities and their positions a few frames later; None if
     there are too few points or an image cannot be read."""
     try:
         left, second = sequence.read(frame)
@@ -202,7 +204,7 @@ def _moved(sequence: Source, frame: int) -> Moved | None:
 def _disparities(
     xy: NDArray[np.float32], left: Image, second: Image | DepthImage, camera: Camera
 ) -> NDArray[np.float64]:
-    """``(N,)`` disparities of ``(N, 2)`` keypoints of the left image; 0 without match or depth."""
+    """``(N,)`` disparities of ``(N, 2)`` keypoints of the left image, 0 if unknown."""
     if second.dtype != np.uint8:
         x, y = np.rint(xy).astype(int).T
         depth = np.asarray(second, np.float64)[y, x]
@@ -232,8 +234,7 @@ def _rows_by_lag(by_lag: dict[int, list[_Pair]]) -> dict[int, float]:
 
 
 def _stereo_picture(pair: _Pair) -> Picture:
-    """Both images with the matches, and between the images a line for each match: green and
-    horizontal if its rows agree."""
+    """Draw both images side by side with a line for each match, green if its rows agree."""
     left, right, matches = pair.left, pair.right, pair.matches
     height, width = left.shape
     begin = width + _GAP  # of the right image
@@ -251,15 +252,15 @@ def _stereo_picture(pair: _Pair) -> Picture:
         cv2.line(drawn, (width, a[1]), (begin - 1, b[1]), color, 1, cv2.LINE_AA)
     other = f" with the right image of frame {pair.frame + pair.lag}" if pair.lag else ""
     caption = (
-        f"Frame {pair.frame}{other}: matches in green if their rows agree to {checks.ROWS_PX} px, "
-        "otherwise in red. Between the images, the lines of a rectified pair are horizontal."
+        f"Frame {pair.frame}{other}: matches whose rows agree to {checks.ROWS_PX} px in green, "
+        "others in red. The lines between the images of a rectified pair are horizontal."
     )
     return Picture(caption, np.asarray(drawn, np.uint8))
 
 
 def _depth_picture(image: Image, depth: checks.Depth) -> Picture:
-    """Depth edges drawn over the image."""
+    """Draw the depth edges over the image."""
     drawn = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     drawn[checks.depth_edges(np.nan_to_num(depth.astype(np.float32)))] = _RED
-    caption = "Depth edges in red over the image; registered depth has them at the objects' edges."
+    caption = "Depth edges in red; they lie on the edges of objects if the depth is registered."
     return Picture(caption, np.asarray(drawn, np.uint8))

@@ -18,9 +18,9 @@ class Finding:
 
     Attributes:
         check: name of the check.
-        verdict: ``unknown`` if the images are not conclusive.
+        verdict: ``unknown`` if the images do not allow a verdict.
         measured: the measurement, with units.
-        fix: what to do; empty unless there is a fault.
+        fix: what the user can do; empty unless there is a fault.
     """
 
     check: str
@@ -30,12 +30,12 @@ class Finding:
 
 
 def judge(check: str, wrong: bool, measured: str, fix: str) -> Finding:
-    """A ``fault`` with its fix, or ``good``."""
+    """Make a finding: a ``fault`` with its fix if ``wrong``, else ``good``."""
     return Finding(check, "fault", measured, fix) if wrong else Finding(check, "good", measured)
 
 
 def lines(findings: Iterable[Finding]) -> Iterator[str]:
-    """What a terminal shows of findings."""
+    """Format findings as lines for the terminal."""
     for finding in findings:
         yield f"{finding.verdict:<8} {finding.check:<16} {finding.measured}"
         if finding.fix:
@@ -43,7 +43,7 @@ def lines(findings: Iterable[Finding]) -> Iterator[str]:
 
 
 def sections(findings: Sequence[Finding]) -> list[Section]:
-    """What a page shows of findings: the faults with their fixes, then the other checks."""
+    """Format findings as sections of a page: faults with their fixes, then the other checks."""
     faults = [
         Alert(f"{f.check.capitalize()}: {f.measured}.", f.fix and f"Fix: {f.fix}.")
         for f in findings

@@ -1,9 +1,9 @@
-"""Estimating the focal length from the motion of the camera.
+"""Estimation of the focal length from the motion of the camera.
 
 With a wrong focal length, a stereo pair reconstructs a scene that is stretched along the optical
 axis. A pure translation is consistent with such a scene, but a rotation about another axis is not.
-The estimate is the focal length with the least reprojection error, where the pose of each frame is
-optimised for each focal length.
+The estimate is the focal length with the least reprojection error, after optimising the motion
+between two frames for each focal length.
 """
 
 from __future__ import annotations
@@ -20,16 +20,18 @@ from vslam.camera import Camera
 Vectors = NDArray[np.float64]
 
 _PIXEL, _DISPARITY = 0.35, 0.3  # px, standard deviations of matches refined by optical flow
-_CAUCHY = 5.0  # variances at which a squared error has half its weight; 95 % of inliers are below 6
+# Squared error, in variances, at which the weight of a point is one half. For 95 % of the inliers,
+# it is less than 6.
+_CAUCHY = 5.0
 _ITERATIONS = 12
-_FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.6, 1.8, 2.0)  # coarse search
+_FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.6, 1.8, 2.0)  # of the coarse search
 _PRECISION = 1e-3  # of the logarithm of the factor
-_STEP = 0.02  # of the logarithm, for the curvature at the minimum
+_STEP = 0.02  # of the logarithm of the factor, to measure the curvature at the minimum
 
 
 @dataclass(frozen=True)
 class Moved:
-    """Points that two frames see.
+    """N points seen in two frames.
 
     Attributes:
         before, after: ``(N, 2)`` pixels in the left images of the first and the second frame.
@@ -46,10 +48,10 @@ class FocalFit:
     """The focal length that fits best.
 
     Attributes:
-        factor: this focal length divided by that of the calibration.
+        factor: its ratio to the focal length of the calibration.
         sigma: standard deviation of the logarithm of ``factor``.
-        turned: largest rotation (degrees) about an axis across the view, among the frames whose
-            points agree with ``factor``.
+        turned: largest rotation (degrees) about an axis perpendicular to the optical axis, among
+            the frames whose points agree with ``factor``.
     """
 
     factor: float
@@ -62,7 +64,7 @@ def fit_focal_length(several: Sequence[Moved], camera: Camera) -> FocalFit:
 
     Args:
         several: at least one pair of frames, each with at least three points.
-        camera: the stereo or RGB-D camera; the disparities of the latter are those of its virtual
+        camera: stereo or RGB-D camera; disparities of an RGB-D camera are those of its virtual
             baseline.
     """
     from scipy.optimize import minimize_scalar
@@ -83,7 +85,7 @@ def fit_focal_length(several: Sequence[Moved], camera: Camera) -> FocalFit:
     around = cost(log + _STEP), cost(log - _STEP)
     least = cost(log)
     curvature = (sum(around) - 2.0 * least) / _STEP**2
-    variance = least / (2.0 * sum(len(moved.before) for moved in several))  # scales the cost
+    variance = least / (2.0 * sum(len(moved.before) for moved in several))  # of one residual
     turned = [
         float(np.linalg.norm(pose[:2]))
         for moved, pose in zip(several, poses, strict=True)
@@ -99,7 +101,8 @@ def fit_focal_length(several: Sequence[Moved], camera: Camera) -> FocalFit:
 def _best_pose(
     moved: Moved, camera: Camera, factor: float, start: Vectors
 ) -> tuple[Vectors, float]:
-    """``(6,)`` rotation vector and translation by Gauss-Newton with Cauchy's loss, and the loss."""
+    """Optimise the motion by Gauss-Newton with Cauchy's loss: ``(6,)`` rotation vector and
+    translation, and their loss."""
     pose = start
     for _ in range(_ITERATIONS):
         error, variance, points = _errors(moved, camera, factor, pose)
@@ -117,7 +120,7 @@ def _best_pose(
 
 
 def _fits(moved: Moved, camera: Camera, factor: float, pose: Vectors) -> bool:
-    """Whether most points agree with a pose."""
+    """Whether most points agree with a motion."""
     error, variance, _ = _errors(moved, camera, factor, pose)
     return float(np.median((error**2).sum(axis=1) / variance)) < _CAUCHY
 
@@ -126,10 +129,10 @@ def _errors(
     moved: Moved, camera: Camera, factor: float, pose: Vectors
 ) -> tuple[Vectors, Vectors, Vectors]:
     """``(N, 2)`` reprojection errors, their ``(N,)`` variances, and ``(N, 3)`` points in the later
-    frame. The variance includes the uncertainty of the points' depth."""
-    seen, points = _project(moved.before, moved.disparity, camera, factor, pose)
+    frame. The variances include the uncertainty of the points' depth."""
+    projected, points = _project(moved.before, moved.disparity, camera, factor, pose)
     nearer, _ = _project(moved.before, moved.disparity + _DISPARITY, camera, factor, pose)
-    return moved.after - seen, _PIXEL**2 + ((nearer - seen) ** 2).sum(axis=1), points
+    return moved.after - projected, _PIXEL**2 + ((nearer - projected) ** 2).sum(axis=1), points
 
 
 def _project(
@@ -144,12 +147,12 @@ def _project(
 
 
 def _jacobian(points: Vectors, camera: Camera, factor: float, pose: Vectors) -> Vectors:
-    """``(N, 2, 6)`` derivative of the pixels by a rotation and a translation of the points."""
+    """``(N, 2, 6)`` derivatives of the pixels with respect to rotation and translation."""
     x, y, z = points.T
     z = np.maximum(z, 1e-3 * camera.baseline)
-    none = np.zeros_like(z)
-    u = factor * camera.fx * np.column_stack([1.0 / z, none, -x / z**2])
-    v = factor * camera.fy * np.column_stack([none, 1.0 / z, -y / z**2])
-    by_shift = np.stack([u, v], axis=1)
-    turned = (points - pose[3:])[:, None, :]
-    return np.concatenate([np.cross(turned, by_shift), by_shift], axis=2)
+    zero = np.zeros_like(z)
+    u = factor * camera.fx * np.column_stack([1.0 / z, zero, -x / z**2])
+    v = factor * camera.fy * np.column_stack([zero, 1.0 / z, -y / z**2])
+    by_translation = np.stack([u, v], axis=1)
+    rotated = (points - pose[3:])[:, None, :]
+    return np.concatenate([np.cross(rotated, by_translation), by_translation], axis=2)

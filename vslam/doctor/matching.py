@@ -1,7 +1,7 @@
 """Matches between two images without assumptions about the cameras' poses.
 
-A run searches for stereo matches only in the same rows; checking the rectification requires a
-search in the whole image.
+A run searches for stereo matches only in the same rows, but a check of the rectification has to
+search the whole image.
 """
 
 from __future__ import annotations
@@ -21,12 +21,16 @@ _EPIPOLAR_PX = 1.5
 _REFINED_PX = 3.0  # largest error of a keypoint in a coarse octave
 _WINDOW = (15, 15)
 _MIN_MATCHES = 12
-_ANOTHER_VIEW = 0.25  # of the image width; matches of another view have moved at least this far
+_ANOTHER_VIEW = 0.25  # of the image width: smallest median motion between two different views
 
 
 @dataclass(frozen=True)
 class Matches:
-    """``left`` and ``right``: ``(N, 2)`` float32 pixels of the same points, to about 0.1 px."""
+    """Pixels of the same N points in two images, accurate to about 0.1 px.
+
+    Attributes:
+        left, right: ``(N, 2)`` float32.
+    """
 
     left: NDArray[np.float32]
     right: NDArray[np.float32]
@@ -36,8 +40,8 @@ class Matches:
 
 
 def match_images(left: Image, right: Image) -> Matches:
-    """ORB matches that satisfy one epipolar geometry, refined by optical flow; none if there are
-    fewer than twelve."""
+    """Find ORB matches that satisfy one epipolar geometry, and refine them by optical flow; no
+    matches are returned if there are fewer than twelve."""
     orb = cv2.ORB.create(_FEATURES)
     kp_left, d_left = orb.detectAndCompute(left, None)
     kp_right, d_right = orb.detectAndCompute(right, None)
@@ -51,45 +55,45 @@ def match_images(left: Image, right: Image) -> Matches:
     a = np.array([kp_left[match.queryIdx].pt for match in found], np.float32)
     b = np.array([kp_right[match.trainIdx].pt for match in found], np.float32)
     refined, tracked, _ = cv2.calcOpticalFlowPyrLK(
-        left, _like(right, left), a, b.copy(), winSize=_WINDOW, maxLevel=0,
+        left, _normalised(right, left), a, b.copy(), winSize=_WINDOW, maxLevel=0,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
     near = (tracked.ravel() == 1) & (np.linalg.norm(refined - b, axis=1) < _REFINED_PX)
     a, b = a[near], refined[near]
     if len(a) < _MIN_MATCHES:
         return none
-    _, obeys = cv2.findFundamentalMat(a, b, cv2.FM_RANSAC, _EPIPOLAR_PX, 0.999)
-    if obeys is None or obeys.sum() < _MIN_MATCHES:
+    _, inliers = cv2.findFundamentalMat(a, b, cv2.FM_RANSAC, _EPIPOLAR_PX, 0.999)
+    if inliers is None or inliers.sum() < _MIN_MATCHES:
         return none
-    kept = obeys.ravel() == 1
+    kept = inliers.ravel() == 1
     return Matches(a[kept], b[kept])
 
 
 def count_views(images: Sequence[Image]) -> int:
-    """Number of images, in order, whose view differs from all views counted before."""
+    """Number of different views in a sequence of images."""
     views: list[Image] = []
     for image in images:
-        if not any(_one_view(image, view) for view in views):
+        if not any(_same_view(image, view) for view in views):
             views.append(image)
     return len(views)
 
 
-def _one_view(image: Image, other: Image) -> bool:
+def _same_view(image: Image, other: Image) -> bool:
     matches = match_images(image, other)
     moved = np.linalg.norm(matches.left - matches.right, axis=1)
     return len(matches) > 0 and float(np.median(moved)) < _ANOTHER_VIEW * image.shape[1]
 
 
 def joined(several: list[Matches]) -> Matches:
-    """All matches of several pairs (at least one)."""
+    """The matches of at least one pair of images, joined."""
     return Matches(
         np.concatenate([matches.left for matches in several]),
         np.concatenate([matches.right for matches in several]),
     )
 
 
-def _like(image: Image, model: Image) -> Image:
-    """An image with the brightness and contrast of another one, as optical flow assumes."""
+def _normalised(image: Image, model: Image) -> Image:
+    """Give an image the brightness and contrast of another one, as optical flow assumes."""
     gain = float(model.std()) / max(float(image.std()), 1.0)
     shifted = (image.astype(np.float32) - image.mean()) * gain + model.mean()
     return np.clip(np.rint(shifted), 0, 255).astype(np.uint8)

@@ -8,13 +8,13 @@ import cv2
 
 from vslam.doctor.examine import Diagnosis, Picture
 from vslam.doctor.findings import sections
-from vslam.errors import ResultsError, counted
+from vslam.errors import counted, write_file
 from vslam.report.page import Figure, Page, Section
 from vslam.report.render import html
 
 
 def write_page(diagnosis: Diagnosis, title: str, path: Path) -> None:
-    """Write the page as self-contained HTML: faults with their fixes first, then other checks.
+    """Write the page as self-contained HTML: faults with their fixes first, then the other checks.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -29,12 +29,7 @@ def write_page(diagnosis: Diagnosis, title: str, path: Path) -> None:
         [counted(faults, "fault") if faults else "no faults"],
         [*sections(diagnosis.findings), Section("", figures)],
     )
-    try:
-        path.write_text(html(page), encoding="utf-8")
-    except OSError as error:
-        raise ResultsError(
-            f"{path}: cannot be written ({error.strerror}); name another file with --out."
-        ) from error
+    write_file(path, html(page), "name another file with --out")
 
 
 def _jpeg(picture: Picture) -> bytes:

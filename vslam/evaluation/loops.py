@@ -1,7 +1,8 @@
 """Evaluation of loops: where the camera revisited a place, and whether a loop was closed there.
 
-ATE alone does not show this: a missed loop costs nothing without drift, and a wrong one may distort
-a part of the map with few frames. Here each loop and each revisit is judged by itself.
+ATE alone does not show this: without drift, a missed loop causes no error, and a wrong loop may
+distort only a part of the map with few frames. Here, each loop and each revisit is judged by
+itself.
 """
 
 from __future__ import annotations
@@ -17,19 +18,19 @@ from vslam.geometry import inverses
 from vslam.loops import LoopEdge
 from vslam.run.outcome import RunOutcome, ground_truth_of
 
-# A revisit.
-MIN_LENGTH_M = 20.0  # shorter ones do not count
+# Definition of a revisit.
+MIN_LENGTH_M = 20.0  # of the stretch
 MAX_LATERAL_M = 5.0  # from the earlier path; the next lane is 3 to 4 m away
 MAX_HEADING_DEG = 30.0  # between the optical axes; from behind, a place looks different
 MIN_SECONDS, MIN_PATH_M = 10.0, 50.0  # since the earlier passage
-# Stretches with a shorter gap count as one, because tracking continues in the old map over it.
+# Stretches with a shorter gap count as one, because tracking continues in the old map across it.
 MAX_INTERRUPTION_M = 10.0
-# The largest error of a right loop's relative pose: well above the error of KITTI's ground truth
-# between two passages, and well below the distance of similar houses in a row.
+# Largest error of the relative pose of a correct loop: well above the error of KITTI's ground truth
+# between two passages, and well below the distance between similar houses in a row.
 MAX_TRANSLATION_M, MAX_ROTATION_DEG = 2.0, 5.0
-_SAMPLE_M = 1.0  # the path is sampled once a metre, so that a standing camera adds no samples
-_UNIT_FRAMES = 20  # before and after a frame, to estimate the unit of a monocular map
-_MAX_STEP_M = 20.0  # between two frames farther apart the path is unknown
+_SAMPLE_M = 1.0  # the path is sampled once per metre, so that a standing camera adds no samples
+_UNIT_FRAMES = 20  # frames before and after a frame from which a monocular map's unit is estimated
+_MAX_STEP_M = 20.0  # between two frames that are farther apart, the path is unknown
 
 Indices = NDArray[np.int64]
 Poses = NDArray[np.float64]
@@ -41,8 +42,8 @@ class Revisits:
 
     Attributes:
         first, last: ``(M,)`` first and last frame of each stretch.
-        first_match, last_match: ``(M,)`` the earlier frames nearest to those two.
-        length_m: ``(M,)`` path length from first to last.
+        first_match, last_match: ``(M,)`` earlier frame at the place of ``first`` and of ``last``.
+        length_m: ``(M,)`` length of each stretch.
     """
 
     first: Indices
@@ -61,11 +62,11 @@ class LoopEvaluation:
 
     Attributes:
         revisits: M stretches.
-        loop_frame: ``(M,)`` query frame of the first right loop closed on each stretch, -1 if it
-            was missed.
+        loop_frame: ``(M,)`` query frame of the first right loop that was closed on each stretch, -1
+            if none was.
         right: for each edge, including rejected ones, whether its relative pose is right; None if
             it has no pose or its frames have no ground truth.
-        n_wrong: number of accepted edges that are not right.
+        n_wrong: number of accepted edges whose relative pose is wrong.
     """
 
     revisits: Revisits
@@ -75,8 +76,10 @@ class LoopEvaluation:
 
     @property
     def n_found(self) -> int:
-        """Number of stretches with a right loop. One loop per stretch is enough, because tracking
-        then continues in the old map."""
+        """Number of stretches with a right loop.
+
+        One loop per stretch is enough, because tracking then continues in the old map.
+        """
         return int(np.count_nonzero(self.loop_frame >= 0))
 
     @property
@@ -86,8 +89,11 @@ class LoopEvaluation:
 
 
 def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
-    """Judge the loops of a run by the ground truth of the frames done. None if a frame has no
-    ground truth, because revisits cannot be found on a path with gaps."""
+    """Judge the loops of a run by the ground truth of its frames.
+
+    Returns None if a frame has no ground truth, because revisits cannot be found on a path with
+    gaps.
+    """
     truth = ground_truth_of(outcome.sequence)
     if truth is None or not len(outcome.trajectory):
         return None
@@ -104,10 +110,10 @@ def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
 
 
 def metres_per_unit(T_wc: Poses, T_wc_true: Poses) -> NDArray[np.float64]:
-    """``(N,)`` metres per unit of a monocular map when each frame was tracked.
+    """``(N,)`` metres per unit of a monocular map at the time of each frame.
 
-    It is the median ratio of true and estimated steps between consecutive frames, over the 41
-    frames around it; 1 if the camera did not move.
+    It is the median ratio of the true to the estimated distance between consecutive frames, over
+    the 41 frames around each frame; 1 if the camera did not move.
 
     Args:
         T_wc: ``(N, 4, 4)`` poses as tracked.
@@ -137,38 +143,40 @@ def _in_metres(edge: LoopEdge, metres: float) -> LoopEdge:
 def revisits(T_wc: Poses, timestamps: NDArray[np.float64]) -> Revisits:
     """Find the stretches on which the camera drives where it drove before, in the same direction.
 
-    A frame is a revisit if the path driven at least ``MIN_SECONDS`` and ``MIN_PATH_M`` earlier
-    passes within ``MAX_LATERAL_M`` of it and has, there, a heading within ``MAX_HEADING_DEG`` of
-    its own. The path between two frames is assumed to be straight.
+    A frame is a revisit if, at least ``MIN_SECONDS`` and ``MIN_PATH_M`` earlier, the camera passed
+    within ``MAX_LATERAL_M`` of it with a heading that differed by at most ``MAX_HEADING_DEG``. The
+    path between two frames is assumed to be straight.
 
     Args:
         T_wc: ``(N, 4, 4)`` ground truth.
         timestamps: ``(N,)`` seconds.
     """
     none = np.zeros(0, np.int64)
+    no_revisits = Revisits(none, none, none, none, np.zeros(0))
     if len(T_wc) < 2:
-        return Revisits(none, none, none, none, np.zeros(0))
+        return no_revisits
     path = path_length(T_wc)
     sampled = np.searchsorted(path, np.arange(0.0, path[-1], _SAMPLE_M))
     sampled = np.unique(np.append(sampled, len(T_wc) - 1))
     match = _earlier_passage(T_wc[sampled], timestamps[sampled], path[sampled])
 
-    back = np.flatnonzero(match >= 0)
-    if not len(back):
-        return Revisits(none, none, none, none, np.zeros(0))
-    at = path[sampled]
-    gap = np.diff(at[back])
-    interrupted = (np.diff(back) > 1) & (gap >= MAX_INTERRUPTION_M)
-    apart = np.flatnonzero(interrupted | (gap > _MAX_STEP_M))
-    first, last = back[np.append(0, apart + 1)], back[np.append(apart, len(back) - 1)]
-    long_enough = at[last] - at[first] >= MIN_LENGTH_M
+    revisiting = np.flatnonzero(match >= 0)
+    if not len(revisiting):
+        return no_revisits
+    travelled = path[sampled]
+    gap = np.diff(travelled[revisiting])
+    interrupted = (np.diff(revisiting) > 1) & (gap >= MAX_INTERRUPTION_M)
+    ends = np.flatnonzero(interrupted | (gap > _MAX_STEP_M))
+    first = revisiting[np.append(0, ends + 1)]
+    last = revisiting[np.append(ends, len(revisiting) - 1)]
+    long_enough = travelled[last] - travelled[first] >= MIN_LENGTH_M
     first, last = first[long_enough], last[long_enough]
     return Revisits(
         first=sampled[first],
         last=sampled[last],
         first_match=sampled[match[first]],
         last_match=sampled[match[last]],
-        length_m=at[last] - at[first],
+        length_m=travelled[last] - travelled[first],
     )
 
 
@@ -183,12 +191,12 @@ def judge_loops(
     An edge is right if ``T_query_match`` agrees with the ground truth within ``MAX_TRANSLATION_M``
     and ``MAX_ROTATION_DEG``. It finds a stretch if it is right and accepted, its match belongs to
     an earlier passage (not to the frames just before), and its query lies on the stretch or within
-    ``MAX_INTERRUPTION_M`` of it, since the camera sees a place for a little longer than it is
+    ``MAX_INTERRUPTION_M`` of it, because the camera sees a place shortly before and after it is
     there.
 
     Args:
         edges: E loops, accepted or not.
-        frames: ``(K,)`` frame of each keyframe that the edges name, -1 if it is of another drive.
+        frames: ``(K,)`` frame of each keyframe, -1 if the keyframe belongs to another drive.
         T_wc: ``(N, 4, 4)`` ground truth of the frames.
         timestamps: ``(N,)`` seconds.
     """
@@ -215,8 +223,8 @@ def judge_loops(
 
 
 def is_right_loop(edge: LoopEdge, frames: Indices, T_wc: Poses) -> bool | None:
-    """Whether the relative pose of one loop is the true one, as :func:`judge_loops` says; None
-    where that cannot be told."""
+    """Whether the relative pose of a loop agrees with the ground truth, as in `judge_loops`; None
+    if it has no pose or its frames have no ground truth."""
     if edge.T_query_match is None or edge.query < 0:
         return None
     query, match = frames[edge.query], frames[edge.match]
@@ -235,7 +243,7 @@ def is_right_loop(edge: LoopEdge, frames: Indices, T_wc: Poses) -> bool | None:
 def _earlier_passage(
     T_wc: Poses, timestamps: NDArray[np.float64], path: NDArray[np.float64]
 ) -> Indices:
-    """``(S,)`` for each sample, the nearest sample of an earlier passage, or -1."""
+    """``(S,)`` index of the nearest sample of an earlier passage for each sample, or -1."""
     from scipy.spatial import cKDTree
 
     position, axis = T_wc[:, :3, 3], T_wc[:, :3, 2]
@@ -244,7 +252,7 @@ def _earlier_passage(
     forward[length > _MAX_STEP_M] = 0.0
     length[length > _MAX_STEP_M] = 0.0
 
-    # A step that passes a sample within max_lateral_m starts at most this far from the sample.
+    # A step that passes within MAX_LATERAL_M of a sample starts at most this far from the sample.
     radius = float(np.hypot(MAX_LATERAL_M, length.max()))
     pairs = cKDTree(position).query_pairs(radius, output_type="ndarray")
     start, query = pairs[:, 0], pairs[:, 1]
@@ -261,7 +269,7 @@ def _earlier_passage(
     query, nearest, distance = query[same], nearest[same], distance[same]
 
     match = np.full(len(T_wc), -1, np.int64)
-    order = np.lexsort((nearest, -distance, query))  # the nearest of each query is written last
+    order = np.lexsort((nearest, -distance, query))  # the nearest match is written last
     match[query[order]] = nearest[order]
     return match
 
@@ -272,5 +280,6 @@ def _long_ago(
     query: Indices | int,
     match: Indices | int,
 ) -> NDArray[np.bool_]:
+    """Whether the match is early enough to belong to an earlier passage than the query."""
     apart = path[query] - path[match] >= MIN_PATH_M
     return apart & (timestamps[query] - timestamps[match] >= MIN_SECONDS)

@@ -1,4 +1,4 @@
-"""Errors of odometry over short motions, beside what their covariances predict."""
+"""Errors of odometry over short motions, and the errors that its covariances predict."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class MotionErrors:
 
     Attributes:
         first: ``(M,)`` int64, index of the frame in which each motion begins.
-        xi: ``(M, 6)`` errors, metres and radians, in the frame of the camera at the end: the true
-            motion is ``exp(xi) T_last_first``.
-        covariance: ``(M, 6, 6)`` what ``relative_covariance`` predicts.
+        xi: ``(M, 6)`` errors in metres and radians, in the camera frame at the end: the true motion
+            is ``exp(xi) T_last_first``.
+        covariance: ``(M, 6, 6)`` covariances of ``xi`` that ``relative_covariance`` predicts.
     """
 
     first: NDArray[np.int64]
@@ -31,21 +31,20 @@ class MotionErrors:
 
     @property
     def nees(self) -> NDArray[np.float64]:
-        """``(M,)`` normalised estimation error squared, divided by its six degrees of freedom: 1 on
-        average if the covariances are right (Bar-Shalom et al., Estimation with Applications to
+        """``(M,)`` normalised estimation errors squared, divided by the six degrees of freedom: 1
+        on average if the covariances are right (Bar-Shalom et al., Estimation with Applications to
         Tracking and Navigation, 2001, 5.4)."""
         solved = np.linalg.solve(self.covariance, self.xi[:, :, None])[:, :, 0]
-        found: NDArray[np.float64] = (self.xi * solved).sum(axis=1) / 6.0
-        return found
+        return np.asarray((self.xi * solved).sum(axis=1) / 6.0, np.float64)
 
     @property
     def distance(self) -> NDArray[np.float64]:
-        """``(M,)`` errors of the distance covered, metres."""
+        """``(M,)`` errors of the translation, metres."""
         return np.asarray(np.linalg.norm(self.xi[:, :3], axis=1), np.float64)
 
     @property
     def sigma(self) -> NDArray[np.float64]:
-        """``(M,)`` predicted standard deviations of the position, metres."""
+        """``(M,)`` predicted standard deviations of the translation, metres."""
         return np.asarray(np.sqrt(np.trace(self.covariance[:, :3, :3], axis1=1, axis2=2)))
 
 
@@ -55,34 +54,33 @@ def motion_errors(
     """Compare the motions of odometry with the true ones.
 
     Args:
-        tracks: one result per frame; only those with an uncertainty and a true pose count.
-        truth: true poses, at the times of frames.
-        interval_s: seconds; every motion ends at the first frame that is so much later.
+        tracks: one result per frame; frames without an uncertainty or a true pose are not used.
+        truth: true poses at the times of frames.
+        interval_s: duration of a motion; it ends at the first frame that is at least this many
+            seconds later.
     """
     true_pose = dict(zip(truth.timestamps.tolist(), truth.T_wc, strict=True))
     usable = [
-        (track, true_pose[track.timestamp])
+        (track.index, track.timestamp, track.T_odom_camera, track.uncertainty)
         for track in tracks
-        if track.timestamp in true_pose and track.uncertainty is not None
+        if track.timestamp in true_pose
+        and track.T_odom_camera is not None
+        and track.uncertainty is not None
     ]
-    times = np.array([track.timestamp for track, _ in usable])
+    times = np.array([timestamp for _, timestamp, _, _ in usable])
     first: list[int] = []
     xi: list[Matrix] = []
     covariance: list[Matrix] = []
-    for k, (one, T_true_one) in enumerate(usable):
-        last = int(np.searchsorted(times, times[k] + interval_s))
+    for index, t_first, T_first, uncertainty_first in usable:
+        last = int(np.searchsorted(times, t_first + interval_s))
         if last == len(usable):
             break
-        other, T_true_other = usable[last]
-        assert one.T_odom_camera is not None
-        assert other.T_odom_camera is not None
-        assert one.uncertainty is not None
-        assert other.uncertainty is not None
-        T_last_first = inverse(other.T_odom_camera) @ one.T_odom_camera
-        T_true = inverse(T_true_other) @ T_true_one
-        first.append(one.index)
+        _, t_last, T_last, uncertainty_last = usable[last]
+        T_last_first = inverse(T_last) @ T_first
+        T_true = inverse(true_pose[t_last]) @ true_pose[t_first]
+        first.append(index)
         xi.append(se3_log(orthonormalised(T_true @ inverse(T_last_first))))
-        covariance.append(relative_covariance(one.uncertainty, other.uncertainty, T_last_first))
+        covariance.append(relative_covariance(uncertainty_first, uncertainty_last, T_last_first))
     return MotionErrors(
         np.array(first, np.int64),
         np.array(xi, np.float64).reshape(-1, 6),

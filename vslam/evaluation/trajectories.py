@@ -1,7 +1,7 @@
-"""Errors of a trajectory: ATE, RPE and KITTI's drift, as papers define them.
+"""Errors of a trajectory, by their usual definitions: ATE, RPE and KITTI's drift.
 
-ATE and RPE are computed by evo (Grupp, 2017), whose command line reproduces them; this is the only
-module that imports it.
+evo (Grupp, 2017) computes ATE and RPE, and its command line reproduces them. Only this module
+imports evo.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ class Evaluation:
     Attributes:
         frames: N, number of compared frames.
         alignment: ``se3``, ``sim3`` or ``none``, the transformation fitted before the comparison.
-        on_one_line: the positions leave the rotation about their line open, so it was fitted to the
-            orientations; evo refuses such trajectories.
-        timestamps: ``(N,)`` seconds, of the estimate.
+        on_one_line: whether all positions lie on one line. They do not determine the rotation about
+            this line, which was then fitted to the orientations; evo rejects such trajectories.
+        timestamps: ``(N,)`` seconds of the estimate.
         ate_rmse_m, ate_mean_m, ate_max_m: RMSE, mean and maximum of ``errors_m``.
         errors_m: ``(N,)`` distance of each aligned position from the ground truth.
         T_wc_aligned: ``(N, 4, 4)`` the estimate, aligned to the ground truth.
         distances_m: ``(N,)`` path length along the ground truth up to each frame.
         rpe_m, rpe_deg: RMSE of the motion from one frame to the next.
-        t_rel_percent, r_rel_deg_per_100m: KITTI's drift over 100 to 800 m, None on paths shorter
-            than 100 m.
+        t_rel_percent, r_rel_deg_per_100m: KITTI's drift over 100 to 800 m; None if the path is
+            shorter than 100 m.
     """
 
     frames: int
@@ -67,17 +67,18 @@ class Evaluation:
 def evaluate_trajectory(
     estimate: Trajectory, ground_truth: Trajectory, alignment: str = "se3"
 ) -> Evaluation:
-    """Compare an estimate with the ground truth, aligned by ``se3``, ``sim3`` or not (``none``).
+    """Compare an estimate with the ground truth after alignment by ``se3`` or ``sim3``, or without
+    alignment (``none``).
 
-    Equally long trajectories with the same timestamps are compared frame by frame. Otherwise each
-    pose is compared with the one nearest in time, at most 10 ms away; ``Evaluation.frames`` is the
-    number of such pairs. ATE is the RMSE of positions after alignment (Umeyama, TPAMI 1991; without
-    scale for ``se3``) [Sturm et al., IROS 2012]. RPE is computed over one frame, KITTI's drift by
-    :func:`kitti_drift`.
+    Trajectories with the same timestamps are compared frame by frame. Otherwise, each pose is
+    compared with the pose nearest in time, if it is at most 10 ms away; ``Evaluation.frames`` is
+    the number of such pairs. ATE is the RMSE of the positions [Sturm et al., IROS 2012] after
+    alignment by Umeyama's method (TPAMI 1991; without scale for ``se3``). RPE is computed from one
+    frame to the next, and KITTI's drift by `kitti_drift`.
 
     Raises:
-        InputError: the alignment is unknown, the trajectories have no common frames, or there is
-            too little motion to compare them.
+        InputError: the alignment is unknown, the trajectories have no common frames, or the camera
+            hardly moves in them.
     """
     from evo import EvoException
     from evo.core.metrics import APE, RPE, PoseRelation
@@ -107,8 +108,7 @@ def evaluate_trajectory(
 
     T_wc_aligned = np.array(aligned.poses_se3)
     errors = np.asarray(ape.error)
-    distances = path_length(ground_truth.T_wc)
-    drift = kitti_drift(T_wc_aligned, ground_truth.T_wc)
+    t_rel, r_rel = kitti_drift(T_wc_aligned, ground_truth.T_wc) or (None, None)
     return Evaluation(
         frames=len(errors),
         alignment=alignment,
@@ -119,19 +119,19 @@ def evaluate_trajectory(
         ate_max_m=float(errors.max()),
         errors_m=errors,
         T_wc_aligned=T_wc_aligned,
-        distances_m=distances,
+        distances_m=path_length(ground_truth.T_wc),
         rpe_m=_rmse(np.asarray(rpe_m.error)),
         rpe_deg=_rmse(np.asarray(rpe_deg.error)),
-        t_rel_percent=None if drift is None else drift[0],
-        r_rel_deg_per_100m=None if drift is None else drift[1],
+        t_rel_percent=t_rel,
+        r_rel_deg_per_100m=r_rel,
     )
 
 
 def _align(estimate: Any, reference: Any, with_scale: bool) -> bool:
     """Align a trajectory of evo in place; returns whether the positions lie on one line.
 
-    The rotation about that line changes no position error. To determine it, points on short axes
-    of the cameras are aligned together with the positions.
+    Positions on a line do not determine the rotation about it. Therefore, points on short axes of
+    the cameras are aligned together with the positions.
     """
     from evo import EvoException
     from evo.core.geometry import umeyama_alignment
@@ -153,13 +153,14 @@ def _align(estimate: Any, reference: Any, with_scale: bool) -> bool:
 def _with_axes(trajectory: Any) -> NDArray[np.float64]:
     """``(3, 3N)`` positions, and points to the right of and below each of them."""
     T_wc = np.array(trajectory.poses_se3)
-    at = T_wc[:, :3, 3]
-    short = 1e-3 * np.linalg.norm(at.std(axis=0))
-    return np.concatenate([at, at + short * T_wc[:, :3, 0], at + short * T_wc[:, :3, 1]]).T
+    position = T_wc[:, :3, 3]
+    short = 1e-3 * np.linalg.norm(position.std(axis=0))
+    ends = [position + short * T_wc[:, :3, axis] for axis in range(2)]
+    return np.concatenate([position, *ends]).T
 
 
 def path_length(T_wc: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``(N,)`` metres travelled from the first pose to each of ``(N, 4, 4)`` poses."""
+    """``(N,)`` metres travelled up to each of ``(N, 4, 4)`` poses."""
     steps = np.linalg.norm(np.diff(T_wc[:, :3, 3], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
@@ -167,11 +168,11 @@ def path_length(T_wc: NDArray[np.float64]) -> NDArray[np.float64]:
 def kitti_drift(
     T_wc: NDArray[np.float64], T_wc_ground_truth: NDArray[np.float64]
 ) -> tuple[float, float] | None:
-    """Average drift over 100, 200 ... 800 m, as the KITTI development kit defines it.
+    """Average drift over segments of 100 to 800 m, as the KITTI development kit defines it.
 
-    A segment of each length starts at every tenth frame and ends at the first frame beyond that
-    length along the ground truth. The error of the motion over a segment is divided by its length
-    [Geiger et al., CVPR 2012].
+    Segments of 100, 200, ..., 800 m start at every tenth frame and end at the first frame beyond
+    this length along the ground truth. The error of the motion over a segment is divided by its
+    length [Geiger et al., CVPR 2012].
 
     Args:
         T_wc: ``(N, 4, 4)`` estimate.
@@ -204,25 +205,24 @@ def read_pair(
     """Read an estimate and its ground truth, each in KITTI's or TUM's format.
 
     Args:
-        estimate, ground_truth: the two files.
-        times: file with the seconds of the frames, one on each line (``times.txt``), for those of
-            the two that are KITTI files.
+        times: file with the time of each frame in seconds, one per line (``times.txt``), for files
+            in KITTI's format, which have no times.
 
     Raises:
-        InputError: a file is malformed, or a KITTI file cannot be matched without times.
+        InputError: a file is malformed, or the two cannot be matched without times.
     """
     timestamps = None if times is None else read_table(times, (1,), "a time in seconds")[:, 0]
     formats = {trajectory_format(estimate), trajectory_format(ground_truth)}
     if timestamps is None and len(formats) == 2:
         raise InputError(
             f"{estimate} and {ground_truth}: one is a KITTI file, which has no times; "
-            "give them with --times, or name two KITTI files."
+            "give its times with --times, or name two KITTI files."
         )
     pair = read_trajectory(estimate, timestamps), read_trajectory(ground_truth, timestamps)
     if timestamps is None and formats == {"kitti"} and len(pair[0]) != len(pair[1]):
         raise InputError(
             f"{estimate}: {len(pair[0])} poses but {len(pair[1])} in {ground_truth}; use "
-            "ground_truth_kitti.txt of the run folder, or the run's TUM file and --times."
+            "ground_truth_kitti.txt from the run folder, or the run's TUM file with --times."
         )
     return pair
 
@@ -243,17 +243,17 @@ def _associate(estimate: Trajectory, ground_truth: Trajectory) -> tuple[Trajecto
         times, true_times, rtol=0.0, atol=MAX_TIME_DIFFERENCE_S
     ):
         return estimate, ground_truth
-    if len(true_times) > len(times):  # evo looks up the poses of the shorter one in the longer
-        mine, true = matching_time_indices(times, true_times, MAX_TIME_DIFFERENCE_S)
+    if len(true_times) > len(times):  # like evo, look up the shorter trajectory in the longer one
+        matched, true = matching_time_indices(times, true_times, MAX_TIME_DIFFERENCE_S)
     else:
-        true, mine = matching_time_indices(true_times, times, MAX_TIME_DIFFERENCE_S)
-    if not mine:
+        true, matched = matching_time_indices(true_times, times, MAX_TIME_DIFFERENCE_S)
+    if not matched:
         raise InputError(
             f"none of the {len(estimate)} poses lies within {1000 * MAX_TIME_DIFFERENCE_S:.0f} ms "
-            f"of the ground truth's {len(ground_truth)}; compare files of the same sequence and "
-            "clock."
+            f"of one of the ground truth's {len(ground_truth)}; compare files of the same sequence "
+            "and clock."
         )
-    return estimate.select(np.array(mine)), ground_truth.select(np.array(true))
+    return estimate.select(np.array(matched)), ground_truth.select(np.array(true))
 
 
 def _rmse(errors: NDArray[np.float64]) -> float:

@@ -1,7 +1,8 @@
-"""The place of a map in the world of its ground truth, and the error of localising in the map.
+"""The transformation from a map to its ground truth, and the error of localisation in the map.
 
-A trajectory is usually aligned with its ground truth before it is compared. Frames localised in a
-map are instead moved by the alignment of the map, so that their error includes that of the map.
+A trajectory is usually aligned with its ground truth before the comparison. Frames that were
+localised in a map are instead transformed by the alignment of the map, so that their error includes
+the error of the map.
 """
 
 from __future__ import annotations
@@ -15,13 +16,14 @@ from vslam.run.outcome import RunOutcome, matched_ground_truth
 
 
 def name_of_world(outcome: RunOutcome) -> str:
-    """Name of the world of a run's ground truth; rendered drives of one route share it, whatever
-    their light and traffic."""
+    """Name of the world frame of a run's ground truth. Rendered drives along one route share it,
+    whatever their light and traffic."""
     return f"{outcome.sequence.dataset} {outcome.sequence.name.partition('+')[0]}"
 
 
 def world_of(outcome: RunOutcome, evaluation: Evaluation) -> World:
-    """The place of a map, from the alignment of the trajectory that it was built with."""
+    """The transformation from a map to its ground truth, by the alignment of the trajectory that
+    built the map."""
     truth = matched_ground_truth(outcome)
     assert truth is not None
     kept = np.isin(outcome.trajectory.timestamps, truth.timestamps)
@@ -30,8 +32,8 @@ def world_of(outcome: RunOutcome, evaluation: Evaluation) -> World:
 
 
 def error_in_map(outcome: RunOutcome) -> float | None:
-    """RMSE (m) of the frames that were localised in the map in which a run began; None if the map's
-    place in the world of the run's ground truth is unknown."""
+    """RMSE (m) of the frames that were localised in the map from which a run started; None if the
+    transformation from this map to the run's ground truth is unknown."""
     world, truth = outcome.world, matched_ground_truth(outcome)
     if world is None or truth is None or outcome.in_map is None:
         return None

@@ -1,4 +1,4 @@
-"""The laboratory: benchmarks of many runs, stress tests, loop detectors compared on images.
+"""Experiments: benchmarks of many runs, stress tests, comparisons of loop detectors on images.
 
-No run needs it; only the command line imports it (tests/test_dependencies.py).
+Running SLAM does not need them; only the command line imports them (tests/test_dependencies.py).
 """

@@ -26,8 +26,8 @@ from vslam.maps.checkpoint import ARRAYS as CHECKPOINT_ARRAYS
 from vslam.maps.checkpoint import checked_checkpoint
 from vslam.maps.stored_map import StoredMap, World, observations
 
-# The file has a list of observations by landmark instead; with keyframe_first_row it determines
-# these columns.
+# Instead of these columns, the file has a list of observations by landmark, which determines them
+# together with keyframe_first_row.
 _NOT_IN_FILE = ("head", "n_observations", "keyframe", "landmark", "next_row")
 # The columns of the map and their names in the file.
 FILE_NAMES = {
@@ -43,7 +43,7 @@ FILE_NAMES = {
 _SIZES = {"keyframe": "K", "landmark": "L", "row": "R"}
 
 
-def _kind(name: str, in_file: str) -> tuple[type, tuple[str | int, ...]]:
+def _layout(name: str, in_file: str) -> tuple[type, tuple[str | int, ...]]:
     """Type and shape that a column of the map must have in the file."""
     empty = (Arrays()._asdict() | KeyframeTable()._asdict())[name]
     size = "K+1" if name == "first_row" else _SIZES[in_file.partition("_")[0]]
@@ -54,7 +54,7 @@ def _kind(name: str, in_file: str) -> tuple[type, tuple[str | int, ...]]:
 # K+1 and L+1 are CSR offsets, one more than the items.
 ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "scales": (np.float64, ("levels",)),
-    **{in_file: _kind(name, in_file) for name, in_file in FILE_NAMES.items()},
+    **{in_file: _layout(name, in_file) for name, in_file in FILE_NAMES.items()},
     "landmark_first_observation": (np.int64, ("L+1",)),
     "observation_row": (np.int64, ("O",)),
     "loop_ends": (np.int64, ("E", 2)),
@@ -70,7 +70,7 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "frame_unit_scale": (np.float64, ("F",)),
 }
 _MAY_BE_NAN = {"row_u_right"}
-_MOST = 1e12  # metres, pixels or seconds; products of a few such numbers are finite too
+_MOST = 1e12  # metres, pixels or seconds; products of a few numbers below this are finite
 _ROTATION_TOLERANCE = 1e-6
 _MOST_PIXELS = 1e6  # width, height and focal length of a camera
 _MAX_OFFSET = 100.0  # pixels
@@ -83,11 +83,11 @@ class DamagedMapError(Exception):
 
 def _scalars(entry: dict[str, Any]) -> Scalars:
     names = asdict(Scalars())
-    found = Scalars(**{name: type(default)(entry[name]) for name, default in names.items()})
-    sound = abs(found.disparity_offset) < _MAX_OFFSET and 0.0 <= found.offset_information < np.inf
-    _require(sound, "the disparity offset")
-    _require(0 <= found.session < _MAX_SESSION, "the number of the drive")
-    return found
+    scalars = Scalars(**{name: type(default)(entry[name]) for name, default in names.items()})
+    _require(abs(scalars.disparity_offset) < _MAX_OFFSET, "the disparity offset")
+    _require(0.0 <= scalars.offset_information < np.inf, "the disparity offset")
+    _require(0 <= scalars.session < _MAX_SESSION, "the number of the drive")
+    return scalars
 
 
 def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
@@ -95,7 +95,7 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
 
     Raises:
         DamagedMapError, KeyError, TypeError, ValueError, AttributeError: the file is damaged; the
-            message says in a few words where.
+            message names the fault in a few words.
     """
     sizes = _check_shapes(data)
     map_ = _build_map(data, sizes)
@@ -132,13 +132,14 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
 
 
 def _check_shapes(data: dict[str, NDArray]) -> dict[str, int]:
-    """Check that every array exists, is finite and has its type and shape; returns K, L, R, ..."""
+    """Check that every array exists, is finite and has the right type and shape; returns the sizes
+    K, L, R, ... by name."""
     sizes: dict[str, int] = {}
     for name, (dtype, shape) in ARRAYS.items():
         array = data[name]
         plain = array.dtype == dtype and array.flags.c_contiguous
         if not plain or array.ndim != len(shape):
-            raise DamagedMapError(f"{name} is of {array.dtype}, {array.ndim} dimensions")
+            raise DamagedMapError(f"{name} has type {array.dtype} and {array.ndim} dimensions")
         for size, wanted in zip(array.shape, shape, strict=True):
             if isinstance(wanted, str):
                 key, plus, _ = wanted.partition("+")
@@ -156,15 +157,15 @@ def _all_differ(numbers: NDArray[np.int64]) -> bool:
     return bool((np.diff(np.sort(numbers)) > 0).all())
 
 
-def _require(holds: bool, otherwise: str) -> None:
+def _require(holds: bool, fault: str) -> None:
     if not holds:
-        raise DamagedMapError(otherwise)
+        raise DamagedMapError(fault)
 
 
 def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
     n, n_landmarks, n_rows = sizes["K"], sizes["L"], sizes["R"]
     scales, parent = data["scales"], data["keyframe_parent"]
-    _require(len(scales) > 1 and bool((np.diff(scales) > 0).all()), "scales do not grow")
+    _require(len(scales) > 1 and bool((np.diff(scales) > 0).all()), "scales do not increase")
     _require(bool(scales[0] > 0), "scales are not positive")
     first_row = data["keyframe_first_row"]
     _check_first("keyframe_first_row", first_row, n_rows)
@@ -200,11 +201,11 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
 
 
 def _check_merges(merged_into: NDArray[np.int32], alive: NDArray[np.bool_]) -> None:
-    """Check that following ``merged_into`` always ends, at a living landmark or at none."""
+    """Check that every chain of ``merged_into`` ends, at a living landmark or at none."""
     n = len(merged_into)
     _check_ids("landmark_merged_into", merged_into, n, least=NONE)
     _require(bool((merged_into[alive] == NONE).all()), "a living landmark that was merged")
-    # Pointer doubling: each round follows twice as many merges as the one before.
+    # Pointer doubling: each round follows twice as many merges as the round before.
     reached = np.append(np.where(merged_into >= 0, merged_into, n), n)
     for _ in range(n.bit_length()):
         reached = reached[reached]
@@ -268,9 +269,9 @@ def camera_of(header: dict[str, Any]) -> Camera:
         raise DamagedMapError(f"the camera: {error}") from error
     sizes = [camera.fx, camera.fy, camera.width, camera.height]
     places = [camera.cx, camera.cy, camera.baseline, camera.right_delay]
-    sound = all(isinstance(x, int | float) and 1 <= x < _MOST_PIXELS for x in sizes)
-    sound = sound and all(isinstance(x, int | float) and abs(x) < _MOST for x in places)
-    _require(sound and camera.baseline >= 0 and isinstance(camera.depth, bool), "camera")
+    valid = all(isinstance(x, int | float) and 1 <= x < _MOST_PIXELS for x in sizes)
+    valid = valid and all(isinstance(x, int | float) and abs(x) < _MOST for x in places)
+    _require(valid and camera.baseline >= 0 and isinstance(camera.depth, bool), "camera")
     return replace(camera, width=int(camera.width), height=int(camera.height))
 
 

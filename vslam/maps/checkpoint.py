@@ -37,37 +37,37 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "patch_shift": (np.float32, ("R", 2)),
 }
 FEATURES = ("xy", "octave", "angle", "descriptors", "u_right")
-_OF_TRACKER = ("index", "timestamp", "lost_frames", "n_tracked")
-_MOST = 1e12  # metres, pixels, seconds
+_TRACKER_FIELDS = ("index", "timestamp", "lost_frames", "n_tracked")
+_MOST = 1e12  # metres, pixels or seconds
 _MOST_FRAMES = 2**31
-_OF_MAPPER = ("reference", "last_frame", "last_timestamp")
+_MAPPER_FIELDS = ("reference", "last_frame", "last_timestamp")
 
 
 def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
     """The arrays of a checkpoint, named as in ``ARRAYS``."""
     tracker, patches = checkpoint.tracker, checkpoint.mapper.patches
-    none = KeyframePatches(-1, np.empty((0, PATCH_PIXELS), np.uint8), np.empty((0, 2), np.float32))
+    no_pixels, no_shift = np.empty((0, PATCH_PIXELS), np.uint8), np.empty((0, 2), np.float32)
     return {
         **{name: getattr(tracker.features, name) for name in FEATURES},
         "landmark": tracker.landmark,
         "coarse": tracker.coarse,
         "patch_keyframe": np.array([one.keyframe for one in patches], np.int64),
-        "patch_pixels": np.concatenate([one.pixels for one in (none, *patches)]),
-        "patch_shift": np.concatenate([one.shift for one in (none, *patches)]),
+        "patch_pixels": np.concatenate([no_pixels, *(one.pixels for one in patches)]),
+        "patch_shift": np.concatenate([no_shift, *(one.shift for one in patches)]),
     }
 
 
 def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
-    """The rest of a checkpoint as a JSON object; JSON preserves float64 exactly."""
+    """Everything else in a checkpoint as a JSON object; JSON preserves float64 exactly."""
     tracker, closing = checkpoint.tracker, checkpoint.closing
     consistency = closing.consistency
     return {
-        "tracker": {name: getattr(tracker, name) for name in _OF_TRACKER}
+        "tracker": {name: getattr(tracker, name) for name in _TRACKER_FIELDS}
         | {
             "T_cw": tracker.T_cw.tolist(),
             "twist": None if tracker.twist is None else tracker.twist.tolist(),
         },
-        "mapper": {name: getattr(checkpoint.mapper, name) for name in _OF_MAPPER},
+        "mapper": {name: getattr(checkpoint.mapper, name) for name in _MAPPER_FIELDS},
         "policy": asdict(checkpoint.policy),
         "odometry": checkpoint.odometry,
         "rig": {"delay": checkpoint.rig.delay, "sides": checkpoint.rig.sides},
@@ -85,15 +85,15 @@ def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
 def checked_checkpoint(
     arrays: dict[str, NDArray], entry: dict[str, Any], map_: Map, n_frames: int
 ) -> Checkpoint:
-    """Build the checkpoint of a file from untrusted arrays and an untrusted entry.
+    """Build the checkpoint of a file from its arrays and its entry, neither of which is trusted.
 
     Args:
         map_: the map of the same file, which has been checked.
         n_frames: number of frames of the drive so far.
 
     Raises:
-        KeyError, TypeError, ValueError, OverflowError: the checkpoint is damaged; the message says
-            in a few words where.
+        KeyError, TypeError, ValueError, OverflowError: the checkpoint is damaged; the message names
+            the fault in a few words.
     """
     sizes = {
         "N": len(arrays["landmark"]),
@@ -105,16 +105,16 @@ def checked_checkpoint(
         array = arrays[name]
         wanted = tuple(sizes[size] if isinstance(size, str) else size for size in shape)
         if array.dtype != dtype or array.shape != wanted or not array.flags.c_contiguous:
-            raise ValueError(f"checkpoint_{name} is {array.dtype} {array.shape}")
+            raise ValueError(f"checkpoint_{name} has type {array.dtype} and shape {array.shape}")
         nan = np.isnan(array) & (name == "u_right")
         if dtype == np.float32 and not (nan | (np.abs(array) < _MOST)).all():
             raise ValueError(f"checkpoint_{name} is out of range")
     tracker, mapper, policy = (dict(entry[name]) for name in ("tracker", "mapper", "policy"))
     T_cw, twist = tracker.pop("T_cw"), tracker.pop("twist")
     landmark, reference = arrays["landmark"], _count(mapper["reference"])
-    # These are -1 and -inf while a drive in a stored map has not inserted a keyframe yet.
+    # These are -1 and -inf until a drive in a stored map inserts its first keyframe.
     last_frame, last_timestamp = _count(mapper["last_frame"], -1), mapper["last_timestamp"]
-    sound = (
+    valid = (
         ((landmark >= -1) & (landmark < map_.n_landmarks)).all()
         and (arrays["octave"] < len(map_.scales)).all()
         and reference < map_.n_keyframes
@@ -123,7 +123,7 @@ def checked_checkpoint(
         and last_frame < n_frames
         and isinstance(policy["gain_awaited"], bool)
     )
-    if not sound:
+    if not valid:
         raise ValueError("the last frame is out of range")
     features = Features(**{name: arrays[name] for name in FEATURES})
     return Checkpoint(

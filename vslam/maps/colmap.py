@@ -1,8 +1,8 @@
 """COLMAP's sparse model, text or binary (https://colmap.github.io/format.html).
 
 COLMAP's poses are ``T_cw`` with x right, y down, z forward, as here, but its pixel coordinates
-begin at the corner of the image: the centre of the upper left pixel is (0.5, 0.5). Since no files
-of rigs and frames are written, every image is a frame of its own.
+begin at the corner of the image: the centre of the upper left pixel is (0.5, 0.5). COLMAP's files
+of rigs and frames are not written, so COLMAP treats every image as a separate frame.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from vslam.camera import Camera
 from vslam.maps.reconstruction import PIXEL_CENTRE, Reconstruction
 
 _CAMERA_ID = 1
-_PINHOLE = 1  # the model's number in COLMAP's camera_models
+_PINHOLE = 1  # number of this model in COLMAP's camera_models
 _POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _TRACK = np.dtype([("image", "<u4"), ("point2d", "<u4")])
 
 
 class _Image(NamedTuple):
-    """``pose``: ``(7,)`` qw qx qy qz tx ty tz of ``T_cw``; ``points`` has the type ``_POINT2D``."""
+    """An image; ``pose`` is ``(7,)`` qw qx qy qz tx ty tz of ``T_cw``, ``points`` has the type
+    ``_POINT2D``."""
 
     id: int
     pose: NDArray[np.float64]
@@ -34,7 +35,8 @@ class _Image(NamedTuple):
 
 
 class _Point(NamedTuple):
-    """``error`` is the mean reprojection error in pixels; ``track`` has the type ``_TRACK``."""
+    """A point; ``error`` is the mean reprojection error in pixels, ``track`` has the type
+    ``_TRACK``."""
 
     id: int
     xyz: NDArray[np.float64]
@@ -137,5 +139,5 @@ def _write_text(folder: Path, camera: Camera, images: list[_Image], points: list
 
 
 def _words(values: tuple[float, ...] | list[float]) -> str:
-    """Numbers with enough digits to be read back exactly."""
+    """Numbers separated by spaces, with enough digits to be read back exactly."""
     return " ".join(map(repr, values))

@@ -32,7 +32,8 @@ def save_nerfstudio(
     Cameras look along -z with y up (OpenGL), ``transform_matrix`` is camera to world, and the
     world's z axis points up. ``applied_transform`` maps vslam's world to the world of both files.
     Pixel coordinates begin at the corner of the image, as in COLMAP: nerfstudio's rays go through
-    ``column + 0.5`` (``Cameras.get_image_coords``), although its documentation suggests (0, 0).
+    ``column + 0.5`` (``Cameras.get_image_coords``), although its documentation suggests that the
+    centre of the first pixel is (0, 0).
 
     Args:
         folder: an existing folder.
@@ -78,9 +79,9 @@ def save_g2o(
     ``EDGE_SE3:QUAT`` lines, each with x y z qx qy qz qw. An edge also has the upper triangle of its
     information matrix, row by row, translation first.
 
-    The information of rotations is per square radian, as GTSAM, Ceres' examples and SE-Sync read
-    it. g2o itself measures rotations by qx qy qz, which are half as large for small angles, and so
-    gives them a quarter of the weight.
+    The information of rotations is per square radian, as GTSAM, Ceres' examples and SE-Sync expect.
+    g2o itself measures rotations by qx qy qz, which are half the angle if it is small, and so gives
+    them a quarter of the weight.
 
     Args:
         ids: ``(N,)`` ids of the vertices.
@@ -110,7 +111,7 @@ def _poses(T: NDArray[np.float64]) -> NDArray[np.float64]:
     """``(N, 7)`` x y z qx qy qz qw with qw >= 0."""
     from scipy.spatial.transform import Rotation
 
-    if not len(T):  # SciPy refuses an empty array
+    if not len(T):  # SciPy rejects an empty array
         return np.empty((0, 7))
     return np.column_stack(
         [T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)]
@@ -124,7 +125,8 @@ def _words(values: list[float]) -> str:
 def save_ply(
     path: Path | str, xyz: NDArray[np.float64], colours: NDArray[np.uint8] | None = None
 ) -> None:
-    """Write ``(N, 3)`` points (world, metres) as binary PLY, with ``(N, 3)`` uint8 RGB colours."""
+    """Write ``(N, 3)`` points (world, metres) as binary PLY, with ``(N, 3)`` uint8 RGB colours if
+    they are given."""
     fields = [("xyz", "<f4", 3)]
     properties = [f"property float {axis}\n" for axis in "xyz"]
     if colours is not None:
@@ -177,6 +179,6 @@ def landmark_colours(
         colours[seen] = pixels.reshape(len(pixels), -1)
     order = np.lexsort((colours @ _LUMA, r.landmark))
     counts = np.bincount(r.landmark, minlength=len(r.xyz))
-    # The lower median, which is a colour that was observed.
+    # The lower median, so that the result is an observed colour.
     middle = order[np.cumsum(counts) - counts + (counts - 1) // 2]
     return colours[middle]

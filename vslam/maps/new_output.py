@@ -14,11 +14,11 @@ from vslam.errors import InputError, ResultsError
 
 @contextmanager
 def new_output(path: Path, *, folder: bool = False) -> Iterator[Path]:
-    """Yield the path of a file to write, or an empty folder, which is renamed to ``path`` at the
-    end, or removed after an error.
+    """Yield the path of a temporary file to write, or with ``folder`` an empty temporary folder. It
+    is renamed to ``path`` at the end, or removed after an error.
 
     Raises:
-        InputError: ``path`` exists already, and is not an empty folder where one is wanted.
+        InputError: ``path`` exists already; with ``folder`` it may be an empty folder.
         ResultsError: it cannot be written, for example because the disk is full.
     """
     empty = path.is_dir() and not path.is_symlink() and not any(path.iterdir())
@@ -43,8 +43,8 @@ def new_output(path: Path, *, folder: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def replaced_file(path: Path) -> Iterator[BinaryIO]:
-    """Yield a file to write, which atomically replaces ``path`` at the end, synced to the disk.
-    After an error ``path`` is unchanged.
+    """Yield a temporary file to write, which is synced to the disk and atomically replaces ``path``
+    at the end. After an error ``path`` is unchanged.
 
     Raises:
         OSError: it cannot be written, for example because the disk is full.
@@ -61,7 +61,7 @@ def replaced_file(path: Path) -> Iterator[BinaryIO]:
             raise
         missing = not part.parent.is_dir()
         why = f"there is no folder {path.parent}" if missing else error.strerror
-        raise OSError(error.errno, why, str(path)) from None  # the user knows no other name
+        raise OSError(error.errno, why, str(path)) from None  # name the file that the user knows
     finally:
         part.unlink(missing_ok=True)
     if os.name == "posix":  # without this sync, a power cut may undo the renaming
@@ -73,7 +73,8 @@ def replaced_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def require_place(path: Path, option: str) -> None:
-    """Check before long work that a file can be written to ``path``, the value of ``option``.
+    """Check before a long computation that a file can be written to ``path``, the value of
+    ``option``.
 
     Raises:
         InputError: ``path`` is a folder, or its parent folder does not exist.
@@ -88,13 +89,14 @@ def require_free(path: Path) -> None:
     """Check that nothing is at ``path``, the value of ``--out``.
 
     Raises:
-        InputError: a file or folder is there.
+        InputError: a file or folder exists there.
     """
     if os.path.lexists(path):
         raise InputError(f"{path}: exists already; remove it, or name another place with --out.")
 
 
 def _beside(path: Path) -> Path:
-    """A hidden path on the same file system, so that renaming is atomic."""
+    """A hidden path in the same folder, and thus on the same file system, so that renaming is
+    atomic."""
     path = path.absolute()
     return path.with_name(f".{path.name}.{os.getpid()}.part")

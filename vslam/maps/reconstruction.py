@@ -20,7 +20,7 @@ PIXEL_CENTRE = 0.5
 class Reconstruction:
     """Living keyframes and landmarks, numbered without gaps, and their observations.
 
-    K keyframes, L landmarks, N observations. Right cameras are left out.
+    K keyframes, L landmarks, N observations, all of the left camera.
 
     Attributes:
         camera: camera of all keyframes; the centre of the upper left pixel is (0, 0), as in OpenCV.
@@ -28,8 +28,9 @@ class Reconstruction:
         timestamps: ``(K,)`` float64 seconds.
         T_cw: ``(K, 4, 4)`` float64 poses.
         xyz: ``(L, 3)`` float64 positions in the world; each landmark is observed at least once.
-        keyframe, landmark: ``(N,)`` int64 ends of each observation, in ascending keyframe order.
-        xy: ``(N, 2)`` float64 pixels, where the keyframe observes the landmark.
+        keyframe, landmark: ``(N,)`` int64, which keyframe observes which landmark, in ascending
+            keyframe order.
+        xy: ``(N, 2)`` float64 pixels at which the keyframe observes the landmark.
     """
 
     camera: Camera

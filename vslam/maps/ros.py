@@ -1,13 +1,13 @@
-"""Messages of ROS 2 from poses and landmarks, and a bag of them, without ROS.
+"""ROS 2 messages made from poses and landmarks, and bags of such messages. ROS is not needed.
 
 The frames are those of REP 105: ``map`` -> ``odom`` -> ``base_link`` -> ``camera_optical``. Their
-axes are those of REP 103: in ``map``, ``odom`` and ``base_link`` x points ahead, y to the left and
-z up; in ``camera_optical``, as everywhere else in vslam, x points right, y down and z ahead.
+axes are those of REP 103: in ``map``, ``odom`` and ``base_link`` x points forward, y left and z up;
+in ``camera_optical``, as everywhere else in vslam, x points right, y down and z forward.
 ``base_link`` lies in the left camera, and ``map`` and ``odom`` in its first pose. Lengths are in
 metres, or in the unit of a monocular map.
 
-Each function takes ``types``, which returns the class of a message by its name: those of rosbags
-for files, those of ROS for a node (``examples/ros2``).
+The argument ``types`` of these functions returns a message class for the name of a message: a class
+of rosbags for files, or one of ROS for a node (``examples/ros2``).
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ T_BASE_OPTICAL = np.array(
 )
 _LAST_SECOND = 2**31  # builtin_interfaces/Time counts seconds in 32 bits with a sign
 _FLOAT32 = 7  # sensor_msgs/PointField
-_VERSION: Literal[8] = 8  # of a bag: the one of ROS 2 Humble, which later releases read too
-# Topics, their types, and whether they get a single message, which late subscribers get too.
+_VERSION: Literal[8] = 8  # bag version of ROS 2 Humble, which later releases read, too
+# For each topic, its message type, and whether it has only one message, which subscribers that
+# connect later also receive.
 TOPICS = {
     "/tf_static": ("tf2_msgs/msg/TFMessage", True),
     "/map_points": ("sensor_msgs/msg/PointCloud2", True),
@@ -48,10 +49,10 @@ TOPICS = {
 
 @dataclass(frozen=True, eq=False)
 class FramePose:
-    """The pose of a frame, as ROS wants it.
+    """The pose of a frame, split into odometry and correction as in REP 105.
 
     Attributes:
-        stamp: nanoseconds.
+        stamp: time of the image in nanoseconds.
         T_odom_camera, T_map_odom: ``(4, 4)`` as in ``TrackResult``.
         near, covariance: ``(6, 6)`` as in ``PoseUncertainty``; None if unknown.
     """
@@ -64,16 +65,16 @@ class FramePose:
 
     @classmethod
     def of(cls, result: TrackResult, stamp: int) -> FramePose:
-        """The pose of a frame as ``Slam.step`` returned it. ``stamp`` is that of its image in
-        nanoseconds, because transforms are looked up by exact times, and seconds in float64 resolve
-        only 0.2 us of Unix time."""
-        known, T = result.uncertainty, result.T_odom_camera
+        """The pose of a frame that ``Slam.step`` returned. ``stamp`` is given in nanoseconds,
+        because ROS looks up transforms by exact times, and Unix time in float64 seconds has a
+        resolution of only 0.2 us."""
+        uncertainty, T = result.uncertainty, result.T_odom_camera
         return cls(
             stamp,
             result.T_wc if T is None else T,
             result.T_map_odom,
-            None if known is None else known.near,
-            None if known is None else known.covariance,
+            None if uncertainty is None else uncertainty.near,
+            None if uncertainty is None else uncertainty.covariance,
         )
 
     @property
@@ -83,14 +84,15 @@ class FramePose:
 
 
 def in_ros_axes(T: Matrix) -> Matrix:
-    """``(..., 4, 4)`` motions between camera frames as motions between frames with ROS's axes."""
-    moved: Matrix = T_BASE_OPTICAL @ T @ T_BASE_OPTICAL.T
-    return moved
+    """Convert ``(..., 4, 4)`` motions between camera frames to motions between frames with ROS's
+    axes."""
+    result: Matrix = T_BASE_OPTICAL @ T @ T_BASE_OPTICAL.T
+    return result
 
 
 def odometry_message(types: Types, pose: FramePose, before: FramePose | None) -> Any:
-    """``nav_msgs/Odometry``: the pose of ``base_link`` in ``odom``, and its mean velocity, in
-    ``base_link``, since the frame ``before``; zero without one."""
+    """``nav_msgs/Odometry``: the pose of ``base_link`` in ``odom``, and its mean velocity since the
+    frame ``before``, in ``base_link``; the velocity is zero if ``before`` is None."""
     twist, R = np.zeros(6), T_BASE_OPTICAL[:3, :3]
     if before is not None:
         motion = inverse(before.T_odom_base) @ pose.T_odom_base
@@ -158,14 +160,15 @@ def points_message(types: Types, stamp: int, xyz: NDArray[np.float64]) -> Any:
 
 
 def nanoseconds(timestamp: float) -> int:
-    """A time in seconds as nanoseconds.
+    """Convert a time in seconds to nanoseconds.
 
     Raises:
-        InputError: ROS cannot express it.
+        InputError: ROS cannot represent it.
     """
     if not 0 <= timestamp < _LAST_SECOND:
         raise InputError(
-            f"ROS has no time {timestamp:.0f} s; give the images times between 0 and 2^31 seconds."
+            f"ROS cannot represent the time {timestamp:.0f} s; give the images times between 0 and "
+            "2^31 seconds."
         )
     return round(1e9 * timestamp)
 
@@ -173,30 +176,38 @@ def nanoseconds(timestamp: float) -> int:
 def save_bag(
     path: Path, poses: Sequence[FramePose], trajectory: Trajectory, xyz: NDArray[np.float64]
 ) -> None:
-    """Write an MCAP file with the topics of ``TOPICS``, at least one pose.
+    """Write an MCAP file with the topics of ``TOPICS``.
 
     Args:
+        poses: the poses of the frames, at least one.
         trajectory: the poses of the path.
         xyz: ``(N, 3)`` landmarks in the world of the trajectory.
 
     Raises:
-        InputError: rosbags is not installed, or ROS cannot express a time of the trajectory.
+        InputError: rosbags is not installed, or ROS cannot represent a time of the trajectory.
         OSError: the file cannot be written.
     """
     try:
-        from rosbags import interfaces as of
+        from rosbags import interfaces
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
     except ModuleNotFoundError as error:
         raise InputError(
-            f"{path}: bags are written by rosbags, which is not installed; "
+            f"{path}: writing a bag needs rosbags, which is not installed; run "
             "pip install 'vslam[bag]'."
         ) from error
-    for_ever = of.QosTime(9223372036, 854775807)
-    kept = of.Qos(
-        of.QosHistory.KEEP_LAST, 1, of.QosReliability.RELIABLE, of.QosDurability.TRANSIENT_LOCAL,
-        for_ever, for_ever, of.QosLiveliness.AUTOMATIC, for_ever, False,
-    )  # fmt: skip
+    forever = interfaces.QosTime(9223372036, 854775807)
+    latched = interfaces.Qos(
+        interfaces.QosHistory.KEEP_LAST,
+        1,
+        interfaces.QosReliability.RELIABLE,
+        interfaces.QosDurability.TRANSIENT_LOCAL,
+        forever,
+        forever,
+        interfaces.QosLiveliness.AUTOMATIC,
+        forever,
+        False,
+    )
     store = get_typestore(Stores.ROS2_HUMBLE)
     types = store.types.__getitem__
     with TemporaryDirectory(dir=path.parent) as folder:
@@ -204,7 +215,7 @@ def save_bag(
         with Writer(bag, version=_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
             topics = {
                 topic: writer.add_connection(
-                    topic, name, typestore=store, offered_qos_profiles=[kept] if once else []
+                    topic, name, typestore=store, offered_qos_profiles=[latched] if once else []
                 )
                 for topic, (name, once) in TOPICS.items()
             }
@@ -235,7 +246,7 @@ def frame_poses(
         covariances: ``near`` and ``covariance`` by time (``read_covariances``).
 
     Raises:
-        InputError: ROS cannot express the times.
+        InputError: ROS cannot represent a time.
     """
     times = odometry.timestamps.tolist()
     corrections = trajectory.T_wc @ inverses(odometry.T_wc)
@@ -248,8 +259,8 @@ def frame_poses(
 
 
 def _covariance(matrix: Matrix | None, R: Matrix) -> NDArray[np.float64]:
-    """``(36,)`` a covariance of ``[x, y, z, rx, ry, rz]`` with the axes rotated by ``R``, row by
-    row; zeros, the convention of ``sensor_msgs`` for an unknown one, for None."""
+    """``(36,)`` the covariance of ``[x, y, z, rx, ry, rz]`` with axes rotated by ``R``, row by row.
+    An unknown covariance (None) is all zeros, as in ``sensor_msgs``."""
     if matrix is None:
         return np.zeros(36)
     both = np.kron(np.eye(2), R)
@@ -259,7 +270,8 @@ def _covariance(matrix: Matrix | None, R: Matrix) -> NDArray[np.float64]:
 
 def _velocity_covariance(pose: FramePose, before: FramePose | None) -> Matrix | None:
     """``(6, 6)`` covariance of the mean velocity between two frames, in the frame of the camera.
-    Their errors relative to the landmarks are independent, and those of the landmarks cancel."""
+    The errors of the two poses relative to the landmarks are independent, and the common error of
+    the landmarks cancels."""
     if before is None or before.near is None or pose.near is None:
         return None
     A = adjoint(inverse(pose.T_odom_camera) @ before.T_odom_camera)

@@ -29,28 +29,28 @@ from vslam.maps.stored_map import StoredMap
 from vslam.untrusted import ARCHIVE_ERRORS, read_json, require_memory
 
 SCHEMA = 8
-_FOREIGN = "not a map of vslam; name a map.npz, or the folder of a run"
+_FOREIGN = "not a map of vslam; name a map.npz or the folder of a run"
 
 
 def save_map(path: Path | str, stored: StoredMap, *, resumable: bool = False) -> None:
     """Write a map; an existing file is replaced.
 
-    After an error or a power cut the file is as it was before. Its ``header`` is JSON (schema,
-    camera, detector, drives, thresholds, versions); the arrays are those of ``ARRAYS``, and, by
-    keyframe, ``detector_NAME_first``, ``detector_NAME_values``, ``image_first`` and
-    ``image_values``. Observations are listed by landmark, in the order of the map's chains.
+    After an error or a power cut, an existing file is unchanged. The file holds the JSON text
+    ``header`` (schema, camera, detector, drives, thresholds, versions), the arrays of ``ARRAYS``,
+    and values for each keyframe: ``detector_NAME_first``, ``detector_NAME_values``, ``image_first``
+    and ``image_values``. Observations are listed by landmark, in the order of the map's chains.
 
     Args:
         path: the file.
         stored: the map.
-        resumable: also write the checkpoint, if there is one, with culled keyframes and landmarks;
+        resumable: also write the checkpoint, if there is one, and culled keyframes and landmarks;
             otherwise only living ones are written.
 
     Raises:
         OSError: the file cannot be written.
     """
-    whole = resumable and stored.checkpoint is not None
-    arrays = _as_arrays(stored if whole else stored.compact(copy=False))
+    with_checkpoint = resumable and stored.checkpoint is not None
+    arrays = _as_arrays(stored if with_checkpoint else stored.compact(copy=False))
     with replaced_file(Path(path)) as file:
         np.savez(file, allow_pickle=False, **arrays)
 
@@ -66,7 +66,7 @@ def load_map(path: Path | str) -> StoredMap:
 
 
 def load_checkpoint(path: Path | str) -> StoredMap:
-    """Read a map like ``load_map``, but leave one with a checkpoint as it was written.
+    """Read a map like ``load_map``, but do not compact a map with a checkpoint.
 
     Args:
         path: a map file, or the folder of a run that has one.
@@ -76,12 +76,12 @@ def load_checkpoint(path: Path | str) -> StoredMap:
     """
     path = map_file_of(path)
     data, header = _read(path)
-    with _as_damage(path):
+    with _damage_reported(path):
         return checked_map(data, header)
 
 
 @contextmanager
-def _as_damage(path: Path) -> Iterator[None]:
+def _damage_reported(path: Path) -> Iterator[None]:
     try:
         yield
     except (*ARCHIVE_ERRORS, DamagedMapError, TypeError, AttributeError) as error:
@@ -158,7 +158,7 @@ def map_file_of(path: Path | str) -> Path:
 
 
 class MadeWith(NamedTuple):
-    """Camera, name of the detector, and changed thresholds that a map was made with."""
+    """The camera, the name of the detector, and the changed thresholds that a map was made with."""
 
     camera: Camera
     detector: str
@@ -166,13 +166,13 @@ class MadeWith(NamedTuple):
 
 
 def made_with(path: Path | str) -> MadeWith:
-    """What a map was made with; its arrays are not read.
+    """Read what a map was made with, without reading its arrays.
 
     Raises:
         InputError: as ``load_map``.
     """
     path = Path(path)
-    with _opened(path) as (_, header), _as_damage(path):
+    with _opened(path) as (_, header), _damage_reported(path):
         thresholds = dict(header.get("thresholds", {}))
         return MadeWith(camera_of(header), str(header["detector"]["name"]), thresholds)
 
@@ -191,22 +191,22 @@ def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
         with np.load(path, allow_pickle=False) as file:
             if "header" not in file.files and "keyframe_first_row" in file.files:
                 raise InputError(
-                    f"{path}: a map of schema {int(file['schema'])}, this version reads {SCHEMA}; "
-                    "run again with it."
+                    f"{path}: a map of schema {int(file['schema'])}, but this version of vslam "
+                    f"reads schema {SCHEMA}; make the map again with this version."
                 )
             header = read_json(file["header"])
             if not isinstance(header, dict) or header.get("kind") != "vslam map":
                 raise InputError(f"{path}: {_FOREIGN}.")
             if header.get("schema") != SCHEMA:
                 raise InputError(
-                    f"{path}: a map of schema {header.get('schema')}, this version reads {SCHEMA}; "
-                    "use the version of vslam that wrote it."
+                    f"{path}: a map of schema {header.get('schema')}, but this version of vslam "
+                    f"reads schema {SCHEMA}; use the version that wrote the map."
                 )
             yield file, header
     except OSError as error:
         why = error.strerror or error
         raise InputError(
-            f"{path}: cannot be read ({why}); name a map.npz, or the folder of a run."
+            f"{path}: cannot be read ({why}); name a map.npz or the folder of a run."
         ) from error
     except BadZipFile as error:
         raise InputError(f"{path}: {_FOREIGN}, or the file is damaged ({error}).") from error

@@ -52,12 +52,13 @@ class StoredMap:
         detector: what the loop detector has stored about the keyframes.
         images: JPEG files (uint8) of the keyframes that learned descriptors may need; None without
             learned descriptors.
-        frames: frame poses of the last drive; None if they are not kept.
+        frames: frame poses of the last drive; None if they were not kept.
         drives: source of the images of each drive, such as "kitti 06".
-        thresholds: those that differed from the defaults in the last drive, by dotted name.
+        thresholds: the thresholds of the last drive that differed from the defaults, by dotted
+            name.
         world: the map's place in the world of a ground truth; None without ground truth.
-        checkpoint: state from which the last drive continues with identical results; the map then
-            includes dead keyframes and landmarks under their old ids. None if the map is compact or
+        checkpoint: state from which the last drive continues with identical results. The map then
+            includes dead keyframes and landmarks, with unchanged ids. None if the map is compact or
             there was no checkpoint.
     """
 
@@ -79,13 +80,14 @@ class StoredMap:
         the first living keyframe that observes them.
 
         Args:
-            copy: False returns views of the keypoint arrays, three quarters of a map, if all
-                keypoints are kept.
+            copy: if False and all keypoints are kept, the keypoint arrays, which are three quarters
+                of a map, are views instead of copies.
         """
         return self.select(self.map.living_keyframes(), copy=copy)
 
     def select(self, keyframes: NDArray[np.int64], *, copy: bool = True) -> StoredMap:
-        """Like ``compact``, but with only some living keyframes and the landmarks that they see.
+        """Like ``compact``, but with only some living keyframes and the landmarks that they
+        observe.
 
         Args:
             keyframes: ``(K,)`` ascending ids of living keyframes. Frame poses are dropped unless
@@ -102,6 +104,7 @@ class StoredMap:
             query, match = int(new_id[edge.query]), int(new_id[edge.match])
             if query >= 0 and match >= 0 and query != match:
                 loops.append(replace(edge, query=query, match=match, features=None, landmarks=None))
+        frames = self.frames if whole else None
         tables = {name: table.select(keyframes) for name, table in self.detector.tables.items()}
         return replace(
             self,
@@ -109,14 +112,14 @@ class StoredMap:
             loops=tuple(loops),
             detector=replace(self.detector, tables=tables),
             images=None if self.images is None else self.images.select(keyframes),
-            frames=None if self.frames is None or not whole else _moved(self.frames, map_, new_id),
+            frames=None if frames is None else _renumbered(frames, map_, new_id),
             checkpoint=None,
         )
 
 
 def selected(map_: Map, keyframes: NDArray[np.int64], *, copy: bool = True) -> Map:
     """A copy with only some living keyframes, ``(K,)`` ascending ids, and the landmarks that they
-    see, numbered without gaps.
+    observe, numbered without gaps.
 
     The parent of a keyframe is its nearest selected ancestor, or else the first selected keyframe.
     """
@@ -128,8 +131,8 @@ def selected(map_: Map, keyframes: NDArray[np.int64], *, copy: bool = True) -> M
     first, rows = gather_observations(a, living.astype(np.int32), new_id)
     count = np.diff(first)
     anchor = new_id[a.first_keyframe[living]]
-    # If the first keyframe of a landmark is not selected, the earliest selected observer replaces
-    # it.
+    # If the first keyframe of a landmark is not selected, the earliest selected keyframe that
+    # observes the landmark replaces it.
     earliest = np.full(len(living), n, np.int64)
     np.minimum.at(earliest, np.repeat(np.arange(len(living)), count), new_id[a.keyframe[rows]])
     anchor = np.where(anchor >= 0, anchor, earliest)
@@ -148,8 +151,8 @@ def selected(map_: Map, keyframes: NDArray[np.int64], *, copy: bool = True) -> M
         a.u_right[kept_rows],
     )
     all_kept = len(kept_rows) == map_.n_rows
-    of_rows = slice(None) if all_kept and not copy else kept_rows
-    parent, restart = _family(map_, keyframes, new_id)
+    chosen_rows = slice(None) if all_kept and not copy else kept_rows
+    parent, restart = _spanning_tree(map_, keyframes, new_id)
     renumbered: dict[str, NDArray] = {
         "first_row": first_row,
         "first_keyframe": anchor[kept].astype(np.int32),
@@ -162,13 +165,13 @@ def selected(map_: Map, keyframes: NDArray[np.int64], *, copy: bool = True) -> M
     for fields, chosen in (
         (KEYFRAME_FIELDS + KeyframeTable._fields, keyframes),
         (LANDMARK_FIELDS, landmarks),
-        (ROW_FIELDS, of_rows),
+        (ROW_FIELDS, chosen_rows),
     ):
         for name in fields:
             columns[name] = renumbered[name] if name in renumbered else columns[name][chosen]
-    found = map_.with_columns(columns)
-    found.scalars = replace(map_.scalars, calibrated_until=n - 1)
-    return found
+    result = map_.with_columns(columns)
+    result.scalars = replace(map_.scalars, calibrated_until=n - 1)
+    return result
 
 
 def observations(
@@ -177,8 +180,7 @@ def observations(
     """The columns of ``Arrays`` that represent observations.
 
     Args:
-        rows: ``(O,)`` rows that observe each landmark, one landmark after the other; each row
-            occurs once.
+        rows: ``(O,)`` rows that observe the landmarks, sorted by landmark; each row occurs once.
         first: ``(L + 1,)`` offsets of each landmark in ``rows``; a dead landmark has no rows.
         u_right: ``(R,)`` right columns of all rows.
     """
@@ -190,11 +192,11 @@ def observations(
     last[first[seen + 1] - 1] = True
     following = np.flatnonzero(~last)
     next_row[rows[following]] = rows[following + 1]
-    votes = np.where(np.isnan(u_right[rows]), 1, 2)
+    weight = np.where(np.isnan(u_right[rows]), 1, 2)  # a stereo observation counts twice
     head, n_observations = np.full(len(count), NONE, np.int32), np.zeros(len(count), np.int32)
     if len(seen):
         head[seen] = rows[first[seen]]
-        n_observations[seen] = np.add.reduceat(votes, first[seen])
+        n_observations[seen] = np.add.reduceat(weight, first[seen])
     return {
         "landmark": landmark,
         "next_row": next_row,
@@ -221,9 +223,9 @@ def appended(one: StoredMap, other: StoredMap) -> StoredMap:
     columns = {name: np.concatenate([column, second[name]]) for name, column in first.items()}
     columns["parent"][n + np.flatnonzero(b.parents < 0)] = 0
     columns["restart"][n : n + 1] = UNPREDICTED
-    found = a.with_columns(columns)
-    found.scalars = replace(
-        a.scalars, session=drives + b.scalars.session, calibrated_until=found.n_keyframes - 1
+    both = a.with_columns(columns)
+    both.scalars = replace(
+        a.scalars, session=drives + b.scalars.session, calibrated_until=both.n_keyframes - 1
     )
     loops = tuple(replace(loop, query=n + loop.query, match=n + loop.match) for loop in other.loops)
     tables = {
@@ -234,7 +236,7 @@ def appended(one: StoredMap, other: StoredMap) -> StoredMap:
     if images is not None and other.images is not None:
         images = images.followed_by(other.images)
     return StoredMap(
-        map=found,
+        map=both,
         camera=one.camera,
         loops=(*one.loops, *loops),
         detector=replace(one.detector, tables=tables),
@@ -245,7 +247,7 @@ def appended(one: StoredMap, other: StoredMap) -> StoredMap:
     )
 
 
-def _family(
+def _spanning_tree(
     map_: Map, keyframes: NDArray[np.int64], new_id: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
     """``parent`` and ``restart`` of the selected keyframes."""
@@ -258,7 +260,7 @@ def _family(
         if ancestor >= 0:
             parent[k] = new_id[ancestor]
 
-    # A sub-map begins at its first selected keyframe; edges of the spanning tree across it are
+    # A sub-map now begins at its first selected keyframe, where edges of the spanning tree may be
     # weak.
     restart = np.zeros(n, np.uint8)
     begins = np.array(map_.restarts, np.int64)
@@ -273,15 +275,15 @@ def _family(
     return parent, restart
 
 
-def _moved(frames: FrameTable, map_: Map, new_id: NDArray[np.int64]) -> FrameTable:
-    """Frame poses relative to living keyframes, under their new ids."""
+def _renumbered(frames: FrameTable, map_: Map, new_id: NDArray[np.int64]) -> FrameTable:
+    """Frame poses relative to living keyframes, with their new ids."""
     reference = frames.reference.copy()
     T_c_reference, unit = frames.T_c_reference.copy(), frames.unit_scale.copy()
     table = map_.keyframes
     for i, keyframe in enumerate(frames.reference.tolist()):
         if not map_.n_keyframes or map_.arrays.keyframe_alive[keyframe]:
             continue
-        # The same pose as FramePoses.pose returns now.
+        # Do not change the pose that FramePoses.pose returns.
         T_c_reference[i, :3, 3] *= table.unit_scale[keyframe] / unit[i]
         T_c_reference[i] = orthonormalised(T_c_reference[i] @ table.T_c_parent[keyframe])
         reference[i] = table.parent[keyframe]

@@ -1,16 +1,17 @@
-"""The look of all figures of reports: colours, style, and their two files.
+"""The style of all figures of reports, and saving figures as PNG and SVG.
 
-Every figure is drawn once in light colours and saved twice: as PNG, and as SVG whose neutral
-colours are CSS variables, so that the HTML page follows the reader's light or dark theme.
+Every figure is drawn once, in the colours of a light theme. In the SVG, neutral colours become CSS
+variables, so that a figure in the HTML page follows the reader's light or dark theme.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib import style
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 BLUE, GREEN, AMBER, RED, GREY = "#3b82f6", "#10b981", "#f59e0b", "#ef4444", "#94a3b8"
 VIOLET = "#8b5cf6"
-COMPARED = ("#ec4899", "#f97316", "#06b6d4")  # of other detectors, in turn
+COMPARED = ("#ec4899", "#f97316", "#06b6d4")  # colours of the detectors of --compare, in turn
 STATE_COLORS = {
     TrackingState.WEAK: AMBER, TrackingState.LOST: RED, TrackingState.DROPPED: VIOLET,
 }  # fmt: skip
@@ -53,21 +54,23 @@ STYLE = {
     "legend.labelcolor": INK,
     "lines.linewidth": 1.6,
     "svg.fonttype": "none",  # text stays text and takes the font of the page
-    "text.parse_math": False,  # a name with dollars is no formula
+    "text.parse_math": False,  # names may contain dollar signs
     "xtick.color": LINE,
     "xtick.labelcolor": MUTED,
     "ytick.color": LINE,
     "ytick.labelcolor": MUTED,
 }
-# Inches, small enough for the text to stay readable on a phone.
-WIDTH, LOW, SQUARE = 5.6, 3.0, 6.6
-DOTS_PER_INCH = 160
+# Inches, small enough for the text to stay readable where a phone shrinks the figure to its width.
+WIDTH, LOW, SQUARE = 4.6, 2.5, 5.4
+DOTS_PER_INCH = 200
+_LEGEND_CHARACTERS = 60  # that fit side by side
+_HANDLE_CHARACTERS = 6  # taken by the line or marker of an entry and the gap to the next
 
 Drawing = tuple[str, str, Figure]  # name, caption and figure
 
 
 def new_figure(title: str, x_label: str, y_label: str, height: float) -> tuple[Figure, Axes]:
-    """A figure of one plot with a title at the left; ``height`` in inches."""
+    """A figure with one plot and its title at the left; ``height`` in inches."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
@@ -79,13 +82,23 @@ def new_figure(title: str, x_label: str, y_label: str, height: float) -> tuple[F
 
 def add_legend(figure: Figure, axes: Axes) -> None:
     """List all labelled artists below the axes, where a legend never covers data."""
-    count = len(axes.get_legend_handles_labels()[0])
-    columns = count if count <= 5 else min(-(-count // 2), 4)
-    figure.legend(loc="outside lower center", ncols=columns, columnspacing=1.2)
+    labels = axes.get_legend_handles_labels()[1]
+    figure.legend(loc="outside lower center", ncols=_legend_columns(labels), columnspacing=1.2)
+
+
+def _legend_columns(labels: Sequence[str]) -> int:
+    """The most columns, as matplotlib fills them, that are not wider than the figure."""
+    lengths = np.array([len(label) + _HANDLE_CHARACTERS for label in labels])
+    columns = len(lengths)
+    while columns > 1 and (
+        sum(max(column) for column in np.array_split(lengths, columns)) > _LEGEND_CHARACTERS
+    ):
+        columns -= 1
+    return columns
 
 
 def finish_map(figure: Figure, axes: Axes) -> None:
-    """Show both axes at equal scale, with a margin and a legend."""
+    """Give both axes the same scale and add a margin and a legend."""
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.06)
     add_legend(figure, axes)
@@ -99,22 +112,22 @@ def plain_ticks(axis: Axis) -> None:
 
 
 def draw(drawings: Iterable[Drawing]) -> list[page.Figure]:
-    """Save drawings; where an iterator makes them, it does so in the style of reports."""
-    # after_reset shuts out a matplotlibrc of the user: equal runs give equal figures.
+    """Save drawings. A lazy iterable makes them here, in the style of reports."""
+    # after_reset ignores the user's matplotlibrc, so that equal runs give equal figures.
     with style.context(STYLE, after_reset=True):
         return [save(*drawing) for drawing in drawings]
 
 
 def save(name: str, caption: str, figure: Figure) -> page.Figure:
-    """Save as PNG and SVG; equal figures give equal bytes."""
+    """Save a figure as PNG and SVG; equal figures give equal bytes."""
     png, svg = io.BytesIO(), io.StringIO()
     figure.set_dpi(DOTS_PER_INCH)
     if (layout := figure.get_layout_engine()) is not None:
         layout.execute(figure)
-        # With an engine, even one that does nothing, each file would cost a drawing for nothing.
+        # With a layout engine, even one that does nothing, savefig would draw the figure twice.
         figure.set_layout_engine(None)
     figure.savefig(png, format="png")
-    # The salt keeps element ids apart between figures of one page, and equal between runs.
+    # The salt makes element ids unique among the figures of a page, and equal in equal runs.
     with mpl.rc_context({"svg.hashsalt": name}):
         figure.savefig(svg, format="svg", metadata={"Date": None}, transparent=True)
     text = svg.getvalue()

@@ -37,7 +37,7 @@
     return [c, width, height];
   };
 
-  // view: the metres at the middle of the canvas, and pixels per metre
+  // view: the position in metres at the middle of the canvas, and pixels per metre
   const whole = () => {
     const range = (...several) => {
       let low = Infinity, high = -Infinity;
@@ -60,7 +60,7 @@
     let lastX = NaN, lastY = NaN;
     c.beginPath();
     lineX.forEach((x, k) => {
-      const [px, py] = place(x, lineZ[k]);  // a step of less than half a pixel is not seen
+      const [px, py] = place(x, lineZ[k]);  // steps of less than half a pixel are skipped
       if (Number.isNaN(px) || (k + 1 < n && Math.abs(px - lastX) + Math.abs(py - lastY) < 0.5)) return;
       c.lineTo(px, py);
       lastX = px; lastY = py;
@@ -84,7 +84,7 @@
       c.beginPath(); c.arc(...place(xs[k], zs[k]), 2.5, 0, 7); c.fill();
     });
     const [px, py] = place(xs[now], zs[now]);
-    if (truth.x.length === n) {  // the error, as a line to where the camera really was
+    if (truth.x.length === n) {  // the error as a line to the true position
       c.strokeStyle = "#ef4444"; c.lineWidth = 1.5;
       c.beginPath(); c.moveTo(px, py); c.lineTo(...place(truth.x[now], truth.z[now])); c.stroke();
     }
@@ -209,7 +209,7 @@
     zoom(Math.exp(-event.deltaY / 400), event.offsetX, event.offsetY);
   }, { passive: false });
 
-  // one finger drags, two pinch, a click goes to the frame nearest to it
+  // one finger drags, two fingers zoom, a click selects the nearest frame
   const fingers = new Map();
   let moved = 0;
   map.addEventListener("pointerdown", (event) => {

@@ -1,9 +1,7 @@
-"""The explorer of a page: pose, state and error of every frame, images of some keyframes.
+"""The explorer in a report: pose, state and error of every frame, and images of some keyframes.
 
-A frame takes 47 bytes of the page, an image with its keypoints about 10,000.
-
-The program is ``explorer.js``, written by hand: a plotting library (Plotly: 4.7 MB) would be larger
-than everything else in the page.
+A frame adds 47 bytes to the page, an image with its keypoints about 10,000. ``explorer.js`` uses no
+plotting library, because that (Plotly: 4.7 MB) would be larger than the rest of the page.
 """
 
 from __future__ import annotations
@@ -32,8 +30,8 @@ def explorer(
     ground_truth: Trajectory | None,
     moments: Collection[Moment],
 ) -> list[Section]:
-    """The section of the page with the explorer; empty if fewer than two frames were tracked. See
-    :func:`explorer_data`."""
+    """The section with the explorer, or none if fewer than two frames were tracked. The arguments
+    are those of :func:`explorer_data`."""
     data = explorer_data(outcome, evaluation, ground_truth, moments)
     if data is None:
         return []
@@ -52,14 +50,14 @@ def explorer_data(
     """Numbers and images for ``explorer.js``, ready for JSON; None if fewer than two frames were
     tracked.
 
-    ``floats`` holds seconds, metres, the heading in degrees (0 looks along z, 90 along x) and the
-    error, NaN where there is none.
+    ``floats`` contains times in seconds, positions in metres, headings in degrees (0 along z, 90
+    along x) and errors in metres, NaN where unknown.
 
     Args:
         outcome: the run.
-        evaluation: of ``outcome.trajectory``, or None.
-        ground_truth: of the frames that are evaluated, or None.
-        moments: of a `vslam.run.moments.MomentRecorder`.
+        evaluation: errors of ``outcome.trajectory``, or None.
+        ground_truth: ground truth of the evaluated frames, or None.
+        moments: images from a `vslam.run.moments.MomentRecorder`.
     """
     n = len(outcome.trajectory)
     if outcome.n_tracked < 2 or len(outcome.tracks) != n:
@@ -70,7 +68,7 @@ def explorer_data(
     if evaluation is not None and ground_truth is not None:
         at = np.searchsorted(times, evaluation.timestamps).clip(0, n - 1)
         errors[at] = evaluation.errors_m
-        if evaluation.frames == n:  # else the whole path is in another frame than the ground truth
+        if evaluation.frames == n:  # otherwise only a part of the path has been aligned
             T_wc, truth = evaluation.T_wc_aligned, ground_truth.T_wc[:, :3, 3]
     states = sorted({str(track.state) for track in outcome.tracks})
     floats = {
@@ -88,11 +86,11 @@ def explorer_data(
         "states": states,
         "state": _packed(state, "u1"),
         "inliers": _packed(inliers, "<u2"),
-        "moments": [_shown(moment) for moment in moments],
+        "moments": [_encoded(moment) for moment in moments],
     }
 
 
-def _shown(moment: Moment) -> dict[str, Any]:
+def _encoded(moment: Moment) -> dict[str, Any]:
     return {
         "frame": moment.frame,
         "jpeg": b64encode(moment.jpeg).decode(),
@@ -103,5 +101,5 @@ def _shown(moment: Moment) -> dict[str, Any]:
 
 
 def _packed(values: NDArray[Any], kind: str) -> str:
-    """Base64 of an array: a third of the bytes of its numbers in JSON, and it can hold NaN."""
+    """An array in base64: a third of the size of its numbers in JSON, and it can hold NaN."""
     return b64encode(values.astype(kind).tobytes()).decode()

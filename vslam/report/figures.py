@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _STAGE_COLORS = [BLUE, AMBER, GREEN, VIOLET, "#ec4899", "#06b6d4", "#84cc16", "#f97316", GREY]
-_MOTION_S = 1.0  # seconds of the motions whose errors are drawn
-_MAX_BINS = 240  # of the stacked times: one bin is a pixel or two wide
+_MOTION_S = 1.0  # duration of the motions whose errors are drawn
+_MAX_BINS = 240  # of the stacked times, so that a bin is one or two pixels wide
 
 
 def draw_figures(
@@ -50,13 +50,13 @@ def draw_figures(
     ground_truth: Trajectory | None,
     verdict: LoopEvaluation | None,
 ) -> list[page.Figure]:
-    """Draw all figures that this run has data for, in the order of the report.
+    """Draw all figures for which this run has data, in the order of the report.
 
     Args:
         outcome: the run.
-        evaluation: of ``outcome.trajectory``, frame by frame, or None.
-        ground_truth: of the same frames, or None.
-        verdict: of ``outcome.loops``, or None.
+        evaluation: errors of ``outcome.trajectory``, or None.
+        ground_truth: ground truth of the evaluated frames, or None.
+        verdict: evaluation of ``outcome.loops``, or None.
     """
     return draw(_drawings(outcome, evaluation, ground_truth, verdict))
 
@@ -72,25 +72,25 @@ def _drawings(
         if evaluation is not None and evaluation.alignment != "none":
             caption += f" Estimate after {evaluation.alignment.upper()} alignment."
         if outcome.compared:
-            caption += " Dashed: the detectors compared, each after its own alignment."
+            caption += " Dashed: the detectors of --compare, each after its own alignment."
         yield "top_view", caption, top_view(outcome, evaluation, ground_truth, verdict)
     if (track := outcome.gps_track) is not None:
         caption = (
-            "From above, in metres from the first fix: the drive by vision alone, aligned as a "
-            "whole, and with GPS."
+            "Seen from above, in metres from the first fix: the trajectory by vision alone, "
+            "aligned to the fixes as a whole, and the trajectory with GPS."
         )
         yield "gps_map", caption, gps_map(track)
     if outcome.corrections:
         caption = (
-            "Keyframes just before the first loop was closed, and at the end. Dashed: each loop, "
-            "between the positions of its two keyframes before its correction; their distance is "
-            "the drift that the correction removed."
+            "Keyframes just before the first loop was closed, and at the end. A dashed line joins "
+            "the two keyframes of each loop before its correction; its length is the drift that "
+            "the correction removed."
         )
         yield "loop_closing", caption, loop_closing(outcome, evaluation, ground_truth)
     if evaluation is not None:
         yield (
             "error_along_path",
-            "Distance of each position from the ground truth, along the path travelled.",
+            "Distance of each position from the ground truth.",
             _error_along_path(outcome, evaluation),
         )
         yield "error_histogram", "Number of frames by error.", _error_histogram(evaluation)
@@ -99,28 +99,28 @@ def _drawings(
         if len(errors.first) > 1:
             yield (
                 "odometry_error",
-                "Error of the motion over one second, by odometry alone (trajectory_odom.tum), and "
-                "twice the standard deviation that its covariance predicts: about one error in "
-                "twenty should lie above, if the ground truth is accurate to that over a second "
-                "(KITTI's is not).",
+                "Error of the motion over one second by odometry alone (trajectory_odom.tum), and "
+                "twice the standard deviation that its covariance predicts. About one error in "
+                "twenty should be larger, provided that the ground truth is that accurate over one "
+                "second (KITTI's is not).",
                 _odometry_error(errors),
             )
     if outcome.tracks:
         yield (
             "tracked_points",
-            f"{_usable_features(outcome)[0].capitalize()}, those that were matched to landmarks, "
-            "and inliers of the pose.",
+            f"{_usable_features(outcome)[0].capitalize()}, matches with landmarks, and inliers of "
+            "the pose.",
             _tracked_points(outcome),
         )
     if stage_names(outcome.tracks):
         yield (
             "stage_times",
-            "Wall time of each stage, stacked; long runs show averages over a few frames.",
+            "Wall time of each stage, stacked; in long runs averaged over a few frames.",
             _stage_times(outcome),
         )
         yield (
             "stage_distribution",
-            "Boxes hold half of the frames that go through a stage, whiskers 90 %.",
+            "Of the frames that went through a stage, boxes contain 50 % and whiskers 90 %.",
             _stage_distribution(outcome),
         )
 
@@ -191,7 +191,7 @@ def _tracked_points(outcome: RunOutcome) -> Figure:
     for state, color in STATE_COLORS.items():
         at = np.array([track.state == state for track in tracks])
         for first, last in _intervals(at):
-            # A legend passes over labels that begin with "_": one entry for each state.
+            # Legends skip labels that begin with "_", so each state has one entry.
             name = state.lower() if first == np.flatnonzero(at)[0] else "_again"
             axes.axvspan(
                 frame[first] - 0.5, frame[last] + 0.5, color=color, alpha=0.3, lw=0, label=name
@@ -203,7 +203,8 @@ def _tracked_points(outcome: RunOutcome) -> Figure:
 
 
 def _usable_features(outcome: RunOutcome) -> tuple[str, list[int]]:
-    """The features that can give landmarks with this sensor, and their number in each frame."""
+    """The kind of features that can become landmarks with this sensor, and their number in each
+    frame."""
     sensor = outcome.sequence.camera.sensor
     if sensor == "mono":
         return "features", [track.n_features for track in outcome.tracks]

@@ -1,9 +1,10 @@
-"""The folder of a finished run, read again: its map, its images and its pose graph."""
+"""Read the folder of a finished run: its map, images and pose graph."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 from vslam.backend.pose_graph import PoseGraph, essential_graph
@@ -19,15 +20,13 @@ from vslam.report.schema import ReportJson
 from vslam.run.options import read_options
 
 _SAME_TIME_S = 1e-6
-_WITHOUT_IMAGES = "export g2o, euroc or ply --no-colours, which need none"
+_WITHOUT_IMAGES = "export g2o, euroc or ply --no-colours, which need no images"
 
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """What the folder of a run holds; ``map`` has the living keyframes only.
-
-    ``loops`` are those that were closed, with the relative poses that they measured.
-    """
+    """The content of a run's folder. ``map`` has no removed keyframes; ``loops`` are the closed
+    ones, with the relative poses that verification measured."""
 
     folder: Path
     report: ReportJson
@@ -40,7 +39,8 @@ def read_run(folder: Path | str) -> FinishedRun:
     """Read the report and the map of a run.
 
     Raises:
-        InputError: no folder of a run, a run without a map, or of another version of vslam.
+        InputError: the folder is not that of a run, or its map is missing, empty or of another
+            version of vslam.
     """
     folder = Path(folder)
     if not (folder / "map.npz").is_file():
@@ -55,7 +55,7 @@ def read_report(folder: Path | str) -> ReportJson:
     """Read ``report.json`` of a run.
 
     Raises:
-        InputError: it is missing, damaged or of another version.
+        InputError: it is missing, damaged or of another version of vslam.
     """
     return ReportJson.read(Path(folder) / "report.json")
 
@@ -65,24 +65,24 @@ def open_images(
     data: str | None = None,
     on_render: Callable[[int, int], None] | None = None,
 ) -> Source:
-    """Open the images of a run again, as its ``run.json`` says.
+    """Open the images of a run again, with the options in its ``run.json``.
 
     Args:
-        data: where they are now, if that is another place.
+        data: the present location of the data, if it has moved.
         on_render: as in :func:`vslam.datasets.open_sequence`.
 
     Raises:
-        InputError: the images are not there, not by the run's camera, or of a live camera.
+        InputError: the images are missing, are of another camera, or came from a live camera.
     """
     if set(run.map.sessions) != {run.map.scalars.session}:  # the report is of the last drive
         raise InputError(
-            f"{run.folder}: the map is of several drives, whose images cannot be opened together; "
-            f"{_WITHOUT_IMAGES}."
+            f"{run.folder}: the map was made from several drives, whose images cannot be opened "
+            f"together; {_WITHOUT_IMAGES}."
         )
     options = read_options(run.folder)
     if run.report.dataset in LIVE:
         raise InputError(
-            f"{run.folder}: what a camera has shown cannot be seen again; {_WITHOUT_IMAGES}."
+            f"{run.folder}: images of a live camera are not stored; {_WITHOUT_IMAGES}."
         )
     moved = {"dataset": run.report.dataset, "mask": None} | ({} if data is None else {"data": data})
     source = open_source(options.model_copy(update=moved), on_render)
@@ -95,29 +95,25 @@ def keyframe_frames(run: FinishedRun, source: Source) -> Iterator[TimedFrame]:
     """The frames of a run's keyframes, in the order of its map.
 
     Raises:
-        InputError: the times are not those of the run.
+        InputError: the times differ from those of the run.
     """
     frames = frames_at(source, run.map.frames.tolist())
-    n = 0
-    for frame, time in zip(frames, run.map.timestamps.tolist(), strict=False):
-        if abs(frame.timestamp - time) > _SAME_TIME_S:
+    for frame, time in zip_longest(frames, run.map.timestamps.tolist()):
+        if frame is None or abs(frame.timestamp - time) > _SAME_TIME_S:
             raise _other_images(run)
         yield frame
-        n += 1
-    if n < len(run.map.frames):
-        raise _other_images(run)
 
 
 def _other_images(run: FinishedRun) -> InputError:
     return InputError(
-        f"{run.report.dataset} {run.report.sequence}: times or camera are not those of "
-        f"{run.folder}; name the data that the run was made on with --data."
+        f"{run.report.dataset} {run.report.sequence}: the times or the camera differ from those of "
+        f"{run.folder}; use --data to name the data that the run was made on."
     )
 
 
 def pose_graph(run: FinishedRun) -> PoseGraph:
-    """The essential graph of a run's final map with its loops as they were measured, with the
-    weights of the run.
+    """The essential graph of a run's final map, with its measured loop edges and the weights that
+    the run used.
 
     Raises:
         InputError: the run's thresholds cannot be read.
@@ -127,7 +123,7 @@ def pose_graph(run: FinishedRun) -> PoseGraph:
 
 
 def graph_of_map(map_: Map, loops: Collection[LoopEdge], config: Config) -> PoseGraph:
-    """The essential graph of a map that is finished."""
+    """The essential graph of a finished map."""
     return essential_graph(
         map_,
         loops,

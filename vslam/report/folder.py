@@ -1,4 +1,4 @@
-"""The folder of one run: its name, and everything that is written to it when the run ends."""
+"""The folder of one run: its name, and all results that are written when the run ends."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from vslam.run.loop_pictures import LoopPicture
     from vslam.run.moments import Moment
 
-_LONGEST_PART = 60  # characters: file systems take 255 for a name, and a URL may have more
+_LONGEST_PART = 60  # characters; file systems limit a name to 255, and a URL may be longer
 
 
 def create_run_folder(
@@ -47,8 +47,9 @@ def create_run_folder(
 ) -> Path:
     """Create ``out/<YYYYmmdd-HHMMSS>-<dataset>-<sequence>-<perturb>-<detector>``.
 
-    The first of the changed ``thresholds`` follows, and how many more there are. A number is added
-    to a name in use. ``out/latest`` becomes a link to the folder where the file system has links.
+    The first changed threshold is appended, with the number of further ones, and a number if the
+    name is in use. ``out/latest`` becomes a symbolic link to the folder if the file system has
+    such links.
 
     Raises:
         InputError: the folder cannot be created.
@@ -77,7 +78,7 @@ def create_run_folder(
 
 
 def _safe(part: str) -> str:
-    """A name as a part of a file name."""
+    """Make a text a valid part of a file name."""
     return re.sub(r"[^A-Za-z0-9.+=-]+", "_", part)[:_LONGEST_PART]
 
 
@@ -91,30 +92,30 @@ def write_results(
     ply: bool = False,
     map_file: Path | None = None,
 ) -> ReportJson:
-    """Evaluate a run, in any state of completion, and write all results.
+    """Evaluate a complete or interrupted run and write all results.
 
     The most valuable files are written first, and one that fails does not affect the others:
-    trajectories
-    (``trajectory_kitti.txt``, ``trajectory.tum``, ``ground_truth_kitti.txt``, ``keyframes.tum``,
-    ``trajectory_causal.tum`` with the poses as they were given at the time, ``covariance.csv`` with
-    their covariances, ``trajectory_odom.tum`` with those that never jump,
-    with GPS ``trajectory_enu.tum``, ``trajectory_gps.csv`` and ``gps.json``,
-    ``trajectory_<detector>.tum`` of each detector compared), maps (``map.npz``, ``map.ply``),
-    numbers (``frames.csv``, ``config.json``, read by ``--config``, and ``report.json``), and pages
-    for people (``figures/*.png``, ``report.md`` and ``report.html``, one file that makes no
-    network request).
+
+    - trajectories: ``trajectory_kitti.txt``, ``trajectory.tum``, ``ground_truth_kitti.txt``,
+      ``keyframes.tum``, ``trajectory_causal.tum`` (poses as first estimated), ``covariance.csv``
+      (their covariances), ``trajectory_odom.tum`` (poses that never jump),
+      ``trajectory_<detector>.tum`` of each detector of ``--compare``, and with GPS
+      ``trajectory_enu.tum``, ``trajectory_gps.csv`` and ``gps.json``;
+    - maps: ``map.npz``, ``map.ply``;
+    - numbers: ``frames.csv``, ``config.json`` (for ``--config``), ``report.json``;
+    - pages: ``figures/*.png``, ``report.md``, ``report.html`` (self-contained).
 
     Args:
-        folder: an existing folder; what is written replaces files of an earlier report.
-        outcome: the run; it may be interrupted, all lost, or without a single frame.
-        pages: whether to write the pages for people: Markdown, HTML and figures.
-        ply: write the landmarks as ``map.ply``, too.
+        folder: an existing folder; files of an earlier report are replaced.
+        outcome: the run; all its frames may be lost, or there may be none.
         moments: images of keyframes for the HTML page.
-        pictures: of closed loops; some are written as ``figures/loop-<frame>-<frame>.jpg``.
-        map_file: where to write the map, too.
+        pictures: pictures of closed loops; some become ``figures/loop-<frame>-<frame>.jpg``.
+        pages: whether to write the pages.
+        ply: whether to write the landmarks as ``map.ply``.
+        map_file: a second place to write the map to.
 
     Raises:
-        ResultsError: some could not be written; none is incomplete, and all others are there.
+        ResultsError: some results could not be written; all others are complete.
     """
     written = Results(folder)
     evaluation, remark = _write_data(written, outcome, ply=ply, map_file=map_file)
@@ -132,7 +133,7 @@ def write_results(
 
 
 class Results:
-    """The results of a run: each is attempted, and an incomplete file is removed."""
+    """Writes the results of a run; the failure of one does not prevent the others."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -140,7 +141,7 @@ class Results:
 
     @contextlib.contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """A part that may fail, whatever it raises, without affecting the other results."""
+        """Run a part of the work; record an exception instead of raising it."""
         try:
             yield
         except Exception as error:
@@ -148,7 +149,7 @@ class Results:
 
     @contextlib.contextmanager
     def file(self, name: str) -> Iterator[Path]:
-        """Where to write a file, or a folder of files."""
+        """The path at which to write a file or folder, which is removed if that fails."""
         path = self.folder / name
         with self.part(name):
             try:
@@ -159,9 +160,10 @@ class Results:
                 raise
 
     def require_all(self) -> None:
-        """
+        """Fail if a part has failed.
+
         Raises:
-            ResultsError: some could not be written.
+            ResultsError: names the parts and their errors.
         """
         if not self._failed:
             return
@@ -190,7 +192,8 @@ def _reason(error: Exception) -> str:
 def _write_data(
     written: Results, outcome: RunOutcome, *, ply: bool, map_file: Path | None
 ) -> tuple[Evaluation | None, str | None]:
-    """Trajectories, maps and tables; returns ``evaluate_run``, which tells where the map lies."""
+    """Write trajectories, maps and tables; return the result of ``evaluate_run``, which also gives
+    the place of the map in the ground truth."""
     write_trajectories(written, outcome)
     with written.file("keyframes.tum") as file:
         write_tum(file, outcome.keyframes)
@@ -227,7 +230,7 @@ def _write_data(
 
 
 def _write_gps(written: Results, outcome: RunOutcome) -> None:
-    """The drive on the Earth, in files of its own."""
+    """Write the georeferenced trajectory."""
     if (track := outcome.gps_track) is None:
         return
     with written.file("trajectory_enu.tum") as file:
@@ -252,8 +255,8 @@ def _config_text(outcome: RunOutcome) -> str:
 
 
 def write_trajectories(written: Results, outcome: RunOutcome) -> None:
-    """Write the final trajectory in both formats, and the ground truth of the same frames. Where it
-    is missing for some frames, it is written in the TUM format alone, which has times."""
+    """Write the final trajectory in both formats, and the ground truth of the same frames. If some
+    frames have none, it is written only in the TUM format, which has times."""
     with written.file("trajectory_kitti.txt") as file:
         write_kitti(file, outcome.trajectory.T_wc)
     with written.file("trajectory.tum") as file:
@@ -272,7 +275,7 @@ def write_trajectories(written: Results, outcome: RunOutcome) -> None:
 
 
 def _evo_command(folder: Path, outcome: RunOutcome, evaluation: Evaluation | None) -> str | None:
-    """The command that repeats the evaluation with evo, None where evo cannot."""
+    """The command that repeats the evaluation with evo; None if evo cannot."""
     if evaluation is None or evaluation.on_one_line:
         return None
     if evaluation.frames == len(outcome.trajectory):
@@ -291,7 +294,7 @@ def _write_pages(
     moments: Collection[Moment],
     pictures: Collection[LoopPicture],
 ) -> None:
-    """Write the figures, and the pages with those that could be drawn."""
+    """Write the figures, and pages with the figures that could be drawn."""
     from vslam.report.explorer import explorer
     from vslam.report.figures import draw_figures
     from vslam.report.loop_tables import seen_loops

@@ -1,4 +1,4 @@
-"""``frames.csv``: the result of tracking for every frame, for scripts and spreadsheets."""
+"""``frames.csv`` and ``covariance.csv``: results of tracking by frame, for scripts."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ _AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 def write_frames(path: Path, tracks: list[TrackResult]) -> None:
-    """Write a row per frame: time (s), state, counts, keyframe or not, standard deviations of the
-    position (m) and the orientation (degrees) relative to the landmarks around the camera and to
-    the start of the drive, milliseconds of each stage.
+    """Write a row per frame: time (s), state, counts, whether it became a keyframe, standard
+    deviations of position (m) and orientation (degrees), and milliseconds of each stage.
 
-    The cell of a stage that a frame did not go through is empty, as are unknown deviations.
+    The first two deviations are relative to the landmarks around the camera, the others relative to
+    the start of the drive. Cells of unknown deviations are empty, and so are those of stages that a
+    frame did not go through.
     """
     stages = stage_names(tracks)
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -49,10 +50,12 @@ def _sigmas(track: TrackResult) -> list[str]:
 
 
 def write_covariances(path: Path, tracks: list[TrackResult]) -> None:
-    """Write a row per frame whose covariances are known: time (s), then the upper triangles, row by
-    row, of the covariance relative to the landmarks around the camera (``local``) and to the start
-    of the drive (``drive``), of ``[x, y, z, rx, ry, rz]`` in metres and radians, in the frame of
-    the camera (``vslam.odometry``)."""
+    """Write a row per frame with known covariances: time (s) and two upper triangles, row by row.
+
+    The covariances are those of ``[x, y, z, rx, ry, rz]`` in metres and radians, in the frame of
+    the camera (``vslam.odometry``). The first is relative to the landmarks around the camera
+    (``local``), the second to the start of the drive (``drive``).
+    """
     upper = np.triu_indices(6)
     pairs = [f"{_AXES[row]}_{_AXES[column]}" for row, column in zip(*upper, strict=True)]
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -70,8 +73,8 @@ def write_covariances(path: Path, tracks: list[TrackResult]) -> None:
 def read_covariances(
     path: Path,
 ) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Read what ``write_covariances`` wrote: the two ``(6, 6)`` covariances of each frame, by its
-    time as the file has it.
+    """Read the two ``(6, 6)`` covariances of each frame that ``write_covariances`` wrote, keyed by
+    the time as it is written in the file.
 
     Raises:
         InputError: the file is missing or damaged.
@@ -88,8 +91,8 @@ def read_covariances(
                 found[time] = both[0], both[1]
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be read ({error.strerror}); name the folder of a run, or run again."
+            f"{path}: cannot be read ({error.strerror}); name the folder of a run, or repeat it."
         ) from error
     except (ValueError, csv.Error) as error:
-        raise InputError(f"{path}: damaged ({error}); run again.") from error
+        raise InputError(f"{path}: damaged ({error}); repeat the run.") from error
     return found

@@ -1,5 +1,4 @@
-"""The tables and pictures of loops, which stay few even where hundreds of candidates were
-rejected."""
+"""Tables and pictures of loops, of limited size even if hundreds of candidates were rejected."""
 
 from __future__ import annotations
 
@@ -17,18 +16,18 @@ if TYPE_CHECKING:
 
 _MAX_CLOSED = 60
 _MAX_REJECTED = 12
-_MAX_SEEN = 6  # loops in pictures: about 0.5 MB of the page
+_MAX_PICTURES = 6  # about 0.5 MB of the page
 _DESCRIPTORS = {"orb": "ORB descriptors", "learned": "learned descriptors"}
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
 def loop_sections(report: ReportJson) -> list[Section]:
-    """Closed loops, revisits, reasons of rejections, and the candidates nearest to acceptance."""
+    """Closed loops, revisits, reasons for rejection, and the candidates nearest to acceptance."""
     return [
         Section("Loops closed", [_closed(report)]),
         Section("Revisits", [_revisits(report)], wide=False),
         Section("Loops rejected", [_reasons(report)], wide=False),
-        Section("Rejected with the most inliers", [_nearly(report)], folded=True),
+        Section("Rejected with the most inliers", [_nearly_accepted(report)], folded=True),
     ]
 
 
@@ -42,13 +41,13 @@ def _revisits(report: ReportJson) -> Table:
         )
         for r in report.revisits
     ]
-    note = "According to the ground truth: frames where the camera drives an earlier stretch again."
-    return Table(("frames", "again", "length", "loop"), rows, ("loop",), note)
+    note = "Frames in which the camera, by the ground truth, drives along an earlier stretch again."
+    return Table(("frames", "earlier frames", "length", "loop"), rows, ("loop",), note)
 
 
 def _closed(report: ReportJson) -> Table:
     closed = [loop for loop in report.loops if loop.accepted]
-    closed.sort(key=lambda loop: loop.right is not False)  # wrong ones first, else as they came
+    closed.sort(key=lambda loop: loop.right is not False)  # stable: wrong ones come first
     rows: list[Row] = [
         (
             *_evidence(loop),
@@ -60,14 +59,14 @@ def _closed(report: ReportJson) -> Table:
     ]
     head = (*_EVIDENCE, "pose", "moved", "time")
     note = (
-        "Proposed by: the detectors that found the place. Verified by: the descriptors whose "
-        "matches give the relative pose, ORB's or those that the network learned. Pose: compared "
-        "with the ground truth. Moved: the largest distance that the correction moved a keyframe."
+        "Proposed by: the detectors that found the place. Verified by: the descriptors (ORB or "
+        "learned) whose matches give the relative pose. Pose: whether it agrees with the ground "
+        "truth. Moved: the largest distance by which the correction moved a keyframe."
     )
     if report.sensor == "mono":
-        note = f"{note.rstrip('.')}, in the unit of the map."
+        note = f"{note.rstrip('.')}, in units of the map."
     if len(closed) > _MAX_CLOSED:
-        note += f" {len(closed) - _MAX_CLOSED} more are in report.json."
+        note += f" report.json lists {len(closed) - _MAX_CLOSED} more."
     return Table(head, rows, ("pose",), note)
 
 
@@ -79,19 +78,19 @@ def _reasons(report: ReportJson) -> Table:
     ordered = sorted(groups.items(), key=lambda group: -len(group[1]))
     rows: list[Row] = [
         (
-            _common(loops),
+            _shared_reason(loops),
             str(len(loops)),
             str(max(one.inliers for one in loops)),
-            _right_of(loops),
+            _right_share(loops),
         )
         for _, loops in ordered
     ]
     head = ("reason", "candidates", "most inliers", "pose right")
-    note = f"{counted(report.loops_rejected, 'candidate')} in all; report.json lists each."
+    note = f"{counted(report.loops_rejected, 'candidate')} in total; report.json lists them."
     return Table(head, rows, ("reason",), note)
 
 
-def _nearly(report: ReportJson) -> Table:
+def _nearly_accepted(report: ReportJson) -> Table:
     rejected = [loop for loop in report.loops if not loop.accepted]
     rejected.sort(key=lambda loop: (-loop.inliers, -loop.matches, -loop.score))
     rows: list[Row] = [
@@ -113,11 +112,11 @@ def _evidence(loop: LoopEntry) -> Row:
     )  # fmt: skip
 
 
-def _common(loops: list[LoopEntry]) -> str:
-    """The reason of loops whose reasons differ only in their numbers, with the ranges of these."""
+def _shared_reason(loops: list[LoopEntry]) -> str:
+    """The reason of loops whose reasons differ only in their numbers, which become ranges."""
     columns = zip(*(_NUMBER.findall(loop.reason) for loop in loops), strict=True)
     ends = [(min(column, key=float), max(column, key=float)) for column in columns]
-    ranges = iter([least if least == most else f"{least}-{most}" for least, most in ends])
+    ranges = iter([low if low == high else f"{low}-{high}" for low, high in ends])
     return _NUMBER.sub(lambda _: next(ranges), loops[0].reason)
 
 
@@ -125,22 +124,24 @@ def _right(loop: LoopEntry) -> str:
     return {True: "right", False: "wrong", None: "n/a"}[loop.right]
 
 
-def _right_of(loops: list[LoopEntry]) -> str:
+def _right_share(loops: list[LoopEntry]) -> str:
     judged = [loop.right for loop in loops if loop.right is not None]
     return f"{sum(judged)} of {len(judged)}" if judged else "n/a"
 
 
 def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[Figure]:
-    """Draw the closed loops that a reader should see: wrong ones first, then those that learned
-    descriptors verified, otherwise in their order.
+    """Draw a few closed loops: wrong ones first, then those that learned descriptors verified.
 
     Args:
-        report: of the run.
-        pictures: of those of its closed loops of which both images are kept.
+        report: the numbers of the run.
+        pictures: the closed loops whose two images were kept.
     """
     closed = {(loop.query_frame, loop.match_frame): loop for loop in report.loops if loop.accepted}
-    of_loop = [(closed.get((one.query_frame, one.match_frame)), one) for one in pictures]
-    shown = [(loop, picture) for loop, picture in of_loop if loop is not None]
+    shown = [
+        (loop, picture)
+        for picture in pictures
+        if (loop := closed.get((picture.query_frame, picture.match_frame))) is not None
+    ]
     if not shown:
         return []
     from vslam.run.loop_pictures import draw_picture
@@ -148,22 +149,21 @@ def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[Fi
     shown.sort(key=lambda one: (one[0].right is not False, one[0].matched_by != "learned"))
     return [
         Figure(name, _caption(loop), draw_picture(picture), file=f"figures/{name}")
-        for loop, picture in shown[:_MAX_SEEN]
+        for loop, picture in shown[:_MAX_PICTURES]
         if (name := f"loop-{picture.query_frame}-{picture.match_frame}.jpg")
     ]
 
 
 def seen_note(report: ReportJson, seen: Collection[Figure]) -> str:
-    """What the pictures show, and how many of the closed loops have one."""
-    note = "Lines join what both images show; at most 60 matches are drawn."
+    """A note on what the pictures show, and how many closed loops are shown."""
+    note = "Lines connect matched points; at most 60 matches are drawn."
     if len(seen) < report.loops_closed:
         note += f" {len(seen)} of the {report.loops_closed} closed loops are shown."
     return note
 
 
 def _caption(loop: LoopEntry) -> str:
-    wrong = loop.right is False
-    shows = "was wrongly taken for" if wrong else "shows"
+    shows = "was wrongly matched to" if loop.right is False else "shows"
     return (
         f"Frame {loop.query_frame} (right) {shows} the place of frame {loop.match_frame} (left): "
         f"{loop.inliers} matches agree; proposed by {loop.proposed_by.replace('+', ' and ')}, "

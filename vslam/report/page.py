@@ -1,8 +1,7 @@
 """A page of results: sections of text, tables and figures.
 
 Every report of vslam is such a page; :mod:`vslam.report.render` writes it as Markdown, as HTML and
-to a terminal. What a form cannot show is left out of it, and so is a section of which nothing is
-left.
+to a terminal. Each format omits the parts that it cannot show, and sections that become empty.
 """
 
 from __future__ import annotations
@@ -16,13 +15,13 @@ Row = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells; a table without rows is not shown, nor is its note.
+    """Rows of cells. A table without rows is not shown, and neither is its note.
 
     Attributes:
         head: a heading for each column.
-        rows: as many cells each.
-        texts: the headings of the columns that hold words, which are aligned to the left.
-        note: what the figures mean, below the table.
+        rows: rows with a cell for each column.
+        texts: the headings of the columns that contain text, which is aligned to the left.
+        note: explanation below the table.
     """
 
     head: Row
@@ -56,20 +55,20 @@ class Tiles:
 
     @property
     def rows(self) -> list[tuple[str, str, str]]:
-        """Label, value and note of each."""
+        """Label, value and note of each tile."""
         return [(tile.label, tile.value, tile.note) for tile in self.tiles]
 
 
 @dataclass(frozen=True)
 class Bullets:
-    """Sentences of a list."""
+    """A list of sentences."""
 
     sentences: Sequence[str]
 
 
 @dataclass(frozen=True)
 class Alert:
-    """A warning: what happened, in bold letters, and what it means."""
+    """A warning: what happened, in bold, and what it means."""
 
     what: str
     meaning: str = ""
@@ -77,22 +76,22 @@ class Alert:
 
 @dataclass(frozen=True)
 class Code:
-    """Text to be typed or copied as it is."""
+    """Text to be typed or copied literally."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture with a caption, a drawing or a photograph.
+    """A drawing or photograph with a caption.
 
     Attributes:
-        name: identifies it in its page.
+        name: identifier, unique in the page.
         caption: what it shows.
         image: PNG or JPEG.
-        svg: a drawing; it begins at its ``<svg`` tag and takes its neutral colours from CSS
-            variables. Empty for a photograph.
-        file: where ``image`` lies, relative to the page; Markdown shows no figure without one.
+        svg: the drawing as an ``<svg>`` element whose neutral colours are CSS variables; empty for
+            a photograph.
+        file: path of ``image`` relative to the page; Markdown shows only figures with a path.
     """
 
     name: str
@@ -103,14 +102,14 @@ class Figure:
 
     @property
     def address(self) -> str:
-        """The image as a ``data:`` address, for a page that loads nothing."""
+        """The image as a ``data:`` URL, for self-contained pages."""
         kind = "png" if self.image.startswith(b"\x89PNG") else "jpeg"
         return f"data:image/{kind};base64,{b64encode(self.image).decode()}"
 
 
 @dataclass(frozen=True)
 class Markup:
-    """HTML, trusted as it is; no other form shows it."""
+    """Trusted HTML, which is not escaped; other formats omit it."""
 
     html: str
 
@@ -120,13 +119,13 @@ Part = str | Table | Pairs | Tiles | Bullets | Alert | Code | Figure | Markup
 
 @dataclass(frozen=True)
 class Section:
-    """Parts under a title; those of a section without a title stand by themselves.
+    """Parts under a heading.
 
     Attributes:
-        title: the heading, or empty.
-        parts: what is shown; a string is a paragraph.
-        folded: closed in HTML until the reader opens it.
-        wide: as wide as the page in HTML; others share their row.
+        title: the heading; if it is empty, HTML shows each part in a card of its own.
+        parts: the content; a string is a paragraph.
+        folded: whether HTML shows only the heading until the reader opens the section.
+        wide: whether HTML makes the section as wide as the page; others share a row.
     """
 
     title: str
@@ -137,7 +136,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """A whole report; ``about`` is shown below the title, in one line."""
+    """A whole report; ``about`` is shown in one line below the title."""
 
     title: str
     about: Sequence[str]

@@ -1,4 +1,4 @@
-"""Pages as Markdown, as HTML and in a terminal, and the files that hold them."""
+"""Render pages as Markdown, as HTML and in a terminal, and write files."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ if TYPE_CHECKING:
 def write_files(
     folder: Path, files: Mapping[str, str | bytes], fix: str = "name another folder"
 ) -> None:
-    """Write files into a folder, which is made if it is not there.
+    """Write files into a folder, which is created if it does not exist.
 
     Args:
         folder: where to write.
         files: text or bytes by file name, in the order in which they are written.
-        fix: what helps if it fails.
+        fix: the remedy that the error message names.
 
     Raises:
         ResultsError: a file cannot be written.
@@ -48,14 +48,14 @@ def write_files(
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:
-    """Lines of comma-separated values; None is empty."""
+    """Rows as comma-separated values; None gives an empty cell."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
 
 
 def markdown(page: Page) -> str:
-    """Markdown whose tables are aligned, so that it can be read in a terminal, too."""
+    """Markdown with aligned tables, which can also be read in a terminal."""
     blocks = [f"# {page.title}", " · ".join(filter(None, page.about))]
     for section in page.sections:
         if parts := [text for part in section.parts if (text := _markdown_part(part))]:
@@ -65,7 +65,7 @@ def markdown(page: Page) -> str:
 
 
 def markdown_table(head: Row, rows: Iterable[Row]) -> list[str]:
-    """Lines of a table whose columns are aligned in the text."""
+    """The lines of a Markdown table with aligned columns."""
     rows = [tuple(cell.replace("|", "\\|").replace("\n", " ") for cell in row) for row in rows]
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     rule = tuple("-" * max(width, 3) for width in widths)
@@ -96,7 +96,7 @@ def _markdown_part(part: Part) -> str:
 
 
 def html(page: Page) -> str:
-    """One self-contained page: style, figures and numbers are inside, and nothing is loaded."""
+    """One self-contained HTML page, which loads nothing."""
     return fill_template("report.html.jinja", page=page)
 
 
@@ -118,12 +118,12 @@ def fill_template(template: str, **values: object) -> str:
 
 
 def _heading_lines(name: str) -> list[str]:
-    """The heading of a column, broken at commas and brackets."""
+    """The lines of a column heading, which is broken at commas and brackets."""
     return re.split(r", | (?=\()", name)
 
 
 def _is_shown(part: Part) -> bool:
-    """Whether there is anything to show of a part."""
+    """Whether a part has any content."""
     match part:
         case Table() | Pairs():
             return bool(part.rows)
@@ -135,8 +135,8 @@ def _is_shown(part: Part) -> bool:
 def show(sections: Iterable[Section], console: Console) -> None:
     """Print sections to a terminal.
 
-    Sentences are wrapped at the width of the console. Lines of tables and values never are: a
-    number that is torn apart cannot be read, and a command could not be copied.
+    Sentences are wrapped at the width of the console. Tables and values are not, because a broken
+    number cannot be read and a broken command cannot be copied.
     """
 
     def say(text: str, *, style: str = "", indent: str = "") -> None:
@@ -171,7 +171,7 @@ def show(sections: Iterable[Section], console: Console) -> None:
 
 
 def _columns(rows: Sequence[Row]) -> list[str]:
-    """Lines of cells, each column as wide as its widest cell."""
+    """The rows as lines in which each column is as wide as its widest cell."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
@@ -180,11 +180,11 @@ def _columns(rows: Sequence[Row]) -> list[str]:
 
 
 def rich_table(table: Table, gap: int) -> RichTable:
-    """A table for rich, as wide as its cells; headings are broken at their commas and brackets.
+    """A rich table that is as wide as its cells need; headings are broken at commas and brackets.
 
     Args:
         table: the cells.
-        gap: characters between two columns.
+        gap: number of spaces between two columns.
     """
     from rich import box
     from rich.table import Table as RichTable
@@ -198,8 +198,8 @@ def rich_table(table: Table, gap: int) -> RichTable:
         show_edge=False,
         pad_edge=False,
         padding=(0, 0, 0, gap - 1),
-        width=sum(widths)
-        + gap * (len(widths) - 1),  # or rich would shrink the columns to the terminal
+        # Without a width, rich would shrink the columns to fit the terminal.
+        width=sum(widths) + gap * (len(widths) - 1),
     )
     for name, head in zip(table.head, heads, strict=True):
         justify: Literal["left", "right"] = "left" if name in table.texts else "right"

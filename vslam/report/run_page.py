@@ -47,14 +47,14 @@ _COMPARED = (
     ("time", "seconds", "{:.1f} s"),
 )
 _ABOUT_COMPARED = (
-    "All detectors saw the same frames. The time is that of tracking and mapping: images are read "
-    "and features are extracted once for all detectors. It is wall time on cores that the "
-    "detectors share; to compare costs, time separate runs."
+    "All detectors saw the same frames. Time: wall time of tracking and mapping, on cores that the "
+    "detectors share, without reading images and extracting features, which is done once for all. "
+    "To compare costs, time separate runs."
 )
 
 
 def headlines(report: ReportJson) -> list[Tile]:
-    """The summary. Lost frames come first: the ATE of a run that was lost half of the time says
+    """The summary. Lost frames come first, because the ATE of a run with many of them means
     little."""
     lost, mono = report.lost_frames, report.sensor == "mono"
     share = f"{100.0 * lost / report.frames:.1f} % of" if lost else "of"
@@ -75,11 +75,9 @@ def headlines(report: ReportJson) -> list[Tile]:
         ),
         *_in_map(report),
         *_on_earth(report),
-        *([Tile("Scale", "arbitrary", "as of any single camera")] if mono else []),
+        *([Tile("Scale", "arbitrary", "unknown to a single camera")] if mono else []),
         Tile("ATE RMSE", _number(report.ate_rmse_m, "m"), evaluated),
-        Tile(
-            "Causal ATE", _number(report.causal_ate_rmse_m, "m"), "poses as estimated at the time"
-        ),
+        Tile("Causal ATE", _number(report.causal_ate_rmse_m, "m"), "poses as first estimated"),
         Tile("RPE", _number(report.rpe_m, "m"), f"per frame; rotation {rotation}"),
         Tile("t_rel", _number(report.t_rel_percent, "%"), "KITTI drift over 100-800 m"),
         Tile("r_rel", _number(report.r_rel_deg_per_100m, "°"), "per 100 m"),
@@ -92,9 +90,9 @@ def headlines(report: ReportJson) -> list[Tile]:
         Tile(
             "CPU",
             f"{report.cpu_ms_per_frame:.1f} ms",
-            f"per frame, of all threads{_together(report)}; start-up {report.startup_s:.1f} s",
+            f"per frame, all threads{_together(report)}; start-up {report.startup_s:.1f} s",
         ),
-        Tile("Memory", f"{report.peak_memory_mb:.0f} MB", f"at its peak{_together(report)}"),
+        Tile("Memory", f"{report.peak_memory_mb:.0f} MB", f"peak{_together(report)}"),
         Tile("Map", f"{report.landmarks:,}", _map_note(report)),
         _loops(report),
     ]
@@ -108,41 +106,42 @@ def _before_map(report: ReportJson) -> str:
 
 
 def _together(report: ReportJson) -> str:
-    """A remark on speed and memory where several detectors were run."""
+    """A remark on speed and memory if several detectors were run; otherwise empty."""
     return f", {len(report.detectors)} detectors together" if report.detectors else ""
 
 
 def advice(report: ReportJson) -> str:
-    """What to do after a run that lost many frames; empty after others."""
+    """What to do if many frames were lost; otherwise empty."""
     if report.lost_frames <= _MANY_LOST * report.frames:
         return ""
-    return "Many frames were lost: vslam doctor checks images, calibration and time stamps."
+    return "Many frames were lost; vslam doctor checks images, calibration and time stamps."
 
 
 def _in_map(report: ReportJson) -> list[Tile]:
     if (found := report.in_map) is None:
         return []
-    fix = "no fix" if found.first_fix_s is None else f"first fix after {found.first_fix_s:.2f} s"
-    times = f"found at {found.found} of {counted(found.sought, 'attempt')}"
+    weak = f", {found.weak_percent:.1f} % with few inliers" if found.weak_percent else ""
+    note = f"of the frames{weak}; found in {found.found} of {counted(found.sought, 'attempt')}"
+    if found.first_fix_s is not None:
+        note += f", first after {found.first_fix_s:.2f} s"
     error = _number(found.error_m, "m")
-    weak = f", {found.weak_percent:.1f} % by few inliers" if found.weak_percent else ""
-    note = f"of the frames{weak}; {fix}, {times}"
     return [
         Tile("In the map", f"{found.in_map_percent:.1f} %", note),
-        Tile("Error in the map", error, "RMSE of these frames, with the map's own alignment"),
+        Tile("Error in the map", error, "RMSE of these frames, after the alignment of the map"),
     ]
 
 
 def _on_earth(report: ReportJson) -> list[Tile]:
     if (found := report.gps_track) is None:
         return []
-    apart = f"{_number(found.residual_m, 'm')} from the trajectory (RMS)"
+    residual = f"{_number(found.residual_m, 'm')} from the trajectory (RMS)"
     used = f"{found.fixes - found.refused} fixes"
-    return [Tile("GPS", used, f"{found.refused} refused; {apart}")]
+    return [Tile("GPS", used, f"{found.refused} refused; {residual}")]
 
 
 def _latency(report: ReportJson) -> list[Tile]:
-    """In a real-time run, dropped frames are a fault of the machine: they colour the tile."""
+    """The latency of a real-time run; dropped frames are marked, because they show that the machine
+    is too slow."""
     if report.latency_ms is None:
         return []
     ms, dropped = report.latency_ms, report.dropped_frames
@@ -168,20 +167,20 @@ def _loops(report: ReportJson) -> Tile:
 
 
 def _revisits(report: ReportJson) -> str:
-    """How many stretches were found again. A right loop on a stretch that is too short to count is
+    """How many revisits were found. If there are none, right loops on shorter stretches are
     mentioned."""
     if report.revisit_stretches:
         return f"{report.loops_found} of {counted(report.revisit_stretches, 'revisit')} found"
-    none = f"the ground truth revisits no stretch of {MIN_LENGTH_M:.0f} m or more"
+    none = f"the drive revisits no stretch of {MIN_LENGTH_M:.0f} m or more"
     right = sum(loop.accepted and loop.right is True for loop in report.loops)
     return f"{none} ({right} right on shorter ones)" if right else none
 
 
 def detector_section(report: ReportJson) -> Section:
-    """A row for each detector, the run's own first; empty where there was no comparison.
+    """A row for each detector, the run's own first; empty if no detectors were compared.
 
-    Figures that no detector has are left out. The loops closed are counted only where there is no
-    ground truth that tells which revisits were found.
+    Columns without any value are left out. The number of closed loops is shown only if no ground
+    truth tells which revisits were found.
     """
     detectors = report.detectors
     if not detectors:
@@ -191,13 +190,13 @@ def detector_section(report: ReportJson) -> Section:
     }
     if "loops_found" in known:
         known.remove("loops_closed")
-    figures = [figure for figure in _COMPARED if figure[1] in known]
+    columns = [column for column in _COMPARED if column[1] in known]
     ended = ("ended early",) if any(one.interrupted for one in detectors) else ()
-    head = ("detector", *(title for title, _, _ in figures), *ended)
+    head = ("detector", *(title for title, _, _ in columns), *ended)
     rows: list[Row] = [
         (
             one.detector,
-            *(number(getattr(one, name), form) for _, name, form in figures),
+            *(number(getattr(one, name), form) for _, name, form in columns),
             *(one.interrupted or "no" for _ in ended),
         )
         for one in detectors
@@ -213,7 +212,7 @@ def _left_out(report: ReportJson) -> str:
     if report.detectors or not report.compare:
         return ""
     return (
-        f"The comparison with {', '.join(report.compare)} was left out: the run was resumed, and "
+        f"The comparison with {', '.join(report.compare)} was left out: the run was resumed, but "
         "only the map of its own detector had been saved."
     )
 
@@ -230,18 +229,17 @@ def run_page(
 
     Args:
         report: the numbers.
-        figures: drawn by :func:`vslam.report.figures.draw_figures`.
-        seen: pictures of closed loops, of :func:`vslam.report.loop_tables.seen_loops`.
-        recordings: names of those beside the page.
-        explorer: of :func:`vslam.report.explorer.explorer`.
-        config: text of ``config.json``, which the HTML page shows as it is.
+        figures: from :func:`vslam.report.figures.draw_figures`.
+        seen: pictures of closed loops, from :func:`vslam.report.loop_tables.seen_loops`.
+        recordings: names of the recordings in the folder of the page.
+        explorer: from :func:`vslam.report.explorer.explorer`.
+        config: text of ``config.json``, for the HTML page.
     """
-    interrupted = f"Interrupted: {report.interrupted}."
-    done = counted(report.frames, "frame")
-    alerts = [Alert(interrupted, f"The results cover the {done} before it.")]
-    if not report.interrupted:
-        alerts = []
-    alerts += [Alert(f"Warning: {warning}") for warning in report.warnings]
+    alerts = [Alert(f"Warning: {warning}") for warning in report.warnings]
+    if report.interrupted:
+        done = counted(report.frames, "frame")
+        interrupted = f"Interrupted: {report.interrupted}."
+        alerts.insert(0, Alert(interrupted, f"The results cover the {done} before that."))
     alerts += [Alert("", advice(report))] if advice(report) else []
     stages = Table(("stage", "mean", "median", "p95", "p99"), stage_rows(report), ("stage",))
     pictures: list[Part] = [seen_note(report, seen), *seen] if seen else []
@@ -262,7 +260,7 @@ def run_page(
         (
             Section("", (*alerts, Tiles(headlines(report)))),
             detector_section(report),
-            Section("Loops seen", pictures),
+            Section("Pictures of closed loops", pictures),
             Section(
                 f"Skipped frames: {report.skipped_frames}",
                 [Bullets(report.skipped_messages)],
@@ -275,7 +273,7 @@ def run_page(
             *loop_sections(report),
             Section(
                 "Reproduce the ATE",
-                ["From the folder that vslam was run in:", evo] if report.evo_command else [],
+                ["In the folder in which vslam was run:", evo] if report.evo_command else [],
                 wide=False,
             ),
             Section(
@@ -291,7 +289,7 @@ def run_page(
 
 
 def _gps(report: ReportJson) -> Section:
-    """The drive on the Earth; empty without GPS."""
+    """The georeferenced trajectory; empty without GPS."""
     if (found := report.gps_track) is None:
         return Section("GPS", ())
     latitude, longitude, altitude = found.datum
@@ -305,10 +303,11 @@ def _gps(report: ReportJson) -> Section:
         without = f"{_number(report.ate_rmse_m, 'm')} without ({report.alignment})"
         rows.append(("ATE RMSE", f"{_number(found.ate_rmse_m, 'm')} with GPS (se3), {without}"))
     note = (
-        "The drive is too straight for GPS to tell the rotation about it: the camera is taken to "
+        "The drive is too straight for GPS to determine the rotation about its direction; the "
+        "camera is assumed to be upright."
     )
     parts: list[Part] = [Pairs(rows)]
-    return Section("GPS", parts if found.level else [*parts, note + "stand upright."])
+    return Section("GPS", parts if found.level else [*parts, note])
 
 
 def stage_rows(report: ReportJson) -> list[Row]:
@@ -320,7 +319,7 @@ def stage_rows(report: ReportJson) -> list[Row]:
 
 
 def option_rows(report: ReportJson) -> list[tuple[str, str]]:
-    """The options of the run, as they would be typed."""
+    """The options of the run by their names on the command line."""
     names = ("dataset", "sequence", "perturb", "detector", "sensor", "seed", "threads", "start")
     options = [(name, str(getattr(report, name))) for name in (*names, "every")]
     limit = "all" if report.max_frames is None else str(report.max_frames)
@@ -340,7 +339,7 @@ def option_rows(report: ReportJson) -> list[tuple[str, str]]:
 
 
 def machine_rows(report: ReportJson) -> list[tuple[str, str]]:
-    """Where and with what the run was made."""
+    """The machine, the packages and the time of the run."""
     machine = report.machine
     packages = {name: text for name, text in report.versions.items() if name != "python"}
     return [

@@ -1,6 +1,6 @@
-"""The schema of ``report.json``: what scripts may rely on.
+"""The schema of ``report.json``, which scripts may rely on.
 
-``Record`` and ``Document`` are the base of all files of results.
+``Record`` and ``Document`` are the base classes of all result files.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from vslam.errors import InputError
 
 
 class Record(BaseModel):
-    """A part of a document; a field that is not known is an error."""
+    """A part of a document; unknown fields are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class Document(Record):
-    """A JSON file of results. A subclass sets ``schema_version`` to the version that it reads."""
+    """A JSON file of results. A subclass sets ``schema_version`` to the one that it can read."""
 
     schema_version: int
 
@@ -31,7 +31,7 @@ class Document(Record):
         """Read a file that ``to_json`` wrote.
 
         Raises:
-            InputError: the file is missing, damaged or of another version.
+            InputError: the file is missing, damaged or of another schema version.
         """
         known = cls.model_fields["schema_version"].default
         try:
@@ -42,7 +42,8 @@ class Document(Record):
         except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
             raise InputError(f"{path}: missing or damaged; name the folder of a run.") from error
         raise InputError(
-            f"{path}: report schema {found}, this version reads {known}; repeat the run with it."
+            f"{path}: report schema {found}, but this version of vslam reads {known}; repeat the "
+            "run with this version."
         )
 
     def to_json(self) -> str:
@@ -51,7 +52,7 @@ class Document(Record):
 
 
 class StageTime(Record):
-    """Milliseconds of one stage over the frames that went through it."""
+    """Time of one stage in milliseconds, over the frames that went through it."""
 
     mean: float
     median: float
@@ -60,14 +61,14 @@ class StageTime(Record):
 
 
 class LoopEntry(Record):
-    """One loop candidate, accepted or not, in frames of this run.
+    """One loop candidate, accepted or rejected, with the frames of this run.
 
-    ``query_frame`` is None for a frame that was not in the map, ``match_frame`` for one of an
-    earlier drive. ``right`` says whether the relative pose agrees with the ground truth, None where
-    that is unknown. ``moved_m`` is the largest distance that the correction moved a keyframe,
-    ``correction_s`` the time it took; None if rejected. ``matched_by`` names the descriptors that
-    the relative pose comes from, ``orb`` or ``learned``, ``proposed_by`` the detector that found
-    the candidate, or several joined by ``+``.
+    ``query_frame`` is None for a frame that did not become a keyframe, ``match_frame`` for a
+    keyframe of an earlier drive. ``right``: whether the relative pose agrees with the ground truth,
+    None if unknown. ``moved_m``: the largest distance by which the correction moved a keyframe;
+    ``correction_s``: its duration; both are None for rejected candidates. ``matched_by``: the
+    descriptors that gave the relative pose. ``proposed_by``: the detector that found the candidate,
+    or several joined by ``+``.
     """
 
     query_frame: int | None
@@ -85,9 +86,9 @@ class LoopEntry(Record):
 
 
 class RevisitEntry(Record):
-    """Frames where the camera drives along an earlier stretch, according to the ground truth.
+    """Frames in which, according to the ground truth, the camera drives along an earlier stretch.
 
-    ``loop_frame`` is the first frame with a right loop that was closed on it, None if missed.
+    ``loop_frame`` is the first of them in which a right loop was closed, None if all missed it.
     """
 
     first_frame: int
@@ -99,14 +100,14 @@ class RevisitEntry(Record):
 
 
 class Measures(Record):
-    """What is measured of a run, and of each detector that is compared with it.
+    """The measures of a run, and of each detector that is compared with it.
 
     Errors are None without ground truth, and KITTI's drift also on paths shorter than 100 m.
-    ``causal_ate_rmse_m`` is of the poses as they were given at the time
-    (``trajectory_causal.tum``), after their own alignment. ``loops_closed`` counts candidates,
-    ``loops_wrong`` those of them that are wrong; ``loops_found`` and ``loops_missed`` count
-    stretches where the camera revisits a place. The last three are None without ground truth.
-    ``interrupted`` says why the run ended early.
+    ``causal_ate_rmse_m`` is the ATE of the poses as first estimated (``trajectory_causal.tum``),
+    after their own alignment. ``loops_closed`` is the number of accepted candidates, of which
+    ``loops_wrong`` are wrong. ``loops_found`` and ``loops_missed`` are numbers of revisited
+    stretches. The last three are None without ground truth. ``interrupted`` is the reason why the
+    run ended early, or None.
     """
 
     lost_frames: int
@@ -126,9 +127,8 @@ class Measures(Record):
 class DetectorFigures(Measures):
     """One of the detectors that were compared on the same frames.
 
-    ``seconds`` is the wall time of the detector's own steps: tracking, waiting for its mapping, and
-    completing the map at the end. It excludes reading images and extracting features, which all
-    detectors share.
+    ``seconds`` is the wall time of tracking, of waiting for mapping, and of completing the map at
+    the end. It excludes reading images and extracting features, which the detectors share.
     """
 
     detector: str
@@ -138,13 +138,12 @@ class DetectorFigures(Measures):
 class MapFigures(Record):
     """How a run was localised in the map that it continued.
 
-    ``in_map_percent`` of the frames are placed in the map at the end; these include
-    ``weak_percent``, which have few inliers (WEAK). ``first_fix_s`` is the time from the first
-    frame to the first one that was found in the map, None if none was. The whole map was searched
-    at ``sought`` frames, successfully at ``found`` of them. ``error_m`` is the RMSE of the
-    positions of the frames in the map after the alignment of the drives that made the map, so that
-    an error in the place of the whole run counts; None where the map does not lie in the world of
-    the ground truth.
+    ``in_map_percent``: frames whose final pose is in the map; ``weak_percent``: those of them with
+    few inliers (WEAK). ``first_fix_s``: time from the first frame to the first localised one, None
+    if there is none. ``sought``: number of frames at which the whole map was searched; ``found``:
+    number of successful searches. ``error_m``: RMSE of the positions in the map, with the alignment
+    of the drives that made the map, so that it includes an offset of the whole run; None if the
+    map has not been aligned to the ground truth.
     """
 
     in_map_percent: float
@@ -156,15 +155,14 @@ class MapFigures(Record):
 
 
 class GpsFigures(Record):
-    """The drive on the Earth, also written as ``gps.json``.
+    """The georeferenced trajectory in numbers, also written as ``gps.json``.
 
-    ``datum`` is the origin of the local east-north-up frame: latitude and longitude in degrees and
-    altitude in metres, those of the first fix. ``fixes`` counts those of tracked frames,
-    ``refused`` those of them that failed the chi-square test. ``residual_m`` is the root mean
-    square distance of the others from the trajectory, ``metres_per_unit`` the mean scale of the
-    map. ``ate_rmse_m`` is the error of ``trajectory_enu.tum`` after its SE3 alignment, None without
-    ground truth. ``level`` is False where the drive is straight, so that the rotation about it is
-    unknown.
+    ``datum``: origin of the local east-north-up frame, the first fix, as latitude and longitude in
+    degrees and altitude in metres. ``fixes``: number of fixes at tracked frames, of which
+    ``refused`` failed the chi-square test. ``residual_m``: root mean square distance of the other
+    fixes from the trajectory. ``metres_per_unit``: mean scale of the map. ``ate_rmse_m``: ATE of
+    ``trajectory_enu.tum`` after SE3 alignment, None without ground truth. ``level``: False if the
+    drive is so straight that GPS does not determine the rotation about its direction.
     """
 
     datum: tuple[float, float, float]
@@ -177,7 +175,7 @@ class GpsFigures(Record):
 
 
 class Machine(Record):
-    """Where the times were measured; ``cores`` counts those that the process may use."""
+    """The machine of the run; ``cores`` is the number of cores that the process may use."""
 
     cpu: str
     cores: int
@@ -188,20 +186,20 @@ class Machine(Record):
 class ReportJson(Measures, Document):
     """One run in numbers.
 
-    ``thresholds`` are those that differ from the defaults, by dotted name.
-    ``evaluation_remark`` says why there are no errors, or of how many frames they are.
-    ``warnings`` are sentences about faults of the rig that the run has shown.
-    ``detectors`` has a row for each detector, the run's own first, where others were run beside it
-    (``--compare``): speed, CPU time and memory are then those of all together. It is empty in a run
-    that was resumed, since the maps of the others are not saved.
-    ``lost_before_map`` counts those of the lost frames that came before the first tracked one, in a
-    run that began a new map.
-    ``longest_loss_s`` is the longest time from a lost frame to the next tracked one, or to the end.
-    ``frames`` counts the frames that were processed; of them ``skipped_frames`` had an unreadable
-    image and ``dropped_frames`` were overtaken by a newer one in a real-time run, whose
-    ``latency_ms`` is from the time of an image to its pose (None in any other run).
-    ``loops_rejected`` counts candidates; ``loops_found`` and ``loops_missed`` add up to
-    ``revisit_stretches``. See :mod:`vslam.evaluation.loops`.
+    - ``frames``: number of processed frames. ``skipped_frames`` of them had an unreadable image;
+      ``dropped_frames`` were replaced by a newer one in a real-time run.
+    - ``lost_before_map``: number of lost frames before the first tracked one, in a run that began a
+      new map. ``longest_loss_s``: the longest time from a lost frame to the next tracked one or to
+      the end.
+    - ``warnings``: sentences about faults of the rig that the run has detected.
+    - ``evaluation_remark``: why there are no errors, or how many frames they cover.
+    - ``latency_ms``: time from an image to its pose in a real-time run, otherwise None.
+    - ``loops_rejected``: number of rejected candidates. ``revisit_stretches``: the sum of
+      ``loops_found`` and ``loops_missed`` (:mod:`vslam.evaluation.loops`).
+    - ``detectors``: with ``--compare``, all detectors, the run's own first; speed, CPU time and
+      memory are then those of all together. It is empty in a resumed run, because the maps of the
+      other detectors are not saved.
+    - ``thresholds``: those that differ from the defaults, by dotted name.
     """
 
     schema_version: int = 5

@@ -1,4 +1,4 @@
-"""From the outcome of a run to the numbers of its report."""
+"""Compute the numbers of a report from the outcome of a run."""
 
 from __future__ import annotations
 
@@ -38,6 +38,9 @@ _OPTIONS = (
     "local_weights", "realtime", "calib", "mask", "gps", "localize", "compare",
 )  # fmt: skip
 
+_WRONG_SCALE = 1.2  # drift changes the scale by a few per cent
+_LEFT_OVER = 0.3  # share of the error, and of the path's size, that a change of scale may leave
+
 
 def summarize(
     outcome: RunOutcome,
@@ -46,12 +49,14 @@ def summarize(
     evo_command: str | None,
     remark: str | None = None,
 ) -> ReportJson:
-    """Reduce a run to what ``report.json`` holds.
-
-    Without an evaluation the errors are None, without a verdict the figures of loops.
+    """Compute the content of ``report.json``.
 
     Args:
-        remark: why there is no evaluation.
+        outcome: the run.
+        evaluation: errors of ``outcome.trajectory``, or None.
+        verdict: evaluation of ``outcome.loops``, or None.
+        evo_command: command that repeats the evaluation, or None.
+        remark: why there is no evaluation, or how many frames it covers.
     """
     frames = len(outcome.tracks)
     states = Counter(track.state for track in outcome.tracks)
@@ -66,7 +71,7 @@ def summarize(
         skipped_messages=outcome.skipped,
         dropped_frames=states[TrackingState.DROPPED],
         frames=frames,
-        warnings=tuple(outcome.warnings),
+        warnings=(*outcome.warnings, *_scale_warnings(outcome, evaluation)),
         alignment=evaluation.alignment if evaluation else None,
         ate_mean_m=evaluation.ate_mean_m if evaluation else None,
         ate_max_m=evaluation.ate_max_m if evaluation else None,
@@ -101,6 +106,30 @@ def summarize(
     )
 
 
+def _scale_warnings(outcome: RunOutcome, evaluation: Evaluation | None) -> list[str]:
+    """A warning if the trajectory of a sensor that knows the scale fits the ground truth only after
+    it is scaled."""
+    camera, ground_truth = outcome.sequence.camera, matched_ground_truth(outcome)
+    if evaluation is None or ground_truth is None or camera.monocular:
+        return []
+    estimate, truth = (
+        T_wc[:, :3, 3] - T_wc[:, :3, 3].mean(axis=0)
+        for T_wc in (evaluation.T_wc_aligned, ground_truth.T_wc)
+    )
+    scale = float(np.sum(estimate * truth) / max(np.sum(estimate**2), 1e-12))
+    error, size, left = (
+        np.linalg.norm(x) for x in (truth - estimate, truth, truth - scale * estimate)
+    )
+    if 1.0 / _WRONG_SCALE < scale < _WRONG_SCALE or left > _LEFT_OVER * min(error, size):
+        return []
+    what = (
+        "the depth scale (--depth-scale)"
+        if camera.depth
+        else "the baseline, and that the calibration is for images of this size"
+    )
+    return [f"the trajectory is {1.0 / scale:.2g} times as large as the ground truth: check {what}"]
+
+
 def _lost_before_map(outcome: RunOutcome) -> int:
     if outcome.settings.map_file is not None or not outcome.n_tracked:
         return 0
@@ -122,7 +151,7 @@ def _longest_loss_s(tracks: list[TrackResult]) -> float:
 
 
 def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
-    """Errors of a run's final trajectory, or None, and why some frames are not evaluated."""
+    """The errors of a run's final trajectory, or None, and a remark if not all frames count."""
     ground_truth = matched_ground_truth(outcome)
     if ground_truth is None:
         return None, "no ground truth"
@@ -130,7 +159,7 @@ def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
         return None, "no frames"
     try:
         found = evaluate_trajectory(outcome.trajectory, ground_truth, outcome.alignment)
-    except InputError as error:  # a clip too short to align is no reason to lose the run
+    except InputError as error:  # too short to align; the other results are still of use
         return None, str(error)
     if found.frames == len(outcome.trajectory):
         return found, None
@@ -138,7 +167,7 @@ def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
 
 
 def causal_ate(outcome: RunOutcome) -> float | None:
-    """ATE of the poses as they were given at the time, None where it cannot be computed."""
+    """ATE of the poses as first estimated; None if it cannot be computed."""
     ground_truth = matched_ground_truth(outcome)
     if ground_truth is None or not outcome.tracks:
         return None
@@ -169,7 +198,7 @@ def _measures(
 def _detectors(
     outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
 ) -> list[DetectorFigures]:
-    """A row for each detector if there was a comparison, the run's own first."""
+    """The detectors that were compared, the run's own first; empty without a comparison."""
     if not outcome.compared:
         return []
     judged = [(outcome, evaluation, verdict)]
@@ -184,7 +213,7 @@ def _figures_in_map(outcome: RunOutcome) -> MapFigures | None:
     inside, tracks = outcome.in_map, outcome.tracks
     if inside is None:
         return None
-    # While a keyframe is being mapped the camera is not looked for.
+    # A lost frame is searched for only while no keyframe is being mapped.
     lost = [track for track in tracks if track.state == TrackingState.LOST]
     found = [track for track in tracks if track.relocalised]
     sought = sum("relocalise" in track.stage_ms for track in lost) + len(found)
@@ -201,7 +230,7 @@ def _figures_in_map(outcome: RunOutcome) -> MapFigures | None:
 
 
 def gps_figures(outcome: RunOutcome) -> GpsFigures | None:
-    """The drive on the Earth in numbers, None without GPS."""
+    """The georeferenced trajectory in numbers; None without GPS."""
     if (track := outcome.gps_track) is None:
         return None
     ate, ground_truth = None, matched_ground_truth(outcome)
@@ -252,7 +281,7 @@ def _loops(outcome: RunOutcome, verdict: LoopEvaluation | None) -> list[LoopEntr
 
 
 def _frame(frames: NDArray[np.int64], keyframe: int) -> int | None:
-    """The frame of this run that became a keyframe; None for none and for earlier drives."""
+    """The frame of this run that became a keyframe; None for -1 and keyframes of earlier drives."""
     return int(frames[keyframe]) if keyframe >= 0 and frames[keyframe] >= 0 else None
 
 
@@ -289,7 +318,7 @@ def _stage_time(ms: list[float]) -> StageTime:
 
 
 def this_machine() -> Machine:
-    """Where this process runs."""
+    """The machine on which this process runs."""
     return Machine(
         cpu=cpu_name(),
         cores=available_cores(),

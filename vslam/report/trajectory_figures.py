@@ -1,4 +1,4 @@
-"""The maps of a report, seen from above: the whole path, and what loop closing did to it."""
+"""The maps of a report, seen from above: the trajectory, and the effect of loop closing on it."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def top_view(
     ground_truth: Trajectory | None,
     verdict: LoopEvaluation | None,
 ) -> Figure:
-    """Estimate and truth, doubtful frames, closed loops, and revisits that were missed; dashed, the
-    estimates of the detectors compared, each after an alignment of its own."""
+    """Estimate, ground truth, weak and lost frames, closed loops and missed revisits. The estimates
+    of the detectors of --compare are dashed, each after its own alignment."""
     figure, axes = _new_map("Top view", outcome, evaluation)
     path = _aligned(outcome, evaluation, outcome.trajectory.T_wc[:, :3, 3])
     x, z = path[:, 0], path[:, 2]
@@ -59,7 +59,7 @@ def top_view(
     for k, (other, color) in enumerate(zip(outcome.compared, cycle(COMPARED), strict=False)):
         its_own = None if evaluation is None else evaluate_run(other)[0]
         points = _aligned(other, its_own, other.trajectory.T_wc[:, :3, 3])
-        # Where paths coincide the dashes of all of them are seen, one after the other.
+        # Shifted dashes keep all of several coinciding paths visible.
         dashes = (2.0 * k, (2.0, 2.0 * len(outcome.compared)))
         axes.plot(
             points[:, 0],
@@ -110,8 +110,8 @@ def loop_closing(
 ) -> Figure:
     """Keyframes before the first correction and at the end, in the frame of the ground truth.
 
-    Both go through the alignment of the final trajectory: before and after are drawn where the map
-    had them, so that what moved is what loop closing moved.
+    Both are transformed by the alignment of the final trajectory, so that every difference between
+    them is the effect of loop closing.
     """
     figure, axes = _new_map("Map before and after loop closing", outcome, evaluation)
     if evaluation is not None and ground_truth is not None:
@@ -146,7 +146,7 @@ def loop_closing(
 
 
 def gps_map(track: GpsTrack) -> Figure:
-    """The drive on the Earth, with and without GPS, and the fixes."""
+    """The trajectory with and without GPS, and the fixes."""
     figure, axes = new_figure("With GPS", "east (m)", "north (m)", SQUARE)
     used = track.anchored.used
     fixes, refused = track.fixes[used], track.fixes[~used]
@@ -170,21 +170,21 @@ def _centres(T_cw: NDArray[np.float64]) -> Points:
 
 
 def _lines(ends: Points) -> Collection[Points]:
-    """x and z of ``(M, 2, 3)`` lines as one polyline each, with gaps."""
+    """x and z of ``(M, 2, 3)`` lines, joined to one polyline with gaps (NaN)."""
     gaps = np.full((len(ends), 1, 3), np.nan)
     points = np.concatenate([ends, gaps], axis=1).reshape(-1, 3)
     return points[:, 0], points[:, 2]
 
 
 def _at_frames(outcome: RunOutcome, path: Points, frames: NDArray[np.int64]) -> Points:
-    """``(F, 3)`` positions of frames of the run, from those of all frames done."""
+    """``(F, 3)`` positions of some frames of the run, from the ``path`` of all of them."""
     times = np.array([outcome.tracks[k].timestamp for k in frames])
     index = np.searchsorted(outcome.trajectory.timestamps, times)
     return path[np.minimum(index, len(path) - 1)]
 
 
 def _aligned(outcome: RunOutcome, evaluation: Evaluation | None, points: Points) -> Points:
-    """Take ``(N, 3)`` points of the estimate's world to where the evaluation has put it."""
+    """Transform ``(N, 3)`` points of the estimated world into the frame of the ground truth."""
     if evaluation is None:
         return points
     S = world_of(outcome, evaluation).S_truth_world

@@ -1,1 +1,1 @@
-"""A run over a sequence: it prepares, tracks and records the frames, and collects the results."""
+"""A run over a sequence: frames are prepared, tracked and recorded, and the results collected."""

@@ -1,10 +1,10 @@
 """Saving the state of a run at intervals, so that a killed run loses at most a minute of work.
 
-``trajectory_online.tum`` gets a line with the pose of each frame when it is tracked. At intervals,
+A line with the pose of each tracked frame is appended to ``trajectory_online.tum``. At intervals,
 the map is copied between two frames, if possible while no keyframe is being mapped. A thread then
-writes what the report needs about the frames so far (``autosave_progress.npz``) and the map
-(``autosave.npz``, an ordinary map file). Each file replaces the previous one atomically. If a run
-is killed between the two, its progress has a few frames more than its map; they are ignored.
+writes the data that the report needs about the frames so far (``autosave_progress.npz``) and the
+map (``autosave.npz``, an ordinary map file). Each file replaces the previous one atomically. If a
+run is killed between the two, its progress has a few frames more than its map; they are ignored.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from vslam.trajectory import tum_line
 
 MAP, PROGRESS, ONLINE = "autosave.npz", "autosave_progress.npz", "trajectory_online.tum"
 LOCK = ".lock"
-_BEGIN = 0.75  # share of the period; the rest is left for waiting for a merge and for writing
-_PATIENCE = 0.95  # share of the period before which no global bundle adjustment is interrupted
-_MISSED = 5  # frames that end during mapping before the save waits for the mapping to end
+_DUE = 0.75  # share of the period after which saving is due, which leaves time for writing
+_DUE_WHILE_ADJUSTING = 0.95  # the same while a global bundle adjustment is running
+_MOST_MISSED = 5  # frames that may end during mapping before saving waits for mapping
 
 _log = logging.getLogger(__name__)
 
@@ -47,11 +47,11 @@ class Unfinished:
 
 @contextmanager
 def lock_run(folder: Path) -> Iterator[None]:
-    """Lock the folder of a run, so that nobody resumes the run while it is in progress. If the
-    lock cannot be created, for example on a full disk, the run continues without it.
+    """Lock the folder of a run, so that no other process resumes the run while it is in progress.
+    If the lock cannot be created, for example on a full disk, the run continues without it.
 
     Raises:
-        InputError: another living process runs in the folder.
+        InputError: another process is running in the folder.
     """
     with ExitStack() as lock:
         with suppress(OSError):
@@ -73,11 +73,11 @@ def find_unfinished(folder: Path) -> Unfinished:
     progress = read_progress(folder / PROGRESS)
     if frames is None or len(frames.timestamp) > len(progress.tracks):
         raise InputError(f"{folder}: {PROGRESS} is older than {MAP}; there is nothing to resume.")
-    _forget_poses(folder / ONLINE, len(frames.timestamp))
+    _keep_poses(folder / ONLINE, len(frames.timestamp))
     return Unfinished(file, progress.until(len(frames.timestamp)))
 
 
-def _forget_poses(path: Path, frames: int) -> None:
+def _keep_poses(path: Path, frames: int) -> None:
     with suppress(OSError):
         lines = path.read_text(encoding="utf-8").splitlines(keepends=True)[:frames]
         with replaced_file(path) as file:
@@ -85,16 +85,20 @@ def _forget_poses(path: Path, frames: int) -> None:
 
 
 class Autosave:
-    """Interface to save a run, called for every frame in order; this base class saves nothing."""
+    """Interface to save a run. This base class saves nothing."""
 
     def frame(self, result: TrackResult) -> None:
-        """Called after a frame was tracked."""
+        """Called for every frame in order, after it was tracked."""
 
     def offer(self, slam: Slam, progress: Callable[[], Progress]) -> None:
-        """Save if it is time; called when a frame is finished."""
+        """Save if saving is due; called after ``frame``."""
 
     def close(self, slam: Slam, progress: Callable[[], Progress], *, resumable: bool) -> None:
-        """Called at the end of the run; ``resumable`` if it ended early with a complete map."""
+        """Called at the end of the run.
+
+        Args:
+            resumable: whether the run ended early with a complete map.
+        """
 
 
 NO_AUTOSAVE = Autosave()
@@ -110,14 +114,14 @@ class FolderAutosave(Autosave):
     def __init__(self, folder: Path, seconds: float, drive: str) -> None:
         """
         Args:
-            seconds: most that a killed run can lose; 0 saves no map.
+            seconds: longest time whose work a killed run can lose; 0 saves no map.
             drive: name of the drive in the map file.
         """
         self._folder, self._seconds, self._drive = folder, seconds, drive
         self._last = time.monotonic()
         self._writer = ThreadPoolExecutor(1, "autosave")
         self._writing: Future[None] | None = None
-        self._missed = 0  # frames, since saving is due, that ended during mapping
+        self._missed = 0  # frames that ended during mapping since saving was due
         self._warned: set[str] = set()
         self._online: TextIO | None = None
         try:
@@ -137,12 +141,12 @@ class FolderAutosave(Autosave):
 
     def offer(self, slam: Slam, progress: Callable[[], Progress]) -> None:
         waited = time.monotonic() - self._last
-        if not self._seconds or waited < _BEGIN * self._seconds:
+        if not self._seconds or waited < _DUE * self._seconds:
             return
-        if slam.is_mapping and self._missed < _MISSED:
+        if slam.is_mapping and self._missed < _MOST_MISSED:
             self._missed += 1
             return
-        if slam.is_adjusting and waited < _PATIENCE * self._seconds:
+        if slam.is_adjusting and waited < _DUE_WHILE_ADJUSTING * self._seconds:
             return
         if self._writing is None or self._writing.done():
             self._save(slam, progress)
@@ -160,11 +164,11 @@ class FolderAutosave(Autosave):
         stored, done = slam.stored_map(self._drive), progress()
         frames, n_done = stored.frames, len(done.tracks)
         if frames is not None and len(frames.timestamp) > n_done:
-            # A step that failed had already added its frame, which must be tracked again.
+            # A failed step has already added its frame, which must be tracked again.
             stored = replace(stored, frames=frames.until(n_done), checkpoint=None)
         try:
             self._writing = self._writer.submit(self._write, _copy(stored), done)
-        except Exception as error:  # no memory for a copy, or no thread
+        except Exception as error:  # there is no memory for a copy, or no thread
             self._warn(MAP, error)
 
     def _write(self, stored: StoredMap, progress: Progress) -> None:
@@ -185,8 +189,8 @@ class FolderAutosave(Autosave):
 
 
 def remove_autosave(folder: Path) -> None:
-    """Remove the files that only resuming needs, and half-written files of killed runs, once the
-    results are written."""
+    """Remove the files that are needed only for resuming, and partly written files of killed runs.
+    Call this after the results are written."""
     for name in (MAP, PROGRESS):
         (folder / name).unlink(missing_ok=True)
         for part in folder.glob(f".{name}.*.part"):
@@ -194,7 +198,7 @@ def remove_autosave(folder: Path) -> None:
 
 
 def _copy(stored: StoredMap) -> StoredMap:
-    """A plain copy of the map, which another thread compacts."""
+    """A copy of the map without compaction, which the writing thread does later."""
     tables = {
         name: replace(table, first=table.first.copy(), values=table.values.copy())
         for name, table in stored.detector.tables.items()

@@ -1,4 +1,4 @@
-"""The trajectory of a finished run on the Earth, from its map and GPS fixes."""
+"""Georeferencing of a finished run with GPS fixes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vslam.geometry import inverses
 from vslam.maps.stored_map import StoredMap
 from vslam.trajectory import Trajectory, bridge_gaps
 
-_LONGEST_S = 0.5  # between two frames, between which a position is interpolated
+_LONGEST_S = 0.5  # between two frames; at longer intervals no position is interpolated
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,11 @@ class GpsTrack:
     Attributes:
         trajectory: poses of the frames, camera to ENU, in metres.
         geodetic: ``(N, 3)`` their latitude and longitude (degrees) and altitude (m).
-        datum: ``(3,)`` latitude, longitude and altitude of the origin: those of the first fix.
-        visual: ``(N, 3)`` positions in ENU without GPS, after the alignment alone.
-        fixes: ``(M, 3)`` the fixes of tracked frames, in ENU.
-        anchored: the keyframes in ENU, and which of the fixes were used.
+        datum: ``(3,)`` latitude, longitude and altitude of the origin, which is the first fix.
+        visual: ``(N, 3)`` the visual trajectory aligned with ENU as a whole, without other use of
+            GPS.
+        fixes: ``(M, 3)`` the fixes at the time of tracked frames, in ENU.
+        anchored: the keyframes in ENU, and which fixes were used.
     """
 
     trajectory: Trajectory
@@ -42,7 +43,7 @@ class GpsTrack:
 
 
 def locate(stored: StoredMap, fixes: Fixes, config: PoseGraphConfig) -> GpsTrack:
-    """Put a finished drive on the Earth. The map is not changed.
+    """Georeference a finished drive. The map is not changed.
 
     Args:
         stored: the map with the poses of its last drive's frames.
@@ -80,11 +81,12 @@ def locate(stored: StoredMap, fixes: Fixes, config: PoseGraphConfig) -> GpsTrack
 def _in_map(
     table: FrameTable, T_kw: NDArray[np.float64], scale: NDArray[np.float64] | None = None
 ) -> Trajectory:
-    """The poses of all frames, from those of their keyframes; interpolated where the camera was
-    lost.
+    """The poses of all frames, derived from the poses of their keyframes; the poses of lost frames
+    are interpolated.
 
     Args:
-        scale: ``(K,)`` by which lengths around each keyframe are multiplied.
+        T_kw: ``(K, 4, 4)`` poses of the keyframes.
+        scale: ``(K,)`` factors for the lengths around each keyframe.
     """
     T_ck = table.T_c_reference.copy()
     if scale is not None:
@@ -99,8 +101,8 @@ def _in_map(
 def _positions(
     table: FrameTable, T_kw: NDArray[np.float64], fixes: Fixes
 ) -> tuple[Positions, NDArray[np.float64]]:
-    """The fixes between tracked frames, each relative to the keyframe of the frame before it, and
-    the datum."""
+    """The fixes between tracked frames, each with the position of the camera at its time relative
+    to the keyframe of the frame before, and the datum."""
     at = np.searchsorted(table.timestamp, fixes.times, "right") - 1
     at[fixes.times == table.timestamp[-1]] -= 1
     inside = (at >= 0) & (at + 1 < len(table.timestamp))
@@ -110,8 +112,8 @@ def _positions(
     inside &= table.tracked[before] & table.tracked[after] & (elapsed <= _LONGEST_S)
     if inside.sum() < 3:
         raise InputError(
-            f"only {inside.sum()} of the {len(fixes)} GPS fixes are of the time of tracked frames; "
-            "at least three are needed."
+            f"only {inside.sum()} of the {len(fixes)} GPS fixes lie within the time of tracked "
+            "frames; at least three are needed."
         )
     before, after, elapsed = before[inside], after[inside], elapsed[inside]
     share = ((fixes.times[inside] - table.timestamp[before]) / elapsed)[:, None]

@@ -15,7 +15,7 @@ from vslam.map import NONE, Map
 
 _PANEL_WIDTH, _GUTTER = 640, 8  # pixels of a picture
 _QUALITY = 80
-_SUBPIXEL = 4  # OpenCV draws positions in 16ths of a pixel
+_SUBPIXEL = 4  # fractional bits of the positions that OpenCV draws
 _WHITE, _INK, _GREEN = (255, 255, 255), (33, 23, 17), (153, 211, 52)  # BGR
 _LINE_OPACITY = 0.35
 
@@ -28,8 +28,7 @@ class LoopPicture:
         query_frame: the frame of this run that closed the loop.
         match_frame: the earlier frame of this run that shows the same place.
         query_jpeg, match_jpeg: their left images, small and grey.
-        query_xy, match_xy: ``(N, 2)`` float64, the pixels of these small images at which both show
-            the same landmark.
+        query_xy, match_xy: ``(N, 2)`` float64 pixels of the same landmarks in these small images.
     """
 
     query_frame: int
@@ -43,12 +42,12 @@ class LoopPicture:
 def loop_matches(
     map_: Map, edge: LoopEdge, camera: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The pixels at which the two keyframes of a closed loop see the same landmarks.
+    """The pixels of the same landmarks in the two keyframes of a closed loop.
 
-    After a loop is closed, the query's inlier features observe the landmarks of the place. A
-    landmark that another keyframe of the place observes, but not the match itself, is projected
-    into the match. Features that lost their landmark in the bundle adjustment after the loop, and
-    landmarks outside the view of the match, are left out.
+    After a loop is closed, the query's inlier features observe the landmarks of the place. If the
+    match itself does not observe such a landmark, the landmark is projected into it. Features that
+    lost their landmark in the bundle adjustment after the loop, and landmarks outside the view of
+    the match, are left out.
 
     Args:
         map_: the map after the correction of the loop.
@@ -104,7 +103,7 @@ def draw_picture(picture: LoopPicture) -> bytes:
         cv2.circle(canvas, point, 5 << (_SUBPIXEL - 1), _GREEN, -1, cv2.LINE_AA, _SUBPIXEL)
     _label(canvas, f"frame {picture.match_frame}", 0)
     _label(canvas, f"frame {picture.query_frame}", _PANEL_WIDTH + _GUTTER)
-    # Chroma subsampling would take the colour from thin lines.
+    # Chroma subsampling would desaturate thin lines.
     options = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
     options += [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
     return cv2.imencode(".jpg", canvas, options)[1].tobytes()

@@ -17,7 +17,7 @@ from vslam.run.loop_pictures import LoopPicture, loop_matches, spread
 from vslam.run.recorder import Recorder
 from vslam.trajectory import Trajectory
 
-_MOST = 96  # moments: about 1 MB of the page
+_MOST = 96  # moments, which take about 1 MB of the page
 _WIDTH = 360  # pixels
 _QUALITY = 55
 _MOST_POINTS = 400
@@ -74,7 +74,7 @@ def _moment(
     size = min(width, _WIDTH), max(1, round(height * min(width, _WIDTH) / width))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
-    # Tracked ones first, evenly thinned out.
+    # Tracked keypoints come first; both kinds are thinned out evenly.
     order = np.argsort(~tracked, kind="stable")
     order = order[:: max(1, -(-len(order) // _MOST_POINTS))]
     share = xy[order] / np.array([width, height], np.float32)
@@ -85,8 +85,8 @@ def _moment(
 class LoopPictureRecorder(Recorder):
     """Keeps a small image of each keyframe, and the data for a picture of each closed loop.
 
-    A loop has no picture if its earlier image is not available: because it belongs to another
-    drive or to the part of a run before it was resumed, or was dropped in a very long run.
+    A loop has no picture if its earlier image was not kept, because it belongs to another drive or
+    to the part of the run before it was resumed, or because the run is very long.
 
     Attributes:
         pictures: pictures of the closed loops, in order.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -10,12 +11,17 @@ from vslam.config import Config
 from vslam.datasets.sources import SourceOptions
 from vslam.errors import InputError
 from vslam.loopclosure.registry import DEFAULT_DETECTOR
+from vslam.plugins import packages_of
 
 OPTIONS = "run.json"
 
 
 class RunOptions(SourceOptions):
-    """The options as given on the command line; in the file, paths are absolute."""
+    """The options as given on the command line. In the file, paths are absolute.
+
+    Attributes:
+        plugins: the package of each plug-in that the other options name; set only in the file.
+    """
 
     perturb: str = "none"
     seed: int = 0
@@ -30,6 +36,7 @@ class RunOptions(SourceOptions):
     compare: tuple[str, ...] = ()
     realtime: bool = False
     autosave: float = 60.0
+    plugins: Mapping[str, str] = {}
 
 
 def write_options(folder: Path, options: RunOptions) -> None:
@@ -39,15 +46,18 @@ def write_options(folder: Path, options: RunOptions) -> None:
         InputError: it cannot be written.
     """
     data = Path(options.data)
-    absolute: dict[str, object] = {
+    changed: dict[str, object] = {
         name: path.resolve()
         for name in ("right", "depth", "mask", "gps", "weights", "local_weights", "map_file")
         if (path := getattr(options, name)) is not None
     }
     if options.data and data.exists():
-        absolute["data"] = str(data.resolve())
-    absolute["calib"] = tuple(path.resolve() for path in options.calib)
-    text = options.model_copy(update=absolute).model_dump_json(indent=2)
+        changed["data"] = str(data.resolve())
+    laws = (law.partition(":")[0] for law in options.perturb.split(","))
+    names = {options.detector, *options.compare, options.dataset or "", *laws}
+    changed["plugins"] = packages_of(sorted(names))
+    changed["calib"] = tuple(path.resolve() for path in options.calib)
+    text = options.model_copy(update=changed).model_dump_json(indent=2)
     try:
         (folder / OPTIONS).write_text(text + "\n", encoding="utf-8")
     except OSError as error:
@@ -61,16 +71,24 @@ def resumed_options(folder: Path) -> RunOptions:
     """The options of a run that is to be resumed.
 
     Raises:
-        InputError: as `read_options`, or the folder contains a symbolic link, through which the
-            run would write outside the folder.
+        InputError: as `read_options`, a plug-in of the run is not installed, or the folder contains
+            a symbolic link, through which the run would write outside the folder.
     """
     for path in folder.rglob("*"):
         if path.is_symlink():
             raise InputError(
-                f"{path}: this is a link, but a resumed run writes only into its own folder; "
-                "replace the link by the file."
+                f"{path}: this is a symbolic link, but a resumed run writes only into its own "
+                "folder; replace the link by the file."
             )
-    return read_options(folder)
+    options = read_options(folder)
+    installed = packages_of(options.plugins)
+    for name, package in options.plugins.items():
+        if name not in installed:
+            raise InputError(
+                f"{folder}: the run used {name} of the package {package}, which is not installed "
+                "here; install the package."
+            )
+    return options
 
 
 def read_options(folder: Path) -> RunOptions:

@@ -31,13 +31,13 @@ class RunOutcome:
 
     Attributes:
         settings: the options of the run, with the canonical name of its perturbation.
-        trajectory: final pose of every processed frame, including lost ones; poses as they were
-            tracked if there is no map.
+        trajectory: final pose of every processed frame, including lost ones. If there is no map,
+            the poses as they were tracked.
         keyframes: final poses of the keyframes.
         tracks: one result per frame.
         warnings: faults of the rig that the run detected, as sentences.
-        skipped: messages for the frames whose images could not be read.
-        latency_ms: from the time of each tracked frame to its pose, in a real-time run.
+        skipped: a message for each frame whose images could not be read.
+        latency_ms: time from the arrival of each tracked frame to its pose, in a real-time run.
         wall_s, cpu_s: seconds from reading the first frame until the last one is tracked and
             mapped; the sum of all detectors if several are compared.
         step_s: wall seconds of this detector's own steps: tracking, waiting for its mapping, and
@@ -47,15 +47,15 @@ class RunOutcome:
         n_landmarks, n_keyframes: size of the final map.
         map: the final map; None for a trajectory from another system or after mapping failed.
         world: place of the continued map in the world of a ground truth, if known.
-        in_map: ``(N,)`` bool, frames localised at the end in the map that the run continued; None
-            for a run that started a new map.
+        in_map: ``(N,)`` bool, frames tracked in the map that the run continued or in sub-maps that
+            loops joined to it; None for a run that started a new map.
         stored: the map with all data needed to continue it; None if the run only localised in it.
         loops: accepted and rejected loop candidates, in the order of their decision.
         corrections: corrections of the map by the accepted loops, in order.
-        keyframe_frames: ``(K,)`` int64, the frame of this run behind each keyframe, including
+        keyframe_frames: ``(K,)`` int64, the frame of this run that became each keyframe, including
             culled ones; -1 for keyframes of earlier drives.
         n_submaps: how often a map or sub-map was started; 0 before the first keyframe.
-        gps_track: the drive on the Earth; None without GPS.
+        gps_track: the georeferenced drive; None without GPS.
         interrupted: why the run ended early ("Ctrl-C", a truncated file), or None.
         compared: the runs of the detectors of ``settings.compare`` on the same frames, without
             their maps; empty for a resumed run.
@@ -109,7 +109,7 @@ def causal_trajectory(tracks: list[TrackResult]) -> Trajectory:
 
 
 def odometry_trajectory(tracks: list[TrackResult]) -> Trajectory:
-    """The pose of each frame in the frame that never jumps (``TrackResult.T_odom_camera``)."""
+    """The pose of each frame by odometry, which never jumps (``TrackResult.T_odom_camera``)."""
     known = [track for track in tracks if track.T_odom_camera is not None]
     times = np.array([track.timestamp for track in known], np.float64)
     poses = [track.T_odom_camera for track in known]

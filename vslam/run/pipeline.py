@@ -1,4 +1,4 @@
-"""From a sequence or stream to an outcome: frames are prepared, tracked in order, recorded."""
+"""Running SLAM on a sequence or stream: frames are prepared, tracked in order and recorded."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from vslam.plugins import reason
 from vslam.run.autosave import NO_AUTOSAVE, Autosave, Unfinished
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome, causal_trajectory, ground_truth_of
-from vslam.run.preparation import Played, PreparedFrame, in_their_time
+from vslam.run.preparation import Played, PreparedFrame, at_their_times
 from vslam.run.progress import Progress, TrackLog, in_frames
 from vslam.run.recorder import Recorder
 from vslam.run.rig import (
@@ -62,39 +62,39 @@ def run_sequence(
     A frame that cannot be read is skipped: it gets a predicted pose, counts as lost and is listed
     in the outcome. A frame that is dropped in a real-time run gets an interpolated pose.
 
-    The run ends early after Ctrl-C (after the current frame), when the source breaks off, and when
-    a part of the run fails, such as a detector of another package. Everything done so far is kept.
-    If mapping failed, the map is incomplete: the outcome then has no map, and its poses are those
-    of tracking.
+    The run ends early after Ctrl-C (after the current frame), when the source ends unexpectedly, or
+    when a part of the run fails, such as a detector of another package. All results so far are
+    kept. If mapping failed, the map is incomplete: the outcome then has no map, and its poses are
+    those of tracking.
 
     The detectors of ``settings.compare`` run on the same frames as the main one. Images are read
-    and features extracted once. Each detector has its own map, of which only trajectory, frames and
-    loops are kept. If one of them fails, the others continue. A resumed run continues without them,
-    because their maps were not saved.
+    and features extracted once. Each detector has its own map, from which only trajectory, frames
+    and loops are kept. If one detector fails, the others continue. A resumed run continues without
+    them, because their maps were not saved.
 
     Args:
         autosave: saves the state of the run at intervals.
-        resume: what an unfinished run left; this run continues at the next frame, and its outcome
-            covers both parts.
-        slam: the result of ``begin`` for the same settings, if it was called before.
+        resume: the saved state of an unfinished run. This run continues at the next frame, and its
+            outcome covers both parts.
+        slam: the result of ``begin`` for the same settings, if it was already called.
 
     Raises:
-        InputError: raised only before the first frame: the images cannot be read, or are not those
-            of the resumed run; also as ``begin``.
+        InputError: before the first frame, the images cannot be read or are not those of the
+            resumed run, or as ``begin``. Later errors end the run early instead.
     """
-    cv2.setNumThreads(1)  # the pool uses the cores
+    cv2.setNumThreads(1)  # the thread pool already uses all cores
     slam = slam or begin(sequence.camera, settings, None if resume is None else resume.map)
     perturbation = perturbation.bound_to(sequence)
     others = [] if resume is not None else _compared(sequence.camera, settings)
     recorder.begin(sequence.camera, ground_truth_of(sequence))
     main = _Run(slam, settings, Progress() if resume is None else resume.progress)
-    n_told = 0  # loops that the recorder knows of
-    broken: list[str] = []
+    n_recorded = 0  # loops
+    end_reasons: list[str] = []  # why the run ended early; the first one counts
     with _stop_on_interrupt() as interrupted:
-        frames = perturbed(_until_broken(sequence.frames(), broken), perturbation)
+        frames = perturbed(_until_broken(sequence.frames(), end_reasons), perturbation)
         frames = _following(frames, main.before.tracks.timestamps)
         try:
-            for played in in_their_time(
+            for played in at_their_times(
                 frames,
                 slam.context,
                 settings,
@@ -103,53 +103,53 @@ def run_sequence(
                 next_extraction=lambda: slam.next_extraction,
             ):
                 result = main.step(played)
-                if (frame := played.made) is not None and frame.problem and not frame.dropped:
+                if (frame := played.prepared) is not None and frame.problem and not frame.dropped:
                     _log.warning("frame %d skipped: %s", result.index, frame.problem)
                 autosave.frame(result)
                 if result.state != TrackingState.DROPPED:
-                    n_told = _show(recorder, slam, result, played, n_told)
+                    n_recorded = _record_frame(recorder, slam, result, played, n_recorded)
                 on_frame(result)
                 autosave.offer(slam, main.so_far)
                 for other in others:
                     if other.problem is None:
-                        with other.keeping_what_is_done(f"frame {result.index}"):
+                        with other.recording_failure(f"frame {result.index}"):
                             other.step(played)
                 if main.problem:
                     break
                 if interrupted.is_set():
-                    if not sequence.live:  # a camera has no other end
-                        broken.append("Ctrl-C")
+                    if not sequence.live:  # for a live source, Ctrl-C is the usual end
+                        end_reasons.append("Ctrl-C")
                     break
-        except Exception as error:  # whatever it is, what is done is kept
+        except Exception as error:  # keep the results so far
             if isinstance(error, InputError) and not main.has_begun:
                 raise
             main.fail(f"frame {len(main.tracks)}", error)
         for one in (main, *others):
-            with one.keeping_what_is_done("completing the map"):
+            with one.recording_failure("completing the map"):
                 one.finish()
-        if not broken and main.problem:
-            broken.append(main.problem)
-        with main.keeping_what_is_done("saving the map"):
-            autosave.close(slam, main.so_far, resumable=bool(broken) and main.has_map)
+        if not end_reasons and main.problem:
+            end_reasons.append(main.problem)
+        with main.recording_failure("saving the map"):
+            autosave.close(slam, main.so_far, resumable=bool(end_reasons) and main.has_map)
     seconds = main.seconds()
-    give_back_memory()  # results need room: a map is copied before it is written
-    with main.keeping_what_is_done("the final trajectory"):
+    give_back_memory()  # writing the results needs memory: the map is copied first
+    with main.recording_failure("the final trajectory"):
         if main.has_map:
-            _tell_loops(recorder, slam, n_told)
+            _record_loops(recorder, slam, n_recorded)
             recorder.finish(main.trajectory(), slam.map)
         else:
             recorder.finish(causal_trajectory(main.tracks), None)
-    ended = broken[0] if broken else main.problem
-    beside = [_outcome(sequence, other, seconds, other.problem or ended) for other in others]
-    compared = tuple(replace(one, map=None, stored=None) for one in beside)  # maps are large
-    return replace(_outcome(sequence, main, seconds, ended), compared=compared)
+    end_reason = end_reasons[0] if end_reasons else main.problem
+    outcomes = [_outcome(sequence, other, seconds, other.problem or end_reason) for other in others]
+    compared = tuple(replace(one, map=None, stored=None) for one in outcomes)  # maps are large
+    return replace(_outcome(sequence, main, seconds, end_reason), compared=compared)
 
 
 def _compared(camera: Camera, settings: RunOptions) -> list[_Run]:
-    """The runs of ``settings.compare`` before their first frame. ``settings.weights`` are those of
-    the main detector only."""
-    alone: dict[str, object] = {"weights": None, "compare": ()}
-    each = [settings.model_copy(update={**alone, "detector": name}) for name in settings.compare]
+    """The runs of the detectors of ``settings.compare``, before their first frame. They use the
+    shipped weights, because ``settings.weights`` are those of the main detector."""
+    common: dict[str, object] = {"weights": None, "compare": ()}
+    each = [settings.model_copy(update={**common, "detector": name}) for name in settings.compare]
     return [_Run(begin(camera, one), one, Progress()) for one in each]
 
 
@@ -175,7 +175,7 @@ class _Run:
 
     @property
     def problem(self) -> str | None:
-        """The failure that ends the run, in a few words; None if nothing failed."""
+        """A short description of the failure that ends the run; None if nothing failed."""
         return self._failure or problem_of(self.slam.detector)
 
     @property
@@ -193,7 +193,8 @@ class _Run:
         return True
 
     def fail(self, what: str, error: Exception) -> None:
-        """Record why the run ends. Only the first failure is kept, because it may cause others."""
+        """Record a failure that ends the run. Only the first one is kept, because it may have
+        caused the others."""
         if self._failure is not None:
             return
         if sys.flags.dev_mode:
@@ -202,8 +203,8 @@ class _Run:
         self._failure = f"{what} failed, {why}"
 
     @contextmanager
-    def keeping_what_is_done(self, what: str) -> Iterator[None]:
-        """Turn an exception into the failure of this run, so that its results so far are kept."""
+    def recording_failure(self, what: str) -> Iterator[None]:
+        """Record an exception as the failure of this run, so that its results so far are kept."""
         try:
             yield
         except Exception as error:
@@ -211,13 +212,13 @@ class _Run:
 
     def trajectory(self) -> Trajectory:
         """The pose of each processed frame, according to the present map."""
-        # A frame that failed after its pose was added does not count.
+        # A step that failed may have added a pose without a result.
         return self.slam.trajectory().select(np.arange(len(self.tracks)))
 
     def step(self, played: Played[PreparedFrame]) -> TrackResult:
         """Track a prepared frame, or skip one that was dropped or cannot be read."""
         start = time.perf_counter()
-        timestamp, frame = played.timestamp, played.made
+        timestamp, frame = played.timestamp, played.prepared
         if frame is None or frame.dropped:
             result = self.slam.skip(timestamp, dropped=True)
         elif frame.images is None:
@@ -226,7 +227,7 @@ class _Run:
         else:
             result = self.slam.step_images(frame.images, timestamp, frame.stage_ms)
             if self.settings.realtime:
-                self.latency_ms.append(1e3 * (time.perf_counter() - played.came))
+                self.latency_ms.append(1e3 * (time.perf_counter() - played.arrived))
         self.step_s += time.perf_counter() - start
         self.tracks.append(result)
         self._log.append(result)
@@ -260,22 +261,23 @@ class _Run:
         )
 
 
-def _show(
+def _record_frame(
     recorder: Recorder,
     slam: Slam,
     result: TrackResult,
     played: Played[PreparedFrame],
-    n_told: int,
+    n_recorded: int,
 ) -> int:
-    """Record a frame, and the map if nobody changes it; returns the number of recorded loops."""
+    """Record a frame, and the map if no job is changing it; returns the number of recorded
+    loops."""
     recorder.frame(result)
-    images = None if played.made is None else played.made.images
+    images = None if played.prepared is None else played.prepared.images
     if result.is_keyframe and slam.frame is not None and images is not None:
         recorder.keyframe(result, images.left, slam.frame.features.xy, slam.frame.landmark >= 0)
     if slam.is_mapping:
-        return n_told
+        return n_recorded
     recorder.map(slam.map)
-    return _tell_loops(recorder, slam, n_told)
+    return _record_loops(recorder, slam, n_recorded)
 
 
 def _following(frames: Iterator[TimedFrame], before: NDArray[np.float64]) -> Iterator[TimedFrame]:
@@ -310,7 +312,7 @@ def _outcome(
         keyframes=causal_trajectory(keyframes),
         tracks=run.tracks,
         skipped=run.skipped,
-        warnings=["there is no map of this run, and its poses are those of tracking"],
+        warnings=["the run has no complete map, and its poses are those of tracking"],
         wall_s=seconds[0],
         cpu_s=seconds[1],
         step_s=run.step_s,
@@ -323,7 +325,7 @@ def _outcome(
         interrupted=interrupted,
     )
     if run.has_map:
-        with run.keeping_what_is_done("collecting the results"):
+        with run.recording_failure("collecting the results"):
             return _with_map(outcome, run)
     return replace(outcome, interrupted=interrupted or run.problem)
 
@@ -355,11 +357,11 @@ def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
 
 
 def _map_warnings(slam: Slam, camera: Camera) -> list[str]:
-    """Warnings about faults of the rig that the map shows."""
+    """Warnings about faults of the rig that the map reveals."""
     try:
         residuals = measure_rig(slam.map, camera)
         return delay_warnings(slam.rig.delay, camera) or residual_warnings(residuals, camera)
-    except Exception as error:  # a check must not cost what is checked
+    except Exception as error:  # a failed check must not end the run
         problem = f"the rig could not be checked ({reason(error)})"
         _log.warning(problem)
         return [problem]
@@ -368,9 +370,10 @@ def _map_warnings(slam: Slam, camera: Camera) -> list[str]:
 def _with_earlier(
     before: Progress, slam: Slam
 ) -> tuple[list[LoopEdge], list[LoopCorrection], NDArray[np.int64]]:
-    """Loops and corrections of a whole run, and the frame of each keyframe that they name.
+    """Loops and corrections of a whole run, including the part before it was resumed, and the frame
+    of each keyframe that they refer to.
 
-    Earlier loops name frames; these frames get numbers after those of the map's keyframes.
+    Earlier loops refer to frames; these get numbers after those of the map's keyframes.
     """
     frames = _frames_of_this_run(slam.map)
     if not before.loops:
@@ -399,7 +402,7 @@ def begin(camera: Camera, settings: RunOptions, saved: Path | None = None) -> Sl
             weights cannot be read.
     """
     config, threads = settings.thresholds, settings.threads
-    late = not settings.realtime  # then nothing is loaded while the camera drives
+    late = not settings.realtime  # in real time, no network may be loaded during the drive
     detector, images = detector_with_images(
         settings.detector, config, settings.weights,
         local_weights=settings.local_weights, late=late,
@@ -413,7 +416,7 @@ def begin(camera: Camera, settings: RunOptions, saved: Path | None = None) -> Sl
 
 
 def require_camera(map_file: Path, camera: Camera) -> None:
-    """Refuse a map that was made with another camera.
+    """Check that a map was made with a camera.
 
     Raises:
         InputError: the cameras differ, or there is no such map.
@@ -431,28 +434,29 @@ def _frames_of_this_run(map_: Map) -> NDArray[np.int64]:
     return np.where(map_.sessions == map_.scalars.session, map_.frames, -1)
 
 
-def _until_broken(frames: Iterator[TimedFrame], broken: list[str]) -> Iterator[TimedFrame]:
-    """The frames of a source until it breaks off; the reason is then appended to ``broken``."""
+def _until_broken(frames: Iterator[TimedFrame], end_reasons: list[str]) -> Iterator[TimedFrame]:
+    """The frames of a source until reading fails; the reason is then appended to
+    ``end_reasons``."""
     try:
         yield from frames
     except BrokenSourceError as error:
-        broken.append(str(error).rstrip("."))
+        end_reasons.append(str(error).rstrip("."))
     except InputError:
         raise
-    except Exception as error:  # the frames before it are still to be tracked
-        broken.append(f"reading the images failed, {reason(error)}")
+    except Exception as error:  # the frames before are still to be tracked
+        end_reasons.append(f"reading the images failed, {reason(error)}")
 
 
-def _tell_loops(recorder: Recorder, slam: Slam, n_told: int) -> int:
-    """Record the loops after the first ``n_told``; returns the number of recorded loops."""
-    if len(slam.loops) > n_told:
-        recorder.loops(slam.loops[n_told:], slam.map)
+def _record_loops(recorder: Recorder, slam: Slam, n_recorded: int) -> int:
+    """Record the loops after the first ``n_recorded``; returns the number of recorded loops."""
+    if len(slam.loops) > n_recorded:
+        recorder.loops(slam.loops[n_recorded:], slam.map)
     return len(slam.loops)
 
 
 @contextmanager
 def _stop_on_interrupt() -> Iterator[threading.Event]:
-    """Turn the first Ctrl-C into a flag, so that no frame is left half done; a second one ends
+    """Turn the first Ctrl-C into a flag, so that the current frame is completed; a second one ends
     the program at once."""
     interrupted = threading.Event()
     if threading.current_thread() is not threading.main_thread():

@@ -1,9 +1,10 @@
-"""Decodes and perturbs frames and extracts their features, a few frames ahead of tracking.
+"""Decoding and perturbation of frames and extraction of their features, a few frames ahead of
+tracking.
 
-Each frame is prepared independently of the others by a small thread pool, and the order is kept, so
-that the result does not depend on the number of threads. In real time, a frame is prepared when it
-arrives, its two images in parallel. Frames that arrive too fast are dropped; which ones depends on
-the machine.
+A small thread pool prepares each frame independently of the others and keeps their order, so that
+the result does not depend on the number of threads. In real time, a frame is prepared when it
+arrives, its two images in parallel, and frames that arrive too fast are dropped; which ones depends
+on the machine.
 """
 
 from __future__ import annotations
@@ -32,23 +33,23 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Played(Generic[T]):
-    """A frame that was played.
+    """A frame that has arrived.
 
     Attributes:
-        timestamp: its time, seconds.
-        made: the prepared frame; None if the frame was dropped.
-        came: its arrival by ``time.perf_counter``.
+        timestamp: seconds.
+        prepared: the prepared frame; None if the frame was dropped.
+        arrived: time of arrival by ``time.perf_counter``.
     """
 
     timestamp: float
-    made: T | None
-    came: float
+    prepared: T | None
+    arrived: float
 
 
 @dataclass(frozen=True)
 class _Arrival:
     frame: TimedFrame
-    came: float
+    arrived: float
 
 
 def play(
@@ -58,85 +59,87 @@ def play(
     *,
     live: bool = False,
 ) -> Iterator[Played[T]]:
-    """Play frames at their own times; if several are waiting, only the newest is prepared.
+    """Play frames in real time; if several are waiting, only the newest is prepared.
 
     One frame is prepared while the previous one is used, so that a frame waits for at most one
-    other. Dropped frames are not kept in memory.
+    other frame. Dropped frames are not kept in memory.
 
     Args:
         frames: frames to play; the first one arrives at once, the others at their timestamps.
-        prepare: function that prepares a frame after its arrival, called in a separate thread. Its
-            first argument is the number of frames that arrived before, dropped ones included.
+        prepare: prepares a frame after its arrival; called in a separate thread. Its first argument
+            is the number of frames that arrived before, including dropped ones.
         threads: with 1, a frame is prepared only after the previous one was used.
-        live: each frame arrives when ``frames`` yields it.
+        live: each frame arrives when ``frames`` yields it, whatever its timestamp.
 
     Yields:
-        Every frame in order; dropped frames come just before the one that replaced them.
+        Every frame in order; dropped frames come just before the frame that replaced them.
 
     Raises:
         Exception: raised by ``prepare`` or ``frames``, after all earlier frames were yielded.
     """
     free = threading.Semaphore(min(threads, 2))
     mailbox = _Mailbox()
-    coming: SimpleQueue[tuple[list[Played[T]], _Arrival, Future[T]] | Exception | None] = (
+    queue: SimpleQueue[tuple[list[Played[T]], _Arrival, Future[T]] | Exception | None] = (
         SimpleQueue()
     )
 
-    def film() -> None:
+    def receive_frames() -> None:
         try:
             begin = None
             for frame in frames:
-                came = time.perf_counter()
+                arrived = time.perf_counter()
                 if not live:
-                    begin = came - frame.timestamp if begin is None else begin
-                    came = begin + frame.timestamp
-                    mailbox.wait_until(came)
+                    begin = arrived - frame.timestamp if begin is None else begin
+                    arrived = begin + frame.timestamp
+                    mailbox.wait_until(arrived)
                 if mailbox.stopped:
                     return
-                mailbox.put(_Arrival(frame, came))
+                mailbox.put(_Arrival(frame, arrived))
             mailbox.end(None)
         except Exception as error:
             mailbox.end(error)
 
-    def hand_on(pool: ThreadPoolExecutor) -> None:
+    def start_preparing(pool: ThreadPoolExecutor) -> None:
         n = 0
         try:
             while True:
                 free.acquire()
                 dropped, newest = mailbox.take()
                 if newest is None:
-                    coming.put(mailbox.error)
+                    queue.put(mailbox.error)
                     return
-                missed = [Played[T](timestamp, None, newest.came) for timestamp in dropped]
+                missed = [Played[T](timestamp, None, newest.arrived) for timestamp in dropped]
                 n += len(dropped)
-                coming.put((missed, newest, pool.submit(prepare, n, newest.frame)))
+                queue.put((missed, newest, pool.submit(prepare, n, newest.frame)))
                 n += 1
-        except Exception as error:  # otherwise the consumer would wait for ever
-            coming.put(error)
+        except Exception as error:  # otherwise the consumer would wait forever
+            queue.put(error)
 
     with ThreadPoolExecutor(min(threads, 2), "extraction") as pool:
-        camera = threading.Thread(target=film, name="camera", daemon=True)
-        handing = threading.Thread(target=hand_on, args=(pool,), name="handing", daemon=True)
-        camera.start()
-        handing.start()
+        receiver = threading.Thread(target=receive_frames, name="camera", daemon=True)
+        starter = threading.Thread(
+            target=start_preparing, args=(pool,), name="preparation", daemon=True
+        )
+        receiver.start()
+        starter.start()
         try:
-            while (arrived := coming.get()) is not None:
-                if isinstance(arrived, Exception):
-                    raise arrived
-                missed, newest, future = arrived
+            while (item := queue.get()) is not None:
+                if isinstance(item, Exception):
+                    raise item
+                missed, newest, future = item
                 yield from missed
-                yield Played(newest.frame.timestamp, future.result(), newest.came)
+                yield Played(newest.frame.timestamp, future.result(), newest.arrived)
                 free.release()
         finally:
             mailbox.stop()
             free.release()
-            camera.join()
-            handing.join()
+            receiver.join()
+            starter.join()
             pool.shutdown(cancel_futures=True)
 
 
 class _Mailbox:
-    """Holds the newest frame, between the thread that plays frames and the one that uses them."""
+    """Passes the newest frame from the thread that receives frames to the one that uses them."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -148,7 +151,8 @@ class _Mailbox:
         self.error: Exception | None = None
 
     def put(self, arrival: _Arrival) -> None:
-        """Replace the newest frame, but wait until the first frame of a run has been taken."""
+        """Replace the newest frame; the first frame of a run is never replaced: wait until it has
+        been taken."""
         with self._changed:
             if self._newest is not None:
                 self._dropped.append(self._newest.frame.timestamp)
@@ -186,8 +190,8 @@ class _Mailbox:
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """A frame ready to be tracked, or the reason why it cannot be read; ``dropped`` tells
-    whether a perturbation dropped it."""
+    """A frame that is ready to be tracked, or the reason why it cannot be read (``problem``);
+    ``dropped`` tells whether a perturbation dropped it."""
 
     images: FrameImages | None
     stage_ms: dict[str, float]
@@ -195,7 +199,7 @@ class PreparedFrame:
     dropped: bool = False
 
 
-def in_their_time(
+def at_their_times(
     frames: Iterator[TimedFrame],
     context: TrackingContext,
     settings: RunOptions,
@@ -204,11 +208,13 @@ def in_their_time(
     begin: int = 0,
     next_extraction: Callable[[], int] = lambda: -1,
 ) -> Iterator[Played[PreparedFrame]]:
-    """Prepared frames with their arrival times: at once, or in real time each at its own time.
+    """Prepared frames with their times of arrival: all frames arrive at once, or in real time each
+    at its own time.
 
     Args:
         begin: index of the first frame.
-        next_extraction: ``Slam.next_extraction``: the features of this frame are extracted ahead.
+        next_extraction: returns ``Slam.next_extraction``, the frame whose features are extracted in
+            advance.
     """
     if settings.realtime:
         with ThreadPoolExecutor(2, "side") as pool:
@@ -241,7 +247,7 @@ def prepared_frames(
             yield frame.timestamp, prepare_frame(frame, context)
         return
     ahead: deque[tuple[float, Future[PreparedFrame]]] = deque()
-    asked = -1
+    requested = -1
     with ThreadPoolExecutor(threads, "extraction") as pool:
         try:
             for frame in frames:
@@ -251,9 +257,9 @@ def prepared_frames(
                     yield timestamp, prepared.result()
                     begin += 1
                     due = next_extraction()
-                    if due > asked and 0 <= due - begin < len(ahead):
+                    if due > requested and 0 <= due - begin < len(ahead):
                         pool.submit(_find_corners, ahead[due - begin][1])
-                        asked = due
+                        requested = due
             for timestamp, prepared in ahead:
                 yield timestamp, prepared.result()
         finally:
@@ -269,8 +275,8 @@ def _find_corners(prepared: Future[PreparedFrame]) -> None:
 def prepare_frame(
     frame: TimedFrame, context: TrackingContext, image_map: ImageMap = map
 ) -> PreparedFrame:
-    """Read one frame and extract its features. If frames are tracked by patches, features and the
-    right image wait until tracking asks for them."""
+    """Read one frame and extract its features. If frames are tracked by patches, the right image is
+    read, and features are extracted, only when tracking needs them."""
     start = time.perf_counter()
     try:
         read_second: Callable[[], Image | DepthImage | None]
@@ -278,7 +284,7 @@ def prepare_frame(
             left, read_second = frame.sides[0](), frame.sides[1]
         else:
             left, second = frame.read(image_map)
-            read_second = _giving(second)
+            read_second = _returning(second)
         mask = None if frame.mask is None else _mask(frame.mask, context.config.orb)
     except UnreadableImageError as error:
         dropped = isinstance(error, DroppedFrameError)
@@ -292,10 +298,10 @@ def prepare_frame(
     return PreparedFrame(images, stage_ms)
 
 
-@lru_cache(maxsize=1)  # the frames of a static mask share its function
+@lru_cache(maxsize=1)  # all frames with the same static mask pass the same function
 def _mask(read: Callable[[], Image], config: OrbConfig) -> Mask:
     return Mask.of(read(), config)
 
 
-def _giving(second: Image | DepthImage | None) -> Callable[[], Image | DepthImage | None]:
+def _returning(second: Image | DepthImage | None) -> Callable[[], Image | DepthImage | None]:
     return lambda: second

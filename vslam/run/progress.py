@@ -1,7 +1,7 @@
 """The progress of a run: the data of its frames that the report needs, as arrays in a file.
 
-An interrupted run leaves this file beside its map, and a resumed run starts from it. Frames are
-added to arrays as they come, so that saving them only copies arrays.
+An interrupted run leaves this file beside its map, and a resumed run starts from it. Each tracked
+frame is appended to arrays, so that saving only copies these arrays.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vslam.untrusted import ARCHIVE_ERRORS, read_json, read_npz
 
 SCHEMA = 3
 _STATES = tuple(TrackingState)
-_POSE, _NUMBERS = 16, 7 + 16 + N_NUMBERS  # columns of a frame: its pose, then the other numbers
+_POSE, _NUMBERS = 16, 7 + 16 + N_NUMBERS  # columns of a row: the pose, then the other numbers
 _UNKNOWN = np.full(N_NUMBERS, np.nan)
 
 
@@ -34,8 +34,8 @@ class TrackTable:
 
     Attributes:
         rows: ``(N, 82)`` float64: ``T_wc`` row by row; time, state, features, stereo features,
-            matches, inliers, flags (1 keyframe, 2 relocalised);
-            ``T_odom_camera`` row by row; ``PoseUncertainty.numbers``. NaN where unknown.
+            matches, inliers, flags (1 keyframe, 2 relocalised); ``T_odom_camera`` row by row;
+            ``PoseUncertainty.numbers``. Unknown numbers are NaN.
         stages: names of the timed stages.
         stage_ms: ``(N, S)`` float64 milliseconds, NaN for a stage that a frame skipped.
     """
@@ -109,9 +109,9 @@ class Progress:
     Attributes:
         tracks: results of the frames.
         skipped, latency_ms, wall_s, cpu_s: see ``RunOutcome``.
-        loops: loops with frame numbers of the run instead of keyframe numbers; -1 for keyframes of
-            earlier drives.
-        corrections: corrections by some of these loops, with frame numbers likewise.
+        loops: loops between frames of the run: frame numbers replace keyframe numbers, with -1 for
+            keyframes of earlier drives.
+        corrections: corrections by the accepted loops, also with frame numbers.
     """
 
     tracks: TrackTable = field(default_factory=TrackTable)
@@ -138,7 +138,8 @@ def _frame_of(message: str) -> int:
 
 
 def frames_of(loops: list[LoopEdge], frames: NDArray[np.int64]) -> list[LoopEdge]:
-    """Replace keyframe numbers in loops by the frames ``(K,)`` of the keyframes; drop features."""
+    """Replace keyframe numbers in loops by the frame numbers ``frames`` ``(K,)`` of the keyframes;
+    features and landmarks are dropped."""
     return [
         replace(
             loop,
@@ -205,7 +206,7 @@ def read_progress(path: Path) -> Progress:
     try:
         header = read_json(arrays["header"])
         if header["kind"] != "vslam progress" or header["schema"] != SCHEMA:
-            raise InputError(f"{path}: from another version of vslam; resume with that version.")
+            raise InputError(f"{path}: written by another version of vslam; resume with that one.")
         wall_s, cpu_s = arrays["seconds"].tolist()
         return Progress(
             tracks=_checked_table(arrays["frames"], header["stages"], arrays["stage_ms"]),

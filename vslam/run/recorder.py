@@ -39,17 +39,17 @@ from vslam.trajectory import Trajectory
 _log = logging.getLogger(__name__)
 _P = ParamSpec("_P")
 
-# Budget: 50 MB for 1,000 frames. At 350 keyframes of 1241x376 with 2,000 features, images take
-# about 11 MB, keypoints 6 MB, 14 maps 5 MB and all that is logged each frame 0.3 MB. A map after
-# each loop, at most one in ten keyframes, can add 35 x 0.36 = 13 MB, and the pictures of those
-# loops 35 x 0.1 = 4 MB.
+# Budget: 50 MB for 1,000 frames. With 350 keyframes of 1241x376 and 2,000 features, images take
+# about 11 MB, keypoints 6 MB, 14 maps 5 MB, and the data of all frames 0.3 MB. A map after each
+# loop, at most one in ten keyframes, can add 35 x 0.36 = 13 MB, and the pictures of those loops
+# 35 x 0.1 = 4 MB.
 _IMAGE_SCALE = 0.5
 _JPEG_QUALITY = 75
 _MAX_POINTS_PER_MAP = 30_000  # the last map is complete
 
 _TRAJECTORY_STEPS = 100  # 0.6 MB for 1,000 frames
-_REJECTED_SHOWN_FRAMES = 20  # then the lines of rejected loops vanish
-_VIEWER_PORT, _WEB_PORT = 9876, 9090  # rerun's own, where they are free
+_REJECTED_SHOWN_FRAMES = 20  # after which the lines of rejected loops are hidden
+_VIEWER_PORT, _WEB_PORT = 9876, 9090  # rerun's default ports
 _VIEWER_STARTS_S = 20.0
 _FLUSH_TIMEOUT_S = 5.0
 _RESERVED_BYTES = 64 * 2**20  # left on the disk for the map, the trajectories and the report
@@ -64,8 +64,8 @@ _STATE_COLORS = {TrackingState.OK: _GREEN, TrackingState.WEAK: _AMBER, TrackingS
 
 @dataclass(frozen=True)
 class _Pace:
-    """How often data is sent: the number of frames in a batch, and of keyframes between two maps,
-    ordinarily and after a correction of the map."""
+    """How often data is sent: the number of frames in a batch, and the number of keyframes between
+    two maps, usually and after a correction of the map."""
 
     frames: int
     keyframes: int
@@ -73,7 +73,7 @@ class _Pace:
 
 
 _FILE_PACE = _Pace(50, 25, 10)
-_VIEWER_PACE = _Pace(5, 5, 2)  # nothing is kept for long there
+_VIEWER_PACE = _Pace(5, 5, 2)  # a viewer keeps no file, whose size would matter
 
 
 class Recorder:
@@ -83,28 +83,29 @@ class Recorder:
     """
 
     def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None:
-        """Log what does not change during a run; called once, before the first frame.
+        """Log the data that does not change during a run; called once, before the first frame.
 
         Args:
-            camera: of the images given to :meth:`keyframe`.
-            ground_truth: of the frames of this run, in any world frame, or None.
+            camera: the camera of the images that :meth:`keyframe` gets.
+            ground_truth: poses of the frames of this run, in any world frame, or None.
         """
 
     def frame(self, result: TrackResult) -> None:
-        """Log one frame. Costs 0.1 ms."""
+        """Log one frame. Takes 0.1 ms."""
 
     def keyframe(self, result: TrackResult, image: Image, xy: NDArray, tracked: NDArray) -> None:
         """Log image and keypoints of a keyframe, after :meth:`frame`.
 
         Args:
-            result: of this frame.
+            result: the result of tracking this frame.
             image: ``(H, W)`` uint8 left image.
             xy: ``(N, 2)`` float32 pixels of its features.
             tracked: ``(N,)`` bool, whether each feature is an inlier of the map.
         """
 
     def map(self, map_: Map) -> None:
-        """Called whenever the map is not being changed; the recorder decides when to log it."""
+        """Called after a frame if no job is changing the map; the recorder decides when to log
+        it."""
 
     def loops(self, edges: Collection[LoopEdge], map_: Map) -> None:
         """Log new loops, accepted or rejected. Called after :meth:`frame`, between two changes of
@@ -112,17 +113,17 @@ class Recorder:
 
         Args:
             edges: the loops since the last call.
-            map_: the map after it was corrected by these loops.
+            map_: the map after these loops have corrected it.
         """
 
     def finish(self, trajectory: Trajectory, map_: Map | None) -> None:
-        """Log the final trajectory and the map, if there is one, write all that is pending and
-        close the file."""
+        """Log the final trajectory and the map, if there is one, write all pending data and close
+        the file."""
 
 
 class SeveralRecorders(Recorder):
-    """Forwards every call to several recorders. If one raises an error, a warning is logged and the
-    others continue without it."""
+    """Forwards every call to several recorders. If one raises an error, a warning is logged, and it
+    gets no more calls."""
 
     def __init__(self, recorders: Sequence[Recorder]) -> None:
         self.recorders = list(recorders)
@@ -152,7 +153,7 @@ class SeveralRecorders(Recorder):
             except Exception as error:
                 self.recorders.remove(recorder)
                 name = type(recorder).__name__
-                _log.warning("%s failed (%s); the run goes on without.", name, reason(error))
+                _log.warning("%s failed (%s); the run continues without it.", name, reason(error))
 
 
 @dataclass(frozen=True)
@@ -172,40 +173,44 @@ def open_viewer(kind: str) -> Viewer:
     """Start the Rerun viewer.
 
     Args:
-        kind: ``native`` for a window, ``web`` for a page that this machine alone can open.
+        kind: ``native`` for a window, ``web`` for a page that can only be opened on this machine.
 
     Raises:
         InputError: it cannot be started here.
     """
     import rerun as rr
 
-    shown, page, words = _has_display(), 0, []
-    if kind == "native" and not shown:
+    has_display, page_port, options = _has_display(), 0, []
+    if kind == "native" and not has_display:
         raise InputError("--view native: there is no display here; use --view web.")
     try:
         port = _free_port(_VIEWER_PORT)
         if kind == "web":
-            page = _free_port(_WEB_PORT)
-            # Both serve the page; the first opens the browser, too.
-            words = ["--web-viewer" if shown else "--serve-web", f"--web-viewer-port={page}"]
-        viewer = _start_viewer(port, words)
+            page_port = _free_port(_WEB_PORT)
+            # Both options serve the page; --web-viewer also opens the browser.
+            serve = "--web-viewer" if has_display else "--serve-web"
+            options = [serve, f"--web-viewer-port={page_port}"]
+        viewer = _start_viewer(port, options)
     except OSError as error:
         raise InputError(f"--view {kind}: no viewer can be started ({error}).") from error
     if kind == "web":
-        atexit.register(viewer.kill)  # a window stays open, a page nobody can close
-    until = time.monotonic() + _VIEWER_STARTS_S
-    while not (_listens(port) and (not page or _listens(page))):
-        if viewer.poll() is not None or time.monotonic() > until:
-            raise InputError(f"--view {kind}: the viewer does not start here; leave it out.")
+        atexit.register(viewer.kill)  # the user can close a window, but not this process
+    deadline = time.monotonic() + _VIEWER_STARTS_S
+    while not (_listens(port) and (not page_port or _listens(page_port))):
+        if viewer.poll() is not None or time.monotonic() > deadline:
+            raise InputError(f"--view {kind}: the viewer does not start here; run without --view.")
         time.sleep(0.05)
     uri = f"rerun+http://127.0.0.1:{port}/proxy"
-    return Viewer(f"http://localhost:{page}?url={uri}" if page else "", rr.GrpcSink(uri))
+    address = f"http://localhost:{page_port}?url={uri}" if page_port else ""
+    return Viewer(address, rr.GrpcSink(uri))
 
 
-def _start_viewer(port: int, words: list[str]) -> subprocess.Popen[bytes]:
-    """Start a viewer that only this machine can reach; rerun's own functions let it listen on every
-    interface. It has its own session, so that Ctrl-C ends the run and not the viewer."""
-    command = [_executable(), "--bind=127.0.0.1", f"--port={port}", "--hide-welcome-screen", *words]
+def _start_viewer(port: int, options: list[str]) -> subprocess.Popen[bytes]:
+    """Start a viewer that only this machine can reach; those that rerun's own functions start
+    listen on every interface. It has its own session, so that Ctrl-C ends the run and not the
+    viewer."""
+    command = [_executable(), "--bind=127.0.0.1", f"--port={port}", "--hide-welcome-screen"]
+    command += options
     nothing = subprocess.DEVNULL
     return subprocess.Popen(
         command, stdin=nothing, stdout=nothing, stderr=nothing, start_new_session=True
@@ -217,7 +222,7 @@ def _has_display() -> bool:
 
 
 def _executable() -> str:
-    """The viewer of the package that is installed, not another one on the path."""
+    """The viewer of the installed rerun package, rather than another version on the path."""
     spec = find_spec("rerun_cli")
     folder = Path(spec.origin).parent if spec and spec.origin else Path()
     found = [path for name in ("rerun", "rerun.exe") if (path := folder / name).is_file()]
@@ -230,7 +235,7 @@ def _listens(port: int) -> bool:
 
 
 def _free_port(wanted: int) -> int:
-    """This port if it is free, otherwise any free port."""
+    """The port ``wanted`` if it is free, otherwise any free port."""
     for port in (wanted, 0):
         with socket.socket() as probe:
             try:
@@ -244,7 +249,8 @@ def _free_port(wanted: int) -> int:
 def _guarded(
     method: Callable[Concatenate[RerunRecorder, _P], None],
 ) -> Callable[Concatenate[RerunRecorder, _P], None]:
-    """Do nothing once the recording is closed; close it instead of raising."""
+    """Decorate a method: it does nothing once the recording has ended, and an error ends the
+    recording instead of being raised."""
 
     @functools.wraps(method)
     def call(self: RerunRecorder, *args: _P.args, **kwargs: _P.kwargs) -> None:
@@ -252,14 +258,14 @@ def _guarded(
             return
         try:
             method(self, *args, **kwargs)
-        except Exception as error:  # no memory, a full disk, a viewer that was closed
+        except Exception as error:  # such as no memory, a full disk, a viewer that was closed
             self._abandon(error)
 
     return call
 
 
 class RerunRecorder(Recorder):
-    """Writes a ``.rrd`` file, or shows the same live.
+    """Writes a ``.rrd`` file, or shows the same data live.
 
     Timelines: ``frame`` (number) and ``time`` (seconds).
 
@@ -276,7 +282,8 @@ class RerunRecorder(Recorder):
     that thread are reported only by a later flush, which may then never return. Therefore the
     recording ends, with a warning in the log, when the disk has less than 64 MB left; everything up
     to that frame is in the file. If a flush fails or takes longer than 5 s, or the viewer was
-    closed, the recording also ends with a warning, and the file may break off within a message.
+    closed, the recording also ends with a warning, and the last message in the file may be
+    incomplete.
     """
 
     def __init__(self, target: Path | Viewer, pictures: Sequence[LoopPicture] = ()) -> None:
@@ -284,8 +291,8 @@ class RerunRecorder(Recorder):
         warning and record nothing.
 
         Args:
-            pictures: a list to which a recorder that is called before this one adds pictures of the
-                closed loops; they are recorded too.
+            pictures: a list to which another recorder, called before this one, appends pictures of
+                the closed loops; they are recorded, too.
         """
         import rerun as rr
 
@@ -295,7 +302,7 @@ class RerunRecorder(Recorder):
         self._recording = rr.RecordingStream("vslam")
         self._open = True
         self._state: TrackingState | None = None
-        self._points: dict[str, tuple[int, int, int]] = {}  # counts of a frame, with their colours
+        self._points: dict[str, tuple[int, int, int]] = {}  # colour of each count of a frame
         self._index = 0  # of the last frame
         self._frames: list[TrackResult] = []
         self._stages: list[str] = []  # each has a colour of its own
@@ -307,7 +314,7 @@ class RerunRecorder(Recorder):
         self._hide_rejected_at: int | None = None  # frame
         try:
             self._recording.set_log_time_enabled(False)  # would be the viewer's default timeline
-            # Before the first log call, or that one is lost.
+            # This must precede the first log call, which would otherwise be lost.
             if isinstance(target, Path):
                 self._recording.save(target)
             else:
@@ -341,7 +348,7 @@ class RerunRecorder(Recorder):
             log(f"points/{name}", rr.SeriesLines(colors=[color], names=[name]))
         log("world/trajectory", rr.LineStrips3D.from_fields(colors=[_BLUE], radii=[-1.0]))
         if ground_truth is not None and len(ground_truth):
-            # The ground truth's world is the first camera of the data set, not of the run.
+            # Move the ground truth from the world of the data set to that of the run.
             T_wc = np.linalg.inv(ground_truth.T_wc[0]) @ ground_truth.T_wc
             log("world/ground_truth", _path(T_wc, _GREY))
 
@@ -349,7 +356,7 @@ class RerunRecorder(Recorder):
     def frame(self, result: TrackResult) -> None:
         import rerun as rr
 
-        # Sent in columns: four times faster than one log call for each value.
+        # Frames are sent in columns, which is four times faster than a log call for each value.
         self._frames.append(result)
         self._index = result.index
         if len(self._frames) >= self._pace.frames:
@@ -368,7 +375,7 @@ class RerunRecorder(Recorder):
         import rerun as rr
 
         if self._path and shutil.disk_usage(self._path.parent).free < _RESERVED_BYTES:
-            _log.warning("%s: the disk is almost full, recording ends here.", self._name)
+            _log.warning("%s: recording ends here, because the disk is almost full.", self._name)
             self._close()
             return
         self._keyframes += 1
@@ -407,7 +414,7 @@ class RerunRecorder(Recorder):
                 self._log_lines("accepted", self._accepted, map_, _GREEN)
         for edge in edges:
             color = _GREEN if edge.accepted else _GREY
-            self._recording.log("state/loops", rr.TextLog(_in_words(edge, map_), color=color))
+            self._recording.log("state/loops", rr.TextLog(_description(edge, map_), color=color))
         self._log_pictures()
 
     @_guarded
@@ -418,7 +425,7 @@ class RerunRecorder(Recorder):
         self._close()
 
     def _log_trajectory(self, trajectory: Trajectory) -> None:
-        """The final trajectory up to each of a hundred frames, so that it grows as the run is
+        """Log the final trajectory up to each of a hundred frames, so that it grows as the run is
         replayed."""
         import rerun as rr
 
@@ -454,7 +461,7 @@ class RerunRecorder(Recorder):
     def _log_lines(
         self, name: str, edges: list[LoopEdge], map_: Map, color: tuple[int, ...]
     ) -> None:
-        """A line from the query to the match of each loop, unless the query is not in the map."""
+        """Log a line from the query to the match of each loop whose query is in the map."""
         import rerun as rr
 
         ends = [(edge.match, edge.query) for edge in edges if edge.query >= 0]
@@ -464,7 +471,7 @@ class RerunRecorder(Recorder):
         self._recording.log(f"world/loops/{name}", lines)
 
     def _log_pictures(self) -> None:
-        """The pictures of new loops; if there are several, the last one stays visible."""
+        """Log the pictures of new loops; if there are several, the last one stays visible."""
         import rerun as rr
 
         new = self._pictures[self._n_pictures :]
@@ -484,10 +491,10 @@ class RerunRecorder(Recorder):
         self._recording.send_columns("world/camera", _times(results), poses)
         extracted = [result for result in results if result.n_features]
         for name in self._points:
-            of = results if name in ("matches", "inliers") else extracted
-            counts = np.array([getattr(result, f"n_{name}") for result in of], np.float64)
+            counted = results if name in ("matches", "inliers") else extracted
+            counts = np.array([getattr(result, f"n_{name}") for result in counted], np.float64)
             scalars = rr.Scalars.columns(scalars=counts)
-            self._recording.send_columns(f"points/{name}", _times(of), scalars)
+            self._recording.send_columns(f"points/{name}", _times(counted), scalars)
         for stage in dict.fromkeys(name for result in results for name in result.stage_ms):
             if stage not in self._stages:
                 color = _STAGE_COLORS[len(self._stages) % len(_STAGE_COLORS)]
@@ -503,7 +510,8 @@ class RerunRecorder(Recorder):
         self._recording.flush(timeout_sec=_FLUSH_TIMEOUT_S)
 
     def _close(self) -> None:
-        # Only after a flush that succeeded: disconnecting from a dead writer can wait forever.
+        # Disconnect only after a successful flush: disconnecting from a dead writer may never
+        # return.
         self._flush()
         self._recording.disconnect()
         self._open = False
@@ -512,8 +520,8 @@ class RerunRecorder(Recorder):
         import rerun as rr
 
         _log.warning("%s: recording ends here (%s).", self._name, reason(error))
-        # rerun 0.41 waits without a limit for its dead writer when a stream is deleted and at the
-        # end of the process. A stream that never dies and no hook at the end avoid both.
+        # When a stream is deleted, and when the process ends, rerun 0.41 waits forever for its dead
+        # writer. So the stream is never deleted, and rerun's hook at the end is removed.
         rr.unregister_shutdown()
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._recording))
         self._open = False
@@ -535,7 +543,7 @@ def _path(T_wc: NDArray[np.float64], color: tuple[int, int, int]) -> Any:
     return rr.LineStrips3D([points], colors=[color], radii=[-1.0])
 
 
-def _in_words(edge: LoopEdge, map_: Map) -> str:
+def _description(edge: LoopEdge, map_: Map) -> str:
     query = f"frame {map_.frames[edge.query]}" if edge.query >= 0 else "a lost frame"
     evidence = f"{edge.n_inliers} inliers of {edge.n_matches} matches"
     by = f"proposed by {edge.proposed_by}, matched by {edge.matched_by} descriptors"
@@ -543,7 +551,7 @@ def _in_words(edge: LoopEdge, map_: Map) -> str:
 
 
 def _half(xy: NDArray[np.floating]) -> NDArray[np.floating]:
-    # Ours has the first pixel's centre at 0, rerun at 0.5.
+    # The centre of the first pixel is 0 in vslam and 0.5 in rerun.
     return (xy + 0.5) * _IMAGE_SCALE
 
 

@@ -16,25 +16,28 @@ from vslam.frontend.sides import ComparedSides
 from vslam.geometry import compose, inverse, orthonormalised, se3_log
 from vslam.map import Map
 
-_FEWEST = 3  # frames: below that it was a reflection or a hand
+_FEWEST = 3  # frames; fewer may show a reflection, or a hand in front of the lens
 _FEWEST_OBSERVATIONS, _MOST_OBSERVATIONS = 3_000, 100_000
 _LARGEST_RESIDUAL_PX = 3.0
 _HUBER_PX = 0.3
 _ROUNDS = 10
-_LEAST_IMAGE_SPEED = 50.0  # pixels a second, deviation: a rig that stands still shows no delay
-_LONGEST_GAP_S = 2.0  # between keyframes; over a longer one their motion is not known
-# Of sound rigs 0.15 ms and 0.11 pixels at most, of one 10 ms late 1.1 ms, of one turned by 2 arc
-# minutes 0.29 pixels (docs/research/stress.md): bundle adjustment hides a part of both.
+# Least standard deviation of the image speed, in pixels per second: without motion, a delay cannot
+# be observed.
+_LEAST_IMAGE_SPEED = 50.0
+_LONGEST_GAP_S = 2.0  # between keyframes; the motion over a longer time is unknown
+# Sound rigs show at most 0.15 ms and 0.11 pixels, a delay of 10 ms shows as 1.1 ms, and a rotation
+# by 2 arc minutes as 0.29 pixels (docs/research/stress.md): bundle adjustment absorbs a part of
+# both.
 _SUSPECT_DELAY_S, _SUSPECT_OFFSET_PX = 0.4e-3, 0.2
 
 
 @dataclass(frozen=True)
 class RigResiduals:
-    """Systematic errors of the columns in right images, as the final map shows them.
+    """Systematic errors of the columns in right images, estimated from the final map.
 
     Attributes:
-        delay_s: how much later than the left image the right one seems to be, from residuals that
-            are proportional to the speed of the image; NaN if the camera hardly moved.
+        delay_s: apparent delay of the right image relative to the left one, which causes residuals
+            proportional to the image speed; NaN if the camera hardly moved.
         offset_px: constant error of all disparities.
     """
 
@@ -43,13 +46,13 @@ class RigResiduals:
 
 
 def measure_rig(map_: Map, camera: Camera) -> RigResiduals | None:
-    """Fit the stereo residuals of a map by a delay, an offset and a scale of disparities; None if
-    there are too few observations or the camera is not stereo."""
+    """Fit a delay, and an offset and a scale error of disparities, to the stereo residuals of a
+    map; None if there are too few observations or the camera is not stereo."""
     if camera.sensor != "stereo" or map_.n_keyframes < 3:
         return None
     arrays = map_.arrays
-    seen = (arrays.landmark[: map_.n_rows] >= 0) & np.isfinite(arrays.u_right[: map_.n_rows])
-    rows = np.flatnonzero(seen)
+    stereo = (arrays.landmark[: map_.n_rows] >= 0) & np.isfinite(arrays.u_right[: map_.n_rows])
+    rows = np.flatnonzero(stereo)
     if len(rows) < _FEWEST_OBSERVATIONS:
         return None
     rows = rows[:: -(-len(rows) // _MOST_OBSERVATIONS)]
@@ -61,8 +64,8 @@ def measure_rig(map_: Map, camera: Camera) -> RigResiduals | None:
     z = p[:, 2]
     speed = camera.fx * (moved[:, 0] - p[:, 0] * moved[:, 2] / z) / z
     disparity = camera.bf / z
-    found = arrays.xy[rows, 0].astype(np.float64) - arrays.u_right[rows]
-    residual = disparity - found  # of the column in the right image
+    measured = arrays.xy[rows, 0].astype(np.float64) - arrays.u_right[rows]
+    residual = disparity - measured  # of the column in the right image
     good = (np.abs(residual) < _LARGEST_RESIDUAL_PX) & (z > 0) & np.isfinite(speed)
     if good.sum() < _FEWEST_OBSERVATIONS:
         return None
@@ -85,8 +88,8 @@ def fit(
 
 
 def _twists(map_: Map) -> NDArray[np.float64]:
-    """``(K, 6)`` twist of each keyframe per second, NaN beside a gap. Drives are treated
-    separately, because each has its own clock."""
+    """``(K, 6)`` twist of each keyframe per second; NaN if the neighbouring keyframes are too far
+    apart in time. Drives are treated separately, because each has its own clock."""
     T_cw, times = map_.arrays.T_cw, map_.timestamps
     twists = np.full((map_.n_keyframes, 6), np.nan)
     living = map_.living_keyframes()
@@ -94,10 +97,10 @@ def _twists(map_: Map) -> NDArray[np.float64]:
     for session in np.unique(sessions):
         drive = living[sessions == session]
         for k, keyframe in enumerate(drive):
-            before, behind = drive[max(0, k - 1)], drive[min(len(drive) - 1, k + 1)]
-            elapsed = times[behind] - times[before]
+            before, after = drive[max(0, k - 1)], drive[min(len(drive) - 1, k + 1)]
+            elapsed = times[after] - times[before]
             if 0 < elapsed < _LONGEST_GAP_S:
-                step = compose(T_cw[behind], inverse(T_cw[before]))
+                step = compose(T_cw[after], inverse(T_cw[before]))
                 twists[keyframe] = se3_log(orthonormalised(step)) / elapsed
     return twists
 
@@ -106,8 +109,8 @@ def calibration_warnings(camera: Camera, calib: Sequence[Path], name: str) -> li
     """Warnings about an implausible calibration.
 
     Args:
-        camera: as calibrated.
-        calib: the files of ``--calib``; if none was given, the data set has its own.
+        camera: the calibrated camera.
+        calib: the files of ``--calib``; empty if the calibration is that of the data set.
         name: name of the sequence.
     """
     source = ", ".join(map(str, calib)) or f"the calibration of {name}"
@@ -115,63 +118,63 @@ def calibration_warnings(camera: Camera, calib: Sequence[Path], name: str) -> li
 
 
 def delay_warnings(delay: SideDelay, camera: Camera) -> list[str]:
-    """A warning if the delay between the sides, measured by the rows of stereo matches, is not that
-    of the calibration."""
+    """A warning if the delay of the right camera, measured by the rows of stereo matches, differs
+    from that of the calibration."""
     if not delay.is_wrong:
         return []
     known = camera.right_delay
     side = "right" if delay.seconds > 0 else "left"
     instead = f" instead of {1e3 * known:.1f} ms (right_delay)" if known else ""
     return [
-        f"The sides are not synchronised: by the rows of stereo matches, the {side} one is "
+        f"The cameras are not synchronised: the rows of stereo matches show that the {side} one is "
         f"{1e3 * abs(delay.seconds):.1f} ms late{instead}. Trigger both by one signal, or write "
         f"right_delay: {delay.seconds:.4f} (seconds) into the file that --calib names and run "
-        "again, see docs/howto/cameras.md."
+        "again; see docs/howto/cameras.md."
     ]
 
 
 def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
-    """A warning if the residuals show a delay between the sides or an offset of disparities."""
+    """A warning if the residuals show a delay between the cameras or an offset of disparities."""
     if found is None:
         return []
-    said = []
+    warnings = []
     if abs(found.delay_s) > _SUSPECT_DELAY_S:
         side = "right" if found.delay_s > 0 else "left"
-        said.append(
-            f"The sides seem not to be synchronised: the {side} one is at least "
-            f"{1e3 * abs(found.delay_s):.1f} ms late, and most of a delay stays hidden. Trigger "
-            "both by one signal."
+        warnings.append(
+            f"The cameras seem not to be synchronised: the {side} one is at least "
+            f"{1e3 * abs(found.delay_s):.1f} ms late, and usually much more, because bundle "
+            "adjustment absorbs most of a delay. Trigger both by one signal."
         )
     elif abs(found.offset_px) > _SUSPECT_OFFSET_PX:
         minutes = 60.0 * np.degrees(abs(found.offset_px) / camera.fx)
-        said.append(
-            f"Disparities are {abs(found.offset_px):.2f} pixels off throughout: the cameras are "
-            f"turned against their calibration by {minutes:.1f} arc minutes or more. Calibrate "
-            "the rig again."
+        warnings.append(
+            f"All disparities are off by {abs(found.offset_px):.2f} pixels: the cameras are "
+            f"rotated relative to their calibration by at least {minutes:.1f} arc minutes. "
+            "Calibrate the rig again."
         )
-    return said
+    return warnings
 
 
 def rig_warnings(sides: ComparedSides) -> list[str]:
-    """Warnings about a side that was black or darker than the other one during a run."""
-    found = []
+    """Warnings about a camera whose images were black or darker than the other's during a run."""
+    warnings = []
     for side, other, black in (
         ("left", "right", sides.n_black_left),
         ("right", "left", sides.n_black_right),
     ):
         if black >= _FEWEST:
-            found.append(
-                f"The {side} side was black in {black} of {sides.n} frames while the {other} "
-                f"one was not: they were tracked with the {other} side alone. Check its cable, "
-                "shutter and lens cap."
+            warnings.append(
+                f"The {side} image was black in {black} of {sides.n} frames while the {other} "
+                f"one was not: these frames were tracked with the {other} image alone. Check the "
+                f"cable, shutter and lens cap of the {side} camera."
             )
     darker = sides.darker_stops
     if len(darker) >= _FEWEST:
         stops = statistics.median(darker)
         side, other = ("right", "left") if stops > 0 else ("left", "right")
-        found.append(
-            f"The {side} side was {abs(stops):.1f} stops darker than the {other} one in "
+        warnings.append(
+            f"The {side} image was {abs(stops):.1f} stops darker than the {other} one in "
             f"{len(darker)} of {sides.n} frames: it was brightened to match. Check exposure, "
-            "gain and aperture of both."
+            "gain and aperture of both cameras."
         )
-    return found
+    return warnings

@@ -1,14 +1,15 @@
-"""Compile every kernel before the first frame, so that no run is timed while it compiles.
+"""Compilation of all kernels before the first frame, so that the time of a run does not include it.
 
-Compiling takes longer than anything else in a first run, and a process compiles one kernel at a
-time because Numba holds a lock. Two processes, ``python -m vslam.run.warmup first`` and
-``... second``, therefore share the work through Numba's cache. The process of the run then calls
-``EVERYTHING``, which loads the compiled kernels and compiles missing ones; this process then does
-not hold the compiler's memory. Later runs load a kernel when they first call it.
+Compilation takes most of the time of a first run, and a process compiles one kernel at a time
+because Numba holds a lock. Two processes, ``python -m vslam.run.warmup first`` and
+``python -m vslam.run.warmup second``, therefore share the work through Numba's cache. The process
+of the run then calls ``EVERYTHING``, which loads the compiled kernels and compiles only missing
+ones, so that this process does not hold the compiler's memory. Later runs load a kernel when they
+first call it.
 
-For new kernels, add a function that calls them to the shorter of ``COMPILE_SHARES``, to
-``EVERYTHING`` if the small SLAM run does not call them, and a module's last kernel to
-``COLD_PROBES``. This shows which share is shorter:
+For new kernels, add a function that calls them to the shorter of ``COMPILE_SHARES``, and to
+``EVERYTHING`` if the small SLAM run does not call them; add the last kernel of a new module to
+``COLD_PROBES``. These commands show which share is shorter:
 
     for share in first second; do
         time NUMBA_CACHE_DIR=$(mktemp -d) python -m vslam.run.warmup $share
@@ -72,7 +73,7 @@ from vslam.slam import Slam
 
 WIDTH, HEIGHT, DISPARITY, STEP, FRAMES = 480, 240, 12, 6, 6
 CAMERA = Camera(240.0, 240.0, WIDTH / 2, HEIGHT / 2, 0.5, WIDTH, HEIGHT)
-# A process that takes longer is stuck: each has less than a minute of work on a slow machine.
+# A process that takes longer hangs: each has less than a minute of work on a slow machine.
 PATIENCE_S = 300.0
 
 
@@ -81,8 +82,8 @@ def compile_kernels(*, processes: int = 2, load: bool = False) -> None:
 
     Args:
         processes: with 1, or on a single core, no other process is started.
-        load: load compiled kernels and GTSAM now, which takes 0.3 s, instead of 2 ms per kernel
-            at its first call; for runs in which no frame may wait.
+        load: load compiled kernels and GTSAM now, which takes 0.3 s, for runs in which no frame may
+            wait; otherwise each kernel is loaded at its first call, which takes 2 ms.
     """
     if load:
         load_optimiser()
@@ -98,8 +99,8 @@ def compile_kernels(*, processes: int = 2, load: bool = False) -> None:
 
 
 def is_cold() -> bool:
-    """Whether kernels must be compiled: whether one of ``COLD_PROBES`` is missing in Numba's cache
-    or older there than its source."""
+    """Whether kernels must be compiled, because one of ``COLD_PROBES`` is missing in Numba's cache
+    or is older than its source."""
     return any(
         all(index.stat().st_mtime < source.stat().st_mtime for index in indexes)
         for source, indexes in map(cached, COLD_PROBES)
@@ -153,8 +154,9 @@ _FEATURES = TrackingConfig(method="orb")
 
 
 def run_everything() -> None:
-    """Run SLAM on a few small images, each a keyframe, of a camera that slides along a textured
-    wall. This reaches all branches of tracking, triangulation, fusion and bundle adjustment."""
+    """Run SLAM on a few small images of a camera that moves sideways along a textured wall. Each
+    becomes a keyframe, so that all kernels of tracking, triangulation, fusion and bundle adjustment
+    are called."""
     every_frame = KeyframeConfig(max_interval_s=0.05, merge_after_frames=1)
     run_slam(Config(keyframes=every_frame, tracking=_FEATURES), FRAMES)
     compile_patches()
@@ -164,8 +166,8 @@ def run_everything() -> None:
 def compile_tracking() -> None:
     """Compile extraction, stereo, matching, pose and tracking by a SLAM run with one keyframe."""
     decode_image()
-    no_other = KeyframeConfig(max_interval_s=1e9, max_tracked_ratio=1e-6, min_tracked_close=0)
-    run_slam(Config(keyframes=no_other, tracking=_FEATURES), 3)
+    only_first = KeyframeConfig(max_interval_s=1e9, max_tracked_ratio=1e-6, min_tracked_close=0)
+    run_slam(Config(keyframes=only_first, tracking=_FEATURES), 3)
 
 
 def compile_patches() -> None:
@@ -174,7 +176,7 @@ def compile_patches() -> None:
 
 
 def decode_image() -> None:
-    """Decode two lines of a PNG."""
+    """Decode two lines of a PNG file."""
     unfilter(np.zeros((2, 5), np.uint8), np.empty((2, 4), np.uint8))
 
 
@@ -211,9 +213,9 @@ def compile_local_mapping() -> None:
 def map_synthetic(keyframes: int) -> tuple[Map, Features]:
     """Map a camera that moves sideways past a cloud of points, without images.
 
-    Every keyframe sees all points. The first half of them are near and have a stereo match, the
-    rest are left for triangulation. One landmark suffices to make a keyframe redundant, so that
-    the fourth insertion culls one. Returns the map and the features of the last keyframe.
+    Every keyframe observes all points. The first half of the points have a stereo match, the others
+    are left for triangulation. Because a single landmark suffices to make a keyframe redundant, the
+    fourth insertion culls one. Returns the map and the features of the last keyframe.
     """
     config = Config(mapping=MappingConfig(redundant_ratio=1e-6))
     verifier = verifier_for(config, CAMERA)
@@ -263,7 +265,7 @@ def compile_recognition() -> None:
 
 
 def compile_learned_matching() -> None:
-    """Compile the matching of learned descriptors, with random ones instead of a network's."""
+    """Compile the matching of learned descriptors, with random descriptors."""
     rng = np.random.default_rng(0)
     coarse, fine = (rng.standard_normal((rows, 2 * rows, 4), np.float32) for rows in (4, 16))
     maps = DescriptorMaps(coarse, fine, 1.0)
@@ -292,7 +294,7 @@ def compile_correction() -> None:
 
 
 def smallest_vocabulary() -> Vocabulary:
-    """Two words."""
+    """A vocabulary of two words."""
     centres = np.array([[0] * 4, [0] * 4, [2**64 - 1] * 4], np.uint64)
     return from_children(2, 1, centres, np.array([2, 0, 0], np.uint8), np.ones(2, np.float32))
 
@@ -314,8 +316,8 @@ def compile_bundle_adjustment() -> None:
     adjust(problem, iterations=1)
 
 
-# The second process starts with kernels that only it needs: by the time it inserts keyframes, the
-# first one, which starts with the insertion, has cached those kernels.
+# The second process starts with kernels that the first one does not need. Before it inserts
+# keyframes, the first process, which starts with this, has already cached the kernels for it.
 COMPILE_SHARES: dict[str, tuple[Callable[[], None], ...]] = {
     "first": (compile_insertion, compile_tracking, compile_depth, compile_recognition),
     "second": (
@@ -333,7 +335,7 @@ EVERYTHING: tuple[Callable[[], None], ...] = (
     compile_learned_matching,
     compile_correction,
 )
-# The kernel that is compiled last in each module with much to compile.
+# The last kernel to be compiled in each module that takes long to compile.
 COLD_PROBES: tuple[tuple[ModuleType, str], ...] = (
     (bundle_adjustment, "_adjust"),
     (sim3_ransac, "_ransac"),
@@ -347,7 +349,7 @@ COLD_PROBES: tuple[tuple[ModuleType, str], ...] = (
 
 
 if __name__ == "__main__":
-    # Garbage collection would take 14 % of the time and find little garbage.
+    # Garbage collection would take 14 % of the time and free little memory.
     gc.disable()
     for share in COMPILE_SHARES[sys.argv[1]]:
         share()

@@ -1,6 +1,6 @@
-r"""Let every part of a run fail once, and record the run's messages and results.
+r"""Make every part of a run fail once, and record the run's messages and results.
 
-This tool injects every fault at every point of tests/faults.py, which also judges the outcomes.
+tests/faults.py defines the faults and where they are injected, and it judges the outcomes.
 
     python tools/experiments/lifelong/inject_faults.py --out docs/research/lifelong/faults.csv
 """
@@ -18,7 +18,7 @@ from collections.abc import Collection
 from dataclasses import astuple, fields
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # a fork would lack its threads
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads do not survive a fork
 sys.path.insert(0, str(Path(__file__).parents[3] / "tests"))
 from faults import FAULTS, POINTS, Row, inject, load_everything, run_in_fork, write_ring
 
@@ -26,11 +26,11 @@ from faults import FAULTS, POINTS, Row, inject, load_everything, run_in_fork, wr
 def inject_all(
     work: Path, points: Collection[str], faults: Collection[str], seed: int, *, once: bool
 ) -> list[Row]:
-    """Inject faults at the given points, and print the outcome of each.
+    """Inject faults at some points and print the outcome of each.
 
     Args:
         work: an empty folder.
-        once: inject one fault per point, drawn from the seed, instead of all.
+        once: inject one random fault per point instead of all.
     """
     load_everything()
     rows = []
@@ -57,13 +57,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--points", nargs="+", default=[point.name for point in POINTS])
     parser.add_argument("--faults", nargs="+", choices=FAULTS, default=list(FAULTS))
-    parser.add_argument(
-        "--once", action="store_true", help="one fault per point, drawn from the seed"
-    )
+    parser.add_argument("--once", action="store_true", help="inject one random fault per point")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="CSV table of all injections")
     options = parser.parse_args()
-    work = Path(tempfile.mkdtemp())  # a fork that ends would delete a TemporaryDirectory
+    work = Path(tempfile.mkdtemp())  # a fork would delete a TemporaryDirectory when it ends
     try:
         rows = inject_all(work, options.points, options.faults, options.seed, once=options.once)
     finally:

@@ -1,13 +1,12 @@
-"""Localise single images in a map that was made by day: the share that is found, by light.
+"""Localise single images, under changes of light, in a map made by day, and count successes.
 
     python tools/experiments/light/day_night.py DATASET SEQ[=MAP_FRAMES] ... --out TABLE.csv
 
-The map is made of the first MAP_FRAMES frames and saved; then left images of the later ones are
-localised in it, each alone. Without MAP_FRAMES, the map is made of the whole drive and images of
-the same drive are localised, except those that became keyframes. An image is found if its pose is
-within 2 m and 15 degrees of the ground truth, as in AirSLAM's experiment on the reuse of maps (Xu
-et al., T-RO 2025, section VII-D). Poses are compared relative to the nearest frame of the map, so
-that the drift of the map does not count.
+The map is made from the first MAP_FRAMES frames and saved; then each later left image is localised
+in it on its own. Without MAP_FRAMES, the map is made from the whole drive and images of the same
+drive are localised, except keyframes. A pose is right within 2 m and 15 degrees of the ground
+truth, as in AirSLAM's experiment on the reuse of maps (Xu et al., T-RO 2025, section VII-D). Poses
+are compared relative to the nearest frame of the map, so that the drift of the map does not count.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ class Day:
 
     Attributes:
         path: its file.
-        T_wc: ``(N, 4, 4)`` poses of the N frames that it was made of.
+        T_wc: ``(N, 4, 4)`` poses of the N frames that it was made from.
         keyframes: numbers of the frames that are keyframes.
     """
 
@@ -59,7 +58,7 @@ class Day:
 
 @dataclass(frozen=True)
 class WholeMap:
-    """Implements ``MapAccess`` for a map to which nothing is added."""
+    """Implements ``MapAccess`` for a map that does not change."""
 
     map: Map
     is_merged: bool = True
@@ -69,7 +68,7 @@ class WholeMap:
 
 
 def map_of(source: Source, n_frames: int, detector: str, path: Path) -> Day:
-    """Make a map of the first frames and save it."""
+    """Make a map from the first frames and save it."""
     slam = Slam(source.camera, detector=detector)
     for frame in islice(source.frames(), n_frames):
         slam.step(*frame.read(map), frame.timestamp)
@@ -84,8 +83,8 @@ class Localiser:
     """Searches a saved map for single images."""
 
     def __init__(self, day: Day, detector: str, candidates: int) -> None:
-        """``candidates`` is the number of keyframes at which an image is looked for, by ORB
-        descriptors and by learned ones."""
+        """``candidates``: number of keyframes with which an image is compared, by ORB and by
+        learned descriptors."""
         config = as_config(
             {
                 "relocalization": {"max_candidates": candidates},
@@ -100,7 +99,7 @@ class Localiser:
         self._relocaliser = Relocaliser(slam.context, places.locate, recognise)
 
     def pose(self, image: Image) -> Matrix | None:
-        """``(4, 4)`` pose T_wc in the world of the map, None if the image is not found."""
+        """``(4, 4)`` pose T_wc in the world of the map, None if localisation fails."""
         extracted = FrameImages(image, lambda: None, self._context).extracted
         frame = Frame.of(extracted, self._context.camera, image=image)
         lost = Found(TrackingState.LOST)
@@ -109,7 +108,7 @@ class Localiser:
 
 
 def is_right(T_wc: Matrix, k: int, day: Day, truth: Matrix) -> bool:
-    """Whether a pose is within the limits.
+    """Whether a pose is within the limits of the ground truth.
 
     Args:
         T_wc: ``(4, 4)`` in the world of the map.
@@ -124,26 +123,26 @@ def is_right(T_wc: Matrix, k: int, day: Day, truth: Matrix) -> bool:
 
 
 def rows_of(source: Source, n_map: int | None, options: argparse.Namespace) -> Iterator[list]:
-    """A row for each detector, law and number of candidates."""
+    """A row for each detector, number of candidates and law."""
     n = len(source.timestamps)
     for detector in options.detectors:
         with tempfile.TemporaryDirectory() as folder:
             day = map_of(source, n_map or n, detector, Path(folder) / "map.npz")
-            asked = [k for k in range(n_map or 0, n, options.every) if k not in day.keyframes]
+            queries = [k for k in range(n_map or 0, n, options.every) if k not in day.keyframes]
             for candidates in options.candidates:
                 localiser = Localiser(day, detector, candidates)
                 for law in options.laws:
                     perturbation = parse_perturbation(law, options.seed).bound_to(source)
                     right = wrong = 0
-                    for k in asked:
+                    for k in queries:
                         t = float(source.timestamps[k] - source.timestamps[0])
                         image, _ = perturbation.apply(k, t, *source.read(k))
                         T_wc = localiser.pose(image)
                         if T_wc is not None:
                             good = is_right(T_wc, k, day, source.ground_truth)
                             right, wrong = right + good, wrong + (not good)
-                    recall = round(right / len(asked), 3)
-                    yield [source.name, law, detector, candidates, len(asked), right, wrong, recall]
+                    count, recall = len(queries), round(right / len(queries), 3)
+                    yield [source.name, law, detector, candidates, count, right, wrong, recall]
 
 
 def main() -> None:

@@ -1,10 +1,10 @@
-"""Measure what a hood in the picture costs, and what a mask repairs.
+"""Measure how a visible hood degrades tracking, and how far a mask repairs it.
 
     python tools/experiments/masks/hood.py --data TOWNS --seq kitti07 --rows 0.2 0.35
 
 A hood that reflects a random texture is painted over the lower part of the images of a stereo
-drive: an arc that stays where it is while the street moves. Prints lost frames, inliers and ATE of
-the drive as it is, with the hood, and with the hood and its mask.
+drive: an arc that stays in place while the street moves. The script prints lost frames, inliers and
+ATE of the drive without the hood, with it, and with the hood and its mask.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from vslam.frontend.masks import Mask
 from vslam.slam import Slam
 from vslam.trajectory import Trajectory
 
-DISPARITY = 90  # of the hood, pixels: it is near
+DISPARITY = 90  # pixels, of the hood, which is near
 
 
 def main() -> None:
@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, help="folder of KITTI, or of rendered towns")
     parser.add_argument("--seq", default="00")
     parser.add_argument("--frames", type=int, default=300)
-    parser.add_argument("--rows", type=float, nargs="+", default=[0.3], help="share of the image")
+    parser.add_argument("--rows", type=float, nargs="+", default=[0.3], help="height, 0 to 1")
     parser.add_argument("--method", default="auto", help="tracking.method")
     options = parser.parse_args()
     source = open_sequence("kitti", options.data, options.seq, max_frames=options.frames)
@@ -59,16 +59,16 @@ def main() -> None:
     start = time.perf_counter()
     for _ in range(100):
         Mask.of(mask, config.orb)
-    print(f"a mask takes {10.0 * (time.perf_counter() - start):.1f} ms")
+    print(f"preparing a mask takes {10.0 * (time.perf_counter() - start):.1f} ms")
 
 
 def draw_hood(height: int, width: int, rows: float) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """``(H, W)`` texture of a hood, and its mask: 0 below an arc that rises to a share of rows."""
-    sky = np.random.default_rng(0).integers(20, 230, (height // 4, width // 4), dtype=np.uint8)
-    sky = cv2.resize(cv2.GaussianBlur(sky, (0, 0), 1.0), (width, height))
+    """``(H, W)`` texture of a hood, and its mask: 0 below an arc, which covers a share ``rows``."""
+    texture = np.random.default_rng(0).integers(20, 230, (height // 4, width // 4), dtype=np.uint8)
+    texture = cv2.resize(cv2.GaussianBlur(texture, (0, 0), 1.0), (width, height))
     arc = height * (1.0 - rows * (1.0 - (np.arange(width) / width - 0.5) ** 2))
     mask = np.where(np.arange(height)[:, None] < arc, 255, 0).astype(np.uint8)
-    return np.asarray(sky, np.uint8), mask
+    return np.asarray(texture, np.uint8), mask
 
 
 if __name__ == "__main__":

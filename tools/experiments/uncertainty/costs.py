@@ -1,10 +1,10 @@
-"""Measure what covariances, masks and the export to ROS cost.
+"""Measure the CPU time of covariances, masks and the export to ROS.
 
     python tools/experiments/uncertainty/costs.py --data "$KITTI_ROOT" --seq 06 --frames 51
 
-Runs a stereo drive in turn without and with a mask that hides nothing, so that both do the same
-work, and prints the medians of CPU times. Fails if a run without a mask does not give the same
-bytes each time, or a mask that hides nothing changes them.
+The script runs a stereo drive alternately without a mask and with a mask that hides nothing, so
+that both do the same work, and prints the medians of CPU times. It fails if the trajectories of any
+two runs differ.
 """
 
 from __future__ import annotations
@@ -60,14 +60,14 @@ def main() -> None:
     assert len(trajectories) == 1, "the trajectories differ"
     for name, several in outcomes.items():
         ms = [1e3 * outcome.cpu_s / len(outcome.tracks) for outcome in several]
-        print(f"{name}: {np.median(ms):.2f} ms a frame ({min(ms):.2f} to {max(ms):.2f})")
+        print(f"{name}: {np.median(ms):.2f} ms per frame ({min(ms):.2f} to {max(ms):.2f})")
     for name, times in spent.items():
         per_frame = len(times) / (len(every) * len(last.tracks))
-        print(f"{name}: {1e3 * np.median(times):.3f} ms a call, {per_frame:.2f} calls a frame")
+        print(f"{name}: {1e3 * np.median(times):.3f} ms per call, {per_frame:.2f} calls per frame")
 
 
 def run(options: argparse.Namespace, mask: Path | None) -> RunOutcome:
-    """A run of the drive by one thread without loop detection."""
+    """Run the drive with one thread and without loop detection."""
     given = RunOptions(
         data=options.data, dataset="kitti", seq=options.seq, max_frames=options.frames, mask=mask,
         detector="none",
@@ -76,7 +76,7 @@ def run(options: argparse.Namespace, mask: Path | None) -> RunOutcome:
 
 
 def timed(function: Callable[..., Any], times: list[float]) -> Callable[..., Any]:
-    """The same function, which also notes the CPU seconds that its thread spent."""
+    """The same function, which also appends the CPU seconds of each call to ``times``."""
 
     def called(*args: Any, **more: Any) -> Any:
         start = time.thread_time()

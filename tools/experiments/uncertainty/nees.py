@@ -1,12 +1,12 @@
-"""Compare the errors of odometry with the covariances that vslam gives: a row per drive.
+"""Compare the errors of odometry with the covariances that vslam estimates, for each drive.
 
     python tools/experiments/uncertainty/nees.py DATA SEQ[:START[:FRAMES]] ... [--perturb LAW ...]
 
-DATA is a folder in KITTI's format with exact ground truth, such as a rendered one. Every drive runs
+DATA is a folder in KITTI's format with exact ground truth, for example rendered. Every drive runs
 under every law. The normalised estimation error squared (NEES; Bar-Shalom et al., Estimation with
 Applications to Tracking and Navigation, 2001, 5.4) of the motion over 1 s and 10 s, divided by its
-six degrees of freedom, has a mean of 1 if the covariances are right, and is larger if they promise
-too much.
+six degrees of freedom, has a mean of 1 if the covariances are consistent, and a larger one if they
+are too small.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from vslam.slam import Slam
 from vslam.trajectory import Trajectory
 
 INTERVALS_S = (1.0, 10.0)
-SKIPPED = 20  # frames at the start, while the map is young
-EVERY = 7  # frames between the intervals' starts: neighbours have nearly the same error
+SKIPPED = 20  # frames at the start, when the map is new
+EVERY = 7  # frames between the starts of intervals; overlapping ones have nearly the same error
 
 
 def results_of(source: Source, law: str, seed: int) -> list[TrackResult]:
-    """What tracking gave for every frame."""
+    """The result of tracking for every frame."""
     slam = Slam(source.camera)
     perturbation = parse_perturbation(law, seed).bound_to(source)
     results = []

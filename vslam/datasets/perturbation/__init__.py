@@ -1,49 +1,48 @@
-"""Seeded perturbations of a sequence: light, weather, glass, sensor, stereo rig.
+"""Seeded perturbations of a sequence: light, weather, glass, sensor and stereo rig.
 
-docs/howto/stress.md lists them with their units.
-
-Here v is a grey value, s the strength, t the time in seconds since the first frame, k the frame and
-n a standard normal number. Laws without a unit have strength 1 by default:
+Each perturbation follows a law, which ``docs/howto/stress.md`` lists with its unit. In this table,
+v is a grey value, s the strength, t the time in seconds since the first frame, k the index of the
+frame and n a standard normal number. Laws without a unit have strength 1 by default:
 
 ============  ======================================================================================
-brightness    v exp(g(t)) + b(t): g and b are Ornstein-Uhlenbeck walks with a time constant of 2 s
-              and standard deviations of 0.35 s and 20 s grey levels. Three times a minute on
+brightness    v exp(g(t)) + b(t): g and b are Ornstein-Uhlenbeck processes with a time constant of
+              2 s and standard deviations of 0.35 s and 20 s grey levels. Three times a minute on
               average (tunnel, auto-exposure), both are redrawn with 1.5 times the deviation. g is
               clipped to [-1.2, 0.7] max(1, s).
-gamma         255 (v / 255)^exp(g(t)): g is such a walk of deviation 0.35 s, without jumps.
+gamma         255 (v / 255)^exp(g(t)): g is such a process of deviation 0.35 s, without jumps.
 flicker       v exp(0.15 s n_k): one n for each frame, as under mains lighting.
 noise         v + 8 s n: one n for each pixel, frame and camera.
 blur          Gaussian blur with a standard deviation of 1.5 s pixels.
-occlusion     a grey rectangle, as of dirt on the glass, over min(0.15 s, 0.9) of the image's area;
+occlusion     a grey rectangle, like dirt on the glass, over min(0.15 s, 0.9) of the image's area;
               place, shape and grey value are redrawn every second.
-fog           meteorological visibility, m, the distance at which contrast falls to 5 %. Depth is
-              from the data set's depth images, else from stereo matching (``depth.py``).
-rain          mm/h: streaks of drops that fall during the exposure, and drops on the glass.
+fog           meteorological visibility (m), the distance at which the contrast falls to 5 %. Depth
+              is that of the data set's depth images, else from stereo matching (``depth.py``).
+rain          rate in mm/h: streaks of drops that fall during the exposure, and drops on the glass.
 night         stops of lost light; photon and read noise are computed in electrons.
-exposure      s: time constant with which auto-exposure follows a light that changes by 3 stops.
+exposure      time constant (s) with which auto-exposure follows a light that changes by 3 stops.
 dark          255 A (v / 255)^(1 / gamma), as in Dark EuRoC (Xu et al., AirSLAM, T-RO 2025, eq. 22):
-              each level lowers either A, by 0.15, or gamma, by 0.1, in turn. The rule is the
-              paper's; the values are our own, and are interpolated between levels.
-blackout      s: in every period of this length, the light goes out once. It is out for 0.16 s and
-              then rises steadily for 0.64 s; next time, it is out for 0.32 s and rises for 0.4 s.
-              The paper names these times for two recordings of UMA-VI; the rest is our own.
-motion        ms: exposure time while the camera turns, at its true rate if poses are known, else at
-              the rate of the optical flow.
-flare         grey levels of veiling glare at 10 degrees from a sun, by 1 / angle^2
-              (Stiles-Holladay), with ghosts.
-vignetting    stops at the corner, growing with the square of the distance from the middle.
-dirt          % of the glass covered by blobs, different on each side, constant during the drive.
+              levels lower A by 0.15 and gamma by 0.1 in turn. The paper gives the rule but not
+              these values, which are interpolated between levels.
+blackout      period (s) in which the light goes out once. It is out for 0.16 s and then rises
+              steadily for 0.64 s; the next time, it is out for 0.32 s and rises for 0.4 s. The
+              AirSLAM paper gives these times for two recordings of UMA-VI, but not the period.
+motion        exposure time (ms), which blurs the image while the camera turns: at its true angular
+              rate if poses are known, else by the optical flow.
+flare         veiling glare (grey levels) at 10 degrees from a sun, which falls with 1 / angle^2
+              (Stiles-Holladay), and lens ghosts.
+vignetting    stops at the corner, growing with the square of the distance from the centre.
+dirt          % of the glass that blobs cover, different on each side, constant during the drive.
 jpeg          quality of the compression.
 resolution    remaining share of the width; the image is scaled up again.
-drop          % of the frames are dropped, independently of each other.
-outage        s: length of an outage without frames in every ten seconds.
-bias          v + s, grey levels.
+drop          % of the frames that are dropped, independently of each other.
+outage        length (s) of an outage without frames in every ten seconds.
+bias          v + s grey levels.
 contrast      remaining % of the contrast about the mean of the image.
 shot          photons at white; a gain keeps the brightness.
-impulse       % of the pixels are black or white.
+impulse       % of the pixels that are black or white.
 bits          number of bits of a grey value.
 stereo_gain   stops by which the right image is darker.
-desync        ms by which the right image is late, simulated by optical flow to the next frame.
+desync        delay (ms) of the right image, simulated by optical flow to the next frame.
 baseline      % by which the baseline is longer than calibrated.
 yaw, pitch    arc minutes by which the right camera is turned right, or up, from its calibration.
 black_right   % of the seconds in which the right image is black.
@@ -51,12 +50,12 @@ black_left    % of the seconds in which the left image is black.
 ============  ======================================================================================
 
 Each law rounds and clips to 8 bits. It is the same for both cameras, except that noise, night,
-shot, impulse, dirt and drops on the glass are drawn separately, and that the last six lines are
-faults of one side. Each law draws from its own random stream, so that it does not depend on other
-laws, and its effect on frame k depends only on the seed, on k and on the time of k, not on earlier
-requests. Laws of other packages (docs/howto/plugins.md) must follow the same rules. Walks are
-defined on a fixed grid in time, so that dropped frames do not change the light. They are extended
-as frames come, so that a stream may be endless.
+shot, impulse, dirt and drops on the glass are drawn separately, and that the laws from stereo_gain
+on are faults of one side. Each law draws from its own random stream, so that it does not depend on
+other laws, and its effect on frame k depends only on the seed, on k and on the time of k, not on
+the order in which frames are read. Laws of other packages (docs/howto/plugins.md) must follow the
+same rules. Random processes are defined on a fixed grid in time, so that dropped frames do not
+change the light, and are extended as frames arrive, so that a stream may be endless.
 """
 
 from __future__ import annotations

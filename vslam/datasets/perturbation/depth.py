@@ -1,4 +1,4 @@
-"""Dense depth of an image, for laws that act by distance: semi-global matching, holes filled."""
+"""Dense depth of an image for laws that depend on distance, by semi-global matching."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from vslam.camera import Camera, DepthImage, Image
 
 _SHRINK = 2  # half size takes a fifth of the time, and fog needs no edges finer than two pixels
 _BLOCK = 5
-_NEAREST_M = 3.0  # determines the range of disparities that are searched
+_NEAREST_M = 3.0  # nearest depth in the search range
 
 
 def dense_depths(
     camera: Camera, left: Image, second: Image | DepthImage | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Depth along z of each pixel of both images; infinite far away, for example in the sky.
+    """``(H, W)`` depth along z (m) of the left image's pixels, and of the right image's pixels or
+    None; infinite where it is very large or unknown, for example in the sky.
 
     Args:
         camera: calibration of the images.
@@ -29,15 +30,15 @@ def dense_depths(
     right = np.asarray(second, np.uint8)
     disparities = disparity(camera, left, right), disparity(camera, right, left, mirrored=True)
     with np.errstate(divide="ignore"):
-        ours, theirs = (np.float32(camera.bf) / found for found in disparities)
-    return ours, theirs
+        of_left, of_right = (np.float32(camera.bf) / found for found in disparities)
+    return of_left, of_right
 
 
 def disparity(
     camera: Camera, image: Image, other: Image, *, mirrored: bool = False
 ) -> NDArray[np.float32]:
-    """``(H, W)`` disparities in pixels of ``image``, a left image, or a right one with
-    ``mirrored``, relative to ``other``. 0 in rows without any match."""
+    """``(H, W)`` float32 disparities in pixels of a left image, relative to the other image; with
+    ``mirrored``, of a right image. They are 0 in rows without any match."""
     import cv2
 
     height, width = image.shape
@@ -59,8 +60,7 @@ def disparity(
         speckleRange=2,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
-    found = matcher.compute(*pair).astype(np.float32) / 16.0
-    found = _filled(found)
+    found = _filled(matcher.compute(*pair).astype(np.float32) / 16.0)
     if mirrored:
         found = found[:, ::-1]
     full = cv2.resize(np.ascontiguousarray(found), (width, height))
@@ -68,14 +68,13 @@ def disparity(
 
 
 def _filled(found: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Fill pixels without a match with the smaller disparity of the nearest matches in their row,
+    """Give pixels without a match the smaller disparity of the two nearest matches in their row,
     because occluded pixels belong to the background (rule of Geiger et al., CVPR 2012)."""
     known = found > 0
     columns = np.broadcast_to(np.arange(found.shape[1]), found.shape)
     before = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
-    after = np.minimum.accumulate(np.where(known, columns, found.shape[1])[:, ::-1], axis=1)[
-        :, ::-1
-    ]
+    backwards = np.where(known, columns, found.shape[1])[:, ::-1]
+    after = np.minimum.accumulate(backwards, axis=1)[:, ::-1]
     padded = np.pad(found, ((0, 0), (0, 1)))
     rows = np.arange(len(found))[:, None]
     left = np.where(before >= 0, padded[rows, before], np.inf)

@@ -57,7 +57,7 @@ def _vignetting(stops: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 
 def _dirt(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
-    """Blobs that differ between the sides and stay for the whole drive."""
+    """Blobs that differ between the two cameras and stay the same during the whole drive."""
     opacity = [_blobs(percent / 100.0, [*stream, side], scene) for side in range(2)]
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:
@@ -80,16 +80,17 @@ def _blobs(share: float, seed: list[int], scene: Scene) -> NDArray[np.float32]:
 
 
 def _flare(greys: float, stream: RandomStream, scene: Scene) -> PairLaw:
-    """A sun that keeps its place in the image, the same on both sides because it is far away."""
+    """A sun that stays at one place in the image, in both cameras because it is far away."""
     camera = scene.camera
     rng = np.random.default_rng(stream)
     sun = np.array([rng.uniform(0.15, 0.85) * camera.width, rng.uniform(0.05, 0.3) * camera.height])
     y, x = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float32)
-    cosine = _cosine(x, y, sun, scene)
+    cosine = _cosine_to(sun, x, y, scene)
     degrees = np.maximum(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))), 0.5)
     veil = greys * (10.0 / degrees) ** 2
     axis = np.array([camera.cx, camera.cy])
-    for _ in range(_GHOSTS):  # reflections between lens elements lie on the line through the axis
+    # Reflections between lens elements lie on the line through the sun and the optical axis.
+    for _ in range(_GHOSTS):
         at = axis + (axis - sun) * rng.uniform(-0.6, 1.4)
         radius = camera.width * rng.uniform(0.01, 0.05)
         veil[(x - at[0]) ** 2 + (y - at[1]) ** 2 < radius**2] += 0.5 * greys
@@ -97,9 +98,10 @@ def _flare(greys: float, stream: RandomStream, scene: Scene) -> PairLaw:
     return EachSide(lambda frame, t, side, image: to_8_bits(image + stray))
 
 
-def _cosine(
-    x: NDArray[np.float32], y: NDArray[np.float32], sun: NDArray[np.float64], scene: Scene
+def _cosine_to(
+    sun: NDArray[np.float64], x: NDArray[np.float32], y: NDArray[np.float32], scene: Scene
 ) -> NDArray[np.float64]:
+    """Cosine of the angle between the rays of pixels and the ray of the pixel ``sun``."""
     camera = scene.camera
     ray = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)])
     to_sun = np.array([(sun[0] - camera.cx) / camera.fx, (sun[1] - camera.cy) / camera.fy, 1.0])

@@ -1,4 +1,4 @@
-"""Types of laws: laws of one image, and laws of a pair of images and their scene."""
+"""Types of laws: laws that change one image, and laws that need both images or the scene."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from vslam.datasets.frames import Source
 from vslam.errors import InputError
 
 RandomStream = tuple[int, int]
-"""The user's seed and the number of the law; further numbers complete a generator's seed."""
+"""The user's seed and a number for the law, which begin the seed of each generator of the law."""
 
 Law = Callable[[int, float, int, Image], Image]
-"""``(frame, t, side, image) -> image`` of the same shape; t is in seconds since the first frame,
-side 0 is left, 1 is right."""
+"""``(frame, t, side, image) -> image`` of the same shape; t is in seconds since the first frame;
+side is 0 for the left and 1 for the right image."""
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,11 @@ class Pair:
     """The images of one frame, which are passed from law to law.
 
     Attributes:
-        index: number of the frame.
+        index: index of the frame.
         t: seconds since the first frame.
         left: ``(H, W)`` uint8.
-        second: the right image, a depth image (float32), or None.
-        clean: both images as they were read.
+        second: the right image, ``(H, W)`` uint8, a depth image, ``(H, W)`` float32, or None.
+        clean: both images before any law changed them.
     """
 
     index: int
@@ -53,7 +53,7 @@ PairLaw = Callable[[Pair], Pair]
 
 @dataclass(frozen=True)
 class Scene:
-    """The data of the source that a law may use besides the images of a frame.
+    """The data of a source that a law may use besides the images of a frame.
 
     Attributes:
         camera: calibration of the source.
@@ -77,19 +77,19 @@ class Scene:
 
 
 Need = Literal["right", "depth", "neighbours"]
-_LACKING: dict[Need, str] = {
-    "right": "needs the images of both sides; this source has one camera",
-    "depth": "needs depth: stereo images, or a depth image; this source has one camera",
-    "neighbours": "looks at the next frame, which a video, bag or camera does not have yet; use a "
-    "data set or a folder of images",
+_UNMET: dict[Need, str] = {
+    "right": "needs stereo images, but this source has no right image",
+    "depth": "needs stereo or depth images, but this source has one camera",
+    "neighbours": "needs the next frame, which a video, bag or camera cannot provide; use a data "
+    "set or a folder of images",
 }
 
 
 def check_need(law: str, need: Need, scene: Scene) -> None:
-    """Refuse a law that needs data which the source does not have.
+    """Check that the source has the data that a law needs.
 
     Raises:
-        InputError: the source lacks what the law needs.
+        InputError: the source does not have them.
     """
     has = {
         "right": scene.camera.sensor == "stereo",
@@ -97,12 +97,12 @@ def check_need(law: str, need: Need, scene: Scene) -> None:
         "neighbours": scene.read is not None,
     }
     if not has[need]:
-        raise InputError(f"--perturb {law}: {_LACKING[need]}.")
+        raise InputError(f"--perturb {law}: {_UNMET[need]}.")
 
 
 @dataclass(frozen=True)
 class SceneLaw:
-    """A law that needs a scene before it can be applied."""
+    """A law that can be applied only after it was bound to a scene."""
 
     name: str
     needs: tuple[Need, ...]
@@ -112,32 +112,34 @@ class SceneLaw:
         """The law for this scene.
 
         Raises:
-            InputError: the data lack what it needs.
+            InputError: the source does not have the data that the law needs.
         """
         for need in self.needs:
             check_need(self.name, need, scene)
         return self.make(scene)
 
     def __call__(self, pair: Pair) -> Pair:
-        raise RuntimeError(f"{self.name} must know its data: call Perturbation.bound_to(source)")
+        raise RuntimeError(f"{self.name} has no scene: call Perturbation.bound_to(source) first")
 
 
 @dataclass(frozen=True)
 class LawKind:
-    """A kind of law, which a strength and a seed complete.
+    """A kind of law, which makes laws of any strength and seed.
 
     Attributes:
-        make: ``(strength, stream) -> Law`` or ``(strength, stream, scene) -> PairLaw``, the latter
-            if ``of_scene``.
+        make: ``(strength, stream) -> Law``, or ``(strength, stream, scene) -> PairLaw`` if
+            ``of_scene``.
         unit: unit of the strength.
         default: strength if none is given.
-        weakest, strongest: ``vslam stress`` searches between them; a small visibility is strong.
-        least, most: allowed range of strengths.
-        logarithmic: strengths differ by ratio, not by difference.
-        drawn: whether the images depend on the seed.
-        needs: what the source must have.
-        sides: ``both``, or ``one`` for a fault of the stereo rig.
+        weakest, strongest: range that ``vslam stress`` searches. ``strongest`` is the smaller
+            number if a small strength has a large effect, for example a short visibility in fog.
         about: a description in a few words.
+        least, most: allowed range of strengths.
+        logarithmic: whether strengths are compared by their ratio rather than their difference.
+        drawn: whether the images depend on the seed.
+        needs: data that the source must have.
+        of_scene: whether the law needs the scene.
+        sides: ``both``, or ``one`` for a fault of the stereo rig.
     """
 
     make: Callable[..., Law | PairLaw]
@@ -155,18 +157,15 @@ class LawKind:
     sides: Literal["both", "one"] = "both"
 
     def law(self, name: str, strength: float, stream: RandomStream) -> PairLaw | SceneLaw:
-        """The law of one strength and seed."""
+        """Make the law of one strength and seed."""
         if not self.of_scene:
             return EachSide(self.make(strength, stream))  # type: ignore[arg-type]
-        return SceneLaw(name, self.needs, partial(self._made, strength, stream))
-
-    def _made(self, strength: float, stream: RandomStream, scene: Scene) -> PairLaw:
-        return self.make(strength, stream, scene)  # type: ignore[return-value]
+        return SceneLaw(name, self.needs, partial(self.make, strength, stream))  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
 class EachSide:
-    """Applies a law of one image to both sides; a depth image is not changed."""
+    """Apply a law of one image to the left and the right image; depth stays unchanged."""
 
     law: Law
 

@@ -1,4 +1,4 @@
-"""Parsing of ``--perturb``, and its application to the frames of a source."""
+"""Parse ``--perturb``, and apply the laws to the frames of a source."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from vslam.errors import DroppedFrameError, InputError, did_you_mean
 
 @dataclass(frozen=True)
 class Perturbation:
-    """Laws that are applied one after the other; without laws, the images pass unchanged.
+    """Laws that are applied one after the other; without laws, images stay unchanged.
 
     Attributes:
-        name: canonical spelling, ``none`` or ``brightness:1.5,blur:0.5`` for example.
-        laws: see the package's docstring.
+        name: canonical spelling, for example ``none`` or ``brightness:1.5,blur:0.5``.
+        laws: see `vslam.datasets.perturbation`.
     """
 
     name: str
@@ -33,7 +33,7 @@ class Perturbation:
         """Prepare the perturbation for one source, because some laws need its depth or poses.
 
         Raises:
-            InputError: the source lacks what a law needs.
+            InputError: the source does not have the data that a law needs.
         """
         if not any(isinstance(law, SceneLaw) for law in self.laws):
             return self
@@ -44,11 +44,13 @@ class Perturbation:
     def apply(
         self, index: int, t: float, left: Image, second: Image | DepthImage | None
     ) -> tuple[Image, Image | DepthImage | None]:
-        """Perturb both ``(H, W)`` uint8 images of frame ``index``, ``t`` seconds after the first
-        frame; thread-safe. Depth images stay unchanged, because their sensor has its own light.
+        """Perturb the images of frame ``index``, ``t`` seconds after the first frame; thread-safe.
 
-        The result for the left image does not depend on the second one, except for fog, whose depth
-        comes from both.
+        Depth images stay unchanged, because depth sensors bring their own light. The left image
+        does not depend on the second one, except in fog, which computes depth from both.
+
+        Args:
+            left, second: images as in `vslam.datasets.frames.TimedFrame`.
 
         Raises:
             DroppedFrameError: the perturbation drops the frame.
@@ -60,11 +62,11 @@ class Perturbation:
 
 
 def parse_perturbation(spec: str, seed: int) -> Perturbation:
-    """Build the perturbation that ``--perturb`` names.
+    """Make a perturbation from the value of ``--perturb``.
 
     Args:
-        spec: ``law[:strength]``, several joined by commas, applied in this order; ``none`` or
-            the empty string for no perturbation.
+        spec: ``law[:strength]``, separated by commas and applied in this order; ``none`` or the
+            empty string for no perturbation.
         seed: not negative; equal seeds give equal images.
 
     Raises:
@@ -86,7 +88,7 @@ def parse_perturbation(spec: str, seed: int) -> Perturbation:
                 f"none, {', '.join(known)}."
             )
         if law in strengths:
-            raise InputError(f"--perturb {spec}: {law} is given twice; add up its strengths.")
+            raise InputError(f"--perturb {spec}: {law} is given twice; give it once.")
         default = known[law].default
         strengths[law] = _parse_strength(spec, known[law], strength) if ":" in item else default
     return Perturbation(
@@ -99,22 +101,22 @@ def parse_perturbation(spec: str, seed: int) -> Perturbation:
 
 
 def perturbed(frames: Iterator[TimedFrame], perturbation: Perturbation) -> Iterator[TimedFrame]:
-    """The same frames, perturbed as they are read; the laws count time from the first frame."""
-    begin = None
+    """Yield the same frames, perturbed as they are read; time counts from the first frame."""
+    first = None
     laws = [law for law in perturbation.laws if isinstance(law, EachSide)]
     pair_needed = len(laws) < len(perturbation.laws)
     for index, frame in enumerate(frames):
-        begin = frame.timestamp if begin is None else begin
-        t = frame.timestamp - begin
+        first = frame.timestamp if first is None else first
+        t = frame.timestamp - first
         read = partial(_read_perturbed, frame, perturbation, index, t)
-        if frame.sides is None or pair_needed:
-            yield TimedFrame(frame.timestamp, read, mask=frame.mask)
-            continue
-        left, right = (
-            partial(_read_side, read_side, laws, index, t, side)
-            for side, read_side in enumerate(frame.sides)
-        )
-        yield TimedFrame(frame.timestamp, read, (left, right), mask=frame.mask)
+        sides = None
+        if frame.sides is not None and not pair_needed:
+            left, right = frame.sides
+            sides = (
+                partial(_read_side, left, laws, index, t, 0),
+                partial(_read_side, right, laws, index, t, 1),
+            )
+        yield TimedFrame(frame.timestamp, read, sides, mask=frame.mask)
 
 
 def _read_side(
@@ -132,10 +134,10 @@ def _read_perturbed(
     return perturbation.apply(index, t, *frame.read(image_map))
 
 
-# Of contact sheets: pixels, grey values, and the factor of a change about the middle grey.
-_TITLE, _GUTTER = 22, 8
-_PAPER, _MIDDLE = 255, 128
-_AMPLIFIED = 4.0
+# Contact sheets.
+_WIDTH, _TITLE, _GUTTER = 480, 22, 8  # px
+_PAPER, _MIDDLE = 255, 128  # grey values of the background, and of pixels without a change
+_AMPLIFIED = 4.0  # factor by which changes are enlarged
 
 
 def contact_sheet(
@@ -145,37 +147,36 @@ def contact_sheet(
     start: int = 0,
     every: int = 1,
 ) -> Image:
-    """A grey image that shows a perturbation, with a row for each frame. A row begins with the left
-    image as it was; then come both perturbed images, and finally how one of them has changed, which
-    is amplified to be visible.
+    """Show a perturbation in a grey image, with a row for each frame: the original left image, the
+    perturbed images, and the amplified change of the side that changed more.
 
     Args:
         indices: frames of the sequence.
-        start, every: how the sequence was selected; rows are labelled by the numbers that its
-            frames had before.
+        start, every: options with which the frames were selected, so that labels show the frame
+            numbers of the whole sequence.
 
     Raises:
-        InputError: the sequence lacks what a law needs.
+        InputError: the sequence does not have the data that a law needs.
         UnreadableImageError: one of the frames cannot be read.
     """
     perturbation = perturbation.bound_to(sequence)
     rows = []
     for index in indices:
         label = f"frame {start + every * index}, {sequence.timestamps[index]:.1f} s"
-        rows.append(_row(sequence, perturbation, index, label, width=480))
+        rows.append(_row(sequence, perturbation, index, label))
     return np.vstack(rows)
 
 
 def sheet_of_laws(sequence: Source, specs: Collection[str], index: int, seed: int) -> Image:
-    """A grey image that shows several perturbations of one frame, with a row for each. The rows are
-    those of ``contact_sheet``; if there are several, they are arranged in two columns.
+    """Show several perturbations of one frame in a grey image, with a row for each as in
+    `contact_sheet`; several rows are arranged in two columns.
 
     Raises:
-        InputError: the sequence lacks what a law needs.
+        InputError: the sequence does not have the data that a law needs.
         UnreadableImageError: the frame cannot be read.
     """
     rows = [
-        _row(sequence, parse_perturbation(spec, seed).bound_to(sequence), index, spec, width=480)
+        _row(sequence, parse_perturbation(spec, seed).bound_to(sequence), index, spec)
         for spec in specs
     ]
     if len(rows) == 1:
@@ -187,45 +188,46 @@ def sheet_of_laws(sequence: Source, specs: Collection[str], index: int, seed: in
 
 
 def laws_for(sequence: Source) -> tuple[list[str], dict[str, str]]:
-    """Names of the laws that apply to a source, and the reasons why the others do not."""
-    fit, unfit = [], {}
+    """Names of the laws that can be applied to a source, and the reasons why others cannot."""
+    applicable, reasons = [], {}
     for name in all_laws():
         try:
             parse_perturbation(name, 0).bound_to(sequence)
         except InputError as error:
-            unfit[name] = str(error)
+            reasons[name] = str(error)
         else:
-            fit.append(name)
-    return fit, unfit
+            applicable.append(name)
+    return applicable, reasons
 
 
-def _row(sequence: Source, perturbation: Perturbation, index: int, label: str, width: int) -> Image:
+def _row(sequence: Source, perturbation: Perturbation, index: int, label: str) -> Image:
     t = float(sequence.timestamps[index] - sequence.timestamps[0])
     left, second = sequence.read(index)
     try:
-        first, other = perturbation.apply(index, t, left, second)
+        new_left, new_second = perturbation.apply(index, t, left, second)
     except DroppedFrameError:
-        first, other = np.zeros_like(left), None if second is None else np.zeros_like(left)
-    pairs = {"left": (left, first)}
-    if other is not None and other.dtype == np.uint8:
-        pairs["right"] = np.asarray(second, np.uint8), np.asarray(other, np.uint8)
+        black = np.zeros_like(left)
+        new_left, new_second = black, None if second is None else black
+    pairs = {"left": (left, new_left)}
+    if new_second is not None and new_second.dtype == np.uint8:
+        pairs["right"] = np.asarray(second, np.uint8), np.asarray(new_second, np.uint8)
     changes = {side: after.astype(float) - before for side, (before, after) in pairs.items()}
     side = max(changes, key=lambda name: float(np.abs(changes[name]).mean()))
     change = np.clip(_MIDDLE + _AMPLIFIED * changes[side], 0, 255).astype(np.uint8)
-    panels = {f"{label}: left as it is": left}
+    panels = {f"{label}: original left image": left}
     panels |= {f"{name} perturbed": after for name, (_, after) in pairs.items()}
     panels[f"change of {side}, times {_AMPLIFIED:g}"] = change
-    return np.hstack([_titled(title, image, width) for title, image in panels.items()])
+    return np.hstack([_titled(title, image) for title, image in panels.items()])
 
 
-def _titled(title: str, image: Image, width: int) -> Image:
-    """An image on paper, of the width in pixels without the margin, under its title."""
+def _titled(title: str, image: Image) -> Image:
+    """An image under its title, with a margin on the right and below."""
     import cv2
 
-    height = round(width * image.shape[0] / image.shape[1])
-    panel = np.full((_TITLE + height + _GUTTER, width + _GUTTER), _PAPER, np.uint8)
-    panel[_TITLE : _TITLE + height, :width] = cv2.resize(
-        image, (width, height), interpolation=cv2.INTER_AREA
+    height = round(_WIDTH * image.shape[0] / image.shape[1])
+    panel = np.full((_TITLE + height + _GUTTER, _WIDTH + _GUTTER), _PAPER, np.uint8)
+    panel[_TITLE : _TITLE + height, :_WIDTH] = cv2.resize(
+        image, (_WIDTH, height), interpolation=cv2.INTER_AREA
     )
     font = cv2.FONT_HERSHEY_SIMPLEX
     cv2.putText(panel, title, (2, _TITLE - 7), font, 0.45, 0, 1, cv2.LINE_AA)
@@ -241,6 +243,6 @@ def _parse_strength(spec: str, kind: LawKind, text: str) -> float:
         unit = "" if kind.unit == "x" else f" {kind.unit}"
         raise InputError(
             f"--perturb {spec}: bad strength '{text}'; give a number from {kind.least:g} to "
-            f"{kind.most:g}{unit}, {kind.default:g} is the default."
+            f"{kind.most:g}{unit}; the default is {kind.default:g}."
         )
     return strength

@@ -1,6 +1,6 @@
 """Laws of the light and of the camera's response to it.
 
-Their random numbers are endless walks in time, which do not depend on the order of reads.
+Their random processes are endless in time and do not depend on the order in which frames are read.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ _JUMPS_PER_S = 3.0 / 60.0
 _JUMP_WIDENING = 1.5
 _GREYS = np.arange(256, dtype=np.float64)
 
-FULL_WELL = 10_000.0  # electrons at grey value 255, of a pixel of 3.75 um (Sony ICX267: 10,000)
-READ_NOISE = 10.0  # electrons, of the same kind of sensor
+FULL_WELL = 10_000.0  # electrons at grey value 255, as in a Sony ICX267
+READ_NOISE = 10.0  # electrons, typical for such sensors
 _TUNNEL_STOPS = 3.0
 _TUNNELS_PER_S = 1.0 / 5.0
-# Gain and gamma at the levels of ``dark``, lowered in turn.
+# Gain and gamma at the levels of ``dark``, which lower them in turn.
 DARK_GAIN = tuple(1.0 - 0.15 * ((level + 1) // 2) for level in range(13))
 DARK_GAMMA = tuple(1.0 - 0.1 * (level // 2) for level in range(13))
-_BLACKOUTS = ((0.16, 0.64), (0.32, 0.40))  # seconds without light, then until it is back
-_LIT_S = 1.0  # no blackout begins earlier
+_BLACKOUTS = ((0.16, 0.64), (0.32, 0.40))  # seconds without light, and seconds of rising light
+_LIT_S = 1.0  # time before the first blackout may begin
 
 
 def ou_walk(
     deviation: float, rng: np.random.Generator, jumps: Iterable[float] = ()
 ) -> Iterator[float]:
-    """An endless Ornstein-Uhlenbeck walk with a time constant of 2 s, exact on a grid of 10 ms.
+    """An endless Ornstein-Uhlenbeck process with a time constant of 2 s, exact on a 10 ms grid.
 
     Args:
-        deviation: stationary standard deviation; the walk begins in the stationary state.
-        rng: generates its normal numbers, one for each step.
-        jumps: increasing times in seconds at which the walk is redrawn with 1.5 times the
+        deviation: stationary standard deviation; the process begins in the stationary state.
+        rng: generates one normal number for each step.
+        jumps: increasing times in seconds at which the process is redrawn with 1.5 times the
             deviation.
     """
     decay = exp(-STEP_S / _TIME_CONSTANT_S)
@@ -59,28 +59,28 @@ def ou_walk(
         yield deviation * x
 
 
-class Drawn:
-    """Random numbers by their position in a stream, drawn on first use; thread-safe."""
+class Cached:
+    """The numbers of an endless iterator by their index, generated on demand; thread-safe."""
 
     def __init__(self, numbers: Iterator[float]) -> None:
         self._numbers = numbers
-        self._drawn = array("d")
+        self._known = array("d")
         self._lock = threading.Lock()
 
     def __getitem__(self, k: int) -> float:
         with self._lock:
-            self._drawn.extend(islice(self._numbers, max(0, k + 1 - len(self._drawn))))
-            return self._drawn[k]
+            self._known.extend(islice(self._numbers, max(0, k + 1 - len(self._known))))
+            return self._known[k]
 
 
 def on_grid(t: float) -> int:
-    """The step of a walk at time t."""
-    # The small offset prevents a time on the grid from rounding into the previous step.
+    """The step of a process at time t."""
+    # The small offset keeps rounding errors from moving a time on the grid to the previous step.
     return floor(t / STEP_S + 1e-6)
 
 
 def jump_times(rng: np.random.Generator, per_second: float = _JUMPS_PER_S) -> Iterator[float]:
-    """Endless times of a Poisson process, in seconds."""
+    """Yield the times of an endless Poisson process, in seconds."""
     time = 0.0
     while True:
         time += rng.exponential(1.0 / per_second)
@@ -88,7 +88,8 @@ def jump_times(rng: np.random.Generator, per_second: float = _JUMPS_PER_S) -> It
 
 
 def _pointwise(curve: Callable[[int, float], NDArray[np.float64]]) -> Law:
-    """A law that maps grey value v of frame k at time t to ``curve(k, t)[v]``."""
+    """A law that maps grey value v of frame k at time t to ``curve(k, t)[v]``; curves are
+    ``(256,)``."""
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:
         import cv2
@@ -105,8 +106,8 @@ def _brightness(strength: float, stream: RandomStream) -> Law:
     def jumps() -> Iterator[float]:
         return jump_times(np.random.default_rng([*stream, 2]))
 
-    log_gain = Drawn(ou_walk(0.35 * strength, rng_gain, jumps()))
-    bias = Drawn(ou_walk(20.0 * strength, rng_bias, jumps()))
+    log_gain = Cached(ou_walk(0.35 * strength, rng_gain, jumps()))
+    bias = Cached(ou_walk(20.0 * strength, rng_bias, jumps()))
     limit = max(1.0, strength)
 
     def curve(frame: int, t: float) -> NDArray[np.float64]:
@@ -117,17 +118,17 @@ def _brightness(strength: float, stream: RandomStream) -> Law:
 
 
 def _gamma(strength: float, stream: RandomStream) -> Law:
-    walk = Drawn(ou_walk(0.35 * strength, np.random.default_rng(stream)))
-    return _pointwise(lambda frame, t: 255.0 * (_GREYS / 255.0) ** np.exp(walk[on_grid(t)]))
+    log_gamma = Cached(ou_walk(0.35 * strength, np.random.default_rng(stream)))
+    return _pointwise(lambda frame, t: 255.0 * (_GREYS / 255.0) ** np.exp(log_gamma[on_grid(t)]))
 
 
 def _flicker(strength: float, stream: RandomStream) -> Law:
-    numbers = Drawn(iter(np.random.default_rng(stream).standard_normal, None))
+    numbers = Cached(iter(np.random.default_rng(stream).standard_normal, None))
     return _pointwise(lambda frame, t: np.exp(0.15 * strength * numbers[frame]) * _GREYS)
 
 
 def _exposure(seconds: float, stream: RandomStream) -> Law:
-    """The scene's light falls and rises by 3 stops; the camera follows with a time constant."""
+    """The light falls and rises by 3 stops in turn; the camera follows with a time constant."""
 
     def errors() -> Iterator[float]:
         rng = np.random.default_rng(stream)
@@ -141,12 +142,13 @@ def _exposure(seconds: float, stream: RandomStream) -> Law:
                 light, jump = -_TUNNEL_STOPS - light, next(steps)
             metered += follow * (light - metered)
 
-    stops = Drawn(errors())
+    stops = Cached(errors())
     return _pointwise(lambda frame, t: _GREYS * 2.0 ** stops[on_grid(t)])
 
 
 def _night(stops: float, stream: RandomStream) -> Law:
-    """Photon noise (Poisson) and read noise in electrons, with the exposure and gain of the day."""
+    """Less light with photon noise (Poisson) and read noise in electrons, at unchanged exposure and
+    gain."""
     electrons = FULL_WELL / 255.0
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:
@@ -154,7 +156,7 @@ def _night(stops: float, stream: RandomStream) -> Law:
             return image
         rng = np.random.Generator(np.random.SFC64([*stream, frame, side]))
         mean = image * np.float32(electrons * 2.0**-stops)
-        # Since read noise is added, a normal number of variance m is a good approximation.
+        # Since read noise is added, a normal distribution approximates Poisson's well.
         noise = rng.standard_normal(image.shape, dtype=np.float32)
         counted = mean + noise * np.sqrt(mean + np.float32(READ_NOISE**2))
         return to_8_bits(counted / np.float32(electrons))
@@ -163,13 +165,13 @@ def _night(stops: float, stream: RandomStream) -> Law:
 
 
 def _dark(level: float, stream: RandomStream) -> Law:
-    gain, gamma = (np.interp(level, range(13), ladder) for ladder in (DARK_GAIN, DARK_GAMMA))
+    gain, gamma = (np.interp(level, range(13), values) for values in (DARK_GAIN, DARK_GAMMA))
     darkened = 255.0 * gain * (_GREYS / 255.0) ** (1.0 / gamma)
     return _pointwise(lambda frame, t: darkened)
 
 
 def _blackout(period: float, stream: RandomStream) -> Law:
-    """One blackout somewhere in every period; the two kinds take turns."""
+    """One blackout at a random time in every period; the two kinds alternate."""
 
     def curve(frame: int, t: float) -> NDArray[np.float64]:
         if t < _LIT_S:

@@ -1,4 +1,4 @@
-"""Laws of motion: blur while the shutter is open, by the true angular rate if it is known."""
+"""Motion blur from the camera's rotation during the exposure, and the rates that it needs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _SHRINK = 2
 
 
 def optical_flow(first: Image, second: Image) -> NDArray[np.float32]:
-    """``(H, W, 2)`` displacement in pixels of each pixel of ``first`` in ``second``, by dense
+    """``(H, W, 2)`` displacement in pixels of each pixel from ``first`` to ``second``, by dense
     inverse search (Kroeger et al., ECCV 2016) at half size."""
     import cv2
 
@@ -28,7 +28,7 @@ def optical_flow(first: Image, second: Image) -> NDArray[np.float32]:
 
 
 def neighbours(scene: Scene, frame: int) -> tuple[int, int]:
-    """The frames before and after a frame; at an end, the frame itself."""
+    """Indices of the previous and the next frame; at an end, of the frame itself."""
     assert scene.times is not None
     return max(0, frame - 1), min(len(scene.times) - 1, frame + 1)
 
@@ -36,41 +36,41 @@ def neighbours(scene: Scene, frame: int) -> tuple[int, int]:
 def image_velocity(scene: Scene, frame: int) -> NDArray[np.float64]:
     """``(2,)`` velocity of the image's centre due to rotation, pixels per second.
 
-    It is computed from the true rotation if known. Otherwise it is the median optical flow to the
-    next frame, which also contains the flow from driving ahead.
+    It is computed from the true rotation if this is known. Otherwise it is the median optical flow
+    to the next frame, which also contains the flow from driving ahead.
     """
     assert scene.times is not None
     assert scene.read is not None
-    before, behind = neighbours(scene, frame)
-    elapsed = float(scene.times[behind] - scene.times[before])
+    previous, following = neighbours(scene, frame)
+    elapsed = float(scene.times[following] - scene.times[previous])
     if elapsed <= 0:
         return np.zeros(2)
-    T_wc = None if scene.T_wc is None else scene.T_wc[[before, behind], :3, :3]
-    if T_wc is not None and np.isfinite(T_wc).all():
+    R_wc = None if scene.T_wc is None else scene.T_wc[[previous, following], :3, :3]
+    if R_wc is not None and np.isfinite(R_wc).all():
         from scipy.spatial.transform import Rotation
 
-        turned = Rotation.from_matrix(T_wc[0].T @ T_wc[1]).as_rotvec()
-        return scene.camera.fx * np.array([-turned[1], turned[0]]) / elapsed
-    pair = (frame, behind) if behind > frame else (before, frame)
+        rotation = Rotation.from_matrix(R_wc[0].T @ R_wc[1]).as_rotvec()
+        return scene.camera.fx * np.array([-rotation[1], rotation[0]]) / elapsed
+    pair = (frame, following) if following > frame else (previous, frame)
     flow = optical_flow(*(scene.read(k)[0] for k in pair))
     step = float(scene.times[pair[1]] - scene.times[pair[0]])
     return np.median(flow.reshape(-1, 2), axis=0).astype(np.float64) / step
 
 
 def forward_speed(scene: Scene, frame: int) -> float:
-    """Speed ahead in metres per second, 0 if it is unknown."""
+    """Forward speed in metres per second, 0 if it is unknown."""
     if scene.times is None or scene.T_wc is None:
         return 0.0
-    before, behind = neighbours(scene, frame)
-    elapsed = float(scene.times[behind] - scene.times[before])
-    T = scene.T_wc[[before, behind]]
+    previous, following = neighbours(scene, frame)
+    elapsed = float(scene.times[following] - scene.times[previous])
+    T = scene.T_wc[[previous, following]]
     if elapsed <= 0 or not np.isfinite(T).all():
         return 0.0
     return float((T[0, :3, :3].T @ (T[1, :3, 3] - T[0, :3, 3]))[2] / elapsed)
 
 
 def line_kernel(shift: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Weights of a centred filter that blurs along ``shift`` pixels."""
+    """Weights of a centred filter that blurs along a shift of ``(2,)`` pixels."""
     reach = int(np.ceil(np.abs(shift).max() / 2.0)) + 1
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
     n = max(2, int(4 * np.hypot(*shift)) + 1)

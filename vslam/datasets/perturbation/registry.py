@@ -1,4 +1,4 @@
-"""All laws by name; those of other packages (docs/howto/plugins.md) are checked at every image."""
+"""All laws by name. Laws of other packages (docs/howto/plugins.md) are checked at every image."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from vslam.errors import InputError, UnreadableImageError
 from vslam.plugins import PERTURBATIONS, PlugIn, find_plugins
 
 PlugInLaw = Callable[[int, float, int, Image], Image]
-_PROBE = (48, 64)  # rows and columns of the image that a law is tried on
+_PROBE = (48, 64)  # rows and columns of the image on which a new law is tried
 
 
 def plugin_laws() -> dict[str, Callable[[float, tuple[int, int]], PlugInLaw]]:
-    """By name, functions that make a law from a strength and the seed of its random stream."""
+    """Functions that make the laws of other packages, each from a strength and the seed of its
+    random stream, by name."""
     return {name: partial(_make, plugin) for name, plugin in find_plugins(PERTURBATIONS).items()}
 
 
@@ -27,13 +28,13 @@ def _make(plugin: PlugIn, strength: float, stream: tuple[int, int]) -> PlugInLaw
     """Make a law and try it on a grey image.
 
     Raises:
-        InputError: the package is broken, or the object that it makes is not a law.
+        InputError: the package is broken, or does not make a law.
     """
     law = plugin.call(strength, stream)
     if not callable(law):
         raise InputError(
-            f"{plugin}: made a {type(law).__name__}, which is not a function; repair or uninstall "
-            "the package."
+            f"{plugin}: returned a {type(law).__name__}, which is not a function; repair or "
+            "uninstall the package."
         )
     checked = partial(_apply, plugin, law)
     checked(0, 0.0, 0, np.full(_PROBE, 128, np.uint8))
@@ -44,21 +45,22 @@ def _apply(plugin: PlugIn, law: PlugInLaw, frame: int, t: float, side: int, imag
     """Apply a law to an image.
 
     Raises:
-        UnreadableImageError: the law fails or returns no image of this size; the frame is skipped.
+        UnreadableImageError: the law fails, or does not return an image of this size; the frame is
+            skipped.
     """
     view = image.view()
     view.flags.writeable = False
     where = Path(f"frame {frame}")
     try:
-        made = plugin.guarded(law, frame, t, side, view)
+        result = plugin.guarded(law, frame, t, side, view)
     except InputError as error:
         raise UnreadableImageError(where, str(error)) from error
-    if getattr(made, "dtype", None) != np.uint8 or made.shape != image.shape:
-        kind = f"{getattr(made, 'dtype', type(made).__name__)} {getattr(made, 'shape', '')}"
+    if getattr(result, "dtype", None) != np.uint8 or result.shape != image.shape:
+        kind = f"{getattr(result, 'dtype', type(result).__name__)} {getattr(result, 'shape', '')}"
         raise UnreadableImageError(
-            where, f"{plugin} gave {kind.strip()}, not uint8 {image.shape}; repair the package."
+            where, f"{plugin} returned {kind.strip()}, not uint8 {image.shape}; repair the package."
         )
-    return np.asarray(made, np.uint8)
+    return np.asarray(result, np.uint8)
 
 
 LAWS: dict[str, LawKind] = {
@@ -78,7 +80,7 @@ LAWS: dict[str, LawKind] = {
 
 
 def all_laws() -> dict[str, LawKind]:
-    """vslam's laws, then those of other packages (docs/howto/plugins.md), of strengths 0 to 10."""
+    """vslam's laws, then those of other packages, whose strengths are from 0 to 10."""
     others = {
         name: LawKind(make, "x", 1.0, 0.1, 10.0, "of another package", logarithmic=True)
         for name, make in plugin_laws().items()
@@ -91,6 +93,6 @@ def law_kind(name: str) -> LawKind:
     """The law with this name.
 
     Raises:
-        KeyError: there is none.
+        KeyError: there is no such law.
     """
     return LAWS[name] if name in LAWS else all_laws()[name]

@@ -13,7 +13,7 @@ def _noise(strength: float, stream: RandomStream) -> Law:
     def law(frame: int, t: float, side: int, image: Image) -> Image:
         rng = np.random.Generator(np.random.SFC64([*stream, frame, side]))
         grain = rng.standard_normal(image.shape, dtype=np.float32)
-        return np.clip(np.rint(image + 8.0 * strength * grain), 0, 255).astype(np.uint8)
+        return to_8_bits(image + 8.0 * strength * grain)
 
     return law
 
@@ -22,9 +22,10 @@ def _shot(photons: float, stream: RandomStream) -> Law:
     def law(frame: int, t: float, side: int, image: Image) -> Image:
         rng = np.random.Generator(np.random.SFC64([*stream, frame, side]))
         counts = rng.poisson(np.arange(256) * (photons / 255.0), (1024, 256)).astype(np.float32)
-        # A table of draws for each grey value is eight times as fast as a draw for each pixel.
-        which = rng.integers(0, len(counts), image.shape, dtype=np.int32)
-        return to_8_bits(counts[which, image] * np.float32(255.0 / photons))
+        # Choosing from a table of draws for each grey value is eight times faster than drawing a
+        # Poisson number for each pixel.
+        row = rng.integers(0, len(counts), image.shape, dtype=np.int32)
+        return to_8_bits(counts[row, image] * np.float32(255.0 / photons))
 
     return law
 
@@ -33,9 +34,9 @@ def _impulse(percent: float, stream: RandomStream) -> Law:
     def law(frame: int, t: float, side: int, image: Image) -> Image:
         rng = np.random.Generator(np.random.SFC64([*stream, frame, side]))
         number = rng.random(image.shape, dtype=np.float32)
-        hit = number < percent / 100.0
+        changed = number < percent / 100.0
         white = number < percent / 200.0
-        return np.where(hit, np.where(white, np.uint8(255), np.uint8(0)), image)
+        return np.where(changed, np.where(white, np.uint8(255), np.uint8(0)), image)
 
     return law
 
@@ -83,7 +84,7 @@ def _drop(percent: float, stream: RandomStream) -> Law:
 
 
 def _outage(seconds: float, stream: RandomStream) -> Law:
-    """One outage somewhere in every ten seconds, but not in the first second of the run."""
+    """One outage at a random time in every ten seconds, but not in the first second of the run."""
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:
         block = int(t // 10.0)

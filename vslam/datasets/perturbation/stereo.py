@@ -1,4 +1,4 @@
-"""Faults of a stereo rig, which affect only one side."""
+"""Laws for the faults of a stereo rig, which affect only one camera."""
 
 from __future__ import annotations
 
@@ -23,6 +23,8 @@ from vslam.datasets.perturbation.motion import neighbours, optical_flow
 
 
 def _of_right(change: Callable[[Pair, Image], Image]) -> PairLaw:
+    """A law that changes only the right image."""
+
     def law(pair: Pair) -> Pair:
         right = pair.right
         return pair if right is None else replace(pair, second=change(pair, right))
@@ -36,14 +38,14 @@ def _gain(stops: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 
 def _desync(ms: float, stream: RandomStream, scene: Scene) -> PairLaw:
-    """The right image at a later time, by moving it along the optical flow to the next frame."""
+    """Simulate a late right image by moving pixels along the optical flow to the next frame."""
     assert scene.times is not None
     assert scene.read is not None
     times, read = scene.times, scene.read
 
     def later(pair: Pair, right: Image) -> Image:
-        before, behind = neighbours(scene, pair.index)
-        other = behind if behind > pair.index else before
+        previous, following = neighbours(scene, pair.index)
+        other = following if following > pair.index else previous
         image = read(other)[1]
         if ms == 0 or other == pair.index or image is None:
             return right
@@ -65,7 +67,7 @@ def _baseline(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 
 def _moved(image: Image, shift: NDArray[np.float32]) -> Image:
-    """Move the pixels of an image by ``(H, W, 2)`` pixels, by backward lookup."""
+    """Shift the pixels of an image by ``(H, W, 2)`` pixels, with a backward lookup."""
     import cv2
 
     y, x = np.mgrid[0 : image.shape[0], 0 : image.shape[1]].astype(np.float32)
@@ -77,7 +79,7 @@ def _moved(image: Image, shift: NDArray[np.float32]) -> Image:
 
 
 def _turned(axis: int) -> Callable[[float, RandomStream, Scene], PairLaw]:
-    """The right camera is turned about its x (0) or y (1) axis."""
+    """A law that turns the right camera about its x (0) or y (1) axis."""
 
     def make(arc_minutes: float, stream: RandomStream, scene: Scene) -> PairLaw:
         from scipy.spatial.transform import Rotation
@@ -91,8 +93,8 @@ def _turned(axis: int) -> Callable[[float, RandomStream, Scene], PairLaw]:
             import cv2
 
             size = (camera.width, camera.height)
-            seen = cv2.warpPerspective(right, H, size, borderMode=cv2.BORDER_REPLICATE)
-            return np.asarray(seen, np.uint8)
+            turned = cv2.warpPerspective(right, H, size, borderMode=cv2.BORDER_REPLICATE)
+            return np.asarray(turned, np.uint8)
 
         return _of_right(turn)
 
@@ -102,6 +104,8 @@ def _turned(axis: int) -> Callable[[float, RandomStream, Scene], PairLaw]:
 def _black(
     side: Literal["left", "right"],
 ) -> Callable[[float, RandomStream, Scene], PairLaw]:
+    """A law that makes the images of one side black during some seconds."""
+
     def make(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
         def law(pair: Pair) -> Pair:
             dark = np.random.default_rng([*stream, int(pair.t)]).uniform() < percent / 100.0

@@ -1,4 +1,4 @@
-"""Laws of the weather: fog by distance, rain in front of the camera and on the glass.
+"""Laws of the weather: fog, and rain in front of the camera and on the glass.
 
 Grey values are assumed to be proportional to luminance, as in KITTI's images.
 """
@@ -28,23 +28,24 @@ AIRLIGHT = 200.0  # grey value of the horizon in dense fog
 _CONTRAST_AT_VISIBILITY = 0.05  # meteorological optical range, WMO Guide No. 8, I.9
 
 _SHUTTER_S = 0.01
-_NEAR_M, _FAR_M = 0.35, 3.0  # farther drops are fainter than a grey level
-_LEAST_MM = 1.0  # smaller drops are fainter, too
+_NEAR_M, _FAR_M = 0.35, 3.0  # streaks of farther drops are fainter than a grey level
+_LEAST_MM = 1.0  # streaks of smaller drops are fainter than a grey level
 _STREAK_GREY = 220.0
-_OPACITY_STEPS = 1000.0  # opacities are drawn in thousandths, up to 0.255
+_OPACITY_STEPS = 1000.0  # opacities are drawn as uint8 in thousandths, so up to 0.255
 _GLASS_WIDTH_M, _WIPED_EVERY_S, _GLASS_DROP_M = 0.03, 3.0, 0.002
 
 
 def _fog(visibility_m: float, stream: RandomStream, scene: Scene) -> PairLaw:
-    """Koschmieder: ``I = J e^(-b d) + A (1 - e^(-b d))`` along the ray (Beitr. Phys. 1924)."""
+    """Koschmieder's law ``I = J e^(-b d) + A (1 - e^(-b d))``, with the distance d along the ray
+    (Beitr. Phys. 1924)."""
     extinction = np.float32(-log(_CONTRAST_AT_VISIBILITY) / visibility_m)
     camera = scene.camera
     y, x = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float32)
     ray = np.sqrt(1 + ((x - camera.cx) / camera.fx) ** 2 + ((y - camera.cy) / camera.fy) ** 2)
 
     def fogged(image: Image, depth: NDArray[np.float32]) -> Image:
-        seen = np.exp(-extinction * ray.astype(np.float32) * depth)
-        return to_8_bits(np.float32(AIRLIGHT) + seen * (image - np.float32(AIRLIGHT)))
+        transmission = np.exp(-extinction * ray.astype(np.float32) * depth)
+        return to_8_bits(np.float32(AIRLIGHT) + transmission * (image - np.float32(AIRLIGHT)))
 
     def law(pair: Pair) -> Pair:
         left, right = dense_depths(camera, *pair.clean)
@@ -57,8 +58,8 @@ def _fog(visibility_m: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 
 def drops_per_m3(mm_per_h: float) -> tuple[float, float]:
-    """Number of raindrops above 1 mm per cubic metre, and the rate (1/mm) at which it decays with
-    the diameter [Marshall and Palmer, J. Meteorology 1948]."""
+    """Number of raindrops larger than 1 mm per cubic metre, and the rate (1/mm) of its exponential
+    decay with the diameter [Marshall and Palmer, J. Meteorology 1948]."""
     rate = 4.1 * mm_per_h**-0.21
     return 8000.0 / rate * exp(-rate * _LEAST_MM), rate
 
@@ -86,14 +87,15 @@ def _rain(mm_per_h: float, stream: RandomStream, scene: Scene) -> PairLaw:
 def _streaks(
     mm_per_h: float, rng: np.random.Generator, side: int, frame: int, scene: Scene
 ) -> NDArray[np.float32]:
-    """Opacity of the drops that fall during the exposure: the share of the exposure for which a
-    drop covers a pixel (Garg and Nayar, IJCV 2007). Both sides see the same drops."""
+    """``(H, W)`` opacity of the drops that fall during the exposure: the share of the exposure for
+    which a drop covers a pixel (Garg and Nayar, IJCV 2007). Both cameras see the same drops."""
     import cv2
 
     camera = scene.camera
     density, rate = drops_per_m3(mm_per_h)
     volume = 2.0 * camera.width * camera.height / (camera.fx * camera.fy)
-    volume *= (_FAR_M**3 - _NEAR_M**3) / 3.0  # twice the width, to cover the right camera's view
+    # The volume is twice as wide as the image, so that it also covers the right camera's view.
+    volume *= (_FAR_M**3 - _NEAR_M**3) / 3.0
     n = rng.poisson(density * volume)
     diameter = np.minimum(_LEAST_MM + rng.exponential(1.0 / rate, n), 6.0)
     z = (rng.uniform(_NEAR_M**3, _FAR_M**3, n)) ** (1.0 / 3.0)
@@ -122,7 +124,7 @@ def _streaks(
 
 
 def glass_drops(mm_per_h: float, camera: Camera) -> float:
-    """Mean number of drops on a glass 30 mm wide that is wiped every 3 s, if all the water that
+    """Mean number of drops on a glass that is 30 mm wide and wiped every 3 s, if all the water that
     falls on it forms drops of 2 mm."""
     area = _GLASS_WIDTH_M**2 * camera.height / camera.width
     fallen = mm_per_h / 3.6e6 * area * _WIPED_EVERY_S
@@ -132,7 +134,7 @@ def glass_drops(mm_per_h: float, camera: Camera) -> float:
 def _drops_on_glass(
     image: Image, mm_per_h: float, rng: np.random.Generator, camera: Camera
 ) -> Image:
-    """Draw drops as lenses that show the scene reduced, upside down and out of focus."""
+    """Draw drops as lenses that show the scene smaller, upside down and out of focus."""
     import cv2
 
     n = rng.poisson(glass_drops(mm_per_h, camera))
@@ -147,12 +149,13 @@ def _drops_on_glass(
         first, last = max(0, int(at[0] - radius)), min(camera.width, int(at[0] + radius) + 1)
         size = (max(1, last - first), max(1, bottom - top))
         turned = cv2.resize(image[::-1, ::-1], size, interpolation=cv2.INTER_AREA)
-        seen = cv2.GaussianBlur(turned, (0, 0), 0.1 * radius).astype(np.float32)
+        refracted = cv2.GaussianBlur(turned, (0, 0), 0.1 * radius).astype(np.float32)
         window = np.s_[top:bottom, first:last]
         r = np.hypot(x[window] - at[0], y[window] - at[1]) / radius
         opacity = np.clip((1.0 - r) / 0.2, 0.0, 1.0)
         if opacity.size:
-            out[window] += opacity * (seen[: opacity.shape[0], : opacity.shape[1]] - out[window])
+            rows, columns = opacity.shape
+            out[window] += opacity * (refracted[:rows, :columns] - out[window])
     return to_8_bits(out)
 
 

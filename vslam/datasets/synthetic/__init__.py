@@ -1,4 +1,4 @@
-"""Rendered towns in KITTI's format: long drives with exact ground truth, without a download."""
+"""Rendered towns in KITTI's format: drives with exact ground truth that need no download."""
 
 from __future__ import annotations
 
@@ -41,26 +41,26 @@ def parse_drive(name: str) -> tuple[str, Variation]:
     """
     first, plus, further = name.partition("+")
     route, *parts = (DRIVES.get(first, first) + plus + further).split("+")
-    town = Variation()
+    variation = Variation()
     try:
         for part in parts:
-            what, _, value = part.partition(":")
-            if what == "change" and 0.0 <= float(value) <= 1.0:
-                town = replace(town, change=float(value))
-            elif what == "moving" and int(value) >= 0:
-                town = replace(town, moving=int(value))
-            elif what == "seed" and int(value) >= 0:
-                town = replace(town, seed=int(value))
+            key, _, value = part.partition(":")
+            if key == "change" and 0.0 <= float(value) <= 1.0:
+                variation = replace(variation, change=float(value))
+            elif key == "moving" and int(value) >= 0:
+                variation = replace(variation, moving=int(value))
+            elif key == "seed" and int(value) >= 0:
+                variation = replace(variation, seed=int(value))
             elif part == "aliased":
-                town = replace(town, aliased=True)
+                variation = replace(variation, aliased=True)
             else:
                 raise ValueError
     except ValueError:
         raise InputError(
-            f"--seq {name}: '{part}' is not understood; after the route only +change:0 to 1, "
-            "+moving:CARS, +seed:N and +aliased are allowed."
+            f"--seq {name}: '{part}' is not understood; the route may only be followed by "
+            "+change:0 to 1, +moving:CARS, +seed:N and +aliased."
         ) from None
-    return route, town
+    return route, variation
 
 
 def open_synthetic(
@@ -83,20 +83,21 @@ def open_synthetic(
         threads, on_frame: as for `render_sequence`.
 
     Raises:
-        InputError: the route or the variation is unknown, or as `render_sequence` and `open_kitti`.
+        InputError: the route or the variation is unknown, or `render_sequence` or `open_kitti`
+            fails.
     """
-    route_name, town = parse_drive(name)
+    route_name, own_variation = parse_drive(name)
     route = built_in_route(route_name)
     until = None if max_frames is None else start + every * max_frames
     root = render_sequence(
         route,
-        variation or town,
+        variation or own_variation,
         cache_folder(),
         until=until,
         threads=threads,
         on_frame=on_frame,
     )
-    found = open_kitti(
+    source = open_kitti(
         root, route_name, start=start, every=every, max_frames=max_frames, monocular=monocular
     )
-    return replace(found, dataset="synthetic", name=name)
+    return replace(source, dataset="synthetic", name=name)

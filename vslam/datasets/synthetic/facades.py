@@ -15,10 +15,10 @@ class FacadeStyle:
     """The common properties of the four sides of a house.
 
     Attributes:
-        wall, frame, glass: grey of wall, window frames and panes.
-        brick: bricks instead of plaster.
+        wall, frame, glass: grey levels of walls, window frames and panes.
+        brick: whether the walls are of brick instead of plaster.
         storey, pitch: vertical and horizontal distance of windows in metres.
-        window: ``(width, height)`` metres.
+        window: ``(width, height)`` of a window in metres.
         shutters, balconies, shop, bands: whether the house has these.
     """
 
@@ -36,7 +36,7 @@ class FacadeStyle:
 
 
 def random_style(rng: Rng, *, town: bool) -> FacadeStyle:
-    """Draw a style; houses in a town may have shops, and houses in a suburb more often shutters."""
+    """Draw a random style; in a town, houses may have shops and have fewer shutters."""
     brick = bool(rng.random() < 0.22)
     low, high = (70, 125) if brick else (185, 238) if rng.random() < 0.6 else (120, 180)
     return FacadeStyle(
@@ -60,14 +60,14 @@ def facade(
     """Paint one side of a house.
 
     Args:
-        rng: random generator of everything that is built.
-        lived: random generator of what residents change from day to day: blinds, curtains, lights.
-        style: of the house.
+        rng: random generator for everything that is built.
+        lived: random generator for what residents change: blinds, curtains and lights.
+        style: style of the house.
         size: width and height in metres.
-        front: whether it is the front, with doors and shop, or a side with fewer windows.
+        front: whether it is the front, with a door and a shop, or a side with fewer windows.
 
     Returns:
-        Albedo ``(H, W)``, 0 to 255, and the windows lit at night ``(H, W)``, 0 to 1.
+        ``(H, W)`` albedo, 0 to 255, and ``(H, W)`` brightness of the windows at night, 0 to 1.
     """
     width, height = size
     columns, rows = (_texels(x) for x in size)
@@ -90,7 +90,7 @@ def facade(
     storeys = max(1, int((height - 0.5) / style.storey))
     across = max(1, int((width - 0.6) / style.pitch))
     keep = 1.0 if front else float(rng.choice([0.0, 0.35, 0.7]))
-    odd = rng.random((storeys, across)) < keep
+    has_window = rng.random((storeys, across)) < keep
     margin = (width - across * style.pitch) / 2
     door = int(rng.integers(across)) if front else -1
     for level in range(storeys):
@@ -101,11 +101,11 @@ def facade(
                 continue
             if level == 0 and k == door:
                 painter.door(middle, height, style)
-            elif odd[level, k] and top > 0.3:
+            elif has_window[level, k] and top > 0.3:
                 painter.window(lived, middle, top, style, lights, balcony=level > 0 and front)
     if front and style.shop:
         painter.shop(height, width, style, lights)
-    if rng.random() < 0.6:  # a downpipe
+    if rng.random() < 0.6:  # drainpipe
         x = float(rng.choice([0.15, width - 0.25]))
         painter.box(x, 0, x + 0.1, height, style.wall * float(rng.uniform(0.5, 0.8)))
         painter.box(x + 0.1, 0, x + 0.15, height, style.wall * 0.45)
@@ -132,7 +132,7 @@ def _lay_bricks(rng: Rng, image: Grey, px: float, py: float) -> None:
 
 @dataclass(frozen=True)
 class _Painter:
-    """Draws on ``image`` in metres; ``px`` and ``py`` are texels per metre."""
+    """Draws on ``image`` with coordinates in metres; ``px`` and ``py`` are texels per metre."""
 
     rng: Rng
     image: Grey
@@ -193,10 +193,10 @@ class _Painter:
         mirrored = 45.0 * np.clip(1.0 - 2.0 * slope - ramp + float(self.rng.uniform(0, 1)), 0, 1)
         pane[:] = glass * float(self.rng.uniform(0.6, 1.4)) + mirrored
         state, amount = lived.random(), float(lived.uniform(0.15, 1.0))
-        if state < 0.45:  # a blind, drawn down part of the way
-            drawn = int(amount * pane.shape[0])
-            slats = 150.0 + 60.0 * float(lived.random()) + 18.0 * (np.arange(drawn) % 4 < 1)
-            pane[:drawn] = slats[:, None]
+        if state < 0.45:  # a partly lowered blind
+            lowered = int(amount * pane.shape[0])
+            slats = 150.0 + 60.0 * float(lived.random()) + 18.0 * (np.arange(lowered) % 4 < 1)
+            pane[:lowered] = slats[:, None]
         elif state < 0.75:  # curtains
             part = max(1, int(0.3 * amount * pane.shape[1]))
             cloth = 110.0 + 90.0 * float(lived.random())
@@ -222,10 +222,8 @@ class _Painter:
         height, width = pane.shape
         for _ in range(int(self.rng.integers(4, 12))):
             w, h = (max(2, int(n * self.rng.uniform(0.06, 0.3))) for n in (width, height))
-            x, y = (
-                int(self.rng.integers(0, width)),
-                height - h - int(self.rng.integers(0, height // 2)),
-            )
+            x = int(self.rng.integers(0, width))
+            y = height - h - int(self.rng.integers(0, height // 2))
             pane[max(y, 0) : y + h, x : x + w] = float(self.rng.uniform(15, 190))
         x = int(self.rng.integers(0, width))
         pane[: height // 2, x : x + width // 3] += 28.0
@@ -245,11 +243,10 @@ class _Painter:
             x1 = min(x + w, width - 0.4)
             self.box(x, top, x1, height - 0.35, style.frame)
             rows, columns = self._slices(x + 0.07, top + 0.07, x1 - 0.07, height - 0.42)
-            shape = self.image[rows, columns].shape
-            if min(shape) > 4:
-                self.image[rows, columns] = 34 + 10 * noise(
-                    self.rng, shape[0], shape[1], 0.8 * self.px, 3
-                )
-                self._goods(self.image[rows, columns])
+            pane = self.image[rows, columns]
+            if min(pane.shape) > 4:
+                tall, wide = pane.shape
+                pane[:] = 34 + 10 * noise(self.rng, tall, wide, 0.8 * self.px, 3)
+                self._goods(pane)
                 lights[rows, columns] = 0.7
             x = x1 + 0.25

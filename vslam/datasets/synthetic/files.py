@@ -1,4 +1,4 @@
-"""Files of a rendered sequence, which are written atomically, by one process, with checksums."""
+"""Files of a rendered sequence: atomic writes by a single process, and checksums."""
 
 from __future__ import annotations
 
@@ -54,14 +54,14 @@ def damaged_frames(folder: Path, manifest: dict[str, Any], *, thorough: bool) ->
     """
     sums, depth = manifest["checksums"], bool(manifest["depth"])
     sizes = manifest.get("sizes") or [None] * len(sums)
-    close = range(len(sums))
-    looked_at = set(close if thorough else np.linspace(0, len(sums) - 1, _SAMPLED).astype(int))
+    frames = range(len(sums))
+    sampled = set(frames if thorough else np.linspace(0, len(sums) - 1, _SAMPLED).astype(int))
     damaged = []
-    for k in close:
+    for k in frames:
         paths = frame_files(folder, k, depth)
         found = size(paths)
-        wrong = found < 0 or (sizes[k] is not None and found != sizes[k])
-        if wrong or (k in looked_at and checksum(paths) != sums[k]):
+        wrong_size = found < 0 or (sizes[k] is not None and found != sizes[k])
+        if wrong_size or (k in sampled and checksum(paths) != sums[k]):
             damaged.append(k)
     return damaged
 
@@ -74,7 +74,7 @@ def write(path: Path, data: bytes) -> None:
 
 
 def write_png(path: Path, image: NDArray[Any], level: int) -> None:
-    """Write a PNG atomically; ``level`` is its compression level."""
+    """Write a PNG file atomically, with a compression level from 0 to 9."""
     data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, level])[1]
     write(path, data.tobytes())
 
@@ -93,13 +93,13 @@ def check_disk(cache: Path, frames: int, depth: bool) -> None:
     """Check that the disk has enough space for ``frames`` pairs of images.
 
     Raises:
-        InputError: it has not; the message says how much is needed.
+        InputError: there is not enough space.
     """
     needed = frames * (2 * _IMAGE_BYTES + (_DEPTH_BYTES if depth else 0))
-    there = cache
-    while not there.exists() and there != there.parent:
-        there = there.parent
-    free = shutil.disk_usage(there).free
+    existing = cache
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    free = shutil.disk_usage(existing).free
     if frames and needed + _RESERVE > free:
         raise InputError(
             f"{cache}: rendering {frames} frames needs {needed / 1e9:.1f} GB and "

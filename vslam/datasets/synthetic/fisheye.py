@@ -1,12 +1,11 @@
-"""A rendered drive as seen by an unrectified fisheye pair, with its calibration.
+"""A rendered drive as an unrectified fisheye pair sees it, with the calibration of the pair.
 
-The town is rendered for a rectified pinhole pair with a sufficient field of view. The images are
-warped into two equidistant cameras that differ in lens and rotation.
+The town is rendered for a rectified pinhole pair with a sufficient field of view, and the images
+are then warped to two equidistant cameras with different lenses and rotations.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from vslam.datasets.synthetic.routes import RATE, Route
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.store import OnFrame, render_sequence
 
-# For each side: focal length relative to that of the pinhole camera, offset of the principal point
+# For each camera: ratio of its focal length to the pinhole camera's, offset of the principal point
 # from the image centre (px), k1 to k4, and rotation vector from the rectified camera (rad).
 _SIDES = (
     (0.970, (6.3, -3.1), (0.012, -0.006, 0.002, -0.0004), (0.011, -0.014, 0.009)),
@@ -31,18 +30,16 @@ _SIDES = (
 )
 _NS = 1_000_000_000
 
-Warp = Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
-
 
 @dataclass(frozen=True)
 class FisheyeRig:
-    """A fisheye pair at the place of a rectified pair.
+    """A fisheye pair with the positions of a rectified pair.
 
     Attributes:
         models: left and right camera.
-        R_own_rectified: for each camera, ``(3, 3)`` float64, maps directions of the rectified
-            camera to its own.
-        T_left_right: ``(4, 4)`` float64, maps points of the right camera to the left one.
+        R_own_rectified: for each camera, ``(3, 3)`` float64 rotation from the frame of the
+            rectified camera to its own.
+        T_left_right: ``(4, 4)`` float64, maps points from the right to the left camera.
     """
 
     models: tuple[CameraModel, CameraModel]
@@ -51,7 +48,7 @@ class FisheyeRig:
 
 
 def fisheye_rig(camera: Camera) -> FisheyeRig:
-    """The fisheye pair at the place of a rectified one."""
+    """The fisheye pair that replaces a rectified pair."""
     models, rotations = [], []
     for scale, (dx, dy), distortion, turn in _SIDES:
         focal = scale * camera.fx
@@ -87,13 +84,13 @@ def render_fisheye(
     threads: int = 2,
     on_frame: OnFrame | None = None,
 ) -> Path:
-    """Write a drive in EuRoC's layout, with the calibration in its format and in Kalibr's.
+    """Write a drive in EuRoC's layout, with the calibration in EuRoC's and in Kalibr's format.
 
     The rendered pinhole images stay in ``folder/pinhole``, so that another call can continue.
 
     Args:
         route, variation, until, threads, on_frame: as for `render_sequence`.
-        folder: where ``mav0``, ``camchain.yaml`` and ``pinhole`` are written.
+        folder: folder for ``mav0``, ``camchain.yaml`` and ``pinhole``.
 
     Returns:
         ``folder``.
@@ -114,10 +111,11 @@ def render_fisheye(
         for side, model in enumerate(rig.models):
             base = folder / "mav0" / f"cam{side}"
             (base / "data").mkdir(parents=True, exist_ok=True)
-            warp = _warp(_seen_at(model, rig.R_own_rectified[side], wide.camera))
+            x, y = np.moveaxis(_seen_at(model, rig.R_own_rectified[side], wide.camera), 2, 0)
             for k, stamp in enumerate(stamps):
                 image = read_grey(frame_files(rendered, k, depth=False)[side])
-                write_png(base / "data" / f"{stamp}.png", warp(image), 1)
+                warped = cv2.remap(image, x, y, cv2.INTER_LANCZOS4)
+                write_png(base / "data" / f"{stamp}.png", warped, 1)
             listed = "".join(f"{stamp},{stamp}.png\n" for stamp in stamps)
             write(base / "data.csv", f"#timestamp [ns],filename\n{listed}".encode())
             write(base / "sensor.yaml", _sensor(model, T_body[side]).encode())
@@ -131,19 +129,12 @@ def render_fisheye(
 
 
 def _seen_at(model: CameraModel, R_own_rectified: Array, camera: Camera) -> NDArray[np.float32]:
-    """``(H, W, 2)`` float32, the rectified pinhole pixel that each pixel of a camera sees."""
+    """``(H, W, 2)`` float32 pixel of the rectified pinhole camera that looks in the same direction,
+    for each pixel of a camera."""
     u, v = np.meshgrid(np.arange(model.width), np.arange(model.height))
     own = unproject(model, np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
     at = camera.project(own @ R_own_rectified)[:, :2]
     return at.reshape(*u.shape, 2).astype(np.float32)
-
-
-def _warp(at: NDArray[np.float32]) -> Warp:
-    def warp(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        found = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LANCZOS4)
-        return np.asarray(found, np.uint8)
-
-    return warp
 
 
 def _sensor(model: CameraModel, T_body_camera: Array) -> str:

@@ -1,4 +1,4 @@
-"""The ground: a mesh over the terrain with a texture of its own for each tile."""
+"""The ground: a mesh over the terrain, with a separate texture for each tile."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from vslam.machine import available_cores
 
 TILE = 12.8  # m
 _FINE, _COARSE = 512, 64  # texels along a side of a tile, with and without a road
-_REACH = 75.0  # m, the ground ends at this distance from the roads
+_REACH = 75.0  # m; the ground ends at this distance from the roads
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class RoadStyle:
 
 
 class _RoadArrays(NamedTuple):
-    """M samples of the middle lines of all roads and their cross-section, as passed to `_paint`.
+    """M samples of the middle lines of all roads and their cross-section, for `_paint`.
 
     ``xz`` (M, 2) f8, ``heading``, ``along`` (M,) f8, ``junction`` (M,) bool: see `terrain.Roads`;
     ``marks`` (M, 10) f8: see `_road_marks`; ``lane``, ``parking``, ``walk``, ``dash`` f8,
@@ -69,8 +69,8 @@ class _RoadArrays(NamedTuple):
 class _TileGrid(NamedTuple):
     """Position and resolution of a tile.
 
-    ``x``, ``z`` f8 corner in metres; ``texel`` f8 metres per texel; ``nearest`` (N, N) i8 nearest
-    sample of the roads at the nodes of a coarse mesh; ``mesh`` f8 metres between nodes.
+    ``x``, ``z`` f8 corner in metres; ``texel`` f8 metres per texel; ``nearest`` (N, N) i8 index of
+    the nearest sample of the roads at the nodes of a coarse mesh; ``mesh`` f8 metres between nodes.
     """
 
     x: float
@@ -83,7 +83,7 @@ class _TileGrid(NamedTuple):
 def make_ground(
     rng: Rng, atlas: AtlasBuilder, roads: Roads, terrain: Terrain, style: RoadStyle
 ) -> Surfaces:
-    """The tiles near the roads; those on the roads have finer textures."""
+    """Make the tiles near the roads; tiles with a road have finer textures."""
     tree = cKDTree(roads.xz)
     low = np.floor((roads.xz.min(axis=0) - _REACH) / TILE).astype(int)
     high = np.ceil((roads.xz.max(axis=0) + _REACH) / TILE).astype(int)
@@ -161,16 +161,16 @@ def _tile(x: float, z: float, terrain: Terrain, texture: int, fine: int) -> Surf
 
 
 def _road_marks(rng: Rng, roads: Roads, style: RoadStyle) -> NDArray[np.float64]:
-    """``(M, 10)`` marks on the road at each sample of its middle line: two cracks (lateral position
-    each), a cross crack, a patch (from, to, tone), a manhole (along, across), and the tones of
-    asphalt and pavement."""
+    """``(M, 10)`` marks on the road at each sample of its middle line: lateral positions of two
+    cracks, whether a crack runs across, a patch (from, to, tone), a manhole (along, across), and
+    the tones of asphalt and pavement."""
     n = len(roads.xz)
     marks = np.full((n, 10), np.nan)
     for k in range(2):
-        walk = np.cumsum(rng.normal(0, 0.035, n))
-        lane = rng.uniform(-0.9, 0.9, n // 120 + 2)[np.arange(n) // 120] * style.lane
-        fresh = rng.random(n // 60 + 2)[np.arange(n) // 60] < 0.8 * style.wear
-        marks[:, k] = np.where(fresh, lane + walk % 1.1 + rng.normal(0, 0.012, n), np.nan)
+        drift = np.cumsum(rng.normal(0, 0.035, n))
+        lateral = rng.uniform(-0.9, 0.9, n // 120 + 2)[np.arange(n) // 120] * style.lane
+        cracked = rng.random(n // 60 + 2)[np.arange(n) // 60] < 0.8 * style.wear
+        marks[:, k] = np.where(cracked, lateral + drift % 1.1 + rng.normal(0, 0.012, n), np.nan)
     marks[:, 2] = np.where(rng.random(n) < 0.012 * style.wear, 1.0, 0.0)
     at = 0
     while at < n:
@@ -225,7 +225,7 @@ def _paint(image, tile, road, grain):
                 min(int((z - z0) / mesh + 0.5), len(nearest) - 1),
                 min(int((x - x0) / mesh + 0.5), len(nearest) - 1),
             ]
-            # The mesh is coarser than the samples, so continue to the nearest sample.
+            # The mesh is coarser than the samples, so move on to the nearest sample.
             fs, fc = math.sin(heading[i]), math.cos(heading[i])
             ahead = (x - xz[i, 0]) * fs + (z - xz[i, 1]) * fc
             j = min(max(i + round(ahead / 0.25), 0), len(xz) - 1)

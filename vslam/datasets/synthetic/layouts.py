@@ -1,4 +1,4 @@
-"""Rendered sequences in other layouts: RGB-D images in TUM's (`vslam.datasets.tum`), or a video."""
+"""Rendered sequences in other layouts: RGB-D in TUM's (`vslam.datasets.tum`), or as a video."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def render_rgbd(
     threads: int = 2,
     on_frame: OnFrame | None = None,
 ) -> Path:
-    """Render a route as an RGB-D camera sees it, or its missing frames, into a folder in TUM's
-    layout, and return the folder.
+    """Render the missing frames of a route for an RGB-D camera into a folder in TUM's layout, and
+    return the folder.
 
-    ``out/stereo`` has the same drive as a KITTI tree. The left image serves as colour image. Depth
-    has no maximum range; it is in centimetres, 0 in the sky. The virtual baseline in
-    ``calibration.yaml`` is the baseline of the rendered pair, so that far points are as uncertain
-    as with stereo.
+    ``out/stereo`` has the same drive as a KITTI tree. The left image serves as the colour image.
+    Depth is in centimetres, 0 in the sky, and has no maximum range. The virtual baseline in
+    ``calibration.yaml`` is the baseline of the rendered pair, so that distant points are as
+    uncertain as with stereo.
 
     Args:
         route, variation, threads, on_frame: as for `render_sequence`.
@@ -42,7 +42,7 @@ def render_rgbd(
         until: write only the frames before this one.
 
     Raises:
-        InputError: as `render_sequence`, or the folder cannot be written.
+        InputError: as `render_sequence`.
     """
     root = render_sequence(
         route,
@@ -86,8 +86,8 @@ def _depth_calibration(camera: Camera) -> str:
 
 
 def write_side_by_side(sequence: Source, path: Path) -> Path:
-    """Write a stereo sequence as one video, left and right images side by side, losslessly (codec
-    FFV1), and vslam's calibration file beside it.
+    """Write a stereo sequence as a lossless video (codec FFV1) with left and right images side by
+    side, and a calibration file beside it.
 
     Args:
         sequence: a stereo sequence; the video gets its mean frame rate.

@@ -1,4 +1,4 @@
-"""Labelled pairs of views for training loop detectors."""
+"""Labelled pairs of views, with which loop detectors are trained."""
 
 from __future__ import annotations
 
@@ -23,11 +23,13 @@ from vslam.datasets.synthetic.store import OnFrame
 from vslam.datasets.synthetic.town import Town, build_town
 
 _HEIGHT = 0.25  # m, largest change of the camera's height
-_EXPOSURE = 0.25  # standard deviation of the log of the ratio of the two exposures
-_APART = 40.0  # m, least distance of different places;
-_SIGHT, _STREET = 160.0, 25.0  # m, that in the same street: along it, and across it
-_TOGETHER, _LATER, _ALIGNED = 4.0, 60, 30.0  # m, frames, degrees: another pass through a place
-_ALIKE = 5  # a look-alike is one of this many most similar places
+_EXPOSURE = 0.25  # standard deviation of the logarithm of the ratio of the two exposures
+# Places are different if they are more than _APART m apart and not in one street: places in one
+# street have parallel headings, are within _SIGHT m, and at most _STREET m apart across the street.
+_APART, _SIGHT, _STREET = 40.0, 160.0, 25.0
+# Two passes through a place differ by at most 4 m and 30 degrees, and by more than 60 frames.
+_TOGETHER, _ALIGNED, _LATER = 4.0, 30.0, 60
+_ALIKE = 5  # number of the most similar places that count as look-alikes of a place
 _PLACES, _SMALL = 160, 8  # number of places that are compared; factor by which views are reduced
 KINDS = ("shift", "alike", "pass", "random")
 _COLUMNS = ("a", "b", "same", "kind", "frame_a", "frame_b", "when_a", "when_b", "distance_m",
@@ -42,7 +44,7 @@ class Moves:
     """Ranges (lowest, highest) of the random motion of the second view of a pair.
 
     Attributes:
-        lateral: metres to the right; negative is to the left, where the other lane is (3.2 m).
+        lateral: metres to the right; -3.2 is on the other lane.
         heading: degrees of rotation, to either side.
     """
 
@@ -63,22 +65,23 @@ def render_pairs(
 ) -> None:
     """Render ``count`` labelled pairs; with all kinds, half of them show the same place twice.
 
-    ``folder/pairs.csv`` has one row for each pair: the two images; ``same`` (1 or 0); the kind; the
-    frame of the drive from which each view was taken; for each view the frame that determines which
-    objects exist and how they are lit; the difference of the second view: metres between the two
-    frames, and the added lateral shift (m), rotation (degrees) and height (m); the ratio of the
-    exposures; and the pose of each camera: x and z in metres, and yaw in degrees from z towards x.
-    The kinds are:
+    The second view is moved at random. Its kind tells from where it is taken:
 
-    - ``shift``: the same frame, moved to the side, turned and raised;
-    - ``pass``: another pass through the place, if the drive has one, moved likewise;
+    - ``shift``: the same frame;
+    - ``pass``: another pass through the place, if the drive has one;
     - ``alike``: another place that is among the most similar ones in a small blurred view;
     - ``random``: any other place.
 
+    ``folder/pairs.csv`` has one row per pair: the two images; ``same`` (1 or 0); the kind; the
+    frame at which each view is taken; for each view, the frame whose light and objects it shows;
+    the distance between the two frames (m); lateral shift (m), rotation (degrees) and rise (m) of
+    the second view; the ratio of the exposures; and for each camera x and z in metres, and yaw in
+    degrees from z towards x.
+
     Args:
         route: drive from which places are taken.
-        variation: of the town; ``aliased`` makes different places more similar, ``change`` makes
-            the views of one place differ as if days lay between them.
+        variation: variation of the town; ``aliased`` makes different places more similar, and
+            ``change`` makes the views of one place differ as if taken on different days.
         folder: output folder.
         count: number of pairs.
         moves: motion of the second views.
@@ -117,15 +120,15 @@ def render_pairs(
             elif kind == "random":
                 apart = np.flatnonzero(_different(route.T_wc[first], route.T_wc))
                 second = int(rng.choice(apart)) if apart.size else last - first
-            whens = (first, last if kind == "shift" and variation.change > 0 else second)
+            moments = (first, last if kind == "shift" and variation.change > 0 else second)
             turn = rng.uniform(*moves.heading) * rng.choice([-1.0, 1.0])
             shift = (rng.uniform(*moves.lateral), turn, rng.uniform(-_HEIGHT, _HEIGHT))
             ratio = float(np.exp(rng.normal(0.0, _EXPOSURE)))
             names: list[str] = []
             cameras: list[float] = []
-            for number, (frame, when) in enumerate(zip((first, second), whens, strict=True)):
+            for number, (frame, moment) in enumerate(zip((first, second), moments, strict=True)):
                 T = route.T_wc[frame] if number == 0 else _shifted(route.T_wc[frame], *shift)
-                image = _view(renderer, route, passes, T, when, 1.0 if number == 0 else ratio,
+                image = _view(renderer, route, passes, T, moment, 1.0 if number == 0 else ratio,
                               key=(variation.seed, k, number))  # fmt: skip
                 names.append(f"images/{k:06d}_{'ab'[number]}.png")
                 write_png(folder / names[-1], image, 1)
@@ -133,7 +136,7 @@ def render_pairs(
                 cameras += [T[0, 3], T[2, 3], yaw]
             distance = float(np.linalg.norm(places[second] - places[first]))
             rows.writerow([
-                *names, int(kind in ("shift", "pass")), kind, first, second, *whens,
+                *names, int(kind in ("shift", "pass")), kind, first, second, *moments,
                 *(f"{x:.3f}" for x in (distance, *shift, ratio, *cameras)),
             ])  # fmt: skip
             if on_frame:
@@ -153,7 +156,7 @@ def _view(
 
 
 def _other_passes(T_wc: Float) -> list[NDArray[np.int64]]:
-    """For each frame, the frames of other passes with about the same position and direction."""
+    """For each frame, the frames of other passes with a similar position and heading."""
     xz, ahead = T_wc[:, [0, 2], 3], T_wc[:, :3, 2]
     again = []
     for k, near in enumerate(cKDTree(xz).query_ball_point(xz, _TOGETHER)):
@@ -164,35 +167,26 @@ def _other_passes(T_wc: Float) -> list[NDArray[np.int64]]:
 
 
 def _different(T_wc: Float, others: Float) -> NDArray[np.bool_]:
-    """``(N,)`` bool: which of the ``(N, 4, 4)`` poses ``others`` show another place than ``T_wc``,
-    not just a view along the same street."""
+    """``(N,)`` bool: which of the ``(N, 4, 4)`` poses ``others`` show a different place than
+    ``T_wc``, and not another view along the same street."""
     away = (others[:, :3, 3] - T_wc[:3, 3])[:, [0, 2]]
     ahead = T_wc[[0, 2], 2] / np.linalg.norm(T_wc[[0, 2], 2])
     aside = np.abs(away @ np.array([ahead[1], -ahead[0]]))
     distance = np.linalg.norm(away, axis=1)
-    alike = np.abs(others[:, [0, 2], 2] @ ahead) > 0.7
-    different: NDArray[np.bool_] = (distance > _APART) & ~(
-        alike & (aside < _STREET) & (distance < _SIGHT)
-    )
-    return different
+    parallel = np.abs(others[:, [0, 2], 2] @ ahead) > 0.7
+    same_street = parallel & (aside < _STREET) & (distance < _SIGHT)
+    return np.asarray((distance > _APART) & ~same_street)
 
 
 def _look_alikes(route: Route, town: Town, passes: Passes, threads: int) -> NDArray[np.int64]:
     """``(P, 2)`` pairs of frames that show different but similar places, several for each place.
 
-    The similarity of two places is the correlation of small, blurred, normalised views.
+    The similarity of two places is the correlation of their small, blurred, normalised views.
     """
     chosen = np.unique(np.linspace(0, len(route.T_wc) - 1, _PLACES).astype(int))
-    camera = route.camera
-    small = Camera(
-        camera.fx / _SMALL,
-        camera.fy / _SMALL,
-        camera.cx / _SMALL,
-        camera.cy / _SMALL,
-        camera.baseline,
-        camera.width // _SMALL,
-        camera.height // _SMALL,
-    )
+    c = route.camera
+    fx, fy, cx, cy = (x / _SMALL for x in (c.fx, c.fy, c.cx, c.cy))
+    small = Camera(fx, fy, cx, cy, c.baseline, c.width // _SMALL, c.height // _SMALL)
     renderer = Renderer(small, town.atlas, town.sky, threads)
     moment = passes.at(0)
     seen = []

@@ -17,15 +17,15 @@ from vslam.datasets.synthetic.shadows import (
     cast_shadows,
     lamp_pools,
 )
-from vslam.datasets.synthetic.site import AFTER, BEFORE, Variation
+from vslam.datasets.synthetic.site import AFTER, ALWAYS, BEFORE, Variation
 from vslam.datasets.synthetic.terrain import CLEARANCE
 from vslam.datasets.synthetic.town import Town
 
-_NEAR, _LEFT = 60.0, 75.0  # m: a place is passed within the first, and left beyond the second
-_AGAIN, _STRETCH = 60, 15  # frames: least time until a revisit; least length of a revisit
-_CASTS = 8  # number of shadow maps that are kept
-_CLOUD = 12.0  # frames for which a cloud hides the sun while it moves between two passes
-_CAR_REACH = np.array([1.1, 2.7])  # half width and length of the largest car, m
+_NEAR, _LEFT = 60.0, 75.0  # m: distances at which a place is reached, and at which it is left
+_AGAIN, _STRETCH = 60, 15  # frames: shortest time until a revisit, and its shortest duration
+_SHADOW_MAPS = 8  # number of shadow maps that are kept
+_CLOUD = 12.0  # frames; a cloud hides the sun while it moves between two passes
+_CAR_REACH = np.array([1.1, 2.7])  # half the width and length of the largest car, m
 
 
 class Passes:
@@ -35,39 +35,42 @@ class Passes:
         self._route, self._town, self._variation = route, town, variation
         self._switch = _switch_frames(town.place, route.T_wc[:, [0, 2], 3])
         self._lock = threading.Lock()
-        self._casts: dict[int, ShadowMap] = {}
+        self._shadows: dict[int, ShadowMap] = {}  # by pass
         self._starts = pass_starts(route.T_wc) if variation.change > 0 else [0]
         self._pools = lamp_pools(town.lamps)
 
     def at(self, frame: int) -> Moment:
-        """The town at the frame ``frame`` of the route."""
+        """The town at a frame of the route."""
         number = int(np.searchsorted(self._starts, frame, side="right")) - 1
         light, night = self._light(frame, number)
         standing = self._standing(frame)
         with self._lock:
-            if number not in self._casts:
-                middle = (*self._starts, len(self._route.T_wc))[number : number + 2]
-                there = self._standing(sum(middle) // 2)
-                shadows = cast_shadows(there, self._town.atlas, light.sun)
-                self._casts[number] = shadows
-                while len(self._casts) > _CASTS:
-                    del self._casts[next(iter(self._casts))]
-            shadows = self._casts[number]
+            if number not in self._shadows:
+                begin, end = (*self._starts, len(self._route.T_wc))[number : number + 2]
+                occluders = self._standing((begin + end) // 2)
+                self._shadows[number] = cast_shadows(occluders, self._town.atlas, light.sun)
+                while len(self._shadows) > _SHADOW_MAPS:
+                    del self._shadows[next(iter(self._shadows))]
+            shadows = self._shadows[number]
         cars = self._cars(frame)
         surfaces = join([standing, *cars]) if cars else standing
         return Moment(surfaces, shadows, light, night, self._pools if night > 0 else NO_LAMPS)
 
     def _standing(self, frame: int) -> Surfaces:
+        """The surfaces of the ground and of all things that do not move."""
         surfaces, when = self._town.surfaces, self._town.when
         if not when.any():
             return surfaces
         later = frame >= self._switch
-        present = (when == 0) | ((when == BEFORE) & ~later) | ((when == AFTER) & later)
+        present = (when == ALWAYS) | ((when == BEFORE) & ~later) | ((when == AFTER) & later)
         return surfaces.select((surfaces.thing < 0) | present[surfaces.thing])
 
     def _light(self, frame: int, number: int) -> tuple[Light, float]:
-        """Light and night (0 to 1) at a frame of pass ``number``. The sun stands still during a
-        pass and moves behind a cloud between two; night falls slowly over the whole drive."""
+        """The light at a frame of pass ``number``, and how dark the night is (0 to 1).
+
+        The sun stands still during a pass, and moves behind a cloud between two passes. Night falls
+        slowly during the whole drive.
+        """
         seed, change = self._variation.seed, self._variation.change
         rng = np.random.default_rng([seed, 11])
         azimuth, rise = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(33, 46))
@@ -77,8 +80,8 @@ class Passes:
         progress = min(frame / max(len(self._route.T_wc) - 1, 1), 1.0)
         progress = progress * progress * (3 - 2 * progress)
         night = max(0.0, change - 0.7) / 0.3 * progress
-        away = min((abs(frame - start) for start in self._starts[1:]), default=1000)
-        clear = 1.0 - float(np.exp(-((away / _CLOUD) ** 2)))
+        from_start = min((abs(frame - start) for start in self._starts[1:]), default=1000)
+        clear = 1.0 - float(np.exp(-((from_start / _CLOUD) ** 2)))
         sun = np.array(
             [np.sin(azimuth) * np.cos(rise), -np.sin(rise), np.cos(azimuth) * np.cos(rise)]
         )
@@ -94,7 +97,7 @@ class Passes:
         return light, night
 
     def _cars(self, frame: int) -> list[Surfaces]:
-        """The first car drives ahead of the camera, the others approach it on the other lane."""
+        """The first car drives ahead of the camera; the others approach on the other lane."""
         T_wc = self._route.T_wc
         here, cars = T_wc[frame], []
         for k, model in enumerate(self._town.moving):
@@ -116,7 +119,7 @@ class Passes:
 
 
 def _switch_frames(place: NDArray[np.float64], cameras: NDArray[np.float64]) -> NDArray[np.int64]:
-    """``(T,)`` the frame at which each place is left for the first time."""
+    """``(T,)`` frame at which each place is left for the first time."""
     switch = np.full(len(place), np.iinfo(np.int64).max)
     for k, xz in enumerate(place):
         distance = np.hypot(*(cameras - xz).T)
@@ -129,7 +132,7 @@ def _switch_frames(place: NDArray[np.float64], cameras: NDArray[np.float64]) -> 
 
 
 def pass_starts(T_wc: NDArray[np.float64]) -> list[int]:
-    """Frame 0, and the frames at which the drive ``(N, 4, 4)`` returns to streets that it knows."""
+    """Frame 0, and the frames at which a drive ``(N, 4, 4)`` returns to earlier streets."""
     xz = T_wc[:, [0, 2], 3]
     tree = cKDTree(xz)
     known = np.array([

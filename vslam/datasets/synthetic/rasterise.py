@@ -1,4 +1,4 @@
-"""Projection, culling and z-buffer, which determine the surface that each image sample sees."""
+"""Projection, culling and z-buffer: which surface each sample of an image sees."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from vslam.kernels import borrowed, inline, kernel
 NEAR = 0.2  # m
 FAR = 400.0  # m
 LAYER_STEP = 1e-3  # relative depth by which a layer is drawn in front of the next lower one
-_SEAM = 1e-6  # overlap of neighbours as a fraction of an edge, so that no sample is missed between
+_SEAM = 1e-6  # overlap of neighbours as a fraction of an edge, so that there are no gaps
 
-# Columns of a row of ``find_visible``: three affine functions of the pixel (u, v) for s/z, t/z and
-# 1/z, two for the texture coordinates over z, then the rest.
+# Columns of the result of ``find_visible``: the coefficients of affine functions of the pixel
+# (u, v) for s/z, t/z, 1/z and for both texture coordinates over z, and then single numbers.
 PLANE, TEXTURE, FIRST_ROW, LAST_ROW, TRIANGLE, LAYER = 0, 9, 15, 16, 17, 18
 NUMBER, DETAIL_U, DETAIL_V, DETAIL, AMBIENT, SUN, GLOW, KEY, COLUMNS = range(19, 28)
 
@@ -48,7 +48,7 @@ class _AlphaMap(NamedTuple):
 
 @kernel
 def find_visible(surfaces, atlas, camera, light):
-    """Project the surfaces that a camera may see, nearest first.
+    """Project the surfaces that a camera may see, in order of their distance.
 
     Args:
         surfaces, atlas, camera, light: `scene.Surfaces`, `scene.Atlas`,
@@ -72,11 +72,11 @@ def find_visible(surfaces, atlas, camera, light):
     corner = np.empty((4, 3))
     left, right = (-1.0 - cx) / fx, (width - cx) / fx
     for q in range(len(origin)):
-        # Written out by coordinates, since three-vectors are too short for a matrix product.
+        # Products are written out, because matrix products are slow for vectors of length three.
         ox, oy, oz = origin[q, 0] - T_wc[0, 3], origin[q, 1] - T_wc[1, 3], origin[q, 2] - T_wc[2, 3]
         sx, sy, sz = edge_s[q, 0], edge_s[q, 1], edge_s[q, 2]
         tx, ty, tz = edge_t[q, 0], edge_t[q, 1], edge_t[q, 2]
-        # Bounding sphere against the frustum.
+        # Discard surfaces whose bounding sphere is outside of the view.
         mx, my, mz = ox + 0.5 * (sx + tx), oy + 0.5 * (sy + ty), oz + 0.5 * (sz + tz)
         radius = 0.5 * (
             math.sqrt(sx * sx + sy * sy + sz * sz) + math.sqrt(tx * tx + ty * ty + tz * tz)
@@ -183,7 +183,7 @@ def _affine(row, at, x, y, z, fx, fy, cx, cy):
 
 @kernel
 def _box(corner, fx, fy, cx, cy):
-    """Pixel box ``u0, u1, v0, v1`` of a quadrilateral clipped at the near plane."""
+    """Bounding box ``u0, u1, v0, v1`` in pixels of a quadrilateral, clipped at the near plane."""
     u0, u1, v0, v1 = 1e9, -1e9, 1e9, -1e9
     for k in range(4):
         a, b = corner[k], corner[(k + 1) % 4]
@@ -203,12 +203,12 @@ def _box(corner, fx, fy, cx, cy):
 
 @kernel
 def rasterise(visible, atlas, band):
-    """Draw the surfaces into a band of samples.
+    """Draw surfaces into a band of samples.
 
     Args:
         visible: from `find_visible`.
         atlas: `scene.Atlas`.
-        band: `SampleBand`; ``inverse_depth`` and ``seen`` are updated.
+        band: `scene.SampleBand`, whose ``inverse_depth`` and ``seen`` are updated.
     """
     visible, alpha = borrowed(visible), borrowed(atlas.alpha)
     alpha_offset, log_size = borrowed(atlas.alpha_offset), borrowed(atlas.log_size)
@@ -275,8 +275,8 @@ def rasterise(visible, atlas, band):
 
 @kernel
 def _fill(value, slope, number, begin, inverse_depth, seen):
-    """Draw surface ``number`` on the part of a row that begins at sample ``begin``; 1/z of sample
-    ``i`` of the row is ``value + slope i``."""
+    """Draw surface ``number`` on the part of a row that begins at sample ``begin``. Sample ``i`` of
+    the row has 1/z = ``value + slope i``."""
     value += slope * begin
     for i in range(np.uintp(len(seen))):
         near = np.float32(value + slope * np.float64(np.int32(i)))
@@ -288,12 +288,12 @@ def _fill(value, slope, number, begin, inverse_depth, seen):
 
 @kernel
 def _fill_cut_out(q, number, span, mask, inverse_depth, seen):
-    """Like `_fill`, but only where the alpha of the texture is at least one half.
+    """Draw as `_fill`, but only where the alpha of the texture is at least one half.
 
     Args:
-        q, number: a row of the result of `find_visible`, and its number.
+        q, number: a row of the result of `find_visible`, and its index.
         span, mask: `_Span`, `_AlphaMap`.
-        inverse_depth, seen: one row of the `SampleBand`, updated.
+        inverse_depth, seen: one row of the `scene.SampleBand`, updated.
     """
     begin, end, v = span.begin, span.end, span.v
     shift, step, value, slope = span.shift, span.step, span.value, span.slope
@@ -301,7 +301,7 @@ def _fill_cut_out(q, number, span, mask, inverse_depth, seen):
     u_slope, v_slope = q[TEXTURE] * step, q[TEXTURE + 3] * step
     u_value = q[TEXTURE] * shift + q[TEXTURE + 1] * v + q[TEXTURE + 2]
     v_value = q[TEXTURE + 3] * shift + q[TEXTURE + 4] * v + q[TEXTURE + 5]
-    # A cut-out is small or far away, so that one level is enough for its row.
+    # One mipmap level is enough for a row, because cut-outs are small or far away.
     middle = 0.5 * (begin + end)
     z = 1.0 / (value + slope * middle)
     a, b = (u_value + u_slope * middle) * z, (v_value + v_slope * middle) * z
@@ -321,7 +321,9 @@ def _fill_cut_out(q, number, span, mask, inverse_depth, seen):
         z = 1.0 / inverse
         x = (u_value + u_slope * i) * z * scale - 0.5
         y = (v_value + v_slope * i) * z * scale - 0.5
-        if level > 0:  # texels are smaller than samples, so the nearest one is enough
+        if (
+            level > 0
+        ):  # the texels of level 0 are smaller than samples, so no interpolation is needed
             c0, r0 = math.floor(x + 0.5) & mask_u, math.floor(y + 0.5) & mask_v
             if alpha[np.uintp(at + (r0 << row_log) + c0)] < 128:
                 continue

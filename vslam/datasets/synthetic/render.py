@@ -1,9 +1,9 @@
-"""The renderer: exact perspective of flat textured surfaces, in Numba, without GPU.
+"""The renderer: exact perspective of flat textured surfaces, in Numba and without a GPU.
 
 A point of a surface is ``origin + s edge_s + t edge_t = z r`` with the ray ``r = K^-1 (u, v, 1)``,
 so ``(s, t, 1) / z = [edge_s edge_t origin]^-1 r``, which are three affine functions of the pixel.
-Therefore a surface covers a single interval of each image row, and depth and texture coordinates
-are exact at every pixel. Visibility is determined on a grid twice as fine as the pixels, and a
+Therefore, a surface covers a single interval of each image row, and depth and texture coordinates
+are exact at every pixel. Visibility is determined on a grid that is twice as fine as the pixels. A
 pixel is shaded once for each surface that its four samples see.
 """
 
@@ -12,6 +12,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
 from typing import NamedTuple
 
 import cv2
@@ -31,7 +33,7 @@ from vslam.datasets.synthetic.shade import shade
 from vslam.datasets.synthetic.shadows import NO_LAMPS, LampPools, ShadowMap
 
 SAMPLES = 2  # visibility samples per pixel in each direction
-_BANDS = 2  # bands of rows per image, each of which is a job for a thread
+_BANDS = 2  # bands of rows per image; each is a job for a thread
 # Lens and sensor.
 SHUTTER = 0.004  # s, exposure time by day
 _BLUR = 0.55  # px, standard deviation of the lens blur
@@ -48,11 +50,11 @@ class Light:
 
     Attributes:
         sun: ``(3,)`` float64 unit vector towards the sun, world.
-        direct: irradiance of the sun on a surface that faces it; 1 at a clear noon.
+        direct: irradiance of the sun on a surface that faces it; 1 at noon under a clear sky.
         ambient: irradiance of the sky on a horizontal surface.
         glow: brightness of lamps and lit windows.
         haze: grey level of the air, 0 to 255.
-        visibility: distance in metres at which contrast falls to 1/e.
+        visibility: distance in metres at which the contrast falls to 1/e.
         exposure: grey levels per unit of radiance.
         headlight: brightness of the car's own headlights 10 m ahead.
     """
@@ -67,7 +69,7 @@ class Light:
     headlight: float = 0.0
 
     def values(self) -> LightValues:
-        """The light in the form for kernels."""
+        """Convert the light for the kernels."""
         sky = (self.direct, self.ambient, self.glow)
         air = (self.haze, self.visibility, self.exposure)
         return LightValues(*(float(x) for x in (*self.sun, *sky, *air, self.headlight)))
@@ -75,7 +77,7 @@ class Light:
 
 @dataclass(frozen=True)
 class Moment:
-    """The scene of one frame; ``night``, 0 to 1, raises the gain of the sensor."""
+    """The scene of one frame; ``night``, from 0 to 1, raises the gain of the sensor."""
 
     surfaces: Surfaces
     shadows: ShadowMap
@@ -85,8 +87,8 @@ class Moment:
 
 
 class RenderedView(NamedTuple):
-    """A rendered view: ``image`` ``(H, W)`` float32 grey levels before the sensor (0 to above 255)
-    and ``depth`` ``(H, W)`` float32 metres along z, 0 in the sky."""
+    """A rendered view: ``image`` is ``(H, W)`` float32 grey levels before the sensor, which may
+    exceed 255; ``depth`` is ``(H, W)`` float32 metres along z, 0 in the sky."""
 
     image: Float32
     depth: Float32
@@ -96,7 +98,7 @@ class Renderer:
     """Renders views of a town; the result does not depend on the number of threads."""
 
     def __init__(self, camera: Camera, atlas: Atlas, sky: int, threads: int = 1) -> None:
-        """``sky`` is the number of the panorama texture; see `textures.sky`."""
+        """Start the threads; ``sky`` is the number of the panorama texture, see `textures.sky`."""
         self._camera = camera
         self._atlas = atlas
         self._sky = sky
@@ -108,14 +110,14 @@ class Renderer:
     def stereo(
         self, moment: Moment, T_wc: NDArray[np.float64]
     ) -> tuple[RenderedView, RenderedView]:
-        """Left and right view of a rig whose left camera stands at ``T_wc`` ``(4, 4)``."""
+        """Render both views of a rig whose left camera has the ``(4, 4)`` pose ``T_wc``."""
         right = T_wc.copy()
         right[:3, 3] += T_wc[:3, 0] * self._camera.baseline
         left_view, right_view = self.views(moment, T_wc, right)
         return left_view, right_view
 
     def views(self, moment: Moment, *T_wc: NDArray[np.float64]) -> list[RenderedView]:
-        """A view from each of the ``(4, 4)`` poses ``T_wc``."""
+        """Render a view from each of the ``(4, 4)`` poses ``T_wc``."""
         prepared = [self._pool.submit(self._prepare, moment, T) for T in T_wc]
         views, jobs = [], []
         for preparation in prepared:
@@ -129,6 +131,7 @@ class Renderer:
     def _prepare(
         self, moment: Moment, T_wc: NDArray[np.float64]
     ) -> tuple[RenderedView, list[Callable[[], None]]]:
+        """An empty view, and the jobs that render its bands."""
         fx, fy, cx, cy = (
             float(x) for x in (self._camera.fx, self._camera.fy, self._camera.cx, self._camera.cy)
         )
@@ -149,14 +152,7 @@ class Renderer:
             shade(visible, samples, self._atlas, self._sky, values, moment.shadows, moment.pools,
                   camera, view)  # fmt: skip
 
-        # The defaults bind the present values of the loop variables.
-        return (
-            view,
-            [
-                lambda a=a, b=b: band(a, b)  # type: ignore[misc]
-                for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
-            ],
-        )
+        return view, [partial(band, *ends) for ends in pairwise(edges.tolist())]
 
 
 def sensor_image(
@@ -167,15 +163,17 @@ def sensor_image(
     night: float,
     key: tuple[int, int, int],
 ) -> NDArray[np.uint8]:
-    """Turn radiance into the ``(H, W)`` uint8 image of the camera, by blur, vignetting, response
-    and noise of its lens and sensor. The result depends only on the radiance and on the key.
+    """Simulate the lens and the sensor: blur, vignetting, response and noise.
 
     Args:
-        radiance: ``(H, W)`` float32, from `render.RenderedView.image`.
-        camera: its focal length scales the motion blur.
+        radiance: ``(H, W)`` float32, from `RenderedView.image`.
+        camera: calibration; the focal length scales the motion blur.
         yaw_rate: rad/s, causes motion blur.
-        night: 0 to 1, lengthens the exposure and raises the gain.
+        night: from 0 to 1, lengthens the exposure and raises the gain.
         key: seed, frame and side, which determine the noise.
+
+    Returns:
+        ``(H, W)`` uint8 image.
     """
     image = radiance
     streak = abs(yaw_rate) * SHUTTER * (1 + 2 * night) * camera.fx
@@ -195,7 +193,7 @@ def sensor_image(
 
 
 def _streak(length: float) -> NDArray[np.float32]:
-    """Box filter ``length`` pixels wide, whose outer pixels are weighted by their covered part."""
+    """Weights of a box filter of any length in pixels, whose outer pixels are partly covered."""
     half = int(np.ceil(length / 2 + 0.5))
     at = np.arange(-half, half + 1)
     weight = np.clip(length / 2 + 0.5 - np.abs(at), 0, 1)

@@ -15,7 +15,7 @@ from vslam.errors import InputError, did_you_mean
 Float = NDArray[np.float64]
 
 CAMERA_HEIGHT = 1.65  # m
-RATE = 10.0  # frames a second
+RATE = 10.0  # frames per second
 _MAX_STEP = 5.0  # m between frames
 _LANE = 1.6  # m from the middle of the road to the middle of a lane
 _CAMERAS = {  # as in KITTI's three recording periods
@@ -32,12 +32,12 @@ class Route:
     """A drive.
 
     Attributes:
-        name: such as ``demo``.
+        name: for example ``demo``.
         about: description in a few words.
         land: ``town``, ``suburb`` or ``motorway``.
         camera: the stereo rig.
-        T_wc: ``(N, 4, 4)`` float64 left camera to the town's world, in which heights are measured
-            from y = 0.
+        T_wc: ``(N, 4, 4)`` float64 poses of the left camera in the world frame of the town, whose
+            heights count from y = 0.
         roads, terrain: the roads and the ground of the drive.
     """
 
@@ -57,20 +57,18 @@ class Route:
     def yaw_rate(self) -> Float:
         """``(N,)`` float64, rad/s."""
         heading = np.unwrap(np.arctan2(self.T_wc[:, 0, 2], self.T_wc[:, 2, 2]))
-        rate: Float = np.gradient(heading) * RATE
-        return rate
+        return np.asarray(np.gradient(heading) * RATE)
 
     @property
     def ground_truth(self) -> Float:
         """``(N, 4, 4)`` float64 ``T_wc`` with the first left camera as the world, as in KITTI."""
-        first: Float = np.linalg.inv(self.T_wc[0])
-        return first @ self.T_wc
+        return np.asarray(np.linalg.inv(self.T_wc[0]) @ self.T_wc)
 
 
 @dataclass(frozen=True)
 class _Leg:
-    """A polyline of corner points ``(x, z)`` in metres, with the lane from each corner on: 1 is the
-    right one, -1 the left one."""
+    """A drive along corner points ``(x, z)`` in metres; ``lanes`` holds the lane from each corner
+    on, 1 for the right and -1 for the left one."""
 
     corners: tuple[tuple[float, float], ...]
     lanes: tuple[float, ...] = ()
@@ -100,7 +98,7 @@ def _bend() -> tuple[tuple[float, float], ...]:
 
 _BUILT_IN = {
     "demo": _BuiltIn(
-        "one loop round a block", "town", "00-02",
+        "one loop around a block", "town", "00-02",
         _Leg(((0, 0), (0, 80), (62, 96), (84, 20), (0, -10), (0, 62)))),
     "00": _BuiltIn(
         "town; five revisits, one on the other lane, one in the opposite direction",
@@ -125,24 +123,24 @@ _BUILT_IN = {
         _Leg(((0, 0), (0, 180), (90, 180), (90, 90), (0, 90), (0, 180), (180, 180), (180, 0),
               (90, 0), (0, 0), (0, 90), (-80, 90), (-80, 0), (0, 0), (90, 0), (90, 160)))),
     "block": _BuiltIn(
-        "a short loop, for many tests of loop closing", "town", "00-02",
+        "short loop for tests of loop closing", "town", "00-02",
         _Leg(((0, 0), (0, 52), (46, 62), (56, 6), (0, -14), (0, 52)), speed=11.0)),
     "lane": _BuiltIn(
-        "the same, the revisit on the other lane", "town", "00-02",
+        "the same loop, revisited on the other lane", "town", "00-02",
         _Leg(((0, 0), (0, 52), (46, 62), (56, 6), (0, -14), (0, 52)), (1, 1, 1, 1, -1, -1),
              speed=11.0)),
 }  # fmt: skip
 
 ROUTES = {name: route.about for name, route in _BUILT_IN.items()}
-# Named drives, each a route with a variation; datasets.md explains how the town was chosen.
+# Names for a route with a variation; datasets.md explains how the town was chosen.
 DRIVES = {"night": "lane+change:1+seed:1"}
 
 
 def built_in_route(name: str) -> Route:
-    """One of `ROUTES`.
+    """Make one of `ROUTES`.
 
     Raises:
-        InputError: unknown name.
+        InputError: the name is unknown.
     """
     if name not in _BUILT_IN:
         known = (*ROUTES, *DRIVES)
@@ -157,12 +155,8 @@ def built_in_route(name: str) -> Route:
     right = np.stack([np.cos(heading), -np.sin(heading)], axis=1)
     path = middle + right * (_LANE * lane)[:, None]
     xz = _drive(path, leg.speed)
-    ahead = middle[-1] + np.outer(np.linspace(0, 130, 200), middle[-1] - middle[-8]) / (
-        np.linalg.norm(middle[-1] - middle[-8])
-    )
-    behind = middle[0] + np.outer(np.linspace(40, 0, 80), middle[0] - middle[8]) / (
-        np.linalg.norm(middle[0] - middle[8])
-    )
+    ahead = _straight(middle[-1], middle[-1] - middle[-8], np.linspace(0, 130, 200))
+    behind = _straight(middle[0], middle[0] - middle[8], np.linspace(40, 0, 80))
     roads = roads_of([np.vstack([behind, middle, ahead])])
     seed = sum(map(ord, name))
     terrain = _terrain(roads.xz, lambda at: plan.hills * _waves(at, seed))
@@ -170,11 +164,17 @@ def built_in_route(name: str) -> Route:
     return Route(name, plan.about, plan.land, camera, _poses(xz, terrain), roads, terrain)
 
 
-def route_of_poses(T_wc: Float, name: str, calibration: str = "00-02") -> Route:
-    """Build a route along given poses, for example KITTI's.
+def _straight(start: Float, direction: Float, metres: Float) -> Float:
+    """``(K, 2)`` points at ``(K,)`` distances from a point in a direction."""
+    return start + np.outer(metres, direction) / np.linalg.norm(direction)
 
-    The heights of all passes over a place are averaged, so that each road has one height; heading,
-    pitch and roll stay as given. ``Route.ground_truth`` has the poses with these heights.
+
+def route_of_poses(T_wc: Float, name: str, calibration: str = "00-02") -> Route:
+    """Make a route along given poses, for example KITTI's.
+
+    The heights of all passes over a place are averaged, because a road has only one height;
+    headings, pitches and rolls are kept. ``Route.ground_truth`` has the poses with the averaged
+    heights.
 
     Args:
         T_wc: ``(N, 4, 4)`` float64, y down.
@@ -182,15 +182,15 @@ def route_of_poses(T_wc: Float, name: str, calibration: str = "00-02") -> Route:
         calibration: one of `CALIBRATIONS`, the KITTI sequences whose camera is used.
 
     Raises:
-        InputError: the calibration is unknown, a pose is not finite, there are fewer than 20 poses
-            or 20 m, or two poses are more than 5 m apart.
+        InputError: the calibration is unknown, a pose is not finite, the path has fewer than 20
+            poses or is shorter than 20 m, or consecutive poses are more than 5 m apart.
     """
     if calibration not in CALIBRATIONS:
         raise InputError(
             f"--calibration {calibration}: unknown; choose one of {', '.join(CALIBRATIONS)}."
         )
     if not np.isfinite(T_wc).all():
-        raise InputError(f"{name}: a pose holds NaN or infinity; repair the trajectory.")
+        raise InputError(f"{name}: a pose contains NaN or infinity; repair the trajectory.")
     if len(T_wc) < 20:
         raise InputError(f"{name}: {len(T_wc)} poses; a trajectory needs at least 20.")
     steps = np.linalg.norm(np.diff(T_wc[:, :3, 3], axis=0), axis=1)
@@ -220,7 +220,8 @@ def route_of_poses(T_wc: Float, name: str, calibration: str = "00-02") -> Route:
 
 
 def _round_corners(leg: _Leg) -> tuple[Float, Float]:
-    """Samples of the middle line every 0.25 m, with arcs at the corners, and the lane at each."""
+    """``(K, 2)`` samples of the middle line every 0.25 m, with arcs at the corners, and the
+    ``(K,)`` lane at each sample."""
     corners = np.array(leg.corners, np.float64)
     lanes = np.array(leg.lanes or (1.0,) * len(corners))
     points, lane = [corners[0][None]], [lanes[:1]]
@@ -253,7 +254,7 @@ def _round_corners(leg: _Leg) -> tuple[Float, Float]:
     keep = np.r_[True, np.diff(along) > 1e-9]
     at = np.arange(0, along[-1], 0.25)
     dense = np.stack([np.interp(at, along[keep], line[keep, i]) for i in (0, 1)], axis=1)
-    # A change of lanes takes some 20 m.
+    # Changing the lane takes about 20 m.
     return _smooth(dense, 25), _smooth(np.interp(at, along[keep], value[keep])[:, None], 81)[:, 0]
 
 
@@ -276,7 +277,7 @@ def _headings(line: Float) -> Float:
 
 
 def _drive(path: Float, speed: float) -> Float:
-    """Positions ``(N, 2)`` at 10 Hz along a path ``(K, 2)``, slower in bends."""
+    """``(N, 2)`` positions at 10 Hz along a ``(K, 2)`` path, slower in bends."""
     along = np.cumsum(np.r_[0, np.linalg.norm(np.diff(path, axis=0), axis=1)])
     keep = np.r_[True, np.diff(along) > 1e-9]
     along, path = along[keep], path[keep]
@@ -291,7 +292,7 @@ def _drive(path: Float, speed: float) -> Float:
 
 
 def _poses(xz: Float, terrain: Terrain) -> Float:
-    """Camera poses over the terrain: heading and pitch follow the path, with a slight sway."""
+    """``(N, 4, 4)`` camera poses whose heading and pitch follow the path and sway slightly."""
     up = terrain.height(xz)
     smooth = _smooth(np.column_stack([xz, up]), 7)
     step = np.gradient(smooth, axis=0)
@@ -313,7 +314,7 @@ def _poses(xz: Float, terrain: Terrain) -> Float:
 
 
 def _waves(xz: Float, seed: int) -> Float:
-    """Heights of hills with unit amplitude at ``(N, 2)`` places."""
+    """``(N,)`` heights of hills with amplitude 1 at ``(N, 2)`` positions."""
     rng = np.random.default_rng(seed)
     total = np.zeros(len(xz))
     for k in range(4):
@@ -334,7 +335,7 @@ def _terrain(xz: Float, height: Callable[[Float], Float]) -> Terrain:
 
 
 def _heights_of(xz: Float, up: Float) -> Callable[[Float], Float]:
-    """A smooth height function through the given heights, averaged where passes disagree."""
+    """A smooth function through the given heights, which averages the heights of several passes."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(xz)
@@ -342,10 +343,9 @@ def _heights_of(xz: Float, up: Float) -> Callable[[Float], Float]:
 
     def height(at: Float) -> Float:
         distance, near = tree.query(at, k=min(24, len(xz)))
-        # Away from the road the ground keeps the road's height.
+        # Away from the road, the ground has the height of the road.
         scale = np.maximum(distance[:, :1], 8.0)
         weight = np.exp(-0.5 * ((distance - distance[:, :1]) / scale) ** 2)
-        total: Float = (averaged[near] * weight).sum(axis=1) / weight.sum(axis=1)
-        return total
+        return np.asarray((averaged[near] * weight).sum(axis=1) / weight.sum(axis=1))
 
     return height

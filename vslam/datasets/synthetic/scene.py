@@ -1,5 +1,5 @@
-"""The scene of the renderer, as its kernels take it: flat textured surfaces, their textures with
-mipmaps, light and camera."""
+"""The scene in the form that the renderer's kernels use: flat textured surfaces, their textures
+with mipmaps, light and camera."""
 
 from __future__ import annotations
 
@@ -21,14 +21,17 @@ class Surfaces(NamedTuple):
 
     Attributes:
         origin, edge_s, edge_t: ``(Q, 3)`` float64 metres, world (x right, y down, z forward).
-        uv: ``(Q, 6)`` float64 ``u0 us ut v0 vs vt``: the texture coordinates
-            ``u = u0 + us s + ut t`` and v alike, where 1 is the width or height of the texture.
-        texture: ``(Q,)`` int32 number in the atlas; a texture with alpha makes a cut-out.
+        uv: ``(Q, 6)`` float64 ``u0 us ut v0 vs vt`` for the texture coordinates
+            ``u = u0 + us s + ut t`` and ``v = v0 + vs s + vt t``, where 1 is the width or height of
+            the texture.
+        texture: ``(Q,)`` int32 number in the atlas; where the texture has alpha, only its opaque
+            part is visible (a cut-out).
         detail: ``(Q,)`` int32 fine texture that multiplies the base texture, -1 for none.
         detail_size: ``(Q,)`` float64 metres that one repeat of the fine texture covers.
         gain: ``(Q,)`` float64 factor on the albedo.
         triangle: ``(Q,)`` bool, keep only ``s + t <= 1``.
-        layer: ``(Q,)`` uint8; of two surfaces in one plane the higher layer is visible.
+        layer: ``(Q,)`` uint8; of two surfaces in one plane, the one with the higher layer is
+            visible.
         material: ``(Q,)`` uint8 ``OPAQUE``, ``FOLIAGE`` or ``SCREEN``.
         thing: ``(Q,)`` int32 number of the object that the surface is a part of, -1 for ground.
     """
@@ -58,7 +61,7 @@ class Surfaces(NamedTuple):
 
 
 def join(parts: list[Surfaces]) -> Surfaces:
-    """All surfaces of ``parts`` (at least one) in their order."""
+    """Join at least one part, in order."""
     if len(parts) == 1:
         return parts[0]
     return Surfaces(*map(np.concatenate, zip(*parts, strict=True)))
@@ -79,7 +82,7 @@ def patches(
     material: int = OPAQUE,
     thing: int = -1,
 ) -> Surfaces:
-    """Surfaces that differ only in position and texture coordinates; arrays as in `Surfaces`."""
+    """Make surfaces that differ only in position and texture coordinates, as in `Surfaces`."""
     arrays = [np.asarray(x, np.float64) for x in (origin, edge_s, edge_t)]
     n = max(len(x) if x.ndim == 2 else 1 for x in arrays)
     o, s, t = (_rows(x, n) for x in arrays)
@@ -148,6 +151,7 @@ class AtlasBuilder:
         return len(self._grey) - 1
 
     def build(self) -> Atlas:
+        """Join the textures."""
         offset, texels = _flatten([*self._grey])
         alpha_offset, alpha = _flatten(self._alpha)
         log_size = [[int(n).bit_length() - 1 for n in p[0].shape[::-1]] for p in self._grey]
@@ -183,7 +187,7 @@ def _flatten(
 
 
 class LightValues(NamedTuple):
-    """Sun, sky and air in the form for kernels, all f8; `render.Light` documents the fields.
+    """Sun, sky and air as f8 for kernels; `render.Light` documents the other fields.
 
     ``sun_x``, ``sun_y``, ``sun_z``: unit vector towards the sun, world.
     """
@@ -201,7 +205,7 @@ class LightValues(NamedTuple):
 
 
 class PosedCamera(NamedTuple):
-    """A camera with its pose in the form for kernels.
+    """A camera with its pose, for kernels.
 
     ``T_wc`` (4, 4) f8; ``fx``, ``fy``, ``cx``, ``cy`` f8 pixels; ``height``, ``width`` i8 pixels.
     """
@@ -216,11 +220,11 @@ class PosedCamera(NamedTuple):
 
 
 class SampleBand(NamedTuple):
-    """The samples of a band of image rows, h rows of w samples.
+    """``(h, w)`` samples in a band of image rows.
 
     ``first_row`` i8 first row of the band, in pixels; ``samples`` i8 samples per pixel in each
     direction; ``inverse_depth`` (h, w) f4 1/z of the nearest surface, 0 if there is none; ``seen``
-    (h, w) i4 the surface's row in the result of `find_visible`, -1 if there is none.
+    (h, w) i4 index of this surface in the result of `find_visible`, -1 if there is none.
     """
 
     first_row: int

@@ -1,4 +1,4 @@
-"""Shading of pixels: trilinear texture, sun, shadow, haze and sky."""
+"""Shading of pixels: trilinear textures, sun, shadows, lamps, haze and sky."""
 
 from __future__ import annotations
 
@@ -28,16 +28,17 @@ _DETAIL_ENDS = 12.0  # texels of the detail texture per pixel at which its contr
 _SKY_HAZE = 185.0  # haze at which the panorama keeps its own grey levels
 SKY_RISE = 1.0  # tangent of the elevation at the upper edge of the sky's panorama
 SKY_FALL = 0.1  # tangent of the depression at its lower edge
-_GLARE, _GLARE_WIDTH = 120.0, 0.10  # grey levels added at the sun; 1 - cos(angle) of a quarter
+# Grey levels that the glare adds at the sun, and 1 - cos(angle) at which it falls to a quarter.
+_GLARE, _GLARE_WIDTH = 120.0, 0.10
 _POOL_GAIN = 2.5  # brightness under a street lamp relative to a lit window
-_SHADE_BIAS = 0.35  # m, an occluder must be this much higher than a point to shade it
+_SHADE_BIAS = 0.35  # m; an occluder must be this much higher than a point to shade it
 
 
 class _PixelRun(NamedTuple):
     """Neighbouring pixels of one row that see one surface.
 
-    ``start``, ``end`` i8 range of columns, without ``end``; ``x``, ``y`` f8 position at which the
-    first pixel is sampled, the others with the same offset; ``weight`` f8 fraction of each pixel
+    ``start``, ``end`` i8 range of columns, without ``end``; ``x``, ``y`` f8 position of the sample
+    in the first pixel, with the same offset in the others; ``weight`` f8 fraction of each pixel
     that the surface covers.
     """
 
@@ -51,9 +52,9 @@ class _PixelRun(NamedTuple):
 class _RowBuffers(NamedTuple):
     """Working memory for one row of W pixels.
 
-    ``total`` (W,) f8 radiance so far; ``nearest`` (W,) f8 greatest 1/z so far. For the present run:
+    ``total`` (W,) f8 radiance so far; ``nearest`` (W,) f8 largest 1/z so far. For the current run:
     ``texel`` (6, W) f8 depth, s, t, half the distance of two texture samples in s and in t, albedo;
-    ``size`` (W,) f4 texels per pixel; ``bits`` (W,) i4 the same memory as integers.
+    ``size`` (W,) f4 texels per pixel; ``bits`` (W,) i4 the bits of ``size`` (same memory).
     """
 
     total: NDArray[np.float64]
@@ -77,7 +78,7 @@ def _bilinear(texels, at, log_w, log_h, level, u, v):
     c0, r0 = int(x0), int(y0)
     c1, r1 = (c0 + 1) & mask_u, at + (((r0 + 1) & mask_v) << row_log)
     c0, r0 = c0 & mask_u, at + ((r0 & mask_v) << row_log)
-    # Unsigned indices spare the check for negative ones.
+    # Unsigned indices avoid Numba's check for negative ones.
     a, b = np.float32(texels[np.uintp(r0 + c0)]), np.float32(texels[np.uintp(r0 + c1)])
     c, d = np.float32(texels[np.uintp(r1 + c0)]), np.float32(texels[np.uintp(r1 + c1)])
     upper = a + (b - a) * fx
@@ -86,15 +87,16 @@ def _bilinear(texels, at, log_w, log_h, level, u, v):
 
 @inline
 def _log2(bits):
-    """Binary logarithm of a float32, given by its bits: the integer part and the fraction, which
-    is interpolated linearly between powers of two."""
+    """Binary logarithm of the float32 with these bits: the integer part and the fraction, which is
+    interpolated linearly between powers of two."""
     return (int(bits) >> 23) - 127, np.float32(int(bits) & 0x7FFFFF) * np.float32(1.0 / 0x800000)
 
 
 @inline
 def _trilinear(texels, offset, number, log_w, log_h, bits, u, v):
-    """Texture ``number`` at ``(u, v)``, averaged over about as many texels of level 0 as the
-    float32 with these ``bits``. Levels are blended over the middle half of an octave."""
+    """Texture ``number`` at ``(u, v)``, averaged over a pixel. ``bits`` are those of a float32, the
+    number of texels of level 0 per pixel in one direction. Two levels are blended over the middle
+    half of an octave."""
     low, part = _log2(bits)
     top = max(log_w, log_h)
     part = (part - np.float32(0.25)) * np.float32(2.0)
@@ -102,7 +104,7 @@ def _trilinear(texels, offset, number, log_w, log_h, bits, u, v):
         low, part = 0, np.float32(0.0)
     if low >= top:
         low, part = top, np.float32(0.0)
-    # With more than one return, Numba would count the arrays' references at each call.
+    # There is only one return statement, because Numba would otherwise count references here.
     row = np.uintp(number)
     high = low
     if part >= 1.0:
@@ -119,7 +121,7 @@ def _trilinear(texels, offset, number, log_w, log_h, bits, u, v):
 @inline
 def _sky(atlas, number, light, x, y, z, bits):
     """Grey level of the panorama in the world direction ``(x, y, z)``, with the glare around the
-    sun; ``bits`` are those of the float32 number of texels per pixel."""
+    sun; ``bits`` as in `_trilinear`."""
     texels, offset, log_size = atlas.texels, atlas.offset, atlas.log_size
     log_w, log_h = log_size[number, 0], log_size[number, 1]
     square = x * x + z * z
@@ -134,7 +136,7 @@ def _sky(atlas, number, light, x, y, z, bits):
 
 @inline
 def _lit(shadow, frame, light, slope, x, y, z):
-    """Fraction of the sunlight that reaches a world point: 0 in shadow to 1, with a soft edge."""
+    """Fraction of the sunlight that reaches a world point; shadows have soft edges."""
     up = -y
     a = (x - light.sun_x * slope * up - frame[0]) / frame[2] - 0.5
     b = (z - light.sun_z * slope * up - frame[1]) / frame[2] - 0.5
@@ -179,7 +181,8 @@ def _pool(pools, frame, x, y, z):
 def shade(visible, band, atlas, sky, light, shadows, pools, camera, view):
     """Shade the rows of a view that belong to a band of samples.
 
-    Pixels whose samples all see one surface are shaded in runs, others once for each surface.
+    Pixels whose samples all see one surface are shaded in runs; other pixels are shaded once for
+    each surface.
 
     Args:
         visible: from `rasterise.find_visible`.
@@ -246,8 +249,9 @@ def shade(visible, band, atlas, sky, light, shadows, pools, camera, view):
 
 @inline
 def _kinds(seen, row, column, samples, number, weight, shift_u, shift_v):
-    """Collect the different surfaces that the samples of a pixel see, with the number of samples
-    and the sum of their offsets from the pixel's centre; returns the number of surfaces."""
+    """Collect the different surfaces that the samples of a pixel see, and for each the number of
+    its samples and the sum of their offsets from the pixel's centre; returns the number of
+    surfaces."""
     kinds = 0
     step = 1.0 / samples
     for a in range(samples):
@@ -268,6 +272,7 @@ def _kinds(seen, row, column, samples, number, weight, shift_u, shift_v):
 
 @inline
 def _alike(seen, row, column, samples, first):
+    """Whether all samples of a pixel see the surface ``first``."""
     alike = True
     for a in range(samples):
         for b in range(samples):
@@ -277,7 +282,7 @@ def _alike(seen, row, column, samples, first):
 
 @inline
 def _sky_run(run, atlas, sky, light, camera, buffers):
-    """Like `_shade_run`, for the sky."""
+    """Add the sky to the pixels of a run, as `_shade_run` adds a surface."""
     start, end, x0, y, weight = run.start, run.end, run.x, run.y, run.weight
     log_size, T_wc = atlas.log_size, camera.T_wc
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
@@ -298,8 +303,8 @@ def _sky_run(run, atlas, sky, light, camera, buffers):
 
 @inline
 def _shade_run(run, visible, number, atlas, light, shadows, pools, camera, buffers):
-    """Add surface ``number`` of ``visible`` to ``buffers.total`` and ``buffers.nearest`` on the
-    pixels of a run; the other arguments are those of `shade`."""
+    """Add a surface, row ``number`` of ``visible``, to the pixels of a run, in ``buffers.total``
+    and ``buffers.nearest``; the other arguments are those of `shade`."""
     start, end, x0, y, weight = run.start, run.end, run.x, run.y, run.weight
     texels, offset, log_size, T_wc = atlas.texels, atlas.offset, atlas.log_size, camera.T_wc
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
@@ -313,7 +318,7 @@ def _shade_run(run, visible, number, atlas, light, shadows, pools, camera, buffe
     base_x = T_wc[0, 1] * ry + T_wc[0, 2] + (x0 - cx) * step_x
     base_y = T_wc[1, 1] * ry + T_wc[1, 2] + (x0 - cx) * step_y
     base_z = T_wc[2, 1] * ry + T_wc[2, 2] + (x0 - cx) * step_z
-    n = np.uintp(number)  # counting the references of a row view would cost more than this indexing
+    n = np.uintp(number)  # a view of the row would be slower, because Numba counts its references
     au, av = visible[n, TEXTURE], visible[n, TEXTURE + 3]
     bu, bv = visible[n, TEXTURE + 1], visible[n, TEXTURE + 4]
     inverse_0 = visible[n, 6] * x0 + visible[n, 7] * y + visible[n, 8]

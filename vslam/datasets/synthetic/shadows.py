@@ -1,4 +1,4 @@
-"""Cast shadows, as a map of the highest occluder on each sun ray, and light of street lamps."""
+"""Shadows, as a map of the highest occluder on each sun ray, and the light of street lamps."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _POOL_CELL, _POOL_REACH = 0.5, 16.0  # m
 
 
 class ShadowMap(NamedTuple):
-    """The highest occluder on each sun ray; the cell of a ray is where it meets height 0.
+    """The highest occluder on each sun ray; the cell of a ray is where the ray meets height 0.
 
     Attributes:
         height_cm: ``(R, C)`` uint16 height of the highest occluder above ``frame[3]`` in
@@ -46,7 +46,7 @@ NO_LAMPS = LampPools(np.zeros((1, 1), np.float32), np.array([0.0, 0.0, 1.0]))
 
 
 def lamp_pools(lamps: NDArray[np.float64]) -> LampPools:
-    """The light of street lamps at ``(L, 2)`` places (x, z)."""
+    """The light of street lamps at ``(L, 2)`` positions (x, z)."""
     if len(lamps) == 0:
         return NO_LAMPS
     low = np.floor(lamps.min(axis=0) - _POOL_REACH)
@@ -65,34 +65,34 @@ def lamp_pools(lamps: NDArray[np.float64]) -> LampPools:
 
 
 def cast_shadows(surfaces: Surfaces, atlas: Atlas, sun: NDArray[np.float64]) -> ShadowMap:
-    """Shadows of all surfaces except the ground (``thing`` -1).
+    """The shadows of all surfaces except the ground (``thing`` -1).
 
     ``sun`` is a ``(3,)`` unit vector towards the sun.
     """
-    casts = surfaces.select(surfaces.thing >= 0)
-    if not len(casts.origin):
+    occluders = surfaces.select(surfaces.thing >= 0)
+    if not len(occluders.origin):
         return ShadowMap(np.zeros((1, 1), np.uint16), np.array([0.0, 0.0, 1.0, 0.0]))
     corners = np.stack(
         [
-            casts.origin + a * casts.edge_s + b * casts.edge_t
+            occluders.origin + a * occluders.edge_s + b * occluders.edge_t
             for a, b in ((0, 0), (1, 0), (0, 1), (1, 1))
         ]
     )
     slope = sun[[0, 2]] / max(-sun[1], 0.05)
     up = -corners[..., 1]
-    cast = corners[..., [0, 2]] - up[..., None] * slope
-    low, high = cast.min(axis=(0, 1)) - 1.0, cast.max(axis=(0, 1)) + 1.0
+    shadow_xz = corners[..., [0, 2]] - up[..., None] * slope
+    low, high = shadow_xz.min(axis=(0, 1)) - 1.0, shadow_xz.max(axis=(0, 1)) + 1.0
     cell = max(_FINEST, math.sqrt(float(np.prod(high - low)) / _MAX_CELLS))
     columns, rows = np.ceil((high - low) / cell).astype(int) + 1
     frame = np.array([low[0], low[1], cell, float(up.min()) - 1.0])
     shadows = ShadowMap(np.zeros((rows, columns), np.uint16), frame)
-    _cast(casts, atlas, slope, shadows)
+    _cast(occluders, atlas, slope, shadows)
     return shadows
 
 
 @kernel
 def _cast(surfaces, atlas, slope, shadows):
-    """Raise the heights of a shadow map to those of the occluders.
+    """Raise the heights of a shadow map to the heights of the occluders.
 
     Args:
         surfaces, atlas: `scene.Surfaces` of the occluders, `scene.Atlas`.

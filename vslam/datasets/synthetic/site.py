@@ -1,4 +1,4 @@
-"""A town under construction, which is shared by all functions that add to it, and its textures."""
+"""A town under construction, to which many functions add, and its textures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,11 @@ from vslam.datasets.synthetic.textures import Rng
 
 @dataclass(frozen=True)
 class Palette:
-    """Texture numbers in the atlas; ``signs`` has a pair of front and back for each sign."""
+    """Numbers of textures in the atlas.
+
+    ``signs`` has the front and the back of each sign. ``later_twigs`` are the sparser twigs of
+    trees after a change.
+    """
 
     sky: int
     twigs: list[int]
@@ -39,7 +43,7 @@ class Palette:
 
 
 def make_palette(rng: Rng, atlas: AtlasBuilder, pool: int) -> Palette:
-    """Paint the textures; ``pool`` is the number of variants of the most varied ones."""
+    """Paint the textures; ``pool`` is the number of variants of trees, fences and walls."""
     add = atlas.add
     return Palette(
         sky=add(textures.sky(rng)),
@@ -69,7 +73,7 @@ def _sign(rng: Rng, atlas: AtlasBuilder) -> tuple[int, int]:
 
 
 def _kerb(rng: Rng) -> textures.Grey:
-    """Kerb stones, each a metre long; the texture covers 4 m."""
+    """Kerb stones of 1 m; the texture covers 4 m."""
     tone = np.repeat(rng.uniform(135, 175, 4), 128)[None, :]
     grey = tone * (1.0 + 0.09 * textures.noise(rng, 32, 512, 8.0, 3))
     grey[:, ::128] = grey[:, 1::128] = 60.0
@@ -78,11 +82,10 @@ def _kerb(rng: Rng) -> textures.Grey:
 
 def _roof_tiles(rng: Rng) -> textures.Grey:
     y, x = np.mgrid[0:256, 0:256]
-    course = 60 + 40 * rng.random() + 13 * np.sin(2 * np.pi * x / 12.8)
-    course = (
-        course * np.where(y % 16 < 4, 0.55, 1.0) * rng.uniform(0.8, 1.2, (16, 20))[y // 16, x // 13]
-    )
-    return np.clip(course * (1 + 0.13 * textures.noise(rng, 256, 256, 60.0, 6)), 5, 240)
+    grey = 60 + 40 * rng.random() + 13 * np.sin(2 * np.pi * x / 12.8)
+    tone = rng.uniform(0.8, 1.2, (16, 20))[y // 16, x // 13]
+    grey = grey * np.where(y % 16 < 4, 0.55, 1.0) * tone
+    return np.clip(grey * (1 + 0.13 * textures.noise(rng, 256, 256, 60.0, 6)), 5, 240)
 
 
 Float = NDArray[np.float64]
@@ -114,16 +117,16 @@ class Site:
     """The town so far, and everything that is needed to add to it.
 
     Attributes:
-        route, variation: what is built.
+        route, variation: the drive and the variation of its town.
         roads: the route's roads with side streets.
         style: cross-section of the roads.
         plan: occupied ground.
         atlas, palette: textures.
         rng: random generator for everything that may differ between variations.
         cameras: ``(N, 2)`` x and z of all possible camera positions.
-        lamps: x and z of the street lamps.
-        parts: surfaces of each thing, in the route's world.
-        place, when: for each thing; see `town.Town`.
+        lamps: x and z of each street lamp.
+        parts: surfaces of the things, in the route's world.
+        place, when: of each thing, as in `town.Town`.
     """
 
     route: Route
@@ -142,11 +145,11 @@ class Site:
 
     @property
     def next_thing(self) -> int:
-        """The ``thing`` number for the surfaces of the next thing."""
+        """Number of the next thing, for ``Surfaces.thing``."""
         return len(self.place)
 
     def stand(self, model: Surfaces, xz: Float, heading: float, when: int = ALWAYS) -> None:
-        """Place a model on the ground; its surfaces must have the number `next_thing`."""
+        """Place a model on the ground as the next thing; its ``thing`` must be `next_thing`."""
         up = float(self.route.terrain.height(xz[None])[0])
         self.parts.append(model.moved(solids.turn(heading), np.array([xz[0], -up, xz[1]])))
         self.place.append(xz)

@@ -1,7 +1,7 @@
 """Houses, trees and street furniture as flat surfaces.
 
-Each has a frame of its own with x right, y down, z away from the viewer, and the ground at y = 0;
-its front lies in the plane z = 0 or faces -z.
+Each model has its own frame: x right, y down, z away from the viewer, and the ground at y = 0. Its
+front lies in the plane z = 0 or faces -z.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from vslam.datasets.synthetic.scene import FOLIAGE, SCREEN, Surfaces, join, patches
 from vslam.datasets.synthetic.textures import Rng
 
-FOUNDATION = 1.2  # m that walls extend below the ground, for slopes
+FOUNDATION = 1.2  # m; walls extend this far below the ground, for slopes
 
 Vector = tuple[float, ...] | NDArray[np.float64]
 
 
 def turn(heading: float) -> NDArray[np.float64]:
-    """Rotation ``(3, 3)`` of the z axis to ``heading`` (radians from +z towards +x)."""
+    """``(3, 3)`` rotation of the z axis to a heading (radians from +z towards +x)."""
     c, s = np.cos(heading), np.sin(heading)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
@@ -29,7 +29,7 @@ def box(
     low: Vector, high: Vector, texture: int, *, thing: int, repeat: float = 0.0, gain: float = 1.0,
     material: int = 0,
 ) -> Surfaces:  # fmt: skip
-    """Sides and top of an upright box; a texture covers ``repeat`` metres, or a whole side if 0."""
+    """Sides and top of a box; the texture covers ``repeat`` metres, or a whole side if 0."""
     (x0, y0, z0), (x1, y1, z1) = low, high
     w, h, d = x1 - x0, y1 - y0, z1 - z0
     origin = [[x0, y0, z0], [x1, y0, z0], [x1, y0, z1], [x0, y0, z1], [x0, y0, z1]]
@@ -82,9 +82,8 @@ def roof(
     tone = float(rng.uniform(0.6, 1.4))
     over = 0.45
     if h > 7.0 and rng.random() < 0.15:
-        rim = box((-w / 2 - 0.2, -h - 0.5, -0.2), (w / 2 + 0.2, -h, d + 0.2), wall, thing=thing,
-                  repeat=3.0, gain=0.7)  # fmt: skip
-        return rim
+        return box((-w / 2 - 0.2, -h - 0.5, -0.2), (w / 2 + 0.2, -h, d + 0.2), wall, thing=thing,
+                   repeat=3.0, gain=0.7)  # fmt: skip
     rise = float(rng.uniform(0.32, 0.55)) * d
     parts = []
     drop = over * rise / (d / 2)
@@ -119,7 +118,7 @@ def roof(
 def tree(
     rng: Rng, twigs: list[int], bark: int, *, height: float, thing: int, conifer: bool = False
 ) -> Surfaces:
-    """A tree: a trunk, and a crown of twigs with alpha."""
+    """A tree: a trunk, branches, and a crown of twigs on flat cards with alpha."""
     radius = float(rng.uniform(0.018, 0.028)) * height
     clear = height * (0.12 if conifer else float(rng.uniform(0.28, 0.4)))
     parts = [_trunk(radius, clear + 0.25 * height, bark, thing)]
@@ -148,7 +147,7 @@ def tree(
 
 
 def bush(rng: Rng, twigs: list[int], *, height: float, thing: int) -> Surfaces:
-    """A bush of twigs down to the ground."""
+    """A bush of twigs that reach down to the ground."""
     cards = int(rng.integers(4, 8))
     middle = np.column_stack([
         rng.normal(0, 0.3 * height, cards), rng.uniform(-0.75, -0.4, cards) * height,
@@ -231,7 +230,7 @@ def panel(
 
 
 def lamp_post(height: float, arm: float, metal: int, screen: int, thing: int) -> Surfaces:
-    """Street lamp whose arm reaches towards -z."""
+    """A street lamp whose arm reaches towards -z."""
     return join([
         box((-0.07, -height, -0.07), (0.07, 0.3, 0.07), metal, thing=thing),
         box((-0.04, -height - 0.05, -arm), (0.04, -height + 0.03, 0.05), metal, thing=thing),
@@ -243,7 +242,7 @@ def lamp_post(height: float, arm: float, metal: int, screen: int, thing: int) ->
 def sign_post(
     rng: Rng, height: float, metal: int, faces: list[tuple[int, int]], thing: int
 ) -> Surfaces:
-    """Signs on a pole that face -z; ``faces`` has the textures of the front and back of each."""
+    """Signs on a pole that face -z; ``faces`` has the front and back texture of each sign."""
     parts = [box((-0.035, -height, -0.035), (0.035, 0.3, 0.035), metal, thing=thing)]
     top = -height
     for face in faces:

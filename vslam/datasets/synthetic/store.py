@@ -1,4 +1,4 @@
-"""Rendered sequences as KITTI trees in the user's cache; rendering that stopped is resumed."""
+"""Rendered sequences as KITTI trees in the user's cache; interrupted renderings are resumed."""
 
 from __future__ import annotations
 
@@ -32,9 +32,10 @@ from vslam.datasets.synthetic.render import Renderer, sensor_image
 from vslam.datasets.synthetic.routes import Route
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.town import build_town
+from vslam.errors import counted
 from vslam.trajectory import write_kitti
 
-VERSION = 2  # raise it whenever the same seed gives different images
+VERSION = 2  # must be raised whenever the same seed gives different images
 DEPTH_SCALE = 100.0  # 16-bit depth images are in centimetres
 _RECORD = "manifest.json"
 
@@ -45,7 +46,7 @@ OnFrame = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Stored:
-    """One rendered sequence: its KITTI tree ``root``, its ``name`` there, and its size in bytes."""
+    """A rendered sequence: the folder of its KITTI tree, and its name and size (bytes) there."""
 
     root: Path
     name: str
@@ -55,7 +56,7 @@ class Stored:
 
 
 def cache_folder() -> Path:
-    """The folder of rendered sequences, in ``$VSLAM_CACHE`` if that is set."""
+    """The folder of rendered sequences, in ``$VSLAM_CACHE`` or the user's cache folder."""
     from platformdirs import user_cache_path
 
     return Path(os.environ.get("VSLAM_CACHE") or user_cache_path("vslam")) / "synthetic"
@@ -73,36 +74,28 @@ def list_stored(cache: Path) -> list[Stored]:
     """All sequences in a cache folder, complete or not."""
     found = []
     for record in sorted(cache.glob(f"*/sequences/*/{_RECORD}")):
-        manifest = _read_record(record.parent)
-        if manifest:
-            size = sum(p.stat().st_size for p in record.parent.rglob("*") if p.is_file())
-            found.append(
-                Stored(
-                    record.parents[2],
-                    record.parent.name,
-                    int(manifest["route"]["frames"]),
-                    "checksums" in manifest,
-                    size,
-                )
-            )
+        folder, root = record.parent, record.parents[2]
+        if manifest := _read_record(folder):
+            frames, complete = int(manifest["route"]["frames"]), "checksums" in manifest
+            found.append(Stored(root, folder.name, frames, complete, _folder_size(folder)))
     return found
 
 
+def _folder_size(folder: Path) -> int:
+    """Total size of the files in a folder in bytes."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
 def place_folder(cache: Path) -> Path:
-    """The folder of the views that benchmarks of loop detectors have rendered."""
+    """The folder of views that benchmarks of loop detectors render."""
     return cache / f"v{VERSION}-places"
 
 
-def place_folders(cache: Path) -> list[Path]:
-    """The `place_folder` of each version that exists."""
-    return sorted(cache.glob("v*-places"))
-
-
 def clean(cache: Path, name: str | None = None) -> int:
-    """Remove one route's sequences of all variations, or everything; returns the freed bytes."""
+    """Remove everything, or all variations of one route; returns the number of freed bytes."""
     freed = 0
-    for places in place_folders(cache) if name is None else []:
-        freed += sum(p.stat().st_size for p in places.rglob("*") if p.is_file())
+    for places in cache.glob("v*-places") if name is None else []:
+        freed += _folder_size(places)
         shutil.rmtree(places)
     for stored in list_stored(cache):
         if name in (None, stored.name):
@@ -123,19 +116,19 @@ def render_sequence(
     threads: int = 2,
     on_frame: OnFrame | None = None,
 ) -> Path:
-    """Render a route, or its missing frames, and return the KITTI tree that holds it.
+    """Render the missing frames of a route, and return the folder of its KITTI tree.
 
     Damaged frames are rendered again, with a warning in the log.
 
     Args:
         route: drive to render.
-        variation: of the town.
+        variation: variation of the town.
         cache: folder of the trees; see `cache_folder`.
         depth: also write ``depth_0``, the depth of the left camera as 16-bit PNG in centimetres.
         until: render only the frames before this one; a later call can continue from there.
         verify: compare the checksums of all frames instead of all sizes and a few checksums.
-        threads: number of frames rendered at a time; the images do not depend on it.
-        on_frame: called with the number of finished frames and of all frames.
+        threads: number of frames that are rendered in parallel; images do not depend on it.
+        on_frame: called with the number of finished frames and the number of all frames.
 
     Raises:
         InputError: the folder cannot be written, the disk is too small, or another process is
@@ -151,7 +144,8 @@ def render_sequence(
         if not (damaged := damaged_frames(folder, found, thorough=verify)):
             return root
         numbers = ", ".join(map(str, damaged[:5])) + (", ..." if len(damaged) > 5 else "")
-        _log.warning("%s: %d damaged, rendered again: %s", folder, len(damaged), numbers)
+        count = counted(len(damaged), "damaged frame")
+        _log.warning("%s: rendering %s again: %s", folder, count, numbers)
         missing, n = damaged, frames
     else:
         missing = list(range(n)) if found is None else _missing(folder, n, depth)
@@ -213,9 +207,9 @@ def render_frames(
 
     Args:
         depth, threads: as for `render_sequence`.
-        on_frame: called with the number of finished frames and ``total``, of which all but
-            ``frames`` exist already.
-        monocular: render the left images alone.
+        on_frame: called with the number of finished frames and ``total``.
+        total: number of frames of the sequence; frames that are not rendered count as finished.
+        monocular: render only the left images.
     """
     town = build_town(route, variation)
     passes = Passes(route, town, variation)
@@ -236,8 +230,8 @@ def render_frames(
             )
             write_png(path, image, 1)
         if depth:
-            steps = np.clip(np.rint(views[0].depth * DEPTH_SCALE), 0, 65535).astype(np.uint16)
-            write_png(paths[2], steps, 1)
+            centimetres = np.clip(np.rint(views[0].depth * DEPTH_SCALE), 0, 65535)
+            write_png(paths[2], centimetres.astype(np.uint16), 1)
 
     with ThreadPoolExecutor(threads) as pool:
         try:
@@ -250,12 +244,12 @@ def render_frames(
 
 
 def _record_of(route: Route, variation: Variation, depth: bool) -> dict[str, Any]:
-    drive = hashlib.sha256(route.T_wc.tobytes()).hexdigest()
+    poses_sha256 = hashlib.sha256(route.T_wc.tobytes()).hexdigest()
     return {
         "version": VERSION,
         "variation": asdict(variation),
         "depth": depth,
-        "route": {"name": route.name, "frames": len(route.T_wc), "poses_sha256": drive},
+        "route": {"name": route.name, "frames": len(route.T_wc), "poses_sha256": poses_sha256},
     }
 
 
@@ -268,7 +262,7 @@ def _read_record(folder: Path) -> dict[str, Any] | None:
 
 
 def calibration_text(camera: Camera) -> str:
-    """``calib.txt`` of KITTI, for cameras that are grey."""
+    """The text of KITTI's ``calib.txt``; the colour cameras P2 and P3 repeat the grey ones."""
     lines = []
     for side in range(4):
         shift = -camera.bf if side % 2 else 0.0

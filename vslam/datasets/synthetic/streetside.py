@@ -16,7 +16,7 @@ _KERB = (0.15, 0.12)  # width and height of kerb stones, m
 
 
 def plant(site: Site, xz: Float, height: float) -> None:
-    """Plant a tree at ``xz`` if there is room."""
+    """Plant a tree at ``(2,)`` x and z if there is room."""
     rng = np.random.default_rng([site.variation.seed, 7, site.next_thing])
     if not site.plan.claim(rectangle(xz, 0.0, 1.6, 1.6), road=site.style.lane + 1.0):
         return
@@ -38,7 +38,7 @@ def plant(site: Site, xz: Float, height: float) -> None:
 
 
 def _pruned(site: Site, model: Surfaces, xz: Float) -> Surfaces | None:
-    """The model without twigs in the free space around the cameras; None if few would remain."""
+    """The model without the twigs too near to a camera; None if 30 % or more of them are."""
     near = float(np.min(np.linalg.norm(site.cameras - xz, axis=1)))
     middle = model.origin + 0.5 * (model.edge_s + model.edge_t)
     size = np.linalg.norm(model.edge_s, axis=1) + np.linalg.norm(model.edge_t, axis=1)
@@ -49,8 +49,8 @@ def _pruned(site: Site, model: Surfaces, xz: Float) -> Surfaces | None:
 
 
 def lay_kerbs(site: Site) -> None:
-    """Lay raised kerb stones between carriageway and pavement, with gaps where a road joins and
-    where the drive cuts a corner."""
+    """Lay raised kerb stones between carriageway and pavement, except where a road joins or where
+    the drive cuts a corner."""
     roads, edge, step = site.roads, site.style.parking, 8
     tree, cameras = cKDTree(roads.xz), cKDTree(site.cameras)
     first = np.arange(0, len(roads.xz) - step, step)
@@ -69,6 +69,7 @@ def lay_kerbs(site: Site) -> None:
 
 
 def _on_ground(site: Site, xz: Float, height: float) -> Float:
+    """``(N, 3)`` points above the ground at ``(N, 2)`` x and z."""
     up = site.route.terrain.height(xz) + height
     return np.stack([xz[:, 0], -up, xz[:, 1]], axis=1)
 
@@ -97,8 +98,7 @@ def furnish(site: Site) -> None:
         ):
             for at in range(int(rng.integers(0, step)), len(roads.xz), step):
                 if rng.random() < rate and not roads.junction[at]:
-                    out = roads.right[at] * side
-                    action(site, roads.xz[at], out, style)
+                    action(site, roads.xz[at], roads.right[at] * side, style)
 
 
 def _park(site: Site, xz: Float, out: Float, style: RoadStyle) -> None:
@@ -108,9 +108,9 @@ def _park(site: Site, xz: Float, out: Float, style: RoadStyle) -> None:
     near = xz + out * (style.lane + 1.15 + float(rng.normal(0, 0.06)))
     if not site.plan.claim(rectangle(near, heading, 2.05, 5.2), road=style.lane - 0.6):
         return
-    leaves = site.changes(rng, 0.8)
-    for when in (BEFORE, AFTER) if leaves else (ALWAYS,):
-        if leaves and rng.random() < 0.35:
+    changes = site.changes(rng, 0.8)
+    for when in (BEFORE, AFTER) if changes else (ALWAYS,):
+        if changes and rng.random() < 0.35:
             continue
         key = site.next_thing % ALIASES if site.variation.aliased else site.next_thing
         car = make_car(np.random.default_rng([site.variation.seed, 10, key]), site.atlas,
@@ -155,12 +155,8 @@ def _screen(site: Site, xz: Float, out: Float, style: RoadStyle) -> None:
 
 
 def _kerb_tree(site: Site, xz: Float, out: Float, style: RoadStyle) -> None:
-    rng = site.rng
-    plant(
-        site,
-        xz + out * (style.parking + float(rng.uniform(0.5, 2.5))),
-        float(rng.uniform(5.0, 10.5)),
-    )
+    at = xz + out * (style.parking + float(site.rng.uniform(0.5, 2.5)))
+    plant(site, at, float(site.rng.uniform(5.0, 10.5)))
 
 
 def _shrub(site: Site, xz: Float, out: Float, style: RoadStyle) -> None:

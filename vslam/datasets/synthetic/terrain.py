@@ -1,4 +1,4 @@
-"""Roads and heights of the ground, which a route and its town share, and the plan of the town."""
+"""Roads and heights of the ground, which a route and its town share, and the town's plan."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 Float = NDArray[np.float64]
 
-CLEARANCE = 2.5  # m around every camera position that are kept free
+CLEARANCE = 2.5  # m, radius around every camera position that is kept free
 _CELL = 0.5  # m
 _BORDER = 150.0  # m of plan around the roads
 
@@ -32,7 +32,8 @@ class Terrain:
     up: Float
 
     def height(self, xz: Float) -> Float:
-        """``(N,)`` metres above y = 0 at ``(N, 2)`` places; the grid's border extends outwards."""
+        """``(N,)`` metres above y = 0 at ``(N, 2)`` positions; outside of the grid, the height of
+        its border."""
         at = (np.asarray(xz, np.float64) - self.corner) / self.cell
         limit = np.array(self.up.shape[::-1]) - 1.001
         at = np.clip(at, 0.0, limit)
@@ -69,15 +70,13 @@ class Roads:
 
 
 def roads_of(lines: list[Float], *, same_road: float = 3.0) -> Roads:
-    """The roads along polylines ``(K, 2)``, with each stretch of road only once.
+    """The roads along polylines ``(K, 2)``, where each stretch of road occurs only once.
 
     Args:
         lines: middle lines of the driven roads (m), in driving order.
-        same_road: a later stretch counts as the same road as an earlier one if it is parallel and
+        same_road: a later stretch belongs to the same road as an earlier one if it is parallel and
             at most this far (m) from it.
     """
-    from scipy.spatial import cKDTree
-
     kept: list[NDArray[np.float64]] = []
     offset = 0.0
     for line in lines:
@@ -148,8 +147,10 @@ class Plan:
 
     def claim(self, corners: Float, *, road: float, tall: bool = False) -> bool:
         """Occupy the ground of a convex polygon ``(K, 2)`` if it is free, at least ``road`` metres
-        from the middle of every road, and clear of every camera; returns whether it was occupied.
-        ``tall`` objects block lines of sight."""
+        from the middle of every road, and `CLEARANCE` from every camera.
+
+        ``tall`` objects block lines of sight. Returns whether the ground was occupied.
+        """
         cells = self._cell(corners)
         low, high = cells.min(axis=0), cells.max(axis=0) + 1
         window = (slice(low[1], high[1]), slice(low[0], high[0]))
@@ -178,12 +179,12 @@ class Plan:
         )
 
     def road_distance(self, xz: Float) -> NDArray[np.float32]:
-        """``(N,)`` metres from ``(N, 2)`` places to the middle of the nearest road."""
+        """``(N,)`` metres from ``(N, 2)`` positions to the middle of the nearest road."""
         c, r = self._cell(xz).T
         return self._road[r, c]
 
     def open_ray(self, start: Float, heading: float, reach: float) -> Float | None:
-        """Places ``(K, 2)``, one per metre, along a line of sight; None if something tall blocks
+        """``(K, 2)`` positions along a line of sight, one per metre; None if a tall object blocks
         it."""
         distance = np.arange(2.0, reach, 1.0)[:, None]
         line = start + distance * np.array([np.sin(heading), np.cos(heading)])

@@ -1,4 +1,4 @@
-"""Procedural textures of plants, fences, walls, signs and sky: albedo 0 to 255, row 0 on top."""
+"""Procedural textures of plants, fences, walls, signs and sky: albedo 0 to 255, top row first."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def noise(rng: Rng, height: int, width: int, cell: float, octaves: int = 4) -> G
     """Tileable band-limited noise ``(height, width)`` float32 of zero mean and unit variance.
 
     Args:
-        cell: mesh of the coarsest grid in texels; each octave has half the mesh and 0.7 of the
-            contrast of the one before.
+        cell: cell size of the coarsest grid in texels; each octave has half the cell size and 0.7
+            of the contrast of the one before.
     """
     total = np.zeros((1, 1), np.float32)
     for octave in range(octaves):
-        mesh = max(cell * 0.5**octave, 1.0)
-        shape = max(2, round(height / mesh)), max(2, round(width / mesh))
+        size = max(cell * 0.5**octave, 1.0)
+        shape = max(2, round(height / size)), max(2, round(width / size))
         total = _stretch(total, *shape) + 0.7**octave * rng.standard_normal(shape, np.float32)
     total = _stretch(total, height, width)
     return np.asarray((total - total.mean()) / max(float(total.std()), 1e-6), np.float32)
@@ -36,16 +36,15 @@ def _stretch(grid: Grey, height: int, width: int) -> Grey:
     """Enlarge a grid by bilinear interpolation with periodic borders."""
     if grid.shape == (height, width):
         return grid
-    border = 1
-    padded = np.pad(grid, border, mode="wrap")
-    rows = (np.arange(height, dtype=np.float32) + 0.5) * (grid.shape[0] / height) - 0.5 + border
-    columns = (np.arange(width, dtype=np.float32) + 0.5) * (grid.shape[1] / width) - 0.5 + border
+    padded = np.pad(grid, 1, mode="wrap")
+    rows = (np.arange(height, dtype=np.float32) + 0.5) * (grid.shape[0] / height) - 0.5 + 1
+    columns = (np.arange(width, dtype=np.float32) + 0.5) * (grid.shape[1] / width) - 0.5 + 1
     at = np.meshgrid(columns, rows)
     return np.asarray(cv2.remap(padded, at[0], at[1], cv2.INTER_LINEAR), np.float32)
 
 
 def detail(rng: Rng, contrast: float, cell: float = 8.0, size: int = 256) -> Grey:
-    """A detail texture of mean 128, which multiplies another one; see `scene.Surfaces.detail`."""
+    """A fine texture of mean 128, which multiplies another one; see `scene.Surfaces.detail`."""
     return np.clip(128.0 * (1.0 + contrast * noise(rng, size, size, cell, 4)), 8, 255)
 
 
@@ -108,18 +107,16 @@ def foliage(rng: Rng, size: int = 256, density: float = 1.0) -> tuple[Grey, Grey
     alpha = np.zeros((size, size), np.float32)
     for _ in range(10):
         angle, reach = rng.uniform(0, 2 * np.pi), rng.uniform(0.25, 0.46) * size
-        end = (
-            int(size / 2 + reach * np.cos(angle)),
-            int(size / 2 + reach * np.sin(angle)),
-        )
+        end = (int(size / 2 + reach * np.cos(angle)), int(size / 2 + reach * np.sin(angle)))
         for image, value in ((alpha, 255.0), (grey, 24.0)):
             cv2.line(image, (size // 2, size // 2), end, value, 2)
     _leaves(rng, grey, alpha, int(1700 * density), radial=True)
     return grey, alpha
 
 
-def hedge(rng: Rng, width: int = 512, height: int = 128) -> tuple[Grey, Grey]:
+def hedge(rng: Rng) -> tuple[Grey, Grey]:
     """A clipped hedge with dense leaves and an uneven upper edge, and its alpha."""
+    width, height = 512, 128
     grey = np.full((height, width), 20.0, np.float32)
     alpha = np.zeros((height, width), np.float32)
     edge = (0.07 + 0.02 * noise(rng, 1, width, 24.0, 4)[0]) * height
@@ -210,24 +207,20 @@ def poster(rng: Rng, size: int = 128) -> Grey:
     return image
 
 
-def sky(rng: Rng, *, treeline: bool = True) -> Grey:
-    """Panorama of clouds over a far treeline; u is the heading, and v decreases with elevation."""
+def sky(rng: Rng) -> Grey:
+    """A panorama of clouds over distant trees; u is the heading, and v falls with elevation."""
     height, width = 512, 2048
     rise = np.linspace(SKY_RISE, -SKY_FALL, height, dtype=np.float32)[:, None]
     zenith = float(rng.uniform(70, 125))  # a clear sky is dark in a grey image
     image = zenith + 75.0 * np.exp(-rise / 0.25) * np.ones((1, width), np.float32)
     clouds = noise(rng, height, width, 300.0, 6)
     clouds = clouds + 0.5 * noise(rng, height, width, 90.0, 5)
-    image += (
-        np.clip(clouds - float(rng.uniform(0.0, 0.6)), 0, 1.6)
-        * 45.0
-        * np.clip(rise * 4 + 0.4, 0, 1)
-    )
+    clouds = np.clip(clouds - float(rng.uniform(0.0, 0.6)), 0, 1.6)
+    image += clouds * 45.0 * np.clip(rise * 4 + 0.4, 0, 1)
     image = np.minimum(image, 250.0)
-    if treeline:
-        for far, tone in ((0.050, 120.0), (0.032, 90.0)):
-            top = far + 0.25 * far * noise(rng, 1, width, 240.0, 7)[0]
-            rough = noise(rng, height, width, 10.0, 3)
-            trees = rise < top + 0.002 * rough
-            image = np.where(trees, tone + 9.0 * rough, image).astype(np.float32)
+    for far, tone in ((0.050, 120.0), (0.032, 90.0)):
+        top = far + 0.25 * far * noise(rng, 1, width, 240.0, 7)[0]
+        rough = noise(rng, height, width, 10.0, 3)
+        trees = rise < top + 0.002 * rough
+        image = np.where(trees, tone + 9.0 * rough, image).astype(np.float32)
     return image

@@ -1,4 +1,4 @@
-"""Building a town along a route; its layout depends only on route and variation."""
+"""Construction of a town along a route, which depends only on the route and the variation."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _ROADS = {
 
 @dataclass(frozen=True)
 class Town:
-    """A town: surfaces of T things, in all their variants before and after a change.
+    """A town of T things; an object before and after a change is two things.
 
     Attributes:
         surfaces: all surfaces, in the route's world.
@@ -44,7 +44,7 @@ class Town:
         sky: number of the sky's panorama in the atlas.
         place: ``(T, 2)`` float64 x and z of each thing.
         when: ``(T,)`` int8 ``ALWAYS``, ``BEFORE`` or ``AFTER``.
-        moving: cars in their own frames; see `solids`.
+        moving: moving cars, in their own frames; see `solids`.
         lamps: ``(L, 2)`` float64 x and z of street lamps.
     """
 
@@ -58,7 +58,8 @@ class Town:
 
 
 def build_town(route: Route, variation: Variation, aside: tuple[float, ...] = (0.0,)) -> Town:
-    """Build the town of a route, with room for cameras that are ``aside`` metres to its right."""
+    """Build the town of a route; ``aside`` lists the lateral shifts of cameras (m, to the right)
+    for which room is kept."""
     rng = np.random.default_rng([variation.seed, 1])
     atlas = AtlasBuilder()
     motorway = route.land == "motorway"
@@ -99,7 +100,7 @@ def build_town(route: Route, variation: Variation, aside: tuple[float, ...] = (0
 
 
 def _with_side_streets(roads: Roads, seed: int) -> Roads:
-    """The roads of the route, and short side streets that branch off."""
+    """The roads of the route with short side streets."""
     rng = np.random.default_rng([seed, 2])
     tree, stubs = cKDTree(roads.xz), []
     at = int(rng.integers(120, 240))
@@ -125,7 +126,7 @@ def _with_side_streets(roads: Roads, seed: int) -> Roads:
 
 
 def _house(site: Site, xz: Float, heading: float, size: tuple[float, float, float]) -> None:
-    """Build a house whose front stands at ``xz`` and faces against ``heading``."""
+    """Build a house whose front is at ``xz`` and faces in the direction opposite to ``heading``."""
     seed, number = site.variation.seed, site.next_thing
     key = number % ALIASES if site.variation.aliased else number
     rng = np.random.default_rng([seed, 3, key])
@@ -155,6 +156,7 @@ def _house(site: Site, xz: Float, heading: float, size: tuple[float, float, floa
 def _try_house(
     site: Site, front: Float, heading: float, size: tuple[float, float, float], clear: float
 ) -> bool:
+    """Build a house if its ground is free; returns whether it was built."""
     ahead = np.array([np.sin(heading), np.cos(heading)])
     middle = front + 0.5 * size[2] * ahead
     if not site.plan.claim(rectangle(middle, heading, size[0], size[2]), road=clear, tall=True):
@@ -164,6 +166,7 @@ def _try_house(
 
 
 def _size(site: Site, rng: Rng) -> tuple[float, float, float]:
+    """Draw width, height and depth of a house in metres."""
     if site.variation.aliased:
         rng = np.random.default_rng([site.variation.seed, 6, site.next_thing % ALIASES])
     if site.route.land == "town":
@@ -213,8 +216,8 @@ def close_sight_lines(site: Site) -> None:
             distance = site.plan.road_distance(line)
             for k in range(24, len(line), 3):
                 size = _size(site, rng)
-                if distance[k] > site.style.walk + 1.0 and _try_house(site, 
-                    line[k], heading + float(angle) + float(rng.normal(0, 0.25)), size,
-                    site.style.walk + 0.5,
-                ):  # fmt: skip
+                if distance[k] <= site.style.walk + 1.0:
+                    continue
+                facing = heading + float(angle) + float(rng.normal(0, 0.25))
+                if _try_house(site, line[k], facing, size, site.style.walk + 0.5):
                     break

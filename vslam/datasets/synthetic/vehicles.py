@@ -1,4 +1,4 @@
-"""Parked and moving cars: extruded outlines with painted sides."""
+"""Parked and moving cars, made of extruded outlines with painted sides."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from vslam.datasets.synthetic.scene import AtlasBuilder, Surfaces, join, patches
 from vslam.datasets.synthetic.textures import Grey, Rng, letters, noise, write
 
-# Outlines from the front bumper over the roof to the rear, as fractions of length and height; the
-# third number tells whether the strip that begins there is paint (0) or glass (1).
+# Outlines from the front bumper over the roof to the rear, as fractions of length and height. The
+# third number tells whether the strip that begins at the point is paint (0) or glass (1).
 _OUTLINES = {
     "hatchback": ((0.0, 0.16, 0), (0.0, 0.42, 0), (0.05, 0.52, 0), (0.27, 0.62, 1),
                   (0.45, 0.97, 0), (0.62, 1.0, 0), (0.86, 0.93, 1), (0.97, 0.62, 0),
@@ -30,14 +30,14 @@ _SIZES = {  # length, width, height in metres
 }
 
 _BELT, _ROOF = 0.6, 0.78  # height of the belt line and width of the roof, as fractions
-_TAPER_AT, _TAPER = (0.0, 0.12, 0.9, 1.0), (0.84, 1.0, 1.0, 0.9)  # width along the length
+_TAPER_AT, _TAPER = (0.0, 0.12, 0.9, 1.0), (0.84, 1.0, 1.0, 0.9)  # relative width along the car
 
 Float = NDArray[np.float64]
 
 
 def make_car(rng: Rng, atlas: AtlasBuilder, thing: int) -> Surfaces:
-    """A car with random shape, colour and number plate, at the origin with +z forward and wheels on
-    y = 0."""
+    """A car with a random shape, colour and number plate, at the origin, with +z forward and the
+    wheels on y = 0."""
     kind = str(rng.choice(list(_OUTLINES), p=[0.4, 0.24, 0.24, 0.12]))
     length, width, height = (float(x * rng.uniform(0.94, 1.06)) for x in _SIZES[kind])
     outline = np.array([(x, y) for x, y, _ in _OUTLINES[kind]])
@@ -53,7 +53,7 @@ def make_car(rng: Rng, atlas: AtlasBuilder, thing: int) -> Surfaces:
         [np.zeros(len(outline)), -height * outline[:, 1], length * (0.5 - outline[:, 0])], axis=1
     )
     parts = _sides((length, width, height), side_id, thing)
-    # The ends are narrower than the middle, the roof narrower than the belt.
+    # The ends are narrower than the middle, and the roof is narrower than the belt line.
     half = 0.5 * width * np.where(
         outline[:, 1] > _BELT,
         1.0 - (1.0 - _ROOF) * (outline[:, 1] - _BELT) / (1.0 - _BELT),
@@ -92,7 +92,7 @@ def make_car(rng: Rng, atlas: AtlasBuilder, thing: int) -> Surfaces:
 def _trapezium(
     top_left: Float, top_right: Float, low_left: Float, low_right: Float, texture: int, thing: int
 ) -> Surfaces:
-    """Two triangles that share a texture; corners ``(3,)``."""
+    """Two triangles that share a texture; the corners are ``(3,)``."""
     return join([
         patches(top_left, top_right - top_left, low_left - top_left, texture, triangle=True,
                 thing=thing),
@@ -102,8 +102,8 @@ def _trapezium(
 
 
 def _sides(size: tuple[float, float, float], texture: int, thing: int) -> list[Surfaces]:
-    """Both sides of a car of ``(length, width, height)``: a lower part that tapers at both ends,
-    and a cabin that leans inwards."""
+    """Both sides of a car of ``(length, width, height)``, each with a lower part that tapers at
+    both ends, and a cabin that leans inwards."""
     length, width, height = size
     parts = []
     for sign in (-1.0, 1.0):
@@ -122,14 +122,13 @@ def _sides(size: tuple[float, float, float], texture: int, thing: int) -> list[S
     return parts
 
 
-def _paint_side(
-    rng: Rng, outline: np.ndarray, glass: list[bool], paint: float
-) -> tuple[Grey, Grey]:
+def _paint_side(rng: Rng, outline: Float, glass: list[bool], paint: float) -> tuple[Grey, Grey]:
+    """The side of a car and its alpha."""
     width, height = 512, 128
     at = (outline * [width - 1, -(height - 1)] + [0, height - 1]).round().astype(np.int32)
     grey = np.full((height, width), paint, np.float32)
     grey *= np.linspace(1.15, 0.75, height, dtype=np.float32)[:, None]
-    # The bulge below the belt line reflects the sky, the sill reflects the street.
+    # The bulge below the belt line reflects the sky, and the sill reflects the street.
     at_row = np.linspace(0, 1, height, dtype=np.float32)[:, None]
     grey += 35.0 * np.exp(-(((at_row - 0.5) / 0.06) ** 2)) - 12.0 * (at_row > 0.68)
     grey = np.clip(grey, 6, 250)
@@ -156,7 +155,7 @@ def _paint_side(
     cv2.rectangle(grey, (0, int(0.45 * height)), (22, int(0.55 * height)), 205.0, -1)
     cv2.rectangle(grey, (width - 16, int(0.42 * height)), (width, int(0.6 * height)), 85.0, -1)
     grey[int(0.87 * height) :] = 26.0
-    # Wheels reach the ground; they are ellipses because texels are not square.
+    # Wheels are ellipses, because texels are not square.
     for x in (int(width * 0.185), int(width * 0.80)):
         centre, rim = (x, height - 29), float(rng.uniform(90, 190))
         axes = np.array([37, 28])

@@ -1,1 +1,1 @@
-"""Many runs: a grid of sequences, perturbations, detectors and seeds, one process per run."""
+"""Benchmarks: a grid of sequences, perturbations, detectors and seeds, with a process per run."""

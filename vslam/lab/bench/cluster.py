@@ -1,7 +1,7 @@
-"""Running the cells of a benchmark on a Dask cluster; the workers send their results back.
+"""Run the cells of a benchmark on a Dask cluster, whose workers send the results back.
 
-If a worker dies, the scheduler gives its cell to another one. The workers need vslam with the
-extra ``cluster``, and the data under the same path.
+If a worker dies, the scheduler gives its cells to another one. The workers need vslam with the
+extra ``cluster``, and the data under the same path as here.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from vslam.lab.bench.execute import CellOutcome, Failed, RunOptions, publish, ru
 from vslam.lab.bench.grid import Cell
 
 _CONNECT_S = 10
-_ASK_S = 2.0  # between questions whether to stop, since each one goes to the scheduler
+_POLL_S = 2.0  # between checks of the stop event; each check is a request to the scheduler
 
 
 def run_on_cluster(
     cells: Collection[Cell], options: RunOptions, scheduler: str, out: Path
 ) -> Generator[CellOutcome, None, None]:
-    """Run cells on the workers of a scheduler; publish and yield each one here when it arrives.
+    """Run cells on the workers of a scheduler; publish and yield each outcome when it arrives.
 
-    A worker runs as many cells at a time as it has threads. Leaving the iteration stops them.
+    A worker runs as many cells at a time as it has threads. Closing the generator stops them.
 
     Raises:
         InputError: Dask is not installed, or no scheduler answers.
-        ResultsError: as :func:`vslam.lab.bench.execute.publish`.
+        ResultsError: the results of a cell cannot be written.
     """
     try:
         from distributed import Client, Event, as_completed
@@ -40,11 +40,11 @@ def run_on_cluster(
         ) from error
     _require_certificates(scheduler)
     try:
-        resolve_address(scheduler)  # for a bad address, a client prints a traceback on closing
+        resolve_address(scheduler)  # a client with a bad address prints a traceback when it closes
         client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"--scheduler {scheduler}: nothing answers there; start one with 'dask scheduler' and "
+            f"--scheduler {scheduler}: no scheduler answers; start one with 'dask scheduler' and "
             "give the address that it prints, for example tcp://HOST:8786."
         ) from error
     stop = Event(f"vslam-bench-{uuid.uuid4().hex}", client=client)
@@ -52,26 +52,26 @@ def run_on_cluster(
         futures = client.map(_run_on_worker, cells, options=options, stop=stop.name, pure=False)
         cell_of = {future.key: cell for future, cell in zip(futures, cells, strict=True)}
         for future in as_completed(futures, loop=client.loop):
-            cell, defect = cell_of[future.key], future.exception()
-            outcome = future.result() if defect is None else Failed(cell, _said(defect))
+            cell, failure = cell_of[future.key], future.exception()
+            outcome = future.result() if failure is None else Failed(cell, _first_line(failure))
             future.release()  # otherwise Dask repeats the finished cells of a worker that dies
             publish(outcome, out)
             yield outcome
     finally:
-        with suppress(OSError):  # the scheduler has ended, and with it all that it ran
+        with suppress(OSError):  # the scheduler has ended, and its workers with it
             stop.set()
         client.close()
 
 
 def _require_certificates(scheduler: str) -> None:
-    """Refuse a TLS address without certificates, because Dask's client would not close."""
+    """Refuse a TLS address without certificates, with which Dask's client would never close."""
     from distributed.security import Security
 
     if not scheduler.startswith("tls://"):
         return
     try:
         context = Security().get_connection_args("client")["ssl_context"]
-    except (OSError, ValueError):  # the files are missing or are not certificates
+    except (OSError, ValueError):  # a file is missing or is not a certificate
         context = None
     if context is None:
         raise InputError(
@@ -81,7 +81,7 @@ def _require_certificates(scheduler: str) -> None:
 
 
 def _run_on_worker(cell: Cell, options: RunOptions, stop: str) -> CellOutcome:
-    """Run a cell on this worker, until the benchmark sets the event ``stop``."""
+    """Run a cell on this worker; kill it when the benchmark sets the event named ``stop``."""
     from distributed import Event
 
     event = Event(stop)
@@ -90,12 +90,12 @@ def _run_on_worker(cell: Cell, options: RunOptions, stop: str) -> CellOutcome:
 
     def stopped() -> bool:
         nonlocal last, is_stopped
-        if time.monotonic() - last > _ASK_S and not is_stopped:
+        if time.monotonic() - last > _POLL_S and not is_stopped:
             last, is_stopped = time.monotonic(), event.is_set()
         return is_stopped
 
     return run_cell(cell, options, stopped)
 
 
-def _said(error: BaseException) -> str:
+def _first_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}".splitlines()[0]

@@ -1,4 +1,4 @@
-"""Estimates of the time and disk space that a grid needs, before it starts and while it runs."""
+"""Estimate the time and disk space that a grid needs, before it starts and while it runs."""
 
 from __future__ import annotations
 
@@ -7,19 +7,27 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from vslam.errors import InputError
+from vslam.errors import InputError, counted
 from vslam.lab.bench.grid import Cell
 from vslam.report.schema import ReportJson
 
-# Used before any cell is finished: two threads of a Xeon, KITTI's images, with loop closing.
+# Seconds per frame and to start a run, used until a cell is finished. Measured with two threads of
+# a Xeon on KITTI's images, with loop closing.
 _FRAME_S, _START_S = 0.06, 5.0
-# Measured and rounded up: the kept files of a cell, and the map, which is deleted after the run.
+# Measured and rounded up: the files of a cell that are kept, and the map, which is deleted.
 _CELL_BYTES, _FRAME_BYTES, _SCRATCH_FRAME_BYTES = 100_000, 1_000, 45_000
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """``seconds`` with all jobs busy; ``kept`` and ``scratch`` bytes; ``basis`` as a text."""
+    """What a grid needs.
+
+    Attributes:
+        seconds: wall time if all jobs are always busy.
+        kept: bytes of the files that stay.
+        scratch: bytes of the files that are deleted after each run.
+        basis: what the estimate of the time is based on, in words.
+    """
 
     seconds: float
     kept: int
@@ -33,27 +41,31 @@ def estimate(
     frames: Mapping[str, int],
     jobs: int,
 ) -> Estimate:
-    """Estimate the missing cells from the finished ones, separately by detector if possible.
+    """Estimate the missing cells from the finished ones, per detector where possible.
 
     Args:
         finished: finished cells and their reports.
         frames: number of frames of each sequence.
-        jobs: cells that run at a time.
+        jobs: number of cells that run at a time.
     """
-    spent: dict[str, list[float]] = {}  # seconds a frame
-    start: list[float] = []
-    for cell, report in list(finished.items()):  # a copy, because cells end meanwhile
+    frame_s: dict[str, list[float]] = {}  # seconds per frame of each finished cell, by detector
+    starts: list[float] = []
+    for cell, report in list(finished.items()):  # a copy, because other threads add cells
         if report.fps > 0:
-            spent.setdefault(cell.detector, []).append(1.0 / report.fps)
-            start.append(report.startup_s)
-    every = [s for seconds in spent.values() for s in seconds]
-    startup = _mean(start, _START_S)
+            frame_s.setdefault(cell.detector, []).append(1.0 / report.fps)
+            starts.append(report.startup_s)
+    every = [s for seconds in frame_s.values() for s in seconds]
+    startup = _mean(starts, _START_S)
     seconds = sum(
-        startup + frames[cell.sequence] * _mean(spent.get(cell.detector, every), _FRAME_S)
+        startup + frames[cell.sequence] * _mean(frame_s.get(cell.detector, every), _FRAME_S)
         for cell in missing
     )
     longest = sorted((frames[cell.sequence] for cell in missing), reverse=True)[:jobs]
-    basis = f"by {len(every)} finished cells" if every else "a guess until the first is finished"
+    basis = (
+        f"based on {counted(len(every), 'finished run')}"
+        if every
+        else "a guess until the first run is finished"
+    )
     return Estimate(
         seconds=seconds / max(1, min(jobs, len(missing))),
         kept=sum(_CELL_BYTES + _FRAME_BYTES * frames[cell.sequence] for cell in missing),
@@ -71,13 +83,13 @@ def check_disk(needed: Estimate, out: Path) -> None:
     free = shutil.disk_usage(out).free
     if needed.kept + needed.scratch > free:
         raise InputError(
-            f"{out}: the grid needs {size(needed.kept + needed.scratch)} but {size(free)} are "
-            "free; free some space or name a folder on another disk with --out."
+            f"{out}: the grid needs {size(needed.kept + needed.scratch)} of disk space, but only "
+            f"{size(free)} are free; free some space or name a folder on another disk with --out."
         )
 
 
 def duration(seconds: float) -> str:
-    """``2 h 05 min``, ``7 min`` or ``40 s``."""
+    """A duration as a text: ``2 h 05 min``, ``7 min`` or ``40 s``."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
@@ -89,5 +101,5 @@ def size(n_bytes: float) -> str:
     return f"{n_bytes / 1e6:.0f} MB" if n_bytes < 1e9 else f"{n_bytes / 1e9:.1f} GB"
 
 
-def _mean(values: Collection[float], otherwise: float) -> float:
-    return sum(values) / len(values) if values else otherwise
+def _mean(values: Collection[float], default: float) -> float:
+    return sum(values) / len(values) if values else default

@@ -1,8 +1,8 @@
-"""Running cells: each in its own process, with its results published as one complete folder.
+"""Run each cell in its own process and publish its results as one complete folder.
 
 A cell is finished when its folder exists, so that a killed benchmark loses only the cells that were
-running. Results are passed as files in memory (a few MB), whichever machine made them; only this
-module writes to the folder of the benchmark.
+running. The result files (a few MB per cell) are passed in memory, also from other machines; only
+this module writes to the folder of the benchmark.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vslam.errors import InputError, ResultsError
 from vslam.lab.bench.grid import Cell, is_finished, tracked_nothing
 
 _POLL_S = 0.1
-_NOT_KEPT = {"map.npz"}  # hundreds of MB for a long sequence, and no figure needs it
+_NOT_KEPT = {"map.npz"}  # hundreds of MB for a long sequence; the report does not need it
 _PARTS, _FAILED = ".parts", "failed"
 
 
@@ -34,12 +34,12 @@ class RunOptions:
 
     Attributes:
         data: root of the data set on the machine that runs the cell; None for rendered towns.
-        config: thresholds, the text of a ``config.json``.
+        config: thresholds, as the text of a ``config.json``.
         threads: threads of each run; they do not change its result.
         command: program that accepts the arguments of ``vslam``; None for vslam itself.
-        others: programs like ``command`` for other systems, by the detector name of their cells.
+        others: programs of other systems, which accept the same arguments, by ``Cell.detector``.
         scratch: folder in which runs write; None for the machine's temporary folder.
-        source: arguments of ``vslam run`` that say how to read the data.
+        source: arguments of ``vslam run`` that describe how to read the data.
     """
 
     data: Path | None
@@ -53,7 +53,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Finished:
-    """A complete run: its files by path relative to ``folder``, in which they were written."""
+    """A complete run: its files by path relative to ``folder``, where the run wrote them."""
 
     cell: Cell
     folder: str
@@ -62,7 +62,7 @@ class Finished:
 
 @dataclass(frozen=True)
 class Failed:
-    """A run without results: ``message`` is one line, ``log`` its whole output."""
+    """A run without results: the reason in one line, and the whole output."""
 
     cell: Cell
     message: str
@@ -75,7 +75,7 @@ CellOutcome = Finished | Failed
 def run_cell(
     cell: Cell, options: RunOptions, stopped: Callable[[], bool] = lambda: False
 ) -> CellOutcome:
-    """Run one cell and return its files; nothing is left on this machine.
+    """Run one cell in a temporary folder and return its files.
 
     Args:
         stopped: called repeatedly; the run is killed when it returns True.
@@ -100,26 +100,26 @@ def run_cell(
                 return Finished(cell, str(folder), _read(folder) | {"log.txt": log.encode()})
         if code:
             return Failed(cell, _reason(code, log), log)
-        return Failed(cell, "no report of this run (another version of vslam?)", log)
+        return Failed(cell, "its report is missing, incomplete or of another version of vslam", log)
 
 
 def run_here(
     cells: Collection[Cell], options: RunOptions, jobs: int, out: Path
 ) -> Generator[CellOutcome, None, None]:
-    """Run cells on this machine, ``jobs`` at a time; publish and yield each one when it ends.
+    """Run cells on this machine, ``jobs`` at a time; publish and yield each outcome when it ends.
 
     Threads suffice, because each one only waits for a process. They also publish, so that a cell
-    that ends while the caller is interrupted is not lost. Leaving the iteration kills the runs.
+    that ends while the caller is interrupted is not lost. Closing the generator kills the runs.
 
     Raises:
-        ResultsError: as :func:`publish`.
+        ResultsError: the results of a cell cannot be written.
     """
     stop = threading.Event()
 
     def run_and_publish(cell: Cell) -> CellOutcome:
         try:
             outcome = run_cell(cell, options, stop.is_set)
-        except OSError as error:  # the run could not be started, or its files could not be read
+        except OSError as error:  # the run cannot be started, or its files cannot be read
             outcome = Failed(cell, error.strerror or str(error))
         if not stop.is_set() or isinstance(outcome, Finished):
             publish(outcome, out)
@@ -141,7 +141,7 @@ def finished_cells(cells: Collection[Cell], out: Path, config: str) -> list[Cell
 
 
 def publish(outcome: CellOutcome, out: Path) -> None:
-    """Write a finished cell into ``out``, completely or not at all; for a failed one, its log.
+    """Write a finished cell into ``out``, completely or not at all, or the log of a failed one.
 
     Raises:
         ResultsError: the folder cannot be written.
@@ -154,17 +154,17 @@ def publish(outcome: CellOutcome, out: Path) -> None:
             failed.write_text(f"{outcome.message}\n\n{outcome.log}")
             return
         target = out / cell.name
-        part = out / _PARTS / str(os.getpid()) / cell.name
+        part = scratch_folder(out) / cell.name
         shutil.rmtree(part, ignore_errors=True)
         for name, data in outcome.files.items():
             path = part / name
             if not path.resolve().is_relative_to(part.resolve()):
                 raise ResultsError(f"{name}: a worker sent a file outside its folder.")
             path.parent.mkdir(parents=True, exist_ok=True)
-            if path.suffix in (".json", ".md", ".html"):  # the command that reproduces the ATE
+            if path.suffix in (".json", ".md", ".html"):  # they print the command that repeats ATE
                 data = data.replace(outcome.folder.encode(), shlex.quote(str(target)).encode())
             path.write_bytes(data)
-        shutil.rmtree(target, ignore_errors=True)  # damaged, or of another version
+        shutil.rmtree(target, ignore_errors=True)  # a damaged result or one of another version
         part.rename(target)
         failed.unlink(missing_ok=True)
     except OSError as error:
@@ -175,13 +175,14 @@ def publish(outcome: CellOutcome, out: Path) -> None:
 
 
 def prepare(out: Path, data: str) -> None:
-    """Create the folder of a benchmark, remove the leftovers of killed ones and check the data.
+    """Create the folder of a benchmark and remove what killed benchmarks left there.
 
     Args:
-        data: identifies the data, because other data may have the same names.
+        data: text that identifies the data. Results in a folder must be of the same data, because
+            sequences of other data may have the same names.
 
     Raises:
-        InputError: the folder cannot be written, or holds runs on other data.
+        InputError: the folder cannot be written, or it holds runs on other data.
     """
     import psutil
 
@@ -192,11 +193,11 @@ def prepare(out: Path, data: str) -> None:
             note.write_text(f"{data}\n")
         if (known := note.read_text().strip()) != data:
             raise InputError(
-                f"{out}: holds runs on {known}, not on {data}; name another folder with --out."
+                f"{out}: contains runs on {known}, not on {data}; name another folder with --out."
             )
-        for left in (out / _PARTS).glob("*"):
-            if not (left.name.isdecimal() and psutil.pid_exists(int(left.name))):
-                shutil.rmtree(left, ignore_errors=True)
+        for folder in (out / _PARTS).glob("*"):
+            if not (folder.name.isdecimal() and psutil.pid_exists(int(folder.name))):
+                shutil.rmtree(folder, ignore_errors=True)
     except OSError as error:
         raise InputError(
             f"{out}: cannot be written ({error.strerror}); name another folder with --out."
@@ -204,20 +205,23 @@ def prepare(out: Path, data: str) -> None:
 
 
 def scratch_folder(out: Path) -> Path:
-    """Folder in which this process keeps unfinished cells."""
+    """Folder of the unfinished cells of this process."""
     return out / _PARTS / str(os.getpid())
 
 
 def tidy(out: Path) -> None:
     """Remove the scratch folder of this process."""
     shutil.rmtree(scratch_folder(out), ignore_errors=True)
-    with suppress(OSError):  # the parent folder also holds those of other benchmarks
+    with suppress(OSError):  # not empty if another process uses the same folder
         (out / _PARTS).rmdir()
 
 
 def _call(command: list[str], log: Path, stopped: Callable[[], bool]) -> int:
-    """Run a command to its end or kill it; returns the exit code. The command gets its own session,
-    so that Ctrl-C reaches it only through us, and a pipe that closes when we end."""
+    """Run a command and return its exit code; kill it if ``stopped`` returns True.
+
+    The command runs in its own session, so that Ctrl-C reaches only this process. Its standard
+    input is a pipe that closes when this process dies (:mod:`vslam.cli.child`).
+    """
     with log.open("wb") as output:
         child = subprocess.Popen(
             command,
@@ -243,8 +247,8 @@ def _reason(code: int, log: str) -> str:
     if code < 0:
         return f"killed by signal {-code}" + (" (out of memory?)" if code == -9 else "")
     lines = [line.strip() for line in log.splitlines() if line.strip()]
-    said = next((line for line in reversed(lines) if line.startswith("error: ")), None)
-    return (said or (lines[-1] if lines else f"exit code {code}")).removeprefix("error: ")
+    errors = [line for line in lines if line.startswith("error: ")]
+    return (errors or lines or [f"exit code {code}"])[-1].removeprefix("error: ")
 
 
 def _read(folder: Path) -> dict[str, bytes]:

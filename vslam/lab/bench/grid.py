@@ -19,14 +19,14 @@ from vslam.report.schema import ReportJson
 
 @dataclass(frozen=True, order=True)
 class Cell:
-    """One run of the grid: everything that determines its figures, except the images.
+    """One run of the grid: everything that determines its result, except the images.
 
     Attributes:
         perturb: perturbation in canonical spelling, e.g. ``none`` or ``brightness:1.5,blur:0.5``.
-        max_frames: number of frames from the first one on, None for all.
-        weights: weights of a learned detector, a file that every worker has under this path; None
-            for the shipped ones.
-        digest: digest of these weights.
+        max_frames: number of frames, counted from the first one; None for all.
+        weights: weight file of a learned detector, with the same path on every worker; None for
+            the shipped weights.
+        digest: digest of the weight file.
         sensor: value of ``--sensor``; None for all images that the data has.
         calib: calibration files.
         thresholds: digest of the thresholds that differ from the defaults; empty if none does.
@@ -46,7 +46,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Name of its folder, different for different cells, so that none overwrites another."""
+        """Name of the folder of its results, unique to the cell."""
         light = self.perturb.replace(":", "").replace(",", "+")
         parts = [self.dataset, self.sequence, light, self.detector, f"seed{self.seed}"]
         parts += [f"{self.max_frames}frames"] if self.max_frames else []
@@ -67,7 +67,7 @@ class Cell:
 
 
 def parse_sequences(text: str) -> list[str]:
-    """``00-02,05,demo`` -> ``00 01 02 05 demo``: names and ranges of numbers, each once.
+    """Parse names and ranges: ``00-02,05,demo`` gives ``00 01 02 05 demo``, without repetitions.
 
     Raises:
         InputError: a range is reversed, or there is no name.
@@ -83,17 +83,17 @@ def parse_sequences(text: str) -> list[str]:
         else:
             names[item] = None
     if not names:
-        raise InputError("--seqs: no sequence; name some, for example 00-05 or demo,00.")
+        raise InputError("--seqs: names no sequence; give some, for example 00-05 or demo,00.")
     return list(names)
 
 
 def parse_perturbations(text: str) -> list[str]:
-    """``none,brightness:2+blur`` -> ``none`` and ``brightness:2,blur:1``, in canonical spelling.
+    """Parse ``none,brightness:2+blur`` into ``none`` and ``brightness:2,blur:1``.
 
     A comma separates entries of the grid; ``+`` joins laws that act together.
 
     Raises:
-        InputError: an entry that ``vslam run --perturb`` would refuse.
+        InputError: ``vslam run --perturb`` would refuse one of the entries.
     """
     specs = [part.strip().replace("+", ",") for part in text.split(",")]
     return list(dict.fromkeys(parse_perturbation(spec, 0).name for spec in specs))
@@ -112,15 +112,16 @@ def make_grid(
     thresholds: str = "",
     repeated: Collection[str] = (),
 ) -> list[Cell]:
-    """All cells, ordered so that an interrupted benchmark is as useful as possible: all sequences
-    with the first seed, then all with the next.
+    """All cells: first every sequence with the first seed, then every sequence with the next one.
 
-    A perturbation without randomness gets one run. Its repetitions would be identical, and a
-    statistical test would count them as independent samples.
+    An interrupted benchmark is most useful in this order. A perturbation without randomness gets
+    one run: its repetitions would be identical, and a statistical test would count them as
+    independent samples.
 
     Args:
+        runs: number of seeds.
         weights: weight files by detector, for detectors that do not use the shipped ones.
-        repeated: systems that are not deterministic; they run with all seeds.
+        repeated: systems that are not deterministic and therefore run with every seed.
     """
     paths = {name: str(path) for name, path in (weights or {}).items()}
     digests = {name: _digest(path) for name, path in (weights or {}).items()}
@@ -146,7 +147,7 @@ def make_grid(
 
 
 def thresholds_digest(config: str) -> str:
-    """Digest of the thresholds that differ from the defaults, for ``Cell``; empty if none does.
+    """Digest of the thresholds that differ from the defaults (``Cell``); empty if none does.
 
     Args:
         config: the text of a ``config.json``.
@@ -207,11 +208,11 @@ def is_finished(cell: Cell, folder: Path, config: str) -> bool:
         report.seed,
         report.max_frames,
         str(report.weights) if report.weights else None,
-        cell.digest,  # the folder is named after it
+        cell.digest,  # part of the folder's name
         cell.sensor,
         tuple(map(str, report.calib)),
-        cell.thresholds,  # those of ``config``
+        cell.thresholds,  # a digest of ``config``
     )
-    as_asked = cell.sensor in (None, report.sensor)
+    same_sensor = cell.sensor in (None, report.sensor)
     whole = (report.start, report.every) == (0, 1)
-    return same_config and as_asked and whole and found == cell
+    return same_config and same_sensor and whole and found == cell

@@ -1,4 +1,4 @@
-"""The table on the terminal while a grid runs."""
+"""The table that the terminal shows while a grid runs."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from vslam.report.schema import ReportJson
 
 
 class GridProgress:
-    """Which cells are finished, failed or missing, and the reports of the finished ones.
+    """The finished, failed and missing cells of a grid.
 
     Attributes:
         cells: the whole grid.
         reports: reports of the finished cells, in the order in which they ended.
-        failed: reasons of failed cells, one line each.
+        failed: why each failed cell failed, in one line.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class GridProgress:
         self.failed: dict[Cell, str] = {}
         self._frames, self._out, self._jobs = frames, out, jobs
         for cell in finished:
-            self._note(cell)
+            self._add_report(cell)
 
     @property
     def missing(self) -> list[Cell]:
@@ -48,22 +48,22 @@ class GridProgress:
         return [c for c in self.cells if c not in self.reports and c not in self.failed]
 
     def add(self, outcome: CellOutcome) -> str:
-        """Add a published cell; returns a line about it."""
+        """Add a published cell and return a line about it."""
         cell = outcome.cell
         if isinstance(outcome, Failed):
             self.failed[cell] = outcome.message
-            said = f"failed: {outcome.message}"
+            result = f"failed: {outcome.message}"
         else:
-            self._note(cell)
+            self._add_report(cell)
             ate = self.reports[cell].ate_rmse_m
-            said = "finished" if ate is None else f"ATE {ate:.3f} m"
-        return f"{len(self.reports) + len(self.failed)}/{len(self.cells)} {cell.name}: {said}"
+            result = "finished" if ate is None else f"ATE {ate:.3f} m"
+        return f"{len(self.reports) + len(self.failed)}/{len(self.cells)} {cell.name}: {result}"
 
     def table(self) -> Table:
-        """A row for each sequence and perturbation and a column for each detector, with the number
-        of finished cells and their median ATE."""
+        """The number of finished cells and their median ATE, with a row for each sequence and
+        perturbation and a column for each detector."""
         detectors = list(dict.fromkeys(cell.detector for cell in self.cells))
-        caption = "Each entry: finished runs, and their median ATE.\n"
+        caption = "Each entry gives the number of finished runs and their median ATE.\n"
         caption += f"{len(self.reports)} of {counted(len(self.cells), 'run')} finished"
         caption += f", {len(self.failed)} failed" if self.failed else ""
         if self.missing:
@@ -84,7 +84,7 @@ class GridProgress:
         text += f"  {statistics.median(ates):.3f} m" if ates else ""
         return text + (f"  [red]{failed} failed[/red]" if failed else "")
 
-    def _note(self, cell: Cell) -> None:
+    def _add_report(self, cell: Cell) -> None:
         report = read_report(self._out / cell.name)
         if report is not None:
             self.reports[cell] = report
@@ -92,9 +92,9 @@ class GridProgress:
 
 @contextmanager
 def shown_live(progress: GridProgress, *, shown: bool) -> Iterator[Callable[[str], None]]:
-    """Show the table on stderr and update it; yields a function that prints a line if stderr is not
-    a terminal. At the end, the table stays only if cells are missing or failed, because the results
-    follow a finished grid."""
+    """Show the table on stderr and update it; yield a function that prints a line where stderr is
+    not a terminal. The table is left standing only if cells are missing or failed, because the
+    results of a complete grid follow it."""
     console = Console(stderr=True, quiet=not shown, highlight=False, soft_wrap=True)
     live = (
         Live(get_renderable=progress.table, console=console, refresh_per_second=1, transient=True)

@@ -1,1 +1,1 @@
-"""Loop detectors compared on images of places, under changes of light, view and town."""
+"""Compare loop detectors on images of places, under changes of light, viewpoint and town."""

@@ -1,4 +1,4 @@
-"""Conditions under which query images are changed; the gallery stays unchanged."""
+"""Conditions: changes that are applied to the query images, but not to the gallery."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _LAWS = {
 _LAWS["all"] = {law: s / 2 for kind in _LAWS.values() for law, s in kind.items()}
 _OTHER_LANE, _TURN = 3.2, 30.0  # metres and degrees of a change of viewpoint at strength 1
 _CLIPPED = 0.6  # share of the pixels that become white, or black, at strength 1
-_APART_S = 10.0  # between images, so that they are independent: light decorrelates in 2 s
+_APART_S = 10.0  # between images, so that their changes are independent: light decorrelates in 2 s
 
 
 @dataclass(frozen=True)
@@ -47,13 +47,14 @@ class Condition:
 
     @property
     def lateral(self) -> tuple[float, float]:
-        """Range of metres to the right. It is never zero, as no two drives take the same line."""
+        """Range of the lateral offset in metres, positive to the right. Even an unchanged view has
+        some offset, because no two drives follow exactly the same line."""
         side = -_OTHER_LANE * self.view
         return (side, side) if self.view else (-0.3, 0.3)
 
     @property
     def heading(self) -> tuple[float, float]:
-        """Range of degrees to either side."""
+        """Range of the turn to either side, in degrees."""
         turn = _TURN * self.view
         return (turn, turn) if self.view else (0.0, 3.0)
 
@@ -65,14 +66,14 @@ class Condition:
 
 
 def parse_conditions(kinds: str, strengths: str) -> list[Condition]:
-    """Conditions of every kind at every strength, after a single ``none``.
+    """The condition ``none``, followed by every other kind at every strength.
 
     Args:
         kinds: names from ``KINDS``, separated by commas.
-        strengths: numbers from 0 to 1, separated by commas.
+        strengths: numbers above 0 and up to 1, separated by commas.
 
     Raises:
-        InputError: a kind is unknown, or a strength is not a number from 0 to 1.
+        InputError: a kind is unknown, or a strength is not such a number.
     """
     names = [name.strip() for name in kinds.split(",") if name.strip()]
     if wrong := [name for name in names if name not in KINDS]:
@@ -96,16 +97,16 @@ def apply(
     """The images under a condition, each with its own random change.
 
     Args:
-        condition: ``change`` leaves images unchanged, because the town is rendered changed.
+        condition: ``change`` does nothing here, because the renderer changes the town.
         images: ``(H, W)`` uint8 each.
         seed: seed of all random changes.
-        rendered: the viewpoint was already changed when the images were rendered.
+        rendered: whether the renderer has already changed the viewpoint.
     """
     out = list(images)
     if condition.view and not rendered:
-        out = [turned(image, _side(seed, k) * condition.heading[0]) for k, image in enumerate(out)]
+        out = [turned(image, _sign(seed, k) * condition.heading[0]) for k, image in enumerate(out)]
     if condition.kind == "clipping":
-        out = [clipped(image, _CLIPPED * condition.strength, _side(seed, k) > 0)
+        out = [clipped(image, _CLIPPED * condition.strength, _sign(seed, k) > 0)
                for k, image in enumerate(out)]  # fmt: skip
     laws = _LAWS.get(condition.kind)
     if laws:
@@ -118,8 +119,8 @@ def apply(
 
 
 def turned(image: Image, degrees: float) -> Image:
-    """The image of a camera turned to the right, exact for a pure rotation; pixels outside the
-    original view are black."""
+    """The image after the camera turns to the right about its centre; pixels outside the original
+    view are black."""
     import cv2
 
     height, width = image.shape
@@ -128,7 +129,7 @@ def turned(image: Image, degrees: float) -> Image:
 
 
 def clipped(image: Image, share: float, bright: bool) -> Image:
-    """Change the exposure so that a share of the pixels becomes white, or black."""
+    """Change the exposure so that a share of the pixels becomes white (``bright``) or black."""
     grey = np.arange(256.0)
     if bright:
         white = max(float(np.quantile(image, 1.0 - share)), 1.0)
@@ -139,5 +140,6 @@ def clipped(image: Image, share: float, bright: bool) -> Image:
     return np.clip(np.rint(curve), 0, 255).astype(np.uint8)[image]
 
 
-def _side(seed: int, k: int) -> float:
+def _sign(seed: int, k: int) -> float:
+    """-1 or 1, drawn for image ``k``."""
     return float(np.random.default_rng([seed, 30, k]).choice([-1.0, 1.0]))

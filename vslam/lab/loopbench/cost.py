@@ -1,6 +1,6 @@
-"""CPU time and memory of one detector, measured in a separate process.
+"""Measure CPU time and memory of one detector in a separate process.
 
-CPU time hardly depends on what else the machine does.
+CPU time hardly depends on other load of the machine.
 """
 
 from __future__ import annotations

@@ -9,13 +9,25 @@ from matplotlib.figure import Figure
 
 from vslam.lab.loopbench.schema import Curve, DecisionCurve, LoopsJson
 from vslam.report import page
-from vslam.report.drawing import AMBER, BLUE, GREEN, GREY, INK, RED, VIOLET, Drawing, draw
+from vslam.report.drawing import (
+    AMBER,
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    RED,
+    VIOLET,
+    WIDTH,
+    Drawing,
+    add_legend,
+    draw,
+)
 
 _COLORS = [GREY, BLUE, VIOLET, AMBER, GREEN, RED]
 _DASHES = ["-", "--", ":"]  # for the first six detectors, the next six, and the rest
 _VERIFIED = {"nothing": "-", "both": ":"}
 
-# Panel, curve, label in the legend (or empty), colour and dashes.
+# Panel, curve, label in the legend (may be empty), colour and dashes.
 Line = tuple[str, Curve | DecisionCurve, str, str, str]
 
 
@@ -37,12 +49,11 @@ def _drawings(report: LoopsJson) -> Iterator[Drawing]:
             for score in online
             if score.verified_by in _VERIFIED
         )  # fmt: skip
-        yield "online", caption, _panels("", drives, lines, min(2, len(drives)))
+        yield "online", caption, _panels("", drives, lines)
     names = _in_order(score.detector for score in report.cells)
     for number, data in enumerate(_in_order(score.data for score in report.cells)):
         scores = [score for score in report.cells if score.data == data]
         conditions = _in_order(score.condition for score in scores)
-        columns = 2 if len(conditions) == 4 else min(3, len(conditions))
         caption = (
             f"Precision against recall on {data}, unverified, with a panel for each condition."
         )
@@ -51,12 +62,13 @@ def _drawings(report: LoopsJson) -> Iterator[Drawing]:
             dash, color = divmod(names.index(score.detector), len(_COLORS))
             look = _COLORS[color], _DASHES[dash % len(_DASHES)]
             lines.append((score.condition, score.curve, score.detector, *look))
-        yield f"precision_recall_{number}", caption, _panels(data, conditions, lines, columns)
+        yield f"precision_recall_{number}", caption, _panels(data, conditions, lines)
 
 
-def _panels(title: str, names: list[str], lines: Iterable[Line], columns: int) -> Figure:
+def _panels(title: str, names: list[str], lines: Iterable[Line]) -> Figure:
+    columns = min(2, len(names))
     rows = -(-len(names) // columns)
-    figure = Figure(figsize=(6.6, 0.7 + 2.1 * rows), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 0.7 + 1.8 * rows), layout="constrained")
     FigureCanvasAgg(figure)
     if title:
         figure.suptitle(title, x=0.01, ha="left", color=INK)
@@ -69,8 +81,7 @@ def _panels(title: str, names: list[str], lines: Iterable[Line], columns: int) -
         axes.set(xlim=(0, 1), ylim=(0, 1.02))
     for name, curve, label, color, dashes in lines:
         panels[name].plot(curve.recall, curve.precision, dashes, color=color, label=label)
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(5, len(labels)))
+    add_legend(figure, grid[0, 0])
     for axes in grid[-1, : (len(names) - 1) % columns + 1]:
         axes.set_xlabel("recall", fontsize=9.5)
     figure.supylabel("precision", fontsize=9.5)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 _MATCHING_LEVEL = 2  # vocabulary level with about 100 nodes; features are matched within a node
-_KEPT_GALLERIES = 3  # enough to keep the unchanged gallery beside those of two strengths
+_KEPT_GALLERIES = 3  # the unchanged gallery and those of two strengths
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class DescribedImage:
         image: ``(H, W)`` uint8.
         xy: ``(N, 2)`` float32 pixels.
         descriptors: ``(N, 32)`` uint8.
-        words: ``(N,)`` int32 of the vocabulary.
-        nodes: direct index.
+        words: ``(N,)`` int32 word of each feature.
+        nodes: direct index of the features.
     """
 
     image: Image
@@ -52,7 +52,7 @@ class DescribedImage:
 
 
 def describe(images: list[Image], vocabulary: Vocabulary, threads: int) -> list[DescribedImage]:
-    """Extract the features of all images as in a run."""
+    """Extract the features of all images as a run does."""
     node_of_word = vocabulary.ancestors(_MATCHING_LEVEL)
 
     def one(image: Image) -> DescribedImage:
@@ -67,14 +67,14 @@ def describe(images: list[Image], vocabulary: Vocabulary, threads: int) -> list[
 
 
 class Scorer(Protocol):
-    """A loop detector without a map."""
+    """A loop detector that compares images and needs no map."""
 
     name: str
     probability: bool
-    """Whether scores are probabilities, with thresholds at 0.5 and 0.9."""
+    """Whether the scores are probabilities, which can be compared with 0.5 and 0.9."""
 
     def store(self, gallery: list[DescribedImage]) -> Any:
-        """The data that the detector stores for the gallery."""
+        """What the detector stores for the gallery."""
 
     def scores(self, queries: list[DescribedImage], stored: Any) -> NDArray[np.float64]:
         """``(Q, G)`` similarities; higher is more similar."""
@@ -121,16 +121,16 @@ def require_comparable(name: str, weights: Path | None) -> None:
 
 
 def open_scorer(name: str, weights: Path | None, vocabulary: Vocabulary) -> Scorer:
-    """``bow``, or one of the networks.
+    """Open ``bow`` or one of the networks.
 
     Raises:
-        InputError: no weights for it, or those of another network.
+        InputError: the weights are missing or belong to another network.
     """
     return BowScorer(vocabulary) if name == "bow" else NetworkScorer(name, weights)
 
 
 class NetworkScorer:
-    """One of ``NETWORKS``, on one thread.
+    """One of ``NETWORKS``, run on one thread.
 
     Attributes:
         parameters: number of learned parameters.
@@ -160,7 +160,7 @@ class NetworkScorer:
 
 
 class LocalDescriptorCache:
-    """Coarse local descriptors of images, computed once for each."""
+    """Coarse local descriptors of images, computed once per image."""
 
     def __init__(self, network: LocalDescriptors | None = None) -> None:
         self._network = network
@@ -183,9 +183,9 @@ class LocalDescriptorCache:
 
 
 class DetectorSet:
-    """The detectors of a benchmark; the others are compared with the first one.
+    """The detectors of a benchmark; the first one is the baseline of the comparison.
 
-    Most conditions share a gallery, so the data of the last few galleries are cached.
+    Most conditions share a gallery, so what was computed for the last few galleries is cached.
     """
 
     def __init__(self, scorers: list[Scorer], vocabulary: Vocabulary, threads: int) -> None:
@@ -195,7 +195,7 @@ class DetectorSet:
         self._kept: OrderedDict[bytes, tuple[list[DescribedImage], dict[str, Any]]] = OrderedDict()
 
     def gallery(self, images: list[Image]) -> tuple[list[DescribedImage], dict[str, Any]]:
-        """Features of the images, and the data that each detector stores for them."""
+        """Features of the images, and what each detector stores for them, by its name."""
         hashed = hashlib.blake2b()
         for image in images:
             hashed.update(f"{image.shape}".encode())

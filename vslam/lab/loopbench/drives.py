@@ -1,4 +1,4 @@
-"""Drives to test loop detectors on: images in the order in which they were taken."""
+"""Drives for testing loop detectors: images in the order in which they were taken."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vslam.loopclosure.siamese.source_registry import open_source, split_spec
 if TYPE_CHECKING:
     from vslam.datasets.synthetic import Variation
 
-_ORDERED = ("kitti", "fabmap")  # kinds of sources with images in order
+_ORDERED = ("kitti", "fabmap")  # kinds of sources whose images are in driving order
 
 
 def open_drives(
@@ -30,8 +30,8 @@ def open_drives(
         progress_bar: opened while a drive is rendered.
 
     Raises:
-        InputError: ``spec`` is not a drive or has an unknown route or option, or the data is
-            missing or malformed.
+        InputError: ``spec`` does not name a drive, its route or an option is unknown, or the data
+            is missing or malformed.
     """
     kind = split_spec(spec)[0]
     if kind in _ORDERED:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.config import LearnedMatchingConfig, VerificationConfig
+from vslam.config import VerificationConfig
 from vslam.geometry import Matrix
 from vslam.lab.loopbench.conditions import Condition
 from vslam.lab.loopbench.detectors import (
@@ -17,7 +17,7 @@ from vslam.lab.loopbench.detectors import (
 from vslam.lab.loopbench.node_matching import match_by_node
 from vslam.lab.loopbench.schema import Curve, Gain, Score, Verified
 from vslam.lab.loopbench.sets import QuerySet, TestSet
-from vslam.loopclosure.local_matching import homography_share, match_coarse
+from vslam.loopclosure.local_matching import homography_inliers, match_coarse
 from vslam.loopclosure.precision_recall import (
     PrecisionRecall,
     accepted_at,
@@ -28,14 +28,14 @@ from vslam.loopclosure.precision_recall import (
 )
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
 
-MIN_SHARE = 0.18  # of the coarse cells; on KITTI 00, 99.7 % of wrong best images have less
+MIN_CELLS, LEAST_COSINE = 90, 0.5  # of coarse matches that fit one homography
 MIN_MATCHES = 20  # that fit one epipolar geometry (ORB-SLAM, VII-B, requires 20 in 3D)
 _EPIPOLAR_PIXELS = 2.0
 _CURVE_POINTS = 200
 _RESAMPLES = 200  # bootstrap resamples of the queries
-# Of sequences, as in OpenSeqSLAM (Sünderhauf et al., ICRA 2013 workshop).
-LENGTH = 10  # queries
-SPEEDS = (0.8, 0.9, 1.0, 1.1, 1.2)  # images of the gallery for each query
+# Matching of sequences, as in OpenSeqSLAM (Sünderhauf et al., ICRA 2013 workshop).
+LENGTH = 10  # queries in a sequence
+SPEEDS = (0.8, 0.9, 1.0, 1.1, 1.2)  # gallery images per query
 _LEAST_P = 1e-6  # probabilities nearer to 0 or 1 are clipped
 
 
@@ -45,7 +45,7 @@ def measure(
     detectors: DetectorSet,
     seed: int,
 ) -> tuple[list[Score], list[Gain]]:
-    """Measure all detectors on a set under a condition; empty if the set does not have it."""
+    """Measure all detectors on a set; empty if the condition cannot be applied to the set."""
     query_set = test_set.query_set(condition, seed)
     if query_set is None:
         return [], []
@@ -115,7 +115,7 @@ def _score(
 def _best_images(
     scores: Matrix, relation: NDArray[np.int8]
 ) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
-    """The best image of each query for which its relation is known, and this relation."""
+    """The most similar image with a known relation to each query, and this relation."""
     best = np.where(relation != UNKNOWN, scores, -np.inf).argmax(1)
     return best, relation[np.arange(len(best)), best]
 
@@ -123,8 +123,8 @@ def _best_images(
 def thinned(curve: PrecisionRecall) -> Curve:
     """The best precision at equal steps of recall, and the end where every pair is accepted.
 
-    With equal steps over the pairs, the whole curve of a good detector would lie in the first step,
-    because it ranks the few true pairs before thousands of others.
+    Equal steps in the number of pairs would not show the curve of a good detector, which ranks the
+    few true pairs before thousands of others: nearly all of it would lie within the first step.
     """
     points = drawn_points(curve)
     return Curve(
@@ -148,7 +148,7 @@ def _gain(
     found: dict[str, Matrix],
     relation: NDArray[np.int8],
 ) -> Gain:
-    """Difference in AP with a bootstrap interval over the queries."""
+    """The difference in AP, with a bootstrap interval over the queries."""
     known, rng = relation != UNKNOWN, np.random.default_rng(0)
 
     def gain(rows: NDArray[np.integer]) -> float:
@@ -170,7 +170,7 @@ def _gain(
 
 
 class Verification:
-    """Tests by local descriptors whether two images show one place; caches the results."""
+    """Tests by local features whether two images show the same place; caches the results."""
 
     def __init__(
         self,
@@ -191,18 +191,19 @@ class Verification:
         return self._by_orb[key]
 
     def by_learned(self, query: int, image: int) -> bool:
-        """Whether enough cells of the coarse grid roughly fit one homography."""
+        """Whether enough similar cells of the coarse grids roughly fit one homography. Their number
+        does not depend on how much of the images is sky or road, as their share would."""
         key = query, image
         if key not in self._by_learned:
             a = self._local.of(self._queries[query].image)
             b = self._local.of(self._gallery[image].image)
-            coarse = match_coarse(a, b, LearnedMatchingConfig().coarse_alike)
-            self._by_learned[key] = homography_share(coarse, a, b) >= MIN_SHARE
+            matches = match_coarse(a, b, LEAST_COSINE)
+            self._by_learned[key] = homography_inliers(matches, a, b) >= MIN_CELLS
         return self._by_learned[key]
 
 
 def epipolar_inliers(a: DescribedImage, b: DescribedImage) -> int:
-    """Number of matches of two images that fit the best fundamental matrix found."""
+    """Number of ORB matches between two images that fit the best fundamental matrix found."""
     import cv2
 
     config = VerificationConfig()
@@ -220,18 +221,18 @@ def epipolar_inliers(a: DescribedImage, b: DescribedImage) -> int:
 
 
 def sequence_scores(scores: Matrix) -> Matrix:
-    """The mean score along the best line that ends at each query and image.
+    """The mean score along the best line that ends at each query and gallery image.
 
-    Sequences recognise a stretch of the way instead of one image. As in SeqSLAM (Milford and Wyeth,
-    ICRA 2012), the scores of a query and its predecessors are added along lines through the
+    A sequence recognises a stretch of road instead of a single image. As in SeqSLAM (Milford and
+    Wyeth, ICRA 2012), the scores of a query and its predecessors are added along lines through the
     gallery, one for each speed.
 
     Args:
         scores: ``(Q, G)`` of queries and images in driving order; higher is more similar.
 
     Returns:
-        ``(Q, G)``. Outside the gallery, a line takes the mean score of the query; the first queries
-        have shorter lines.
+        ``(Q, G)``. Where a line leaves the gallery, the mean score of the query is added; the lines
+        of the first queries are shorter.
     """
     n_queries, n_images = scores.shape
     usual = scores.mean(1)
@@ -247,6 +248,6 @@ def sequence_scores(scores: Matrix) -> Matrix:
 
 
 def log_odds(p: Matrix) -> Matrix:
-    """Log odds of probabilities, which can be added over independent observations."""
+    """Log odds of probabilities; those of independent observations can be added."""
     p = np.clip(p, _LEAST_P, 1.0 - _LEAST_P)
     return np.asarray(np.log(p / (1.0 - p)))

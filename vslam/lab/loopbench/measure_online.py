@@ -36,14 +36,16 @@ def measure_drive(
         InputError: no image has a true match before the window.
         UnreadableImageError: an image is missing or damaged.
     """
-    searchable = window.searchable(len(drive), drive.times)
-    judge(_nothing(len(drive)), drive.relation, searchable)
-    images = describe([drive.grey(k) for k in range(len(drive))], vocabulary, threads)
+    n = len(drive)
+    searchable = window.searchable(n, drive.times)
+    # Refuse a drive without loops before the features are extracted.
+    judge(Decisions(np.full(n, -1), np.full(n, -np.inf)), drive.relation, searchable)
+    images = describe([drive.grey(k) for k in range(n)], vocabulary, threads)
     verify = Verification(images, images, LocalDescriptorCache())
     scores = []
     for scorer in scorers:
         found = decide(scorer.scores(images, scorer.store(images)), searchable)
-        by_orb, by_learned = np.zeros((2, len(images)), np.bool_)
+        by_orb, by_learned = np.zeros((2, n), np.bool_)
         for k in np.flatnonzero(found.match >= 0):
             pair = int(k), int(found.match[k])
             by_orb[k], by_learned[k] = verify.by_orb(*pair), verify.by_learned(*pair)
@@ -54,10 +56,6 @@ def measure_drive(
             for by, decisions in kept.items()
         ]
     return scores
-
-
-def _nothing(n: int) -> Decisions:
-    return Decisions(np.full(n, -1), np.full(n, -np.inf))
 
 
 def _score(

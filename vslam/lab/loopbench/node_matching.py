@@ -1,7 +1,8 @@
-"""Matching by the direct index of a vocabulary (Galvez-Lopez and Tardos, T-RO 2012, IV).
+"""Match features by the direct index of a vocabulary (Galvez-Lopez and Tardos, T-RO 2012, IV).
 
-Only features whose words lie under the same node of the tree are compared. Runs compare all pairs
-of descriptors, which finds a quarter more matches but is too slow for thousands of pairs of images.
+Only features whose words lie under the same node of the tree are compared. Loop closing compares
+all pairs of descriptors instead, which finds a quarter more matches but is too slow for thousands
+of image pairs.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from vslam.kernels import hamming, kernel
 
 
 class NodeIndex(NamedTuple):
-    """Direct index of an image: its features by the node of the tree under which their words lie.
+    """Direct index of an image: its features, sorted by the node under which their words lie.
 
-    ``node`` (N,) i4 ascending; ``feature`` (N,) i4, index within the image.
+    ``node``: ``(N,)`` int32, ascending. ``feature``: ``(N,)`` int32, index within the image.
     """
 
     node: NDArray[np.int32]
@@ -37,13 +38,14 @@ def match_by_node(
     """Match features of two images whose words lie under the same node of the vocabulary.
 
     Args:
-        node_a, feature_a: direct index of image a (``NodeIndex``); likewise b.
+        node_a, feature_a: direct index of image a (``NodeIndex``); likewise for image b.
         descriptors_a, descriptors_b: ``(M, 4)`` and ``(N, 4)`` uint64, of all features.
-        max_distance: bits.
+        max_distance: largest Hamming distance in bits.
         ratio: largest ratio of the best to the second best distance under the node; 1 disables it.
 
     Returns:
-        ``(M,)`` int32 feature of b or -1; each feature of b occurs at most once (closest match).
+        ``(M,)`` int32 feature of b for each feature of a, or -1. A feature of b is matched at most
+        once, with the closest feature of a.
     """
     matches = np.full(len(descriptors_a), -1, np.int32)
     distances = np.full(len(descriptors_a), 257, np.int64)

@@ -1,4 +1,4 @@
-"""The usual protocol of the literature: one decision for each image of a drive, in order.
+"""The usual protocol of the literature: one decision per image of a drive, in driving order.
 
 An image is compared with all images before a time window. The most similar one is its match, and
 the score of the match is compared with a threshold. The ground truth marks which images show the
@@ -10,7 +10,7 @@ same place:
 
 Recall at 100 % precision is the highest recall over all thresholds without a wrong match (Cummins
 and Newman, IJRR 2008; Galvez-Lopez and Tardos, T-RO 2012; Garcia-Fidalgo and Ortiz, RA-L 2018; An
-et al., IROS 2019). A match that verification rejects counts as no match at any threshold.
+et al., IROS 2019). If verification rejects a match, the image has no match at any threshold.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME
 
 @dataclass(frozen=True)
 class Window:
-    """The newest images, with which a query is not compared: ``amount`` images, or seconds if
+    """The newest images, with which a query is not compared: a number of images, or of seconds if
     ``timed``."""
 
     amount: float
@@ -37,15 +37,18 @@ class Window:
         return f"{self.amount:g} {'s' if self.timed else 'images'}"
 
     def searchable(self, n: int, times: NDArray[np.float64] | None) -> NDArray[np.int64]:
-        """``(n,)`` number of images, from the first on, with which each image may be compared.
+        """For each image, the number of images from the start of the drive that may be searched.
 
         Args:
             n: number of images in the drive.
             times: ``(n,)`` seconds, ascending; None assumes one image per second, DLoopDetector's
                 default.
+
+        Returns:
+            ``(n,)`` int64.
         """
         clock = np.arange(n, dtype=np.float64) if times is None or not self.timed else times
-        # Times are multiples of an interval that floating-point numbers do not represent exactly.
+        # The tolerance absorbs rounding of the times, which are multiples of the frame interval.
         return np.searchsorted(clock, clock - self.amount + 1e-6, side="right")
 
 
@@ -62,7 +65,7 @@ def parse_window(text: str) -> Window:
             raise ValueError
     except ValueError as error:
         raise InputError(
-            f"--window {text}: must be above 0, seconds (20s) or a number of images (200)."
+            f"--window {text}: must be a positive number of seconds (20s) or of images (200)."
         ) from error
     return Window(amount, timed)
 
@@ -72,8 +75,8 @@ class Decisions:
     """The decisions for N images.
 
     Attributes:
-        match: ``(N,)`` int64 image found, -1 for none.
-        score: ``(N,)`` float64, -inf for none.
+        match: ``(N,)`` int64 index of the image found, -1 for none.
+        score: ``(N,)`` float64 score of the match, -inf for none.
     """
 
     match: NDArray[np.int64]
@@ -84,17 +87,17 @@ class Decisions:
             raise InputError("loops bench: a score is NaN; check the weights of the detector.")
 
     def only(self, accepted: NDArray[np.bool_]) -> Decisions:
-        """Keep the ``(N,)`` accepted decisions; the others become no match."""
+        """Only the accepted decisions, given as a mask ``(N,)``; other images get no match."""
         return Decisions(
             np.where(accepted, self.match, -1), np.where(accepted, self.score, -np.inf)
         )
 
 
 def decide(scores: NDArray[np.float64], searchable: NDArray[np.int64]) -> Decisions:
-    """The most similar of the searchable images, for each image of a drive.
+    """Find the most similar searchable image for each image of a drive.
 
     Args:
-        scores: ``(N, N)`` similarities, a row for each query.
+        scores: ``(N, N)`` similarities, with a row for each query.
         searchable: ``(N,)``, see :meth:`Window.searchable`.
     """
     match, score = np.full(len(scores), -1, np.int64), np.full(len(scores), -np.inf)
@@ -110,10 +113,10 @@ class Judged:
 
     Attributes:
         score: ``(N,)`` float64, -inf for no decision.
-        right: ``(N,)`` bool, the match is marked as the same place.
-        far: ``(N,)`` bool, the match is known to be another place. A match that is neither right
+        right: ``(N,)`` bool, whether the match is marked as the same place.
+        far: ``(N,)`` bool, whether the match shows another place. A match that is neither right
             nor far lies near the place, but not near enough to be marked.
-        answerable: ``(N,)`` bool, images that have a marked image before the window.
+        answerable: ``(N,)`` bool, whether there is a marked image before the window.
     """
 
     score: NDArray[np.float64]
@@ -123,14 +126,14 @@ class Judged:
 
     @property
     def near(self) -> NDArray[np.bool_]:
-        """``(N,)`` bool, decisions that are neither right nor far."""
+        """``(N,)`` bool, whether there is a match that is neither right nor far."""
         return np.isfinite(self.score) & ~self.right & ~self.far
 
 
 def judge(
     decisions: Decisions, relation: NDArray[np.int8], searchable: NDArray[np.int64]
 ) -> Judged:
-    """Compare decisions with the relation ``(N, N)`` int8 of the images of a drive.
+    """Compare decisions with the ground truth, the relation ``(N, N)`` int8 of the images.
 
     Raises:
         InputError: no image has a marked image before the window.
@@ -151,11 +154,11 @@ def judge(
 
 
 def decision_curve(judged: Judged, *, near_is_wrong: bool = True) -> PrecisionRecall:
-    """Precision and recall over images, at each distinct score from the lowest on.
+    """Precision and recall over images, with each distinct score as the threshold.
 
     Args:
-        near_is_wrong: count every unmarked match as wrong, as in the literature; False leaves out
-            matches near the place.
+        near_is_wrong: count matches near the place as wrong, as the literature does; False leaves
+            them out.
     """
     wrong = judged.far | (judged.near & near_is_wrong)
     counted = judged.right | wrong

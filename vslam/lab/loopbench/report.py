@@ -8,8 +8,9 @@ from typing import TypeVar
 
 import numpy as np
 
+from vslam.errors import counted
 from vslam.lab.loopbench.curves import draw_curves
-from vslam.lab.loopbench.measure import LENGTH, MIN_MATCHES, MIN_SHARE
+from vslam.lab.loopbench.measure import LENGTH, MIN_CELLS, MIN_MATCHES
 from vslam.lab.loopbench.schema import LoopsJson, OnlineScore, Score
 from vslam.report.page import Bullets, Page, Pairs, Section, Table
 from vslam.report.render import html, markdown, write_files
@@ -18,23 +19,24 @@ _Scored = TypeVar("_Scored", bound=Score | OnlineScore)
 
 MEAN = "mean of all"
 _ABOUT_AP = (
-    "Average precision without verification, over all pairs of a query and a gallery image whose "
-    "relation is known. Last columns: AP of a detector minus that of the first one, with a 95 % "
-    "bootstrap interval over the queries; * if the interval excludes 0."
+    "Average precision (AP) without verification, over all pairs of a query and a gallery image "
+    "whose relation is known. The last columns give the AP of a detector minus that of the first "
+    "one, with a 95 % bootstrap interval over the queries; * marks intervals that exclude 0."
 )
 _ABOUT_RECALL = "The highest recall without a wrong pair, and the precision at a recall of 70 %."
 _ABOUT_VERIFIED = (
-    "Share of the queries with a place in the gallery whose best image shows this place; then the "
-    f"shares for which, in addition, at least {MIN_MATCHES} ORB matches fit one epipolar geometry, "
-    "matches of learned local descriptors that fit one homography cover "
-    f"{100 * MIN_SHARE:.0f} % of the image, or at least one of the two tests passes."
+    "Of the queries with a place in the gallery, the share whose best image shows this place, and "
+    "the shares that are then also verified by ORB, by learned descriptors, or by at least one of "
+    f"the two. ORB verifies a pair of images if at least {MIN_MATCHES} matches fit one epipolar "
+    "geometry, learned descriptors if at least "
+    f"{MIN_CELLS} coarse matches fit one homography."
 )
 _ABOUT_SEQUENCES = (
     "Share of the queries whose best image shows their place, by scores of single images and of "
-    f"sequences of {LENGTH} queries (SeqSLAM). Images without order have no sequences."
+    f"sequences of {LENGTH} queries (SeqSLAM). Sequences need images in driving order."
 )
 _ABOUT_WRONG = (
-    "Number of queries whose best image shows another place and still passes those tests."
+    "Number of queries whose best image shows another place and is verified nevertheless."
 )
 _ABOUT_ACCURACY = (
     "Balanced accuracy: the mean of the shares of true and false pairs that are classified "
@@ -42,17 +44,19 @@ _ABOUT_ACCURACY = (
 )
 _ABOUT_ACCEPTED = "Over the pairs with p of at least 0.9; if there are none, precision is 1."
 _ABOUT_COST = (
-    "Medians, each detector in its own process with one thread. Image: time in addition to the ORB "
-    "features, which tracking extracts anyway. Parameters of bow: weights of its words."
+    "Medians; each detector runs in its own process with one thread. The time for an image does "
+    "not include the ORB features, which tracking extracts anyway. The parameters of bow are the "
+    "weights of its words."
 )
 
 _ABOUT_ONLINE = (
-    "Each image is compared with the images before the window. Recall: among the images with a "
-    "true match there, the share with a right decision. In brackets: recall if unmarked matches "
-    "near the place do not count as wrong."
+    "Each image is compared with the images before the window. Recall is the share of images with "
+    "a right decision among those with a true match before the window. In brackets: recall if "
+    "unmarked matches near the place do not count as wrong."
 )
 _ABOUT_DECISIONS = (
-    "Numbers of decisions at the lowest threshold whose match is marked, near the place, or far."
+    "Numbers of decisions at the lowest threshold whose match is marked as the same place (right), "
+    "is unmarked but near it, or is far from it."
 )
 
 
@@ -73,10 +77,10 @@ def loops_page(report: LoopsJson) -> Page:
         title(report),
         (f"vslam {report.versions.get('vslam', '')}", f"{report.created:%Y-%m-%d %H:%M %Z}"),
         (
-            Section("Who wins where", [Bullets(words(report))]),
+            Section("Summary", [Bullets(words(report))]),
             Section("", draw_curves(report), wide=False),
             *tables(report),
-            Section("Made", [Pairs(_made(report))]),
+            Section("Provenance", [Pairs(_provenance(report))]),
         ),
     )
 
@@ -87,8 +91,8 @@ def title(report: LoopsJson) -> str:
 
 
 def words(report: LoopsJson) -> list[str]:
-    """Sentences about the result of each detector but the first under each condition, and about the
-    best detector on each drive."""
+    """Sentences that compare each detector with the first one under each condition, and that name
+    the best detector on each drive."""
     sentences = _online_words(report.online)
     for first, second in dict.fromkeys((g.first, g.second) for g in report.gains):
         for condition in _conditions(report):
@@ -97,12 +101,12 @@ def words(report: LoopsJson) -> list[str]:
             better = [g.data for g in gains if g.low > 0]
             worse = [g.data for g in gains if g.high < 0]
             mean = float(np.mean([g.difference for g in gains]))
-            said = [f"better on {', '.join(better)}"] if better else []
-            said += [f"worse on {', '.join(worse)}"] if worse else []
-            verdict = "; ".join(said) or "no difference beyond chance on any set"
+            verdicts = [f"better on {', '.join(better)}"] if better else []
+            verdicts += [f"worse on {', '.join(worse)}"] if worse else []
+            verdict = "; ".join(verdicts) or "no significant difference on any set"
             sentences.append(
-                f"{condition}: {second} {mean:+.3f} AP against {first}, mean of {len(gains)} "
-                f"{'sets' if len(gains) > 1 else 'set'}; {verdict}."
+                f"{condition}: AP of {second} minus that of {first} is {mean:+.3f}, the mean of "
+                f"{counted(len(gains), 'set')}; {verdict}."
             )
     return sentences
 
@@ -112,7 +116,8 @@ def tables(report: LoopsJson) -> list[Section]:
     if not report.cells:
         return _online_tables(report.online)
     names = _detectors(report)
-    head = ("images", "condition", *names, *_gain_heads(report))
+    gains = (f"{second} - {first}" for first, second in _compared(report))
+    head = ("images", "condition", *names, *gains)
     found = [
         Section("Average precision", [Table(head, _ap_rows(report), head[:2], _ABOUT_AP)]),
         *(_retrieval_table(report, *one) for one in _TABLES),
@@ -131,44 +136,38 @@ def tables(report: LoopsJson) -> list[Section]:
 
 
 def _accepted(score: Score) -> str:
-    return "-" if score.accepted is None else ", ".join(f"{share:.3f}" for share in score.accepted)
+    return "-" if score.accepted is None else _listed(score.accepted)
 
 
 def _sequence(score: Score) -> str:
-    found = score.sequence_right
-    return f"{score.first_right:.3f}, {'-' if found is None else f'{found:.3f}'}"
+    return _listed((score.first_right, score.sequence_right))
 
 
 def _operating_points(score: Score) -> str:
     names = ("recall_at_100_precision", "precision_at_70_recall")
-    return ", ".join(f"{score.figures[name]:.3f}" for name in names)
+    return _listed(score.figures[name] for name in names)
 
 
 def _verified(score: Score) -> str:
-    shares = (score.first_right, *(v.right for v in score.verified.values()))
-    return ", ".join(f"{share:.3f}" for share in shares)
+    return _listed((score.first_right, *(v.right for v in score.verified.values())))
 
 
-def _accuracies(score: Score) -> str:
-    return ", ".join("-" if a is None else f"{a:.3f}" for a in score.accuracy.values())
+def _listed(values: Iterable[float | None]) -> str:
+    return ", ".join("-" if value is None else f"{value:.3f}" for value in values)
 
 
-# Title, cell and note of the tables with a column for each detector.
+# Title, text of a cell, and note of each table that has a column for each detector.
 _TABLES: list[tuple[str, Callable[[Score], str], str]] = [
     ("Recall at 100 % precision, precision at 70 % recall", _operating_points, _ABOUT_RECALL),
-    ("Best image right, also verified by ORB, learned descriptors, one of both", _verified,
+    ("Best image right, and also verified by ORB, by learned descriptors, by either", _verified,
      _ABOUT_VERIFIED),
-    ("Best image right, over a sequence", _sequence, _ABOUT_SEQUENCES),
-    ("Wrong images verified by ORB, learned descriptors, one of both",
+    ("Best image right, by single images, by sequences", _sequence, _ABOUT_SEQUENCES),
+    ("Wrong images verified by ORB, by learned descriptors, by either",
      lambda score: ", ".join(str(v.wrong) for v in score.verified.values()), _ABOUT_WRONG),
     ("Largest F1", lambda score: f"{score.figures['max_f1']:.3f}", ""),
-    ("Accuracy at p = 0.5, 0.9", _accuracies, _ABOUT_ACCURACY),
+    ("Accuracy at p = 0.5, 0.9", lambda score: _listed(score.accuracy.values()), _ABOUT_ACCURACY),
     ("Precision, recall at p = 0.9", _accepted, _ABOUT_ACCEPTED),
 ]  # fmt: skip
-
-
-def _gain_heads(report: LoopsJson) -> list[str]:
-    return [f"{second} - {first}" for first, second in _compared(report)]
 
 
 def _compared(report: LoopsJson) -> list[tuple[str, str]]:
@@ -233,8 +232,8 @@ def _by_detector(
     about: Callable[[_Scored], tuple[str, ...]],
     shown: Callable[[_Scored], str],
 ) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Head and rows of a table with a column for each detector: what scores are ``about``, then
-    what is ``shown`` of each."""
+    """Head and rows of a table with a column for each detector. ``about`` gives the first cells of
+    a row, ``shown`` the cell of a score."""
     rows: dict[tuple[str, ...], dict[str, str]] = {}
     for score in scores:
         rows.setdefault(about(score), {})[score.detector] = shown(score)
@@ -248,13 +247,13 @@ def _online_words(scores: Iterable[OnlineScore]) -> list[str]:
     sentences = []
     for data in dict.fromkeys(s.data for s in scores):
         for by in ("nothing", "both"):
-            of = [s for s in scores if (s.data, s.verified_by) == (data, by)]
-            best = max(s.recall_at_100_precision for s in of)
-            names = [s.detector for s in of if s.recall_at_100_precision == best]
+            group = [s for s in scores if (s.data, s.verified_by) == (data, by)]
+            best = max(s.recall_at_100_precision for s in group)
+            names = [s.detector for s in group if s.recall_at_100_precision == best]
             how = "unverified" if by == "nothing" else "verified by ORB or learned descriptors"
             sentences.append(
-                f"{data}, {of[0].answerable} of {of[0].images} images with a true match, {how}: "
-                f"highest recall at 100 % precision {best:.3f} ({', '.join(names)})."
+                f"{data} ({group[0].answerable} of {group[0].images} images have a true match), "
+                f"{how}: the highest recall at 100 % precision is {best:.3f} ({', '.join(names)})."
             )
     return sentences
 
@@ -272,7 +271,7 @@ def _data(report: LoopsJson) -> list[str]:
     return list(dict.fromkeys(c.data for c in report.cells))
 
 
-def _made(report: LoopsJson) -> list[tuple[str, str]]:
+def _provenance(report: LoopsJson) -> list[tuple[str, str]]:
     return [
         ("machine", report.machine),
         ("vslam", report.versions.get("vslam", "")),

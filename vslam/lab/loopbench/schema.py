@@ -1,4 +1,4 @@
-"""The schema of ``loops.json``, on which scripts may rely."""
+"""The schema of ``loops.json``, which scripts may rely on."""
 
 from __future__ import annotations
 
@@ -9,16 +9,19 @@ from vslam.report.schema import Document, Record
 
 
 class Curve(Record):
-    """Precision and recall from the lowest threshold on, at selected points."""
+    """Precision and recall at selected thresholds, from the lowest one upwards."""
 
     precision: list[float]
     recall: list[float]
 
 
 class Verified(Record):
-    """Best images that pass verification. ``right``: those that show the query's place, as a share
-    of the queries that have a place in the gallery; ``wrong``: number of those that show another
-    place."""
+    """Best images that pass verification.
+
+    ``right``: the share of queries whose best image shows their place and is verified, among the
+    queries that have a place in the gallery. ``wrong``: the number of queries whose best image
+    shows another place and is verified.
+    """
 
     right: float
     wrong: int
@@ -28,12 +31,12 @@ class Score(Record):
     """One detector on one set of images under one condition.
 
     ``figures`` are those of :func:`vslam.loopclosure.precision_recall.summary`, without
-    verification. ``accuracy`` is balanced, by threshold on p; None for detectors without p.
+    verification. ``accuracy``: balanced accuracy by threshold on p; None for detectors without p.
     ``accepted``: precision and recall of the pairs with p of at least 0.9; None without p and in
     older files. ``first_right``: among the ``queries`` with a place in the gallery, the share whose
     best image shows it; ``sequence_right``: the same for scores added along sequences, None for
-    images without order. ``verified``: by ``orb``, by ``learned`` local descriptors, or by at least
-    one of them (``both``); empty if nothing was verified.
+    images without order. ``verified``: the images verified by ``orb``, by ``learned`` local
+    descriptors, or by at least one of them (``both``); empty if nothing was verified.
     """
 
     data: str
@@ -50,7 +53,7 @@ class Score(Record):
 
 
 class DecisionCurve(Record):
-    """Precision and recall over images at selected, ascending thresholds on the score."""
+    """Precision and recall over images at selected thresholds on the score, in ascending order."""
 
     threshold: list[float]
     precision: list[float]
@@ -61,11 +64,11 @@ class OnlineScore(Record):
     """One detector on one drive, with one decision per image (:mod:`vslam.lab.loopbench.online`).
 
     ``window``: the newest images, which are not searched. ``verified_by``: ``nothing``, ``orb``,
-    ``learned`` local descriptors, or ``both`` (at least one of the two). Of the ``images``,
-    ``answerable`` have a true match before the window. At the lowest threshold, ``right`` images
-    have a true match, ``near`` an unmarked one near the place, ``far`` one at another place.
-    Figures count near matches as wrong; those that end in ``_far`` leave them out.
-    ``max_f1_threshold`` is None if nothing is found.
+    ``learned`` local descriptors, or ``both`` (at least one of the two). ``answerable``: the number
+    of images that have a true match before the window. ``right``, ``near``, ``far``: the numbers
+    of matches, at the lowest threshold, that are marked as the same place, that are not marked but
+    near it, and that show another place. Figures whose names end in ``_far`` leave out near
+    matches; the others count them as wrong. ``max_f1_threshold`` is None if nothing is found.
     """
 
     data: str
@@ -100,8 +103,8 @@ class Gain(Record):
 class Cost(Record):
     """Median costs of one detector in a separate process with one thread.
 
-    ``image_ms``: time for an image in addition to the ORB features, which tracking extracts anyway;
-    ``query_ms``: by number of keyframes.
+    ``image_ms``: time per image, without the ORB features, which tracking extracts anyway.
+    ``query_ms``: time per query, by number of keyframes.
     """
 
     detector: str
@@ -113,8 +116,9 @@ class Cost(Record):
 
 
 class LoopsJson(Document):
-    """``kind`` distinguishes this file from those of runs. ``cells``, ``gains`` and ``costs``
-    belong to the protocol ``retrieval``, ``online`` to the other one."""
+    """The results of ``vslam loops bench``. ``kind`` distinguishes this file from those of runs.
+    The protocol ``retrieval`` fills ``cells``, ``gains`` and ``costs``, the other one ``online``.
+    """
 
     kind: Literal["loops"] = "loops"
     schema_version: int = 3

@@ -1,4 +1,4 @@
-"""Image sets for testing loop detectors: rendered towns, drives, collections with ground truth."""
+"""Image sets for testing loop detectors: rendered towns, and collections with ground truth."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from vslam.loopclosure.siamese.image_source import UNKNOWN, ImageSource
 from vslam.loopclosure.siamese.source_registry import open_source, split_spec
 
 ProgressBar = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
-"""``(text, number)`` opens a bar; the function that it yields is called after each step."""
+"""``(text, number of steps)`` opens a bar and yields a function to be called after each step."""
 
-_GAP = 50  # images of a drive just before a query, which are not searched
+_GAP = 50  # images of a drive before a query that are not searched
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class TestSet:
 
     Attributes:
         title: title in the report.
-        query_set: function of ``(condition, seed)`` that returns the images under the condition;
-            None if the set does not have it.
+        query_set: function of ``(condition, seed)`` that returns the images under the condition, or
+            None if the condition cannot be applied to the set.
     """
 
     __test__ = False  # pytest must not collect this class because of its name
@@ -58,14 +58,14 @@ class TestSet:
 def open_set(spec: str, cache: Path, *, threads: int, progress_bar: ProgressBar) -> list[TestSet]:
     """Open ``town:ROUTE[seed=101,aliased=1,places=150]`` or a source of ``vslam train``.
 
-    A town is rendered into ``cache`` on first use, once for each viewpoint and change.
+    A town is rendered into ``cache`` when it is first needed, once per viewpoint and change.
 
     Args:
         cache: folder of rendered towns.
         progress_bar: opened while a town is rendered.
 
     Raises:
-        InputError: unknown kind, route or option, or data that is missing or malformed.
+        InputError: the kind, route or an option is unknown, or the data is missing or malformed.
     """
     if split_spec(spec)[0] != "town":
         return [_images(source) for source in open_source(spec)]
@@ -77,7 +77,7 @@ def open_set(spec: str, cache: Path, *, threads: int, progress_bar: ProgressBar)
 
 
 def rendered_route(spec: str, defaults: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """The route of ``KIND:ROUTE[options]``, and its options by name.
+    """The route and the options of ``KIND:ROUTE[options]``, with defaults for missing options.
 
     Raises:
         InputError: the route or an option is unknown, or an option is not a number.
@@ -93,7 +93,7 @@ def rendered_route(spec: str, defaults: dict[str, Any]) -> tuple[str, dict[str, 
     try:
         return route, defaults | {name: type(defaults[name])(given[name]) for name in given}
     except ValueError as error:
-        raise InputError(f"--data {spec}: an option is not a number.") from error
+        raise InputError(f"--data {spec}: one of the options is not a number.") from error
 
 
 def _images(source: ImageSource) -> TestSet:

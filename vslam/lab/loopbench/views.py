@@ -1,4 +1,4 @@
-"""Left images of some frames of a long drive, for tests of loop detectors."""
+"""Render the left images of some frames of a drive, for tests of loop detectors."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ def render_views(
     threads: int = 2,
     on_frame: OnFrame | None = None,
 ) -> None:
-    """Render the left images of some frames into a KITTI tree, unless they exist there.
+    """Render the left images of some frames into a tree in KITTI's layout, unless they exist.
 
-    The images are identical to those of `render_sequence`. Poses and times are those of the whole
-    drive; the file of poses is written last, so that it exists only if all images do.
+    The images are identical to those of `render_sequence`. Poses and times of the whole drive are
+    written; the file of poses comes last, so that it exists only if all images do.
 
     Args:
-        route: drive from which frames are taken.
-        variation: of the town.
-        root: the tree, which is used only for this route and variation.
+        route: the drive.
+        variation: appearance of the town.
+        root: root of the tree, which must not be used for other routes or variations.
         frames: frame numbers, ascending.
         threads: number of threads of the renderer.
-        on_frame: called with the number of finished frames and of all frames.
+        on_frame: called with the number of finished frames and the number of all frames.
 
     Raises:
         InputError: the folder cannot be written, or the disk is too small.

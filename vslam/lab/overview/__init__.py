@@ -1,1 +1,1 @@
-"""One report of many runs: medians, loop detectors compared, trajectories, strength curves."""
+"""One report of many runs: medians, comparisons of systems, trajectories, strength curves."""

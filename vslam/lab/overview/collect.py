@@ -1,4 +1,4 @@
-"""Finished runs found on disk, of vslam and of other systems, reduced to what is compared."""
+"""Find finished runs of vslam and of other systems on disk, and read what the report compares."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from vslam.run.outcome import alignment_of
 from vslam.trajectory import Trajectory, read_trajectory
 from vslam.untrusted import require_utf8
 
-MONOCULAR = ", mono"  # ends the name of a monocular system
-# Options of a run that change its results and that its drive does not say.
+MONOCULAR = ", mono"  # suffix of the name of a monocular system
+# Options of a run that change its results and are not part of its `Drive`.
 _OPTIONS = ("weights", "local_weights", "realtime", "map", "localize", "mask")
 
 
 @dataclass(frozen=True)
 class Found:
-    """Runs in the order found, notes on what was left out, and files of trajectories.
+    """The runs found, in order, and notes on what was left out.
 
     Attributes:
-        estimate: the trajectory of each run by its ``source``.
-        truth: the folder of a run with the ground truth of each (dataset, place).
+        estimate: the trajectory file of each run, by its ``source``.
+        truth: for each (dataset, place), the folder of a run that holds its ground truth.
     """
 
     runs: list[RunEntry]
@@ -44,8 +44,8 @@ def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
     Interrupted runs and reports that this version cannot read are left out with a note.
 
     Raises:
-        InputError: a folder is not there, none holds a finished run, or a trajectory cannot be
-            read or placed.
+        InputError: a folder is missing, none contains a finished run, a trajectory cannot be read,
+            or its sequence is not clear.
     """
     found = Found([], [])
     for folder in run_folders(folders):
@@ -64,9 +64,9 @@ def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
             if other.interrupted:
                 found.notes.append(f"left out: {other.detector} in {folder} ({other.interrupted})")
                 continue
-            beside = _beside(entry, report, other, folder)
-            found.runs.append(beside)
-            found.estimate[beside.source] = Path(beside.source)
+            compared = _compared_entry(entry, report, other, folder)
+            found.runs.append(compared)
+            found.estimate[compared.source] = Path(compared.source)
         if (folder / "ground_truth_kitti.txt").is_file():
             found.truth.setdefault((entry.drive.dataset, entry.drive.place), folder)
     if not found.runs:
@@ -81,7 +81,7 @@ def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
 
 
 def read_aligned(found: Found, run: RunEntry) -> tuple[Trajectory, Trajectory | None]:
-    """The trajectory of a run, aligned where there is a ground truth, and that ground truth.
+    """The trajectory of a run, aligned to the ground truth if there is one, and the ground truth.
 
     Raises:
         InputError: a file is missing or malformed.
@@ -95,15 +95,15 @@ def read_aligned(found: Found, run: RunEntry) -> tuple[Trajectory, Trajectory | 
         evaluation = evaluate_trajectory(estimate, truth, run.alignment)
     except InputError:  # too short to align
         return estimate, None
-    # Matched by time, an estimate may have fewer poses than the truth; only places are drawn.
+    # The estimate may lack some frames, so these timestamps may be wrong; only places are drawn.
     return Trajectory(estimate.timestamps[: evaluation.frames], evaluation.T_wc_aligned), truth
 
 
 def run_folders(folders: Collection[Path]) -> list[Path]:
-    """Folders that hold a ``report.json``, at any depth; hidden ones are left out.
+    """Folders at any depth that contain a ``report.json``, except hidden ones.
 
     Raises:
-        InputError: no such folder.
+        InputError: a folder does not exist.
     """
     found: dict[Path, Path] = {}
     for folder in folders:
@@ -130,7 +130,7 @@ def _read(folder: Path, notes: list[str]) -> ReportJson | None:
 
 
 def _is_overview(path: Path) -> bool:
-    """Whether a file is a report of many runs, which is not a run."""
+    """Whether a file is a report of many runs instead of one run."""
     try:
         OverviewJson.read(path)
     except InputError:
@@ -138,8 +138,10 @@ def _is_overview(path: Path) -> bool:
     return True
 
 
-def _beside(entry: RunEntry, report: ReportJson, other: DetectorFigures, folder: Path) -> RunEntry:
-    """A detector that ran beside the one of the run (``--compare``)."""
+def _compared_entry(
+    entry: RunEntry, report: ReportJson, other: DetectorFigures, folder: Path
+) -> RunEntry:
+    """The entry of another detector of the same run (``--compare``)."""
     return entry.model_copy(
         update={
             "system": other.detector + entry.system.removeprefix(report.detector),
@@ -158,9 +160,9 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
     sequence, town = report.sequence, None
     laws: list[str] = []
     if report.dataset == "synthetic":
-        from vslam.datasets.synthetic import parse_drive  # and with it the renderer
+        from vslam.datasets.synthetic import parse_drive  # imports the renderer
 
-        # What changes a rendered town is a perturbation, too: 05+change:0.5 is the route 05.
+        # Changes of a rendered town count as perturbations: 05+change:0.5 is on the route 05.
         town = parse_drive(sequence)[1].seed
         sequence, *parts_of_town = sequence.split("+")
         laws = [part for part in parts_of_town if not part.startswith("seed:")]
@@ -179,7 +181,7 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
         town=town,
         alignment=alignment_of(report.sensor),
         frames=report.frames,
-        # The frames per second of a run with several detectors are of all together.
+        # With --compare, fps is the speed of all detectors together.
         measures={
             name: None if name == "fps" and report.detectors else getattr(report, name)
             for name, *_ in MEASURES
@@ -202,7 +204,7 @@ def _settings(report: ReportJson, folder: Path) -> dict[str, Any]:
 
 
 def _name_by_settings(found: Found) -> None:
-    """Make one system of each set of settings; its name has those that not all runs share."""
+    """Make each combination of settings a system; its name lists those that not all runs share."""
     first = found.runs[0].settings
     shared = {
         name: value
@@ -220,7 +222,7 @@ def _name_by_settings(found: Found) -> None:
 
 
 def without_settings(system: str) -> str:
-    """The name of a system without the settings that tell its runs from others."""
+    """The name of a system without the settings in brackets."""
     return re.sub(r" \(.*\)", "", system)
 
 
@@ -229,7 +231,8 @@ def _add_external(text: str, found: Found) -> None:
     system, *where = name.split("@")
     if not (separator and system and file) or len(where) > 2:
         raise InputError(
-            f"--trajectory {text}: write NAME=FILE, or NAME@SEQUENCE@PERTURB=FILE to say of what."
+            f"--trajectory {text}: write NAME=FILE or, to name the sequence and perturbation, "
+            "NAME@SEQUENCE@PERTURB=FILE."
         )
     perturb = where[1] if len(where) == 2 else "none"
     places = {
@@ -239,22 +242,27 @@ def _add_external(text: str, found: Found) -> None:
     }
     if len(places) != 1:
         known = ", ".join(dict.fromkeys(run.drive.sequence for run in found.runs))
-        fix = "two excerpts of it are there" if places and where else f"one of {known}"
+        if places and where:
+            raise InputError(
+                f"--trajectory {text}: the runs cover different excerpts of {where[0]}; name "
+                "folders with one excerpt only."
+            )
         raise InputError(
-            f"--trajectory {text}: of which sequence? name it, {system}@SEQUENCE=FILE ({fix})."
+            f"--trajectory {text}: its sequence is not clear; write {system}@SEQUENCE=FILE with "
+            f"one of {known}."
         )
     dataset, sequence, excerpt = next(iter(places))
     drive = Drive(dataset=dataset, sequence=sequence, excerpt=excerpt, perturb=perturb)
     truth = _truth(found, drive)
     if truth is None:
-        raise InputError(f"--trajectory {text}: none of the runs of {sequence} has a ground truth.")
+        raise InputError(f"--trajectory {text}: no run on {sequence} has a ground truth.")
     path = Path(file)
     alignment = _alignment_of_external(system, drive, found)
     evaluation = evaluate_trajectory(read_trajectory(path, truth.timestamps), truth, alignment)
     if evaluation.frames < len(truth):
         found.notes.append(
-            f"{system} has a pose for {evaluation.frames} of {len(truth)} frames of {drive.place}, "
-            f"{perturb}: its errors are of those, where vslam's are of all"
+            f"{system} has poses for {evaluation.frames} of {len(truth)} frames of {drive.place}, "
+            f"{perturb}: its errors cover only these frames, those of vslam cover all"
         )
     measures: dict[str, float | None] = {
         measure: getattr(evaluation, measure, None) for measure, *_ in MEASURES
@@ -276,8 +284,8 @@ def _add_external(text: str, found: Found) -> None:
 
 
 def _alignment_of_external(system: str, drive: Drive, found: Found) -> str:
-    """The alignment of vslam's runs of the same place. Where only some of them are monocular, the
-    ending of the name decides."""
+    """The alignment of vslam's runs on the same sequence. If only some of them are monocular, the
+    suffix of the system's name decides."""
     there = {run.alignment for run in found.runs if run.drive.place == drive.place}
     if len(there) == 1:
         return there.pop()

@@ -1,4 +1,4 @@
-"""The figures of many runs: errors by sequence, strength curves, trajectories from above."""
+"""The figures of a report of many runs: errors by sequence, strength curves, trajectories."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _COLORS = [AMBER, BLUE, GREEN, VIOLET, RED, "#06b6d4", "#ec4899", "#84cc16"]
-_MIN_STRENGTHS = 2  # not counting none
-_DASHES = ["-", (0, (5, 1.5)), (0, (2, 1)), (0, (5, 1, 1, 1))]  # where lines cover each other
+_MIN_STRENGTHS = 2  # in a strength curve, not counting the images as they are
+_DASHES = ["-", (0, (5, 1.5)), (0, (2, 1)), (0, (5, 1, 1, 1))]  # keep lines that overlap visible
 
 Looks = Mapping[str, tuple[str, Any]]  # colour and dashes of each system
 
 
 def draw_overview(report: OverviewJson, found: Found) -> list[page.Figure]:
-    """Draw all that there is data for, in the order of the report."""
+    """Draw all figures for which there is data, in the order of the report."""
     looks = {
         name: (_COLORS[k % len(_COLORS)], _DASHES[k % len(_DASHES)])
         for k, name in enumerate(systems(report.rows))
@@ -59,7 +59,7 @@ def draw_overview(report: OverviewJson, found: Found) -> list[page.Figure]:
 
 
 def _errors(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
-    """ATE by sequence: one figure for each perturbation."""
+    """ATE by sequence, with a figure for each perturbation."""
     for perturb in dict.fromkeys(row.drive.perturb for row in rows):
         known = [r for r in rows if r.drive.perturb == perturb and r.measures["ate_rmse_m"]]
         places = list(dict.fromkeys((row.drive.dataset, row.drive.place) for row in known))
@@ -87,7 +87,7 @@ def _errors(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
 
 
 def _curves(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
-    """ATE and loops against the strength of a law, one figure for each law and sequence."""
+    """ATE and loops against the strength of a law, with a figure for each law and sequence."""
     laws = {
         law.partition(":")[0]: None
         for row in rows
@@ -108,8 +108,8 @@ def _curves(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
                 continue
             yield (
                 f"strength-{law}-{place.dataset}-{place.place}",
-                "Medians over runs, shaded from the smallest to the largest value. Strength 0: the "
-                "images as they are.",
+                "Medians over runs, shaded from the smallest to the largest value. Strength 0 are "
+                "the images as they are.",
                 _curve(f"{place.place}: {law}", mine, strength, looks),
             )
 
@@ -133,7 +133,7 @@ def _curve(
             at = [strength[row.drive] for row in some]
             median, least, greatest = _spreads(some, measure)
             axes.fill_between(at, least, greatest, color=color, alpha=0.16, linewidth=0)
-            label = name if axes is upper else "_again"  # one entry of the legend for both
+            label = name if axes is upper else "_again"  # one legend entry for both panels
             axes.plot(at, median, "o", linestyle=dashes, color=color, markersize=4, label=label)
     upper.set_ylabel("ATE RMSE (m)")
     lower.set(xlabel="strength", ylabel="loops found")
@@ -146,7 +146,7 @@ def _curve(
 
 
 def _paths(report: OverviewJson, found: Found, looks: Looks) -> Iterator[Drawing]:
-    """The run with the median ATE of each system, one figure for each drive."""
+    """The run with the median ATE of each system, with a figure for each drive."""
     for drive in dict.fromkeys(row.drive for row in report.rows):
         figure, axes = new_figure(
             f"{drive.place}, {_light(drive.perturb)}", "x (m)", "z (m)", SQUARE
@@ -157,7 +157,8 @@ def _paths(report: OverviewJson, found: Found, looks: Looks) -> Iterator[Drawing
         finish_map(figure, axes)
         yield (
             f"path-{drive.dataset}-{drive.place}-{drive.perturb}",
-            "Seen from above, aligned to the ground truth; each system by its run of median ATE.",
+            "Seen from above, aligned to the ground truth. Each system is represented by its run "
+            "with the median ATE.",
             figure,
         )
 
@@ -169,7 +170,7 @@ def _draw_paths(axes: Axes, rows: list[Row], found: Found, looks: Looks) -> int:
         try:
             estimate, truth = read_aligned(found, _median_run(runs))
         except InputError as error:
-            found.notes.append(f"no path of {row.system} on {row.drive.place}: {error}")
+            found.notes.append(f"{row.system} is not drawn on {row.drive.place}: {error}")
             continue
         if truth is not None and not drawn:
             x, z = truth.T_wc[:, 0, 3], truth.T_wc[:, 2, 3]
@@ -197,7 +198,7 @@ def _spreads(rows: list[Row], measure: str) -> np.ndarray:
 
 
 def _logarithmic(axes: Axes) -> None:
-    """A logarithmic axis from at least a third to three times the data, in plain numbers."""
+    """Make the y axis logarithmic, from a third to three times the data, with plain numbers."""
     low, high = axes.dataLim.intervaly
     axes.set_yscale("log")
     axes.set_ylim(max(low, 1e-4) / 3.0, max(high, 1e-4) * 3.0)

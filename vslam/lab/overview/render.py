@@ -1,4 +1,4 @@
-"""The report of many runs: its page, its rows as CSV, and the files of both."""
+"""Write the report of many runs: its page, and its rows as CSV."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ _MOTION = ("rpe_m", "rpe_deg", "t_rel_percent", "r_rel_deg_per_100m")
 _OTHER = ("loops_found", "loops_missed", "loops_wrong", "fps")
 _ABOUT_ERRORS = (
     "Medians over runs, with the smallest and the largest value in brackets. The ATE counts every "
-    "frame, lost ones included, after the alignment named: SE3 keeps the scale; Sim3, for "
-    "monocular runs, fits it. The causal ATE is that of the poses as they were estimated at the "
-    "time. Systems with different alignments are not compared."
+    "frame, including lost ones, after the alignment in the table: SE3 keeps the scale; Sim3 fits "
+    "it for monocular runs. The causal ATE is that of the poses as they were first estimated. "
+    "Systems with different alignments are not compared."
 )
 _ABOUT_MOTION = (
-    "The RPE is the error of the motion from one frame to the next; t_rel and r_rel are KITTI's "
-    "drift over 100 to 800 m."
+    "RPE: error of the motion from one frame to the next. t_rel and r_rel: KITTI's drift over 100 "
+    "to 800 m."
 )
 _ABOUT_OTHERS = (
-    "Loops are judged by the ground truth. fps is that of the frame loop; runs that share a "
-    "machine are slower."
+    "Loops are judged by the ground truth. fps: frames per second of the frame loop, lower for "
+    "runs that shared a machine."
 )
 ALIGNMENTS = {"se3": "SE3", "sim3": "Sim3"}
 _TESTED = (
-    "Better, worse, same: sequences on which the first system named has smaller, larger or equal "
-    "errors. p is that of Wilcoxon's signed-rank test on sequences, each with the median of its "
-    "runs, because runs of one sequence are not independent. Over all conditions a sequence counts "
-    f"once, with the mean of its medians. Two-sided, level {ALPHA:g}, not corrected for the "
-    "number of tests. Comparisons in which all sequences tie are left out."
+    "Better, worse, same: numbers of sequences on which the errors of the system named first are "
+    "smaller, larger or equal. p: two-sided Wilcoxon signed-rank test over sequences, at the level "
+    f"{ALPHA:g}, not corrected for the number of tests. A sequence counts once, with the median of "
+    "its runs, because these are not independent; over all conditions, with the mean of its "
+    "medians. Comparisons in which all sequences tie are left out."
 )
 
 
@@ -49,20 +49,20 @@ def write_overview(
     """Gather finished runs and write ``report.{html,md,json}`` and ``table.csv`` into ``out``.
 
     Args:
-        runs: folders of runs, or folders that hold such at any depth.
-        trajectories: ``NAME[@SEQUENCE[@PERTURB]]=FILE``, of other systems.
-        out: made if it is not there.
+        runs: folders that contain runs at any depth.
+        trajectories: trajectories of other systems, ``NAME[@SEQUENCE[@PERTURB]]=FILE``.
+        out: folder, created if it does not exist.
         baseline: the system that the others are compared with; None for the simplest.
 
     Raises:
-        InputError: no finished run, a trajectory that cannot be read or placed, or no run of the
-            baseline.
+        InputError: there is no finished run, or none of the baseline, or a trajectory cannot be
+            read or its sequence is not clear.
         ResultsError: a file cannot be written.
     """
     found = collect(runs, trajectories)
     report = summarize(found, baseline)
     figures = draw_overview(report, found)
-    notes = list(dict.fromkeys((*report.notes, *found.notes)))  # drawing adds some
+    notes = list(dict.fromkeys((*report.notes, *found.notes)))  # drawing has added some
     report = report.model_copy(update={"notes": notes})
     page = overview_page(report, figures)
     files = {"report.json": report.to_json(), "table.csv": render_csv(report)}
@@ -82,7 +82,7 @@ def overview_page(report: OverviewJson, figures: Collection[Figure]) -> Page:
             Section("", [*figures], wide=False),
             Section("Notes", [Bullets(report.notes)]),
             _runs(report),
-            Section("Made", [Pairs(_made(report))]),
+            Section("Provenance", [Pairs(_provenance(report))]),
         ),
     )
 
@@ -97,7 +97,7 @@ def title(report: OverviewJson) -> str:
 
 
 def render_csv(report: OverviewJson) -> str:
-    """A line for each row; of each measure the median, the least and the greatest."""
+    """A line for each row, with the median, smallest and largest value of each measure."""
     names = [name for name, *_ in MEASURES]
     head = ["dataset", "sequence", "excerpt", "perturb", "system", "alignment", "runs", "frames"]
     lines: list[list[object]] = [
@@ -115,7 +115,7 @@ def render_csv(report: OverviewJson) -> str:
 
 
 def _results(report: OverviewJson) -> list[Section]:
-    """Several tables of the same rows, because one would be too wide to read."""
+    """Several tables with the same rows, because a single one would be too wide."""
     texts = ("sequence", "perturbation", "system")
 
     def table(name: str, measures: Collection[Measure], note: str, *, aligned: bool) -> Section:
@@ -184,7 +184,7 @@ def _runs(report: OverviewJson) -> Section:
     return Section("Runs", [Table(head, rows, texts)], folded=True)
 
 
-def _made(report: OverviewJson) -> list[tuple[str, str]]:
+def _provenance(report: OverviewJson) -> list[tuple[str, str]]:
     machines = dict.fromkeys(run.machine for run in report.runs if run.machine)
     return [
         ("machines", "; ".join(machines)),

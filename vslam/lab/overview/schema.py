@@ -1,4 +1,4 @@
-"""The schema of the ``report.json`` of many runs: what scripts may rely on."""
+"""The schema of the ``report.json`` of many runs, which scripts may rely on."""
 
 from __future__ import annotations
 
@@ -25,14 +25,12 @@ MEASURES: tuple[Measure, ...] = (
     ("fps", "fps", "", 1),
 )
 DECIMALS = {name: decimals for name, _, _, decimals in MEASURES}
-ALL = "all"  # in the place of a perturbation: over all of them
+ALL = "all"  # stands for a comparison over all perturbations
 
 
 class Drive(Record):
-    """Images on which systems are compared; drives that differ only in a seed are one.
-
-    ``excerpt`` is empty for a whole sequence.
-    """
+    """Images on which systems are compared, whatever the seed; ``excerpt`` is empty for a whole
+    sequence."""
 
     dataset: str
     sequence: str
@@ -46,15 +44,15 @@ class Drive(Record):
 
 
 class RunEntry(Record):
-    """One run. ``measures`` has the names of ``MEASURES``; None where a run has no such value.
+    """One run.
 
-    ``settings`` are the thresholds and options that differ from the defaults. ``system`` is the
-    loop detector, followed in brackets by the settings that not all runs share, or the name of
-    another system; ``source`` the folder of the run, or the file of the trajectory of another
-    system or of a detector that ran beside another (``--compare``); ``seed`` is None
-    for other systems. ``town`` is the seed of a rendered town: the same route in another town
-    counts as the same drive with another seed. ``alignment`` is what was fitted before errors were
-    computed: ``se3``, or ``sim3`` for a monocular run, whose scale is arbitrary.
+    ``system``: the loop detector, followed in brackets by the settings that not all runs share, or
+    the name of another system. ``settings``: thresholds and options that differ from the defaults.
+    ``seed``: None for other systems. ``town``: seed of a rendered town; the same route in another
+    town counts as the same drive with another seed. ``alignment``: the transformation fitted before
+    errors are computed, ``se3``, or ``sim3`` for a monocular run, whose scale is arbitrary.
+    ``measures``: by the names of ``MEASURES``; None if unknown. ``source``: the folder of the run,
+    or the trajectory file of another system or of a detector of ``--compare``.
     """
 
     drive: Drive
@@ -79,8 +77,7 @@ class Spread(Record):
 
 
 class Row(Record):
-    """All runs of one system on one drive, which share an ``alignment``; None for a measure that no
-    run has."""
+    """All runs of one system on one drive; a measure that no run has is None."""
 
     drive: Drive
     system: str
@@ -91,7 +88,7 @@ class Row(Record):
 
 
 class Pair(Record):
-    """Medians of two systems on one drive, and ``difference``, the second minus the first."""
+    """Medians of two systems on one drive; ``difference`` is the second minus the first."""
 
     drive: Drive
     first: float
@@ -103,10 +100,10 @@ class Comparison(Record):
     """Two systems under one perturbation, paired by sequence.
 
     ``perturb`` is ``all`` for a comparison over all perturbations: a sequence then counts once,
-    with its mean over the perturbations under which both systems have run on it. ``p_value`` is
-    two-sided, of Wilcoxon's signed-rank test on the differences that are not ties; None where there
-    are too few of them for the test. ``winner`` is the system with the smaller errors by that test,
-    None where the test does not decide.
+    with its mean over the perturbations that both systems have run. ``p_value`` is that of the
+    two-sided Wilcoxon signed-rank test on the differences that are not ties, None if there are too
+    few of them. ``winner`` is the system with significantly smaller errors, None if neither has.
+    ``words`` describes the result in sentences.
     """
 
     measure: str
@@ -124,8 +121,8 @@ class Comparison(Record):
 
 
 class OverviewJson(Document):
-    """``kind`` distinguishes this file from the ``report.json`` of one run. ``systems`` are in the
-    order in which they are compared, the baseline first."""
+    """A report of many runs. ``kind`` distinguishes this file from the ``report.json`` of one run.
+    ``systems`` are in the order of comparison, the baseline first."""
 
     kind: Literal["overview"] = "overview"
     schema_version: int = 4

@@ -1,12 +1,12 @@
-"""A page of all runs in some folders, on this machine alone: ``vslam report --serve``.
+"""``vslam report --serve``: a web page of all runs in some folders, for this machine only.
 
-Only reports that were found are served, by number: no path of a request is ever opened. Requests
-with another host name are refused, so that no page on the web can read reports through the browser
-(DNS rebinding).
+Requests name a report by its number; a path from a request is never opened. Requests for another
+host name are refused, so that a web site cannot read reports through the user's browser (DNS
+rebinding).
 
-A report may come from a stranger and contain any script. It is sandboxed: its scripts run in an
-origin of their own and reach neither other reports nor the network. A ``report.html`` or
-``report.json`` that is a link out of its folder is not read.
+A report may come from a stranger and contain any script, so it is sandboxed: its scripts run in an
+origin of their own and can reach neither other reports nor the network. A ``report.html`` or
+``report.json`` that is a symbolic link is not read.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from vslam.report.schema import ReportJson
 from vslam.untrusted import require_utf8
 
 HOST = "127.0.0.1"
-_NAMES = (HOST, "localhost")
-_MOST_BESIDE = 4
+_HOST_NAMES = (HOST, "localhost")
+_MAX_COMPARED = 4
 _LISTS_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-src 'self'"
 _REPORT_POLICY = (
     "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; "
@@ -40,10 +40,10 @@ _REPORT = re.compile("/run/([0-9]{1,9})")
 
 
 def list_runs(folders: Collection[Path]) -> list[tuple[Path, ReportJson]]:
-    """Folders of all runs and their reports, the newest first; what cannot be read is left out.
+    """Folders of all runs and their reports, newest first; unreadable reports are left out.
 
     Raises:
-        InputError: no such folder, or no run in any of them.
+        InputError: a folder does not exist, or none contains a run.
     """
     found: list[tuple[Path, ReportJson]] = []
     for folder in map(Path.resolve, run_folders(folders)):
@@ -57,28 +57,28 @@ def list_runs(folders: Collection[Path]) -> list[tuple[Path, ReportJson]]:
 
 
 def _is_own(path: Path) -> bool:
-    """Whether a path without links is a file, and not itself a link to another place."""
+    """Whether a path in a resolved folder is a file and not a symbolic link."""
     return path.is_file() and path.resolve() == path
 
 
 def make_server(folders: Sequence[Path], port: int = 0) -> http.server.ThreadingHTTPServer:
-    """A server on the loopback interface, to be started by its ``serve_forever``.
+    """A server on the loopback interface; its ``serve_forever`` starts it.
 
     The folders are read again whenever the list is requested.
 
     Args:
-        folders: folders of runs, or folders that hold such at any depth.
-        port: 0 for any that is free.
+        folders: folders that contain runs at any depth.
+        port: 0 for any free port.
 
     Raises:
-        InputError: no run, or the port is taken.
+        InputError: there is no run, or the port is in use.
     """
     pages = _Pages(folders)
 
     class Handler(http.server.BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             host = (self.headers.get("Host") or "").partition(":")[0]
-            status, text = pages.answer(self.path) if host in _NAMES else (403, "forbidden")
+            status, text = pages.answer(self.path) if host in _HOST_NAMES else (403, "forbidden")
             is_ours = self.path == "/" or self.path.startswith("/compare?")
             body = text.encode()
             self.send_response(status)
@@ -100,13 +100,13 @@ def make_server(folders: Sequence[Path], port: int = 0) -> http.server.Threading
         return http.server.ThreadingHTTPServer((HOST, port), Handler)
     except OSError as error:
         raise InputError(
-            f"--port {port}: cannot be opened ({error.strerror}); name another one."
+            f"--port {port}: cannot be opened ({error.strerror}); choose another port."
         ) from error
 
 
 class _Pages:
-    """What is answered; a page keeps its number, its place in ``_known``, as long as the server
-    lives."""
+    """The pages of the server. The number of a report is its index in ``_known`` and never changes
+    while the server runs."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
         self._folders = folders
@@ -115,7 +115,7 @@ class _Pages:
         self._list()
 
     def answer(self, request: str) -> tuple[int, str]:
-        """Status and page for a path with its query."""
+        """The HTTP status and the page for a path with its query."""
         try:
             url = urlsplit(request)
             if url.path == "/":
@@ -129,9 +129,9 @@ class _Pages:
             return self._report(int(found[1]))
         if url.path == "/compare":
             chosen = [int(n) for n in parse_qs(url.query).get("run", []) if _NUMBER.fullmatch(n)]
-            known = [n for n in dict.fromkeys(chosen) if n < len(self._known)][:_MOST_BESIDE]
-            beside = [(n, self._known[n].parent.name) for n in known] if len(known) > 1 else []
-            return 200 if beside else 400, fill_template("compare.html.jinja", runs=beside)
+            known = [n for n in dict.fromkeys(chosen) if n < len(self._known)][:_MAX_COMPARED]
+            runs = [(n, self._known[n].parent.name) for n in known] if len(known) > 1 else []
+            return 200 if runs else 400, fill_template("compare.html.jinja", runs=runs)
         return 404, "not found"
 
     def _report(self, number: int) -> tuple[int, str]:
@@ -151,7 +151,7 @@ class _Pages:
                     self._known.append(page)
                 number = self._known.index(page)
             rows.append((number, folder.name, _cells(report)))
-        return fill_template("runs.html.jinja", head=_HEAD, rows=rows, most=_MOST_BESIDE)
+        return fill_template("runs.html.jinja", head=_HEAD, rows=rows, most=_MAX_COMPARED)
 
 
 _HEAD = ("data", "perturb", "detector", "frames", "lost", "ATE (m)", "loops", "wrong", "fps")

@@ -1,12 +1,13 @@
-"""From runs to rows, and from rows to who wins where.
+"""Summarize runs in rows and compare systems.
 
-A system is represented on a drive by the median over its runs. Two systems are compared under one
-perturbation and over all of them, paired by *sequence*: runs of one sequence are not independent,
-and counting each of them would overstate the evidence.
+The median over its runs represents a system on a drive. Two systems are compared under each
+perturbation and over all of them, paired by *sequence*: runs on the same sequence are not
+independent, so counting each of them would overstate the evidence.
 """
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
@@ -42,7 +43,7 @@ class Shown(NamedTuple):
     decimals: int
 
     def text(self, value: float, sign: str = "") -> str:
-        """The figure without its unit; ``sign`` is ``+`` for differences."""
+        """The value without its unit; ``sign`` is ``+`` for differences."""
         return f"{self.scale * value:{sign}.{self.decimals}f}"
 
 
@@ -51,20 +52,20 @@ ROTATION = {"rpe_deg": Shown("RPE", "°", 1.0, 3)}
 
 
 def summarize(found: Found, baseline: str | None = None) -> OverviewJson:
-    """Reduce runs to what the report holds.
+    """Compute the content of the report from the runs.
 
     Args:
         found: the runs.
         baseline: the system that the others are compared with; None for the simplest.
 
     Raises:
-        InputError: no run of the baseline.
+        InputError: there is no run of the baseline.
     """
     names = systems(found.runs, baseline)
     if baseline is not None and not _is_called(names[0], baseline):
         meant = did_you_mean(baseline, names)
         raise InputError(
-            f"--baseline {baseline}: no run of it{meant}; choose from {', '.join(names)}."
+            f"--baseline {baseline}: there is no such run{meant}; choose from {', '.join(names)}."
         )
     rows = make_rows(found.runs)
     laws = list(dict.fromkeys(row.drive.perturb for row in rows))
@@ -88,23 +89,23 @@ def summarize(found: Found, baseline: str | None = None) -> OverviewJson:
 
 
 def _unlike_towns(runs: Iterable[RunEntry]) -> Iterator[str]:
-    """Drives whose medians are not of the same rendered towns in all systems."""
+    """A note on each drive that some systems have run in other rendered towns than others."""
     towns: dict[Drive, dict[str, set[int]]] = {}
     for run in runs:
         if run.town is not None:
             towns.setdefault(run.drive, {}).setdefault(run.system, set()).add(run.town)
     for drive, seeds in towns.items():
         if len(set(map(frozenset, seeds.values()))) > 1:
-            had = "; ".join(
+            lists = "; ".join(
                 f"{system} in {', '.join(map(str, sorted(seeds[system])))}" for system in seeds
             )
-            yield f"{drive.place}, {drive.perturb}: runs in towns of different seeds ({had})"
+            yield f"{drive.place}, {drive.perturb}: systems ran in different towns ({lists})"
 
 
 def systems(runs: Iterable[RunEntry | Row], baseline: str | None = None) -> list[str]:
-    """The baseline if one is named, monocular or not, then loop detectors from the simplest to the
-    most elaborate, then other systems as they came. Of one detector the run without changed
-    settings comes first."""
+    """Names of the systems: first the baseline if one is named, then loop detectors from the
+    simplest to the most elaborate, then other systems in the order found. A detector without
+    changed settings precedes the same one with changed settings."""
     names = dict.fromkeys(run.system for run in runs)
 
     def key(name: str) -> tuple[bool, int, bool]:
@@ -116,12 +117,12 @@ def systems(runs: Iterable[RunEntry | Row], baseline: str | None = None) -> list
 
 
 def _is_called(system: str, name: str | None) -> bool:
-    """Whether ``--baseline`` may call a system so: with its settings or without."""
+    """Whether a name means this system: its settings and the monocular suffix may be omitted."""
     return name in {one.removesuffix(MONOCULAR) for one in (system, without_settings(system))}
 
 
 def make_rows(runs: list[RunEntry]) -> list[Row]:
-    """One row for each drive and system, sequences in the order of their names."""
+    """A row for each drive and system, ordered by the names of the sequences."""
     groups: dict[tuple[Drive, str], list[RunEntry]] = {}
     for run in runs:
         groups.setdefault((run.drive, run.system), []).append(run)
@@ -150,17 +151,17 @@ def make_rows(runs: list[RunEntry]) -> list[Row]:
 def compare(
     rows: list[Row], first: str, second: str, perturb: str, measure: str
 ) -> Comparison | None:
-    """The second system against the first, by a measure of which less is better.
+    """Compare the errors of two systems.
 
     Args:
-        rows: medians of both, and of others.
-        first, second: systems. Errors after different alignments are not compared.
+        rows: medians of both systems, and maybe of others.
+        first, second: names of the systems. Errors after different alignments are not compared.
         perturb: a perturbation, or `ALL`: a sequence then counts with its mean over the
-            perturbations under which both systems have run on it.
-        measure: ``ate_rmse_m`` or ``rpe_m``.
+            perturbations that both systems have run.
+        measure: ``ate_rmse_m`` or ``rpe_m``; less is better.
 
     Returns:
-        None where the two share no drive.
+        None if the systems share no drive.
     """
     medians: dict[str, dict[tuple[Drive, str], float]] = {first: {}, second: {}}
     for row in rows:
@@ -178,10 +179,9 @@ def compare(
     for (drive, _), both in values.items():
         a, b = (statistics.fmean(column) for column in zip(*both, strict=True))
         pairs.append(Pair(drive=drive, first=a, second=b, difference=b - a))
-    better = [
-        pair for pair in pairs if pair.difference < 0 and not is_tie(pair.difference, measure)
-    ]
-    worse = [pair for pair in pairs if pair.difference > 0 and not is_tie(pair.difference, measure)]
+    different = [pair for pair in pairs if not is_tie(pair.difference, measure)]
+    better = [pair for pair in different if pair.difference < 0]
+    worse = [pair for pair in different if pair.difference > 0]
     p_value, second_is_less = _wilcoxon([pair.difference for pair in (*better, *worse)])
     winner = None
     if p_value is not None and p_value < ALPHA:
@@ -204,13 +204,13 @@ def compare(
 
 
 def is_tie(difference: float, measure: str) -> bool:
-    """Whether two systems differ by at most half of the last digit that is printed."""
+    """Whether two errors differ by at most half a unit of the last digit that is printed."""
     shown = COMPARED[measure]
     return shown.scale * abs(difference) <= 0.5 * 10.0**-shown.decimals
 
 
 def strengths(drives: Iterable[Drive], law: str) -> dict[Drive, float]:
-    """The strength of a law in each drive that has this law alone; 0 in drives without any law."""
+    """The strength of a law in each drive with this law alone, and 0 for unperturbed drives."""
     found = {}
     for drive in drives:
         if drive.perturb == "none":
@@ -221,15 +221,12 @@ def strengths(drives: Iterable[Drive], law: str) -> dict[Drive, float]:
 
 
 def least_pairs() -> int:
-    """Pairs below which Wilcoxon's two-sided test cannot reach ``ALPHA``, whatever they are."""
-    n = 1
-    while 2.0 ** (1 - n) > ALPHA:
-        n += 1
-    return n
+    """Number of pairs that Wilcoxon's two-sided test needs at least in order to reach ``ALPHA``."""
+    return math.ceil(1.0 - math.log2(ALPHA))
 
 
 def _wilcoxon(differences: list[float]) -> tuple[float | None, bool]:
-    """The two-sided p, None where there are too few differences, and whether they tend to be
+    """The two-sided p, None if there are too few differences, and whether they tend to be
     negative."""
     if len(differences) < least_pairs():
         return None, False
@@ -240,6 +237,8 @@ def _wilcoxon(differences: list[float]) -> tuple[float | None, bool]:
 
 
 def _words(found: Comparison, better: list[Pair], worse: list[Pair]) -> str:
+    """The result of a comparison in sentences."""
+
     def named(some: list[Pair]) -> str:
         return ", ".join(pair.drive.place for pair in some)
 
@@ -260,8 +259,7 @@ def _words(found: Comparison, better: list[Pair], worse: list[Pair]) -> str:
     if not untied:
         return f"{beginning} a tie on {f'all {n} sequences' if n > 1 else 'the only sequence'}."
     verdict = f"{found.winner} wins" if found.winner else "no winner"
-    text = f"{beginning} {verdict}. Of {counted(n, 'sequence')}, "
-    text += "; ".join(counts) + ". "
+    text = f"{beginning} {verdict}. Of {counted(n, 'sequence')}, {'; '.join(counts)}. "
     differences = sorted(pair.difference for pair in found.pairs)
     least, greatest = (shown.text(differences[k], "+") for k in (0, -1))
     median = shown.text(found.median_difference, "+")
@@ -270,7 +268,10 @@ def _words(found: Comparison, better: list[Pair], worse: list[Pair]) -> str:
     if found.p_value is None:
         return text.rstrip()
     chance = "unlikely to be chance" if found.winner else "may be chance"
-    return text + f"Wilcoxon's signed-rank test on {untied}: p = {found.p_value:.3g}, {chance}."
+    return (
+        f"{text}Wilcoxon's signed-rank test on {untied} sequences: p = {found.p_value:.3g}, "
+        f"{chance}."
+    )
 
 
 def _spread(values: Iterable[float | None]) -> Spread | None:

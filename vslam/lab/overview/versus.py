@@ -1,4 +1,4 @@
-"""Systems side by side: a row for each sequence and perturbation, then who wins."""
+"""Systems side by side: tables by sequence and perturbation, then sentences on who wins."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from vslam.report.page import Bullets, Section, Table
 _TEXTS = ("sequence", "perturbation")
 _SHOWN = {**COMPARED, **ROTATION}
 _MEASURES = ("lost_frames", *_SHOWN, "loops_found")
-_WIDTH = 60  # characters for all columns of figures, so that a table fits a terminal of 80
-_COLUMN = 6  # characters of a column of figures at least
+_WIDTH = 60  # characters for all columns of numbers, so that a table fits 80 columns
+_COLUMN = 6  # smallest width of a column of numbers, in characters
 _NOTES = {
     "lost_frames": "Lost: number of lost frames.",
     "rpe_m": "RPE: error of the motion from one frame to the next.",
     "loops_found": (
-        "Loops: revisits found, of those in the ground truth; a dash where there are none."
+        "Loops: revisits found of those in the ground truth; a dash if there are none."
     ),
 }
 
@@ -30,10 +30,10 @@ Rows = dict[str, dict[Key, Row]]
 
 
 def versus(report: OverviewJson) -> list[Section]:
-    """The systems that have run on the same drives side by side, and which of them wins.
+    """Sections that show systems side by side and name the winner.
 
-    Systems share a section if they share a drive and were aligned in the same way. A sentence comes
-    first where no drive has a revisit, so that loop detectors cannot differ.
+    Systems share a section if they share a drive and an alignment. If no drive has a revisit, the
+    first section explains why loop detectors cannot differ.
     """
     rows: Rows = {name: {} for name in report.systems}
     for row in report.rows:
@@ -52,26 +52,27 @@ def versus(report: OverviewJson) -> list[Section]:
 
 
 def median_text(spread: Spread | None, decimals: int) -> str:
-    """The median in so many decimals; that of an even number of counts may need one more."""
+    """The median with a number of decimals, or with one if the median of counts is no integer."""
     if spread is None:
         return "n/a"
     return f"{spread.median:.{1 if decimals == 0 and spread.median % 1 else decimals}f}"
 
 
 def _without_revisits(report: OverviewJson) -> str:
-    """Why loop detectors do not differ, or hardly; empty if a drive has a revisit or no run has a
-    ground truth."""
+    """Why loop detectors hardly differ; empty if a drive has a revisit or no run has a ground
+    truth."""
     judged = [row for row in report.rows if row.measures["loops_found"] is not None]
     names = {row.system for row in judged if row.system == without_settings(row.system)}
     counts = [row.measures[name] for row in judged for name in ("loops_found", "loops_missed")]
     if len(names) < 2 or any(count.greatest for count in counts if count is not None):
         return ""
-    none = f"No drive revisits a stretch of {MIN_LENGTH_M:.0f} m or more"
+    no_loop = f"No drive revisits a stretch of {MIN_LENGTH_M:.0f} m or more"
     compared = [c for c in report.comparisons if {c.first, c.second} <= names]
     if all(_is_tie(one) for one in compared):
-        return f"{none}, so there is no loop to find and the loop detectors cannot differ."
+        return f"{no_loop}, so there is no loop to find and the loop detectors cannot differ."
     return (
-        f"{none}. Loop detectors can differ only by wrong loops and by loops on shorter stretches."
+        f"{no_loop}. Loop detectors can differ only in wrong loops and in loops on shorter "
+        "stretches."
     )
 
 
@@ -83,10 +84,10 @@ def _section(report: OverviewJson, rows: Rows, names: list[str]) -> Section:
     order = {(row.drive, row.alignment): None for row in report.rows if row.system in names}
     words = [re.split(", | ", name) for name in names]  # a heading breaks between them
     width = sum(max(_COLUMN, *(1 + len(word) for word in parts)) for parts in words)
-    each = max(1, _WIDTH // width)  # measures of one table
+    per_table = max(1, _WIDTH // width)
     tables = []
-    for k in range(0, len(_MEASURES), each):
-        measures = _MEASURES[k : k + each]
+    for k in range(0, len(_MEASURES), per_table):
+        measures = _MEASURES[k : k + per_table]
         head = [*_TEXTS, *(f"{_title(one)}, {name}" for one in measures for name in names)]
         lines = [
             (
@@ -124,8 +125,8 @@ def _cell(row: Row | None, measure: str) -> str:
 
 
 def _points(report: OverviewJson, rows: Rows, names: list[str]) -> Iterator[str]:
-    """Totals over the runs on the drives that all of ``names`` share, lost frames first, then each
-    system compared with its baseline: the first one that shares a drive."""
+    """Sentences: lost frames and loops in total, over the drives that all systems share, then a
+    comparison of each system with its baseline, the first system that shares a drive with it."""
     shared = set.intersection(*(set(rows[name]) for name in names))
     runs = {
         name: [
@@ -160,16 +161,16 @@ def _points(report: OverviewJson, rows: Rows, names: list[str]) -> Iterator[str]
         sharing = (other for other in names[:k] if rows[other].keys() & rows[name].keys())
         baseline = next(sharing, None)
         for measure in COMPARED:
-            found_ = [
+            comparisons = [
                 one
                 for one in report.comparisons
                 if (one.first, one.second, one.measure) == (baseline, name, measure)
             ]
-            if found_:
-                shown.append(found_[-1])  # over all conditions where there are several
+            # The last one is over all conditions if there are several.
+            shown += comparisons[-1:]
     yield from (one.words for one in shown)
     if any(one.p_value is None and one.first_better + one.second_better for one in shown):
         yield (
             f"Where fewer than {least_pairs()} sequences differ, Wilcoxon's test cannot reach "
-            f"p < {ALPHA:g}: the figures say nothing about other sequences."
+            f"p < {ALPHA:g}: the result does not generalize to other sequences."
         )

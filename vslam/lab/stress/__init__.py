@@ -1,1 +1,1 @@
-"""Stress tests: bisection of the strength at which runs fail, for laws, systems and seeds."""
+"""Stress tests: find by bisection the strength at which runs fail, per law, system and seed."""

@@ -1,4 +1,4 @@
-"""The criterion by which a run has failed."""
+"""The criterion that decides whether a run has failed."""
 
 from __future__ import annotations
 
@@ -9,19 +9,24 @@ from vslam.report.schema import ReportJson
 _LOSS_S = 10.0
 _ERRORS_M = (10.0, 1.0)
 ABSOLUTE = (
-    "Absolute: whether the run also fails by the rules of AirSLAM (Xu et al., T-RO 2025): lost "
-    f"for more than {_LOSS_S:g} s, or an ATE above {_ERRORS_M[0]:g} m (on OIVIO and UMA-VI) or "
-    f"{_ERRORS_M[1]:g} m (on Dark EuRoC)."
+    "Absolute: the reason if the run also fails by the rules of AirSLAM (Xu et al., T-RO 2025), "
+    f"which allow no loss of more than {_LOSS_S:g} s and no ATE above {_ERRORS_M[0]:g} m (on OIVIO "
+    f"and UMA-VI) or {_ERRORS_M[1]:g} m (on Dark EuRoC)."
 )
 
 
 def absolute_verdict(report: ReportJson) -> str:
-    """Why a run failed by limits that do not depend on its clean run (``ABSOLUTE``); empty if it
-    did not fail."""
+    """Why a run exceeded the limits that do not depend on its clean run (``ABSOLUTE``); empty if it
+    did not."""
     if report.longest_loss_s is not None and report.longest_loss_s > _LOSS_S:
         return f"lost for {report.longest_loss_s:.0f} s"
     above = [limit for limit in _ERRORS_M if (report.ate_rmse_m or 0.0) > limit]
     return f"ATE above {above[0]:g} m" if above else ""
+
+
+def lost_percent(report: ReportJson) -> float:
+    """Lost frames in percent of those that were not dropped."""
+    return 100.0 * report.lost_frames / max(1, report.frames - report.dropped_frames)
 
 
 @dataclass(frozen=True)
@@ -29,9 +34,9 @@ class Criterion:
     """Limits relative to the same system's run on the unperturbed (clean) images.
 
     Attributes:
-        lost_percent: largest allowed percentage of lost frames; dropped frames are not lost.
+        lost_percent: largest allowed percentage of lost frames; dropped frames are not counted.
         ate_factor: largest allowed ratio of the ATE to the clean ATE.
-        ate_least_m: no run fails because of an ATE below this, even if the clean ATE is tiny.
+        ate_least_m: ATE in metres that is always allowed, however small the clean ATE is.
     """
 
     lost_percent: float = 5.0
@@ -50,9 +55,8 @@ class Criterion:
 
     def verdict(self, report: ReportJson, clean: ReportJson) -> str:
         """Why a run failed; empty if it did not fail."""
-        frames = max(1, report.frames - report.dropped_frames)
-        if 100.0 * report.lost_frames > self.lost_percent * frames:
-            return f"{100.0 * report.lost_frames / frames:.0f} % lost"
+        if (lost := lost_percent(report)) > self.lost_percent:
+            return f"{lost:.0f} % lost"
         limit = self.ate_limit(clean)
         if limit is not None and (report.ate_rmse_m is None or report.ate_rmse_m > limit):
             ate = "unknown" if report.ate_rmse_m is None else f"{report.ate_rmse_m:.3g} m"

@@ -1,4 +1,4 @@
-"""Running other systems, which read a folder in KITTI's format and write a trajectory.
+"""Run other systems, which read a folder in KITTI's format and write a trajectory.
 
 The command is a template with ``{folder}`` and ``{out}``. ``folder`` holds ``image_0``,
 ``image_1``, ``calib.txt`` and ``times.txt`` of the perturbed frames, without dropped ones. The
@@ -37,13 +37,13 @@ _SAME_TIME_S = 1e-3
 
 @dataclass(frozen=True)
 class Poses:
-    """``T_wc`` of each frame of a run, and a mask of the known ones."""
+    """``(N, 4, 4)`` poses ``T_wc`` of the frames of a run, and a mask of the known ones."""
 
     T_wc: NDArray[np.float64]
     known: NDArray[np.bool_]
 
     def bridged(self, times: NDArray[np.float64]) -> Trajectory:
-        """All poses at the ``(N,)`` times of the frames; unknown ones are interpolated."""
+        """The trajectory at the ``(N,)`` times of the frames; unknown poses are interpolated."""
         return bridge_gaps(Trajectory(times, self.T_wc), self.known)
 
 
@@ -57,15 +57,14 @@ def check_template(name: str, template: str) -> None:
         filled = template.format(folder="F", out="O")
     except (KeyError, IndexError, ValueError, AttributeError) as error:
         raise InputError(
-            f"--system {name}={template}: unknown placeholder {error}; write {{folder}} and "
-            "{out}."
+            f"--system {name}={template}: unknown placeholder {error}; use {{folder}} and {{out}}."
         ) from error
     try:
         shlex.split(filled)
     except ValueError as error:
         raise InputError(
-            f"--system {name}={template}: cannot be split into words ({error}); quote it as in a "
-            "shell."
+            f"--system {name}={template}: cannot be split into words ({error}); quote it as in "
+            "a shell."
         ) from error
     if "{folder}" not in template or "{out}" not in template:
         raise InputError(
@@ -81,8 +80,12 @@ def run_external(
     template: str,
     folder: Path,
 ) -> ReportJson:
-    """Run another system on a perturbed sequence and write its run folder: ``report.json`` and
-    trajectories. Loops are not evaluated, because other systems do not report them.
+    """Run another system on a perturbed sequence; write ``report.json`` and trajectories.
+
+    Loops are not evaluated, because other systems do not report them.
+
+    Args:
+        folder: the folder of the run.
 
     Raises:
         InputError: the system ends with an error or writes no trajectory.
@@ -105,7 +108,7 @@ def run_external(
 
 
 def export_kitti(sequence: Source, perturbation: Perturbation, folder: Path) -> NDArray[np.int64]:
-    """Write the perturbed frames; returns the indices of the frames that were not dropped."""
+    """Write the perturbed frames and return the indices of those that were not dropped."""
     import cv2
 
     times: list[float] = []
@@ -135,7 +138,7 @@ def _call(template: str, sequence: Path, out: Path) -> None:
         template.format(folder=shlex.quote(str(sequence)), out=shlex.quote(str(out)))
     )
     try:
-        # A system can read its standard input to notice when this process ends.
+        # The standard input of a system closes when this process ends, so that it can end, too.
         with subprocess.Popen(
             words,
             stdin=subprocess.PIPE,
@@ -150,15 +153,15 @@ def _call(template: str, sequence: Path, out: Path) -> None:
     except OSError as error:
         raise InputError(f"{words[0]}: cannot be started ({error.strerror}).") from error
     if code:
-        said = [line for line in log.splitlines() if line.strip()]
-        raise InputError(f"{words[0]}: exit code {code}: {said[-1] if said else 'no output'}")
+        lines = [line for line in log.splitlines() if line.strip()]
+        raise InputError(f"{words[0]}: exit code {code}: {lines[-1] if lines else 'no output'}")
 
 
 def _outcome(
     sequence: Source, settings: RunOptions, kept: NDArray[np.int64], out: Path, wall: float
 ) -> RunOutcome:
     if not (out / "trajectory.txt").is_file():
-        raise InputError(f"{settings.detector}: no trajectory.txt in {{out}}.")
+        raise InputError(f"{settings.detector}: wrote no trajectory.txt into {{out}}.")
     times = np.asarray(sequence.timestamps, np.float64)
     final = read_poses(out / "trajectory.txt", times, kept)
     causal = final
@@ -168,7 +171,9 @@ def _outcome(
     if (out / "states.txt").is_file():
         states = (out / "states.txt").read_text().split()
         if len(states) != len(kept):
-            raise InputError(f"{settings.detector}: {len(states)} states for {len(kept)} frames.")
+            raise InputError(
+                f"{settings.detector}: states.txt has {len(states)} states for {len(kept)} frames."
+            )
         lost[kept] = np.array(states) != "OK"
     dropped = np.ones(len(times), bool)
     dropped[kept] = False
@@ -201,13 +206,13 @@ def _outcome(
 
 
 def read_poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) -> Poses:
-    """Read the poses that a system wrote. An unknown pose is the last known one before it, or the
-    first one.
+    """Read the poses that a system wrote. An unknown pose repeats the last known one before it, or
+    the first known one.
 
     Args:
         path: file in KITTI's or TUM's format.
         times: ``(N,)`` seconds of the frames.
-        kept: indices of the frames that the system got.
+        kept: indices of the frames that the system received.
 
     Raises:
         InputError: the file is malformed.
@@ -229,7 +234,7 @@ def read_poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) 
 
 
 def _last_known(poses: Poses) -> NDArray[np.float64]:
-    """Replace every pose by the last known one at its time, or before that by the first one."""
+    """Replace unknown poses by the last known one before them, or by the first known one."""
     if not poses.known.any():
         return poses.T_wc
     at = np.where(poses.known, np.arange(len(poses.known)), -1)

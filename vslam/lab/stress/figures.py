@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from vslam.lab.stress.schema import BoundaryEntry, StressJson
 
 _COLORS = (BLUE, AMBER, GREEN, VIOLET, RED)
-# Value, title and least upper end of the axis, so that zero lost frames are drawn at the bottom.
+# Value, title, and smallest upper end of the axis, which keeps zeros at the bottom of the panel.
 _PANELS = (
     ("lost_percent", "lost (%)", 5.0),
     ("ate_rmse_m", "ATE (m)", 0.1),
@@ -39,13 +39,13 @@ def draw_curves(report: StressJson) -> list[page.Figure]:
     """A figure for each sequence and law, with the strongest perturbation on the right."""
     systems = list(dict.fromkeys(entry.system for entry in report.boundaries))
     colors = {name: _COLORS[k % len(_COLORS)] for k, name in enumerate(systems)}
-    by: dict[tuple[str, str], list[BoundaryEntry]] = {}
+    groups: dict[tuple[str, str], list[BoundaryEntry]] = {}
     for entry in report.boundaries:
-        by.setdefault((entry.sequence, entry.law), []).append(entry)
-    caption = "One line for each seed; crosses are failed runs. Strength grows to the right."
+        groups.setdefault((entry.sequence, entry.law), []).append(entry)
+    caption = "One line per seed; crosses mark failed runs. The strength increases to the right."
     return draw(
         (f"{sequence}-{law}", caption, _curves(sequence, law, entries, colors))
-        for (sequence, law), entries in by.items()
+        for (sequence, law), entries in groups.items()
     )
 
 

@@ -1,8 +1,8 @@
 """The preset ``kitti-c``: the corruptions of RoboDepth's KITTI-C for which vslam has a law.
 
 KITTI-C (Kong et al., NeurIPS 2023) has 18 corruptions in 5 severities, most of them with the
-parameters of ImageNet-C (Hendrycks and Dietterich, ICLR 2019). The strengths here are those
-parameters if a law has the same one; otherwise the note describes the difference.
+parameters of ImageNet-C (Hendrycks and Dietterich, ICLR 2019). The strengths here equal these
+parameters where a law has the same parameter; otherwise a note describes the difference.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from vslam.datasets.perturbation import parse_perturbation
 
 @dataclass(frozen=True)
 class Corruption:
-    """``specs`` are values of ``--perturb``, weakest first, empty without a law; ``note`` describes
-    the difference from KITTI-C."""
+    """``specs``: values of ``--perturb``, weakest first, or empty if vslam has no such law.
+    ``note``: the difference from KITTI-C."""
 
     specs: tuple[str, ...]
     note: str = ""
@@ -26,43 +26,43 @@ class Corruption:
         return [parse_perturbation(spec, 0).name for spec in self.specs]
 
 
-def _of(text: str, values: tuple[float, ...]) -> tuple[str, ...]:
+def _specs(text: str, values: tuple[float, ...]) -> tuple[str, ...]:
     return tuple(text.format(value) for value in values)
 
 
 _SIGMA = (0.08, 0.12, 0.18, 0.26, 0.38)  # as a fraction of white
 
 CORRUPTIONS: dict[str, Corruption] = {
-    "brightness": Corruption(_of("bias:{:g}", (25.5, 51.0, 76.5, 102.0, 127.5))),
+    "brightness": Corruption(_specs("bias:{:g}", (25.5, 51.0, 76.5, 102.0, 127.5))),
     "dark": Corruption(
-        _of("night:{:g}", (0.74, 1.0, 1.32, 1.74, 2.32)),
+        _specs("night:{:g}", (0.74, 1.0, 1.32, 1.74, 2.32)),
         "light times 0.6 to 0.2 with our sensor's noise; theirs also squares the image",
     ),
     "fog": Corruption(
-        _of("fog:{:g}", (600, 300, 150, 75, 40)),
+        _specs("fog:{:g}", (600, 300, 150, 75, 40)),
         "by distance, visibility 600 to 40 m; theirs is a cloud texture that ignores depth",
     ),
     "frost": Corruption((), "no law"),
     "snow": Corruption((), "no law"),
-    "contrast": Corruption(_of("contrast:{:g}", (40, 30, 20, 10, 5))),
+    "contrast": Corruption(_specs("contrast:{:g}", (40, 30, 20, 10, 5))),
     "defocus_blur": Corruption(
-        _of("blur:{:g}", (1.0, 1.33, 2.0, 2.67, 3.33)),
+        _specs("blur:{:g}", (1.0, 1.33, 2.0, 2.67, 3.33)),
         "Gaussian with the standard deviation of their discs of 3 to 10 pixels",
     ),
     "glass_blur": Corruption((), "no law"),
     "motion_blur": Corruption(
-        _of("motion:{:g}", (20, 40, 60, 80, 100)),
+        _specs("motion:{:g}", (20, 40, 60, 80, 100)),
         "shutter of 20 to 100 ms at the true rotation; theirs has a fixed direction and length",
     ),
     "zoom_blur": Corruption((), "no law"),
     "elastic_transform": Corruption((), "no law"),
-    "color_quant": Corruption(_of("bits:{:g}", (5, 4, 3, 2, 1)), "of grey values"),
+    "color_quant": Corruption(_specs("bits:{:g}", (5, 4, 3, 2, 1)), "of grey values"),
     "gaussian_noise": Corruption(tuple(f"noise:{255 * s / 8:.3g}" for s in _SIGMA)),
-    "impulse_noise": Corruption(_of("impulse:{:g}", (3, 6, 9, 17, 27))),
-    "shot_noise": Corruption(_of("shot:{:g}", (60, 25, 12, 5, 3))),
+    "impulse_noise": Corruption(_specs("impulse:{:g}", (3, 6, 9, 17, 27))),
+    "shot_noise": Corruption(_specs("shot:{:g}", (60, 25, 12, 5, 3))),
     "iso_noise": Corruption(tuple(f"shot:25,noise:{0.7 * 255 * s / 8:.3g}" for s in _SIGMA)),
     "pixelate": Corruption(
-        _of("resolution:{:g}", (0.6, 0.5, 0.4, 0.3, 0.25)), "scaled up smoothly"
+        _specs("resolution:{:g}", (0.6, 0.5, 0.4, 0.3, 0.25)), "scaled up smoothly"
     ),
-    "jpeg_compression": Corruption(_of("jpeg:{:g}", (25, 18, 15, 10, 7))),
+    "jpeg_compression": Corruption(_specs("jpeg:{:g}", (25, 18, 15, 10, 7))),
 }

@@ -1,10 +1,10 @@
-"""Runs ORB-SLAM3 (``pip install pyorbslam3``) on a folder in KITTI's format.
+"""Run ORB-SLAM3 (``pip install pyorbslam3``) on a folder in KITTI's format.
 
 usage: PYTHON orbslam3.py VOCABULARY FOLDER OUT [--frames N]
 
-It prints the costs of its frame loop as a JSON object. The interpreter that has pyorbslam3 starts
-this file and need not have vslam, so nothing of vslam is imported here. The process ends when its
-standard input does.
+It prints the costs of its frame loop as a JSON object. The file imports nothing from vslam, because
+the interpreter that has pyorbslam3 may not have vslam. The process ends when its standard input is
+closed.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ Viewer.ViewpointF: 2000.0
 
 
 def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
-    """Track the first ``frames`` stereo frames, None for all; write ``trajectory.txt``,
+    """Track the first ``frames`` stereo frames (None: all) and write ``trajectory.txt``,
     ``causal.txt`` and ``states.txt``."""
     import pyorbslam3
 
@@ -75,8 +75,8 @@ def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
     slam = pyorbslam3.Slam(vocabulary, str(settings), pyorbslam3.Sensor.STEREO, use_viewer=False)
     causal, states, track_ms = [], [], []
     wall, cpu = time.perf_counter(), time.process_time()
-    for ours, theirs, t in zip(left, right, times, strict=True):
-        images = [cv2.imread(str(path), 0) for path in (ours, theirs)]
+    for *paths, t in zip(left, right, times, strict=True):
+        images = [cv2.imread(str(path), 0) for path in paths]
         began = time.perf_counter()
         found = slam.track_stereo(*images, t)
         track_ms.append(1e3 * (time.perf_counter() - began))
@@ -102,7 +102,7 @@ def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
 
 
 def _keep_first_of_each_time(path: Path) -> None:
-    """Remove duplicates, because ORB-SLAM3 writes some frames twice after a loss."""
+    """Remove duplicate times: ORB-SLAM3 writes some frames twice after a loss."""
     by_time: dict[float, str] = {}
     for line in path.read_text().splitlines():
         by_time.setdefault(float(line.split()[0]), line)
@@ -110,9 +110,9 @@ def _keep_first_of_each_time(path: Path) -> None:
 
 
 def _tum(t: float, T_wc: np.ndarray) -> str:
-    from_matrix = cv2.Rodrigues(T_wc[:3, :3])[0].ravel()
-    angle = float(np.linalg.norm(from_matrix))
-    axis = from_matrix / angle if angle else np.zeros(3)
+    rotation = cv2.Rodrigues(T_wc[:3, :3])[0].ravel()
+    angle = float(np.linalg.norm(rotation))
+    axis = rotation / angle if angle else np.zeros(3)
     q = [*(np.sin(angle / 2) * axis), np.cos(angle / 2)]
     return " ".join(f"{x:.9f}" for x in (t, *T_wc[:3, 3], *q)) + "\n"
 

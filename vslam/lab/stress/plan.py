@@ -1,4 +1,4 @@
-"""Searches in progress: the cells that they need next, and their results so far."""
+"""Searches in progress: the cells to run next, and the results so far."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vslam.lab.stress.search import Boundary, boundary, next_position, strength_
 from vslam.report.schema import ReportJson
 
 Reports = Callable[[Cell], ReportJson | str | None]
-"""The report of a finished cell, why it failed, or None if it has not run."""
+"""Function that gives the report of a cell, the reason why it failed, or None before it has run."""
 
 
 @dataclass
@@ -23,8 +23,9 @@ class Search:
 
     Attributes:
         clean: the cell on clean images.
-        seed: seed of the perturbation.
         law: name of the law.
+        seed: seed of the perturbation.
+        steps: number of bisections.
         verdicts: verdicts of finished tests, by position.
         tested: cells of finished tests, by position.
     """
@@ -51,7 +52,7 @@ class Search:
         return None if (position := self.position()) is None else self.cell(position)
 
     def advance(self, reports: Reports, criterion: Criterion) -> None:
-        """Judge the runs that have finished."""
+        """Judge the runs that have ended."""
         clean = reports(self.clean)
         if not isinstance(clean, ReportJson):
             return
@@ -76,11 +77,11 @@ class Plan:
     Attributes:
         clean: the runs of each system on the clean images of each sequence.
         laws: names of the laws whose boundaries are searched.
-        seeds: number of seeds of each law.
-        steps: bisections of each search.
-        baseline: the system to which the errors of a preset are compared.
-        repeated: systems that are not deterministic; they run with all seeds under every law.
-        preset: ``kitti-c`` for fixed severities, or None.
+        seeds: number of seeds for each law.
+        steps: number of bisections in each search.
+        baseline: the system with which the errors of a preset are compared.
+        repeated: systems that are not deterministic and therefore run with every seed.
+        preset: ``kitti-c`` for its fixed severities, or None.
     """
 
     clean: list[Cell]
@@ -93,8 +94,8 @@ class Plan:
     preset: str | None = None
 
     def searches(self) -> list[Search]:
-        """All searches, one for each seed. A law without random numbers is searched with one seed
-        only, unless the system itself gives different results each time."""
+        """All searches. A law without random numbers is searched with one seed only, unless the
+        system is not deterministic."""
         return [
             Search(clean, law, seed, self.steps)
             for seed in range(self.seeds)
@@ -130,8 +131,8 @@ def parse_laws(text: str) -> list[str]:
         if name not in all_laws():
             raise InputError(
                 f"--laws {text}: unknown law '{name}'{did_you_mean(name, all_laws())}; choose from "
-                f"all, {', '.join(all_laws())}; their strengths are searched for."
+                f"all, {', '.join(all_laws())}, without strengths."
             )
     if not names:
-        raise InputError("--laws: no law; name some, for example fog,rain, or all.")
+        raise InputError("--laws: names no law; give some, for example fog,rain, or all.")
     return names

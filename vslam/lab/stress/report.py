@@ -1,5 +1,5 @@
-"""The report of a stress test: ``stress.json``, ``boundaries.csv``, ``report.md``, ``report.html``,
-``boundaries.jpg``."""
+"""Write the report of a stress test: ``stress.json``, ``boundaries.csv``, ``boundaries.jpg``,
+``report.md`` and ``report.html``."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from vslam.report.page import Bullets, Figure, Page, Row, Section, Table, number
 from vslam.report.render import csv_text, html, markdown, write_files
 
 _ABOUT = (
-    "The weakest strength at which a run fails, found by bisection: the median over seeds, with "
-    "the smallest and the largest in brackets, and the reason for one seed. > means that no "
-    "strength makes a run fail."
+    "The weakest strength at which a run fails, found by bisection: the median over seeds, the "
+    "smallest and the largest in brackets, and the reason for one of the seeds. > means that runs "
+    "do not fail even at the greatest strength."
 )
 _NOT_MONOTONE = (
-    "Bisection assumes that a system that withstands one strength withstands all weaker ones. "
-    "These runs failed although a run at a higher strength did not."
+    "Bisection assumes that a system that withstands a strength also withstands all weaker ones. "
+    "These runs failed although a run at a greater strength did not."
 )
 
 
@@ -36,7 +36,7 @@ def write_report(out: Path, report: StressJson, sequences: Mapping[str, Source])
     Args:
         out: an existing folder.
         report: the numbers.
-        sequences: sequences by name, for images at the boundaries; missing ones are left out.
+        sequences: sequences by name, for example images; without the first one, none are drawn.
 
     Raises:
         ResultsError: a file cannot be written.
@@ -68,7 +68,7 @@ def render_csv(report: StressJson) -> str:
 
 
 def title(report: StressJson) -> str:
-    """The systems and sequences, in one line."""
+    """The systems and sequences in one line."""
     systems = list(dict.fromkeys(entry.system for entry in report.clean))
     places = list(dict.fromkeys(f"{entry.dataset} {entry.sequence}" for entry in report.clean))
     excerpt = f", {counted(report.max_frames, 'frame')}" if report.max_frames else ""
@@ -101,7 +101,7 @@ def boundary_sections(report: StressJson) -> list[Section]:
 
 
 def groups(report: StressJson) -> dict[tuple[str, str, str], list[BoundaryEntry]]:
-    """Searches grouped by sequence, law and system; those of a group differ in their seed."""
+    """Searches grouped by sequence, law and system; those of a group differ only in their seed."""
     found: dict[tuple[str, str, str], list[BoundaryEntry]] = {}
     for entry in report.boundaries:
         found.setdefault((entry.sequence, entry.law, entry.system), []).append(entry)
@@ -156,9 +156,9 @@ def _preset(report: StressJson) -> list[Section]:
         ("sequence", "corruption", *systems, "law"),
         rows,
         ("sequence", "corruption", "law"),
-        "ATE summed over the five severities, in percent of the baseline's sum, with the mean "
-        "share of lost frames in brackets. The mean includes the corruptions that have a law and "
-        "an ATE for each system.",
+        "ATE summed over the five severities, in percent of the baseline's sum; the mean share of "
+        "lost frames in brackets. The mean is over the corruptions for which every system has an "
+        "ATE.",
     )
     title = f"Corruption error against {report.baseline}, preset {report.preset}"
     return [Section(title, [table])]
@@ -220,7 +220,7 @@ def _runs(report: StressJson) -> Table:
 
 
 def _sheet(report: StressJson, sequences: Mapping[str, Source]) -> list[Figure]:
-    """A frame in the middle of the first sequence under each law, at the weakest strength at which
+    """A picture of the middle frame of the first sequence under each law, at the strength at which
     the first system failed, or at the greatest strength if it did not fail."""
     specs: dict[str, str] = {}
     first = next(iter(sequences), None)
@@ -232,10 +232,10 @@ def _sheet(report: StressJson, sequences: Mapping[str, Source]) -> list[Figure]:
         return []
     try:
         image = sheet_of_laws(sequences[first], list(specs.values()), len(sequences[first]) // 2, 0)
-    except InputError:  # the images were removed meanwhile; write the numbers without them
+    except InputError:  # the images have been removed; the numbers are written without them
         return []
     import cv2
 
     data = bytes(np.asarray(cv2.imencode(".jpg", image)[1]).tobytes())
-    caption = "For each law: the clean image, and both perturbed images at the boundary."
+    caption = "For each law, the clean image and both perturbed images at the boundary."
     return [Figure("boundaries", caption, data, file="boundaries.jpg")]

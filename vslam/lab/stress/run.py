@@ -1,4 +1,4 @@
-"""Running all searches together: each round runs the next cell of every open search."""
+"""Run all searches together: each round runs the next cell of every open search."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RunCells = Callable[[Collection[Cell]], Generator[CellOutcome, None, None]]
 
 
 class Results:
-    """Results by cell: reports in the folder, and failures of this session."""
+    """The results of cells: reports in the folder, and failures of this session."""
 
     def __init__(self, out: Path, config: str) -> None:
         self._out, self._config = out, config
@@ -52,7 +52,7 @@ def run_all(
 ) -> None:
     """Run the clean cells, then the cells of all searches in rounds, then ``others``.
 
-    Cells that are already finished are not run again, whichever command ran them.
+    Cells that an earlier command has finished are not run again.
     """
     _run(clean, results, run, say)
     while True:
@@ -79,13 +79,11 @@ def _run(
     with closing(run(missing)) as outcomes:
         for k, outcome in enumerate(outcomes, start=1):
             results.add(outcome)
-            failed = f"failed: {outcome.message}" if isinstance(outcome, Failed) else None
-            said = failed or _said(results(outcome.cell))
-            say(f"{k}/{len(missing)} {outcome.cell.name}: {said}")
+            say(f"{k}/{len(missing)} {outcome.cell.name}: {_in_words(results(outcome.cell))}")
 
 
-def _said(report: ReportJson | str | None) -> str:
-    if not isinstance(report, ReportJson):
-        return "finished"
-    ate = "no ATE" if report.ate_rmse_m is None else f"ATE {report.ate_rmse_m:.3f} m"
-    return f"{ate}, {report.lost_frames} lost"
+def _in_words(result: ReportJson | str | None) -> str:
+    if not isinstance(result, ReportJson):
+        return f"failed: {result}" if result else "finished"
+    ate = "no ATE" if result.ate_rmse_m is None else f"ATE {result.ate_rmse_m:.3f} m"
+    return f"{ate}, {result.lost_frames} lost"

@@ -1,4 +1,4 @@
-"""The schema of ``stress.json``, without times or machine: equal runs give equal bytes."""
+"""The schema of ``stress.json``. It has no times and no machine, so equal runs give equal bytes."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from vslam.report.schema import Document, Record
 
 
 class Tested(Record):
-    """One run at one strength; ``verdict`` is why it failed, and ``absolute`` why it failed by
-    limits that do not depend on the clean run; they are empty if it did not."""
+    """One run at one strength. ``verdict``: why it failed, or empty. ``absolute``: why it failed by
+    limits that do not depend on the clean run, or empty."""
 
     strength: float
     verdict: str
@@ -19,7 +19,7 @@ class Tested(Record):
 
 
 class BoundaryEntry(Record):
-    """One search: see :class:`vslam.lab.stress.search.Boundary`."""
+    """The result of one search (:class:`vslam.lab.stress.search.Boundary`)."""
 
     dataset: str
     sequence: str
@@ -35,7 +35,7 @@ class BoundaryEntry(Record):
 
 
 class CleanEntry(Record):
-    """The run of a system on unperturbed images, from which the limits are derived."""
+    """The run of a system on clean images, from which the limits are derived."""
 
     dataset: str
     sequence: str
@@ -49,8 +49,11 @@ class CleanEntry(Record):
 
 
 class CorruptionEntry(Record):
-    """One corruption of a preset. By system: the median ATE over seeds, summed over severities, and
-    this sum in percent of the baseline's; None without a law or an ATE."""
+    """One corruption of a preset, with values by system; None without a law or an ATE.
+
+    ``ate_sum_m``: the median ATE over seeds, summed over severities. ``error_percent``: this sum in
+    percent of the baseline's. ``lost_percent``: the mean share of lost frames.
+    """
 
     sequence: str
     corruption: str

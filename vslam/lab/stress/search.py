@@ -16,9 +16,9 @@ class Boundary:
     """The strength at which a system fails under a law.
 
     Attributes:
-        holds_to: greatest strength at which, by the bisection, no run failed; None if runs fail at
-            every tested strength.
-        fails_at: least strength at which, by the bisection, a run failed; None if none failed.
+        holds_to: greatest strength that the bisection found to hold; None if runs failed at every
+            tested strength.
+        fails_at: least strength that the bisection found to fail; None if none failed.
         reason: reason of the failure at ``fails_at``.
         also_failed: strengths below ``holds_to`` at which a run failed nevertheless.
     """
@@ -40,8 +40,8 @@ def strength_at(kind: LawKind, position: float) -> float:
 
 
 def bracket(failed: Mapping[float, bool], steps: int) -> tuple[float, float, float | None]:
-    """Positions that hold and that fail, by the bisection so far, and the next one to test; None if
-    both are final.
+    """The greatest position that holds and the least that fails, by the bisection so far, and the
+    next position to test, None if the bisection has ended.
 
     Args:
         failed: whether the run failed, by tested position.
@@ -62,8 +62,8 @@ def next_position(failed: Mapping[float, bool], steps: int) -> float | None:
     """The next position to test; None at the end of the search.
 
     The greatest strength is tested first. If it fails, the interval is bisected ``steps`` times.
-    The last test is at half of the position that holds, to check the assumption of bisection that
-    a system also withstands all weaker strengths. For the arguments see :func:`bracket`.
+    The last test, at half of the position that holds, checks the assumption of bisection that a
+    system also withstands all weaker strengths. The arguments are those of :func:`bracket`.
     """
     if 1.0 not in failed:
         return 1.0
@@ -75,7 +75,7 @@ def next_position(failed: Mapping[float, bool], steps: int) -> float | None:
 
 
 def boundary(verdicts: Mapping[float, Verdict], kind: LawKind, steps: int) -> Boundary:
-    """The boundary according to the finished tests, whose verdicts are given by position."""
+    """The boundary according to the verdicts of finished tests, by position."""
     holds, fails, _ = bracket({p: bool(v) for p, v in verdicts.items()}, steps)
     weaker = tuple(
         strength_at(kind, position)

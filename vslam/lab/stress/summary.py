@@ -1,13 +1,13 @@
-"""Computing the numbers of the report from finished searches."""
+"""Compute the numbers of the report from finished searches."""
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 
 from vslam.datasets.perturbation import law_kind
 from vslam.lab.bench.grid import Cell
-from vslam.lab.stress.criterion import Criterion, absolute_verdict
+from vslam.lab.stress.criterion import Criterion, absolute_verdict, lost_percent
 from vslam.lab.stress.kitti_c import CORRUPTIONS, Corruption
 from vslam.lab.stress.plan import Plan, Reports, Search
 from vslam.lab.stress.schema import BoundaryEntry, CleanEntry, CorruptionEntry, StressJson, Tested
@@ -18,9 +18,10 @@ from vslam.report.schema import ReportJson
 def summarise(
     plan: Plan, searches: Collection[Search], reports: Reports, notes: list[str]
 ) -> StressJson:
-    """Make the report from the searches that have ended; its notes also name failed clean runs."""
+    """Make the report from the searches that have ended. A note is added for each clean run that
+    failed."""
     failed = [(cell, found) for cell in plan.clean if isinstance(found := reports(cell), str)]
-    notes = [*notes, *(f"{cell.name} is left out, it fails on clean images: {why}"
+    notes = [*notes, *(f"{cell.name} is left out because it fails on clean images: {why}"
                        for cell, why in failed)]  # fmt: skip
     ended = [s for s in searches if isinstance(reports(s.clean), ReportJson) and s.wants() is None]
     return StressJson(
@@ -94,11 +95,6 @@ def _tested(strength: float, verdict: str, report: ReportJson | str | None) -> T
     )
 
 
-def lost_percent(report: ReportJson) -> float:
-    """Lost frames in percent of those that were not dropped."""
-    return 100.0 * report.lost_frames / max(1, report.frames - report.dropped_frames)
-
-
 def corruption_entries(
     cells: Collection[Cell], reports: Reports, baseline: str
 ) -> list[CorruptionEntry]:
@@ -132,7 +128,7 @@ def _corruption(
                 and isinstance(report := reports(cell), ReportJson)
             ]
             known = [report.ate_rmse_m for report in found if report.ate_rmse_m is not None]
-            # Without its failed seeds, a system that breaks would look better than one that holds.
+            # Leaving out failed seeds would make a system that fails look better.
             all_known = bool(known) and len(known) == len(found)
             ates.append(statistics.median(known) if all_known else None)
             losses += [lost_percent(report) for report in found]
@@ -156,10 +152,6 @@ def _corruption(
 
 def mean_error(entries: Collection[CorruptionEntry], system: str) -> float | None:
     """mCE in percent: the mean over the corruptions for which every system has an error."""
-    known = [e.error_percent[system] for e in entries if _complete(e.error_percent)]
-    values = [value for value in known if value is not None]
+    complete = (e.error_percent for e in entries if None not in e.error_percent.values())
+    values = [value for errors in complete if (value := errors.get(system)) is not None]
     return statistics.fmean(values) if values else None
-
-
-def _complete(errors: Mapping[str, float | None]) -> bool:
-    return bool(errors) and all(value is not None for value in errors.values())

@@ -1,0 +1,84 @@
+"""Compare two tests of whether images show one place, on photographs of places.
+
+    python tools/experiments/local_descriptors/image_test.py PHOTOS multiview webcams
+
+PHOTOS is a folder of sets, SET/PLACE/*; every image is a query. Its right image is the most similar
+one of its place, by the capsule network; with webcams, whose view never changes, the query is
+warped and its right image is one of another hour. Its wrong images are the two most similar ones of
+other places. Prints the share of right and of wrong pairs that pass: matches of coarse cells that
+one homography explains must cover 18 % of the image, or there must be 90 of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.config import LearnedMatchingConfig
+from vslam.lab.loopbench.detectors import LocalDescriptorCache, NetworkScorer
+from vslam.lab.loopbench.measure import LEAST_COSINE, MIN_CELLS
+from vslam.loopclosure.local_matching import homography_inliers, homography_share, match_coarse
+
+MIN_SHARE = 0.18
+WEBCAMS = "webcams"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("photos", type=Path)
+    parser.add_argument("sets", nargs="+")
+    parser.add_argument("--of-place", type=int, default=10, help="images of a place, at most")
+    options = parser.parse_args()
+    print("| set | right pairs | by share, by number | wrong pairs | by share, by number |")
+    print("|---|---|---|---|---|")
+    for name in options.sets:
+        right, wrong = measure(options.photos / name, options.of_place)
+        cells = [
+            f"{len(passed)} | {' %, '.join(f'{100 * x:.1f}' for x in passed.mean(axis=0))} %"
+            for passed in (right, wrong)
+        ]
+        print(f"| {name} | {' | '.join(cells)} |", flush=True)
+
+
+def measure(folder: Path, of_place: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """``(N, 2)`` bool: whether each right and each wrong pair passes by share and by number."""
+    gallery, places = [], []
+    for place in sorted(path for path in folder.iterdir() if path.is_dir()):
+        files = sorted(place.iterdir())
+        for file in files[:: -(-len(files) // of_place)]:
+            gallery.append(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE))
+            places.append(place.name)
+    rng, place = np.random.default_rng(0), np.array(places)
+    queries = [warped(image, rng) for image in gallery] if folder.name == WEBCAMS else gallery
+    scorer, local = NetworkScorer("capsule"), LocalDescriptorCache()
+    stored = scorer.embed(gallery)
+    pairs: tuple[list[tuple[bool, bool]], ...] = ([], [])
+    for q, embedded in enumerate(scorer.embed(queries)):
+        order = np.argsort(-scorer.compare(embedded, stored))
+        same, other = order[place[order] == place[q]], order[place[order] != place[q]]
+        same = same[same != q]
+        same = rng.permutation(same) if folder.name == WEBCAMS else same
+        for found, images in zip(pairs, (same[:1], other[:2]), strict=True):
+            for g in images:
+                a, b = local.of(queries[q]), local.of(gallery[g])
+                loose = match_coarse(a, b, LearnedMatchingConfig().coarse_alike)
+                cells = homography_inliers(match_coarse(a, b, LEAST_COSINE), a, b)
+                found.append((homography_share(loose, a, b) >= MIN_SHARE, cells >= MIN_CELLS))
+    return np.array(pairs[0]), np.array(pairs[1])
+
+
+def warped(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """The image under a homography that moves its corners by up to 12 % of its size."""
+    height, width = image.shape
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    moved = corners + rng.uniform(-0.12, 0.12, (4, 2)) * [width, height]
+    H = cv2.getPerspectiveTransform(corners, moved.astype(np.float32))
+    return cv2.warpPerspective(image, H, (width, height), borderMode=cv2.BORDER_REFLECT)
+
+
+if __name__ == "__main__":
+    main()

@@ -255,17 +255,17 @@ def edited(tmp_path: Path, write: Callable, pattern: str, by: str) -> list[Path]
         (own, "lens: pinhole", "lens: wide", "left: lens wide is unknown"),
         (own, "focal:", "focus:", "left: focus is unknown; known are centre, distortion"),
         (own, "T_left_right:", "T_right_left:", "T_right_left is unknown"),
-        (own, r"  - \[0\.99", "  - [0.39", "holds no rotation"),
+        (own, r"  - \[0\.99", "  - [0.39", "contains no valid rotation"),
         (own, "right:", "right: 3\nleft:", "right must be a section"),
         (orbslam3, "PinHole", "Fish", "Camera.type Fish is unknown"),
         (orbslam3, "Camera1.fy", "Camera1.f", "Camera1.fy is missing"),
         (ros, "plumb_bob", "fov", "distortion model fov is unknown"),
-        (own, "left:", "links:", "no known calibration"),
-        (own, "# ours", "[", "no YAML at line"),
+        (own, "left:", "links:", "the format of this calibration is unknown"),
+        (own, "# ours", "[", "not valid YAML at line"),
         (own, "[\\s\\S]+", "words", "must be a list of keys with values"),
         (own, "[\\s\\S]+", "", "is empty"),
-        (own, "left:", "links:", r"it has the keys T_left_right, links, right"),
-        (own, "[\\s\\S]+", "<?xml version='1.0'?>", "XML, which is not read; .* .yml"),
+        (own, "left:", "links:", r"its keys are T_left_right, links, right"),
+        (own, "[\\s\\S]+", "<?xml version='1.0'?>", "XML, which is not supported; .* .yml"),
     ],
 )  # fmt: skip
 def test_bad_files(tmp_path, write, pattern, by, words):
@@ -277,10 +277,10 @@ def test_bad_files(tmp_path, write, pattern, by, words):
 def test_missing_files_and_too_many(tmp_path):
     with pytest.raises(InputError, match=r"none\.yaml: the calibration is missing"):
         read_calibration([tmp_path / "none.yaml"])
-    with pytest.raises(InputError, match="no calibration in this folder"):
+    with pytest.raises(InputError, match="there is no calibration in this folder"):
         read_calibration([tmp_path])
     (path,) = own(tmp_path, (LEFT, RIGHT))
-    with pytest.raises(InputError, match="a file too many; this format has one"):
+    with pytest.raises(InputError, match="is one file too many; this format has one"):
         read_calibration([path, path])
 
 
@@ -319,13 +319,19 @@ IDENTITY = "T_left_right: [1, 0, 0, 0.1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
     [
         (f"left: {ONE}\ndepth_scale: 0\n", "depth_scale is 0 but must be positive"),
         (f"left: {ONE}\nvirtual_baseline: -0.1\n", "virtual_baseline is -0.1 but must be"),
-        (f"{PAIR}{IDENTITY}baseline: 0.1\n", "T_left_right and baseline say the same thing"),
-        (f"left: {ONE}\nbaseline: 0.1\n", "baseline is of a stereo pair, but right is missing"),
-        (f"left: {ONE}\n{IDENTITY}", "T_left_right is of a stereo pair, but right is missing"),
-        (f"left: {ONE}\nright_delay: 0.01\n", "right_delay is of a stereo pair, but right is"),
+        (
+            f"{PAIR}{IDENTITY}baseline: 0.1\n",
+            "T_left_right and baseline both give the transformation",
+        ),
+        (
+            f"left: {ONE}\nbaseline: 0.1\n",
+            "baseline belongs to a stereo pair, but right is missing",
+        ),
+        (f"left: {ONE}\n{IDENTITY}", "T_left_right belongs to a stereo pair, but right is missing"),
+        (f"left: {ONE}\nright_delay: 0.01\n", "right_delay belongs to a stereo pair, but right is"),
         (f"{PAIR}{IDENTITY}right_delay: 4.7\n", "right_delay is 4.7 s but must be between"),
         (f"{PAIR}{IDENTITY}right_delay: -0.1\n", "right_delay is -0.1 s but must be between"),
-        (f"{PAIR}baseline: 0.1\ndepth_scale: 5000\n", "depth_scale is of a camera with depth"),
+        (f"{PAIR}baseline: 0.1\ndepth_scale: 5000\n", "depth_scale belongs to a camera with depth"),
         (f"{SETTINGS}DepthMapFactor: 0\n", "DepthMapFactor is 0 but must be positive"),
         (f"{SETTINGS}Camera.bf: -40\nDepthMapFactor: 5000\n", "Camera.bf is -40 but must be"),
         (f"{SETTINGS}Camera.bf: 0\n", "Camera.bf is 0 but must be positive"),

@@ -1,8 +1,8 @@
-"""The YAML of calibration files: typed access to its values, or an error in one sentence.
+"""The YAML of calibration files: typed access to its values, with errors of one sentence.
 
-OpenCV's dialect is understood too: the header ``%YAML:1.0``, ``!!opencv-matrix``, and brackets
-directly after a colon. Scalars are read as text and converted on access, because YAML 1.1 reads
-``1e-05`` as text while OpenCV writes it as a number.
+OpenCV's dialect is accepted: the header ``%YAML:1.0``, ``!!opencv-matrix``, and brackets directly
+after a colon. Scalars are read as text and converted on access, because OpenCV writes the number
+``1e-05``, which YAML 1.1 takes for text.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from vslam.errors import InputError
 
 _HEADER = re.compile(r"\A\ufeff?%YAML[: ]1\.\d.*\n?")
 _MOST_BYTES = 100_000  # parsed within two seconds; a calibration file has about 5,000
-_MOST_STEPS = 10_000  # upper bound of the lists and numbers at one key
+_MOST_STEPS = 10_000  # lists and numbers at one key
 _NO_SPACE = re.compile(r"^(\s*[\w.]+):(?=\[)", re.MULTILINE)
 
 
@@ -57,7 +57,7 @@ class Document:
         return self._numbers(key, "one number", 1)[0]
 
     def numbers(self, key: str, *counts: int) -> tuple[float, ...]:
-        """The numbers at a key, flattened; there must be one of ``counts``, if any is given."""
+        """The numbers at a key, flattened; their number must be one of ``counts``, if given."""
         wanted = " or ".join(map(str, counts))
         return self._numbers(key, f"{wanted} numbers" if counts else "numbers", *counts)
 
@@ -109,15 +109,15 @@ def read_document(path: Path) -> Document:
         ) from error
     if too_large:
         raise InputError(
-            f"{path}: larger than {_MOST_BYTES // 1000} kB, which no calibration is; name another "
-            "file."
+            f"{path}: is larger than {_MOST_BYTES // 1000} kB, so it is not a calibration; name "
+            "another file."
         )
     if not text.strip():
         raise InputError(f"{path}: the calibration is empty; name another file.")
     if text.lstrip("\ufeff \n").startswith("<?xml"):
         raise InputError(
-            f"{path}: the calibration is XML, which is not read; save it under a name that ends in "
-            ".yml, for which cv2.FileStorage writes YAML."
+            f"{path}: the calibration is XML, which is not supported; save it as YAML, which "
+            "cv2.FileStorage writes to names that end in .yml."
         )
     text = _NO_SPACE.sub(r"\1: ", _HEADER.sub("", text))
     try:
@@ -125,7 +125,7 @@ def read_document(path: Path) -> Document:
     except (yaml.YAMLError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         line = f" at line {mark.line + 1}" if mark else ""
-        raise InputError(f"{path}: the calibration is no YAML{line}; correct it.") from error
+        raise InputError(f"{path}: the calibration is not valid YAML{line}; correct it.") from error
     if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
         raise InputError(f"{path}: the calibration must be a list of keys with values, in YAML.")
     return Document(str(path), values)
@@ -134,8 +134,8 @@ def read_document(path: Path) -> Document:
 def _flat(value: object) -> list[str]:
     """Flatten nested lists of text.
 
-    Nested YAML aliases can expand a few lines into gigabytes or form a cycle, so that a list with
-    more items than any matrix becomes "no number", which the caller refuses.
+    Nested YAML aliases can expand a few lines into gigabytes or form a cycle. A list with more
+    items than any matrix therefore becomes "no number", which the caller refuses.
     """
     found: list[str] = []
     waiting = [value]

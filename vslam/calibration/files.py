@@ -19,8 +19,8 @@ from vslam.calibration.models import Calibration, CameraModel
 from vslam.errors import InputError, ResultsError
 
 _Reader = Callable[[Sequence[Document], Size | None], Calibration]
-# Keys of a format, its reader and its largest number of files; the first format whose keys are all
-# in one file is used.
+# The keys of each format, its reader and the largest number of its files. The first format with all
+# its keys in one file is used.
 _FORMATS: tuple[tuple[set[str], _Reader, int], ...] = (
     ({"left"}, read_own, 1),
     ({"cam0"}, read_kalibr, 1),
@@ -35,7 +35,7 @@ _FORMATS: tuple[tuple[set[str], _Reader, int], ...] = (
     ({"K1"}, read_opencv, 2),
     ({"cameraMatrix1"}, read_opencv, 2),
 )
-_PAIRS = (  # searched for in a folder, in this order
+_PAIRS = (  # file names in the order in which a folder is searched for them
     ("mav0/cam0/sensor.yaml", "mav0/cam1/sensor.yaml"),
     ("cam0/sensor.yaml", "cam1/sensor.yaml"),
     ("left.yaml", "right.yaml"),
@@ -48,12 +48,12 @@ def read_calibration(files: Sequence[Path | str], size: Size | None = None) -> C
     """Read a calibration in any of the formats of docs/howto/cameras.md.
 
     Args:
-        files: one file, or one for each camera, left first, or a folder that holds them.
-        size: width and height of the images, for files without them.
+        files: one file, one file for each camera (left first), or a folder that contains them.
+        size: width and height of the images, for files that do not give them.
 
     Raises:
-        InputError: a file or key is missing, the format or model is unknown, or a number is
-            impossible for a camera.
+        InputError: a file or key is missing, the format or model is unknown, or no camera can have
+            the numbers.
     """
     paths = [
         found
@@ -65,15 +65,15 @@ def read_calibration(files: Sequence[Path | str], size: Size | None = None) -> C
         if any(keys <= document.values.keys() for document in documents):
             if len(documents) > most:
                 raise InputError(
-                    f"--calib {paths[most]}: a file too many; this format has "
-                    f"{'one' if most == 1 else 'at most two'}, leave the others out."
+                    f"--calib {paths[most]}: is one file too many; this format has "
+                    f"{'one' if most == 1 else 'at most two'}, so leave the others out."
                 )
             return reader(documents, size)
     there = ", ".join(" ".join(key.split())[:20] for key in sorted(documents[0].values)[:6])
     raise InputError(
-        f"{paths[0]}: no known calibration (it has the keys {there}); give one in vslam's own "
-        "format (docs/howto/cameras.md), Kalibr's camchain, OpenCV's YAML, EuRoC's sensor.yaml, "
-        "ROS's camera_info or the settings of ORB-SLAM."
+        f"{paths[0]}: the format of this calibration is unknown (its keys are {there}); give "
+        "vslam's own format (docs/howto/cameras.md), Kalibr's camchain, OpenCV's YAML, EuRoC's "
+        "sensor.yaml, ROS's camera_info or the settings of ORB-SLAM."
     )
 
 
@@ -112,5 +112,6 @@ def _in_folder(folder: Path) -> list[Path]:
         if found:
             return found
     raise InputError(
-        f"{folder}: no calibration in this folder; name the file, or the files of both cameras."
+        f"{folder}: there is no calibration in this folder; name the file, or those of both "
+        "cameras."
     )

@@ -1,7 +1,7 @@
 """Readers of the calibration formats, which docs/howto/cameras.md describes.
 
-They share one file because each is a few lines on the same helpers. The formats are documented in
-Kalibr's wiki (yaml formats), OpenCV's samples ``stereo_calib.cpp`` and ``camera_calibration.cpp``,
+Each is a few lines that call the same helpers. The formats are documented in Kalibr's wiki (yaml
+formats), OpenCV's samples ``stereo_calib.cpp`` and ``camera_calibration.cpp``,
 the ASL dataset format of EuRoC (Burri et al., IJRR 2016), ROS's ``sensor_msgs/CameraInfo``, the
 settings files of ORB-SLAM2 and ``Calibration_Tutorial.pdf`` of ORB-SLAM3.
 """
@@ -34,18 +34,12 @@ _LENSES: dict[str, Lens] = {
     "rational_polynomial": "pinhole",
     "equidistant": "fisheye",
 }
-_OWN_KEYS = {
-    "left",
-    "right",
-    "T_left_right",
-    "baseline",
-    "right_delay",
-    "depth_scale",
-    "virtual_baseline",
-}
+_PAIR_KEYS = ("T_left_right", "baseline", "right_delay")
+_DEPTH_KEYS = ("depth_scale", "virtual_baseline")
+_OWN_KEYS = {"left", "right", *_PAIR_KEYS, *_DEPTH_KEYS}
 _OWN_CAMERA_KEYS = {"lens", "size", "focal", "centre", "distortion"}
 _OFF_CENTRE = 0.2  # of the image size; images of half the resolution give 0.5, of twice it 0.25
-_ROUNDED = 1e-3  # tolerance for rotations, which are rounded in files
+_ROUNDED = 1e-3  # tolerance of rotations, whose numbers are rounded in files
 _LONGEST_DELAY_S = 0.1  # between the two images of a pair
 
 
@@ -75,42 +69,41 @@ def read_own(documents: Sequence[Document], size: Size | None) -> Calibration:
 
 
 def _right_delay(document: Document) -> float:
-    """Seconds by which the right image is taken later than the left one; 0 if not in the file."""
+    """Seconds by which the right image is taken later than the left one; 0 if the file has none."""
     if "right_delay" not in document:
         return 0.0
     delay = document.number("right_delay")
     if not abs(delay) < _LONGEST_DELAY_S:
         raise InputError(
             f"{document.source}: right_delay is {delay:g} s but must be between "
-            f"-{_LONGEST_DELAY_S} and {_LONGEST_DELAY_S} s; write how many seconds after the left "
-            "image the right one is taken."
+            f"-{_LONGEST_DELAY_S} and {_LONGEST_DELAY_S} s; give the seconds by which the right "
+            "image is taken later than the left one."
         )
     return delay
 
 
 def _refuse_contradictions(document: Document) -> None:
-    """Check that a pair has one transformation and no depth, and a single camera neither."""
-    transformations = [key for key in ("T_left_right", "baseline") if key in document]
-    of_pair = [*transformations, *(key for key in ("right_delay",) if key in document)]
-    of_depth = [key for key in ("depth_scale", "virtual_baseline") if key in document]
-    if len(transformations) == 2:
+    """Check that a pair has one transformation and no depth, and a single camera no pair's keys."""
+    of_pair, of_depth = ([k for k in keys if k in document] for keys in (_PAIR_KEYS, _DEPTH_KEYS))
+    if {"T_left_right", "baseline"} <= set(of_pair):
         raise InputError(
-            f"{document.source}: T_left_right and baseline say the same thing; leave one out."
+            f"{document.source}: T_left_right and baseline both give the transformation; leave one "
+            "out."
         )
     if of_pair and "right" not in document:
         raise InputError(
-            f"{document.source}: {of_pair[0]} is of a stereo pair, but right is missing; add right "
-            f"or leave {of_pair[0]} out."
+            f"{document.source}: {of_pair[0]} belongs to a stereo pair, but right is missing; add "
+            f"right or leave {of_pair[0]} out."
         )
     if of_depth and "right" in document:
         raise InputError(
-            f"{document.source}: {of_depth[0]} is of a camera with depth, right is of a stereo "
-            "pair; leave one of them out."
+            f"{document.source}: {of_depth[0]} belongs to a camera with depth, but right to a "
+            "stereo pair; leave one of them out."
         )
 
 
 def read_kalibr(documents: Sequence[Document], size: Size | None) -> Calibration:
-    """Read Kalibr's ``camchain.yaml``: ``cam0`` and, to its right, ``cam1``."""
+    """Read Kalibr's ``camchain.yaml``: ``cam0`` is left, and ``cam1``, if present, right."""
     (document,) = documents
     sections = [document.section(key) for key in ("cam0", "cam1") if key in document]
     models = [_named_camera(section, "distortion_coeffs", size) for section in sections]
@@ -125,7 +118,8 @@ def read_kalibr(documents: Sequence[Document], size: Size | None) -> Calibration
 
 
 def read_euroc(documents: Sequence[Document], size: Size | None) -> Calibration:
-    """Read EuRoC's ``sensor.yaml`` of one or two cameras; ``T_BS`` maps the camera to the body."""
+    """Read EuRoC's ``sensor.yaml`` of one or two cameras; ``T_BS`` maps points of the camera to the
+    body."""
     models = [_named_camera(document, "distortion_coefficients", size) for document in documents]
     if len(models) == 1:
         return Calibration(models[0], source=documents[0].source)
@@ -137,16 +131,16 @@ def read_ros(documents: Sequence[Document], size: Size | None) -> Calibration:
     """Read ROS's ``camera_info`` of one or two cameras: a printed message or a file of
     ``camera_calibration``."""
     found = [_ros_names(document) for document in documents]
-    models = [_matrix_camera(d, d.source, "K", "D", _ros_lens(d), size) for d in found]
+    models = [_matrix_camera(d, d.source, "K", "D", _lens(d, "none"), size) for d in found]
     if len(models) == 1:
         return Calibration(models[0], source=documents[0].source)
     left, right = found
     P = right.matrix("P", 3, 4)
     if P[0, 3] == 0 and "P" in left and left.matrix("P", 3, 4)[0, 3] != 0:
         raise InputError(
-            f"{_sources(documents)}: the sides seem swapped, since the baseline is in the first "
-            "camera's projection matrix instead of the second's; name the left camera first, with "
-            "--topics or --calib."
+            f"{_sources(documents)}: the sides seem swapped, because the projection matrix of the "
+            "first camera contains the baseline, not that of the second; name the left camera "
+            "first, with --topics or --calib."
         )
     T_left_right = _unrectified(left.matrix("R", 3, 3), right.matrix("R", 3, 3), P, right.source)
     return _pair(_sources(documents), models[0], models[1], T_left_right)
@@ -154,8 +148,7 @@ def read_ros(documents: Sequence[Document], size: Size | None) -> Calibration:
 
 def read_opencv(documents: Sequence[Document], size: Size | None) -> Calibration:
     """Read what OpenCV's samples write: ``camera_matrix``, or ``M1 D1 M2 D2 R T`` in one file or
-    two. M may also be called K, and both may have the names of OpenCV's manual, ``cameraMatrix1``
-    and ``distCoeffs1``."""
+    two. ``K1``, or ``cameraMatrix1`` and ``distCoeffs1`` as in OpenCV's manual, are read too."""
     source = _sources(documents)
     document = Document(source, {k: v for each in documents for k, v in each.values.items()})
     lens: Lens = "fisheye" if _flag(document, "fisheye_model") else "pinhole"
@@ -221,18 +214,18 @@ def _own_camera(document: Document, size: Size | None) -> CameraModel:
 
 
 def _named_camera(document: Document, distortion: str, size: Size | None) -> CameraModel:
-    """A camera as in Kalibr's and EuRoC's files, which name the camera and distortion models."""
+    """A camera of Kalibr's or EuRoC's files, which name the camera and distortion models."""
     if (kind := document.text("camera_model")) != "pinhole":
         raise InputError(
             f"{document.source}: camera_model {kind} is unknown; known is pinhole, with one of "
             f"the distortion models {', '.join(_LENSES)}."
         )
-    word = document.text("distortion_model")
+    lens, distorted = _lens(document), document.text("distortion_model") != "none"
     return _camera(
         document.source,
-        _lens(document.source, word),
+        lens,
         document.numbers("intrinsics", 4),
-        () if word == "none" else document.numbers(distortion),
+        document.numbers(distortion) if distorted else (),
         _size_of(document, size, "resolution"),
     )
 
@@ -240,11 +233,11 @@ def _named_camera(document: Document, distortion: str, size: Size | None) -> Cam
 def _matrix_camera(
     document: Document, source: str, K: str, D: str, lens: Lens, size: Size | None
 ) -> CameraModel:
-    """A camera as in OpenCV's files: a camera matrix and a vector of distortion coefficients."""
+    """A camera given by a camera matrix and a vector of distortion coefficients."""
     matrix = document.matrix(K, 3, 3)
     numbers = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
     if "image_width" in document or size is None:
-        size = int(document.number("image_width")), int(document.number("image_height"))
+        size = _size_of(document, size, "image_width", "image_height")
     elif max(abs(c / n - 0.5) for c, n in zip(numbers[2:], size, strict=True)) > _OFF_CENTRE:
         raise InputError(
             f"{source}: the principal point ({numbers[2]:.1f}, {numbers[3]:.1f}) is far from the "
@@ -258,18 +251,15 @@ def _orbslam_camera(document: Document, name: str, lens: Lens, size: Size | None
     order = ("k1", "k2", "k3", "k4") if lens == "fisheye" else ("k1", "k2", "p1", "p2", "k3")
     keys = [f"{name}.{key}" for key in order]
     distortion = [document.number(key) if key in document else 0.0 for key in keys]
-    if "Camera.width" in document or size is None:
-        size = int(document.number("Camera.width")), int(document.number("Camera.height"))
     numbers = tuple(document.number(f"{name}.{key}") for key in ("fx", "fy", "cx", "cy"))
+    size = _size_of(document, size, "Camera.width", "Camera.height")
     return _camera(document.source, lens, numbers, tuple(distortion), size)
 
 
 def _orbslam2_unrectified(document: Document, size: Size | None) -> Calibration:
     models, rotations = [], []
     for side in ("LEFT", "RIGHT"):
-        found = size
-        if f"{side}.width" in document or size is None:
-            found = int(document.number(f"{side}.width")), int(document.number(f"{side}.height"))
+        found = _size_of(document, size, f"{side}.width", f"{side}.height")
         models.append(
             _matrix_camera(document, document.source, f"{side}.K", f"{side}.D", "pinhole", found)
         )
@@ -297,23 +287,22 @@ def _ros_names(document: Document) -> Document:
     return Document(document.source, values)
 
 
-def _ros_lens(document: Document) -> Lens:
-    word = document.text("distortion_model")
-    return _lens(document.source, word or "none")
-
-
-def _lens(source: str, word: str) -> Lens:
+def _lens(document: Document, unnamed: str = "") -> Lens:
+    """The lens of a distortion model; an empty name means the model ``unnamed``."""
+    word = document.text("distortion_model") or unnamed
     if word not in _LENSES:
         raise InputError(
-            f"{source}: distortion model {word} is unknown; known are {', '.join(_LENSES)}."
+            f"{document.source}: distortion model {word} is unknown; known are "
+            f"{', '.join(_LENSES)}."
         )
     return _LENSES[word]
 
 
-def _size_of(document: Document, size: Size | None, key: str) -> Size:
-    if key not in document and size is not None:
+def _size_of(document: Document, size: Size | None, *keys: str) -> Size:
+    """Width and height at one key or two, or ``size`` if the file has none."""
+    if keys[0] not in document and size is not None:
         return size
-    width, height = document.numbers(key, 2)
+    width, height = document.numbers(keys[0], 2) if len(keys) == 1 else map(document.number, keys)
     return int(width), int(height)
 
 
@@ -346,9 +335,7 @@ def _camera(
     if width < 1 or height < 1:
         raise InputError(f"{source}: the image size {width}x{height} must be positive.")
     if width * height > MOST_PIXELS:
-        raise InputError(
-            f"{source}: no camera has images of {width}x{height} pixels; correct the size."
-        )
+        raise InputError(f"{source}: the image size {width}x{height} is too large; correct it.")
     if fx <= 0 or fy <= 0:
         raise InputError(f"{source}: the focal lengths {fx:g}, {fy:g} must be positive.")
     if not (0 < cx < width and 0 < cy < height):
@@ -363,8 +350,8 @@ def _pair(source: str, left: CameraModel, right: CameraModel, T_left_right: Arra
     R = T_left_right[:3, :3]
     if not np.allclose(R @ R.T, np.eye(3), atol=_ROUNDED) or np.linalg.det(R) < 0:
         raise InputError(
-            f"{source}: the transformation between the cameras holds no rotation; "
-            "check its numbers and their order."
+            f"{source}: the transformation between the cameras contains no valid rotation; check "
+            "its numbers and their order."
         )
     U, _, Vt = np.linalg.svd(R)  # U Vt is the rotation nearest to the rounded one
     return Calibration(left, right, _rigid(U @ Vt, T_left_right[:3, 3]), source=source)
@@ -375,8 +362,8 @@ def _unrectified(R_left: Array, R_right: Array, P: Array, source: str) -> Array:
     projection matrix."""
     if P[0, 0] <= 0 or P[0, 3] == 0:
         raise InputError(
-            f"{source}: the projection matrix holds no baseline; its fourth number must be minus "
-            "the baseline in metres times the focal length."
+            f"{source}: the projection matrix contains no baseline; its fourth number must be the "
+            "negative baseline in metres times the focal length."
         )
     baseline = np.array([-P[0, 3] / P[0, 0], 0.0, 0.0])
     return _rigid(R_left.T @ R_right, R_left.T @ baseline)

@@ -12,23 +12,32 @@ BIT = 12  # pixels of the texture for a bit of a tag
 FINE = 2  # samples of a pixel in each direction
 
 
-def texture(board: Board) -> tuple[np.ndarray, float, np.ndarray]:
-    """The printed board with its margin, pixels per metre, and where the board's origin is."""
+def texture(
+    board: Board, *, legacy: bool = False, border: int = 2, upright: bool = False
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """The printed board with its margin, pixels per metre, and where the board's origin is.
+
+    Args:
+        board: the board.
+        legacy: a ChArUco board of even height begins with a marker, as before OpenCV 4.6.
+        border: bits of black around the tags of an AprilGrid.
+        upright: these tags are not upside down as in Kalibr's AprilGrids.
+    """
+    side = 60
     if board.kind == "charuco":
-        side = 60
         size = (board.columns, board.rows)
         number = getattr(cv2.aruco, f"DICT_{board.dictionary}")
         markers = cv2.aruco.getPredefinedDictionary(number)
         made = cv2.aruco.CharucoBoard(size, board.square, board.marker, markers)
+        made.setLegacyPattern(legacy)
         image = made.generateImage((side * board.columns, side * board.rows))
         return _framed(image, side, side / board.square)
     if board.kind == "checkerboard":
-        side = 60
         fields = np.indices((board.rows + 1, board.columns + 1)).sum(axis=0) % 2
         image = np.kron(255 * fields.astype(np.uint8), np.ones((side, side), np.uint8))
         framed, scale, origin = _framed(image, side, side / board.square)
         return framed, scale, origin + side
-    return _aprilgrid(board)
+    return _aprilgrid(board, border, upright)
 
 
 def _framed(image: np.ndarray, margin: int, scale: float) -> tuple[np.ndarray, float, np.ndarray]:
@@ -36,10 +45,9 @@ def _framed(image: np.ndarray, margin: int, scale: float) -> tuple[np.ndarray, f
     return framed, scale, np.array([margin, margin], float)
 
 
-def _aprilgrid(board: Board) -> tuple[np.ndarray, float, np.ndarray]:
-    """As Kalibr prints it: from the lower left, turned by half a turn, two bits of black around a
-    tag, and a black square in every corner between tags."""
-    tag = 10 * BIT
+def _aprilgrid(board: Board, border: int, upright: bool) -> tuple[np.ndarray, float, np.ndarray]:
+    """Row by row from the lower left, with a black square in every corner between tags."""
+    tag = (6 + 2 * border) * BIT
     pitch = round(tag * board.square / board.marker)
     gap = pitch - tag
     across, down = pitch * board.columns + gap, pitch * board.rows + gap
@@ -48,9 +56,9 @@ def _aprilgrid(board: Board) -> tuple[np.ndarray, float, np.ndarray]:
     for row in range(board.rows):
         for column in range(board.columns):
             number = row * board.columns + column
-            drawn = cv2.aruco.generateImageMarker(markers, number, tag, borderBits=2)
+            drawn = cv2.aruco.generateImageMarker(markers, number, tag, borderBits=border)
             y, x = down - pitch * (row + 1), gap + pitch * column
-            image[y : y + tag, x : x + tag] = np.rot90(drawn, 2)
+            image[y : y + tag, x : x + tag] = drawn if upright else np.rot90(drawn, 2)
     for y in range(0, down, pitch):
         for x in range(0, across, pitch):
             image[y : y + gap, x : x + gap] = 0
@@ -61,8 +69,8 @@ def _aprilgrid(board: Board) -> tuple[np.ndarray, float, np.ndarray]:
 class Renderer:
     """Images of one board by one camera."""
 
-    def __init__(self, board: Board, model: CameraModel) -> None:
-        self.printed, self.scale, self.origin = texture(board)
+    def __init__(self, board: Board, model: CameraModel, **printed: bool | int) -> None:
+        self.printed, self.scale, self.origin = texture(board, **printed)
         self.up = board.kind == "aprilgrid"
         self.model = model
         width, height = FINE * model.width, FINE * model.height

@@ -16,6 +16,7 @@ from vslam.calibration.boards import (
     Board,
     View,
     board_points,
+    find_corners,
     other_board,
     read_board,
     same_order,
@@ -205,6 +206,27 @@ def test_aprilgrid_of_kalibr_in_euroc_layout_by_fisheye_cameras(calibrate, tmp_p
     check_pair(read_calibration(["calibration.yaml"]), FISHEYE)
 
 
+@pytest.mark.parametrize("border", [1, 2])
+def test_aprilgrid_of_upright_tags(border):
+    upright = Renderer(APRILGRID, PINHOLE, border=border, upright=True)
+    (T,) = poses(APRILGRID, PINHOLE, 1)
+    view = find_corners(APRILGRID, upright.image(T, np.random.default_rng(0)))
+    xy = project(PINHOLE, transform(T, board_points(APRILGRID)))
+    assert len(view.ids) > 30
+    assert np.linalg.norm(view.xy - xy[view.ids], axis=1).max() < 0.5
+
+
+def test_charuco_board_that_begins_with_a_marker():
+    board = replace(CHARUCO, rows=6)
+    (T,) = poses(board, PINHOLE, 1)
+    for legacy in (False, True):
+        image = Renderer(board, PINHOLE, legacy=legacy).image(T, np.random.default_rng(0))
+        view = find_corners(board, image)
+        xy = project(PINHOLE, transform(T, board_points(board)))
+        assert len(view.ids) > 15
+        assert np.linalg.norm(view.xy - xy[view.ids], axis=1).max() < 0.5
+
+
 def test_written_calibration_is_read_as_the_same(tmp_path):
     pair = Calibration(PINHOLE, FISHEYE, T_LEFT_RIGHT)
     for calibration in (pair, pair.left_alone()):
@@ -326,6 +348,7 @@ def test_images_without_the_board_are_an_error_that_says_what_was_looked_for(cal
     write_images(tmp_path / "pair", {"left": images, "right": [blank] * 2}, ["0.png", "1.png"])
     write_images(tmp_path, {"mixed": [blank, blank[:100]]}, ["0.png", "1.png"])
     rest = ("--board", "checkerboard", "--size")
+    charuco = ("pair", "--board", "charuco", "--square", 0.04, "--marker", 0.03, "--size")
     for words, said in (
         (("blank", *rest, "9x6"), "blank: no checkerboard of 9x6 inner corners in any of 2 images"),
         (("board", *rest, "10x7"), "a checkerboard of 9x6 inner corners: give --board checker"),
@@ -338,6 +361,8 @@ def test_images_without_the_board_are_an_error_that_says_what_was_looked_for(cal
         (("pair", *rest, "9x6", "--square", 30), "give both in metres, such as 0.025 for 25 mm"),
         (("pair", *rest, "9"), "--size 9: give columns and rows, such as 9x6."),
         (("pair", "--board", "none.yaml"), "--board none.yaml: there is no such file; give"),
+        ((*charuco, "7x5", "--dictionary", "8X8_50"), "8X8_50: OpenCV has no such markers; give a"),
+        ((*charuco, "12x9", "--dictionary", "4x4_50"), "50 markers are too few for this board"),
     ):
         code, _, err = calibrate(*words)
         message = err[err.index("error: ") :]

@@ -8,7 +8,6 @@ towards the viewer.
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -39,17 +38,14 @@ _REACH_PX = (2, 6)  # least and greatest half width of the window in which a cor
 # To recognise a board. A few false tags and a small false checkerboard appear in any image of
 # houses, so it takes more tags than that, or the same checkerboard in two images.
 _RECOGNISED_TAGS = 6
+_TRIED_TAGS = 50  # the first of a dictionary tell its family, many times faster than all
 _SIZES = (50, 100, 250, 1000)  # of the dictionaries of a family; each begins with the smaller ones
-_FAMILIES = (
-    *((f"{bits}X{bits}_50", 1) for bits in (4, 5, 6, 7)),
-    ("ARUCO_ORIGINAL", 1),
-    *((_TAGS, border) for border in _BORDERS),
-)  # a dictionary of each family, and the black bits around its tags
+# The largest dictionary of each family, and the black bits around its tags.
+_FAMILIES = tuple((f"{n}X{n}_1000", 1) for n in (4, 5, 6, 7))
+_FAMILIES += (("ARUCO_ORIGINAL", 1), *((_TAGS, border) for border in _BORDERS))
 _MOST_COLUMNS = 40
 _OFF_PLACE = 0.2  # largest distance of a tag from its place in the layout, in squares
 _SAME_RATIO = 0.12  # relative error of the measured marker / square, which blur decreases
-
-_Found = tuple[NDArray[np.int64], Array] | None  # ids and xy of a `View`
 
 
 @dataclass(frozen=True)
@@ -87,13 +83,12 @@ class Board:
                 f"a {self.kind} cannot have the size {self.columns}x{self.rows}; give {least} to "
                 "100 columns and rows."
             )
-        if self.kind == "charuco":
-            n = len(_dictionary(self.dictionary).bytesList)
-            if n < self.columns * self.rows // 2:
-                raise InputError(
-                    f"--dictionary {self.dictionary}: {n} markers are too few for this board; give "
-                    "the --size and the --dictionary that were printed."
-                )
+        n = len(_dictionary(self.dictionary).bytesList)
+        if self.kind == "charuco" and n < self.columns * self.rows // 2:
+            raise InputError(
+                f"--dictionary {self.dictionary}: {n} markers are too few for this board; give the "
+                "--size and the --dictionary that were printed."
+            )
 
     def __str__(self) -> str:
         size = f"{self.columns}x{self.rows}"
@@ -150,21 +145,17 @@ def board_points(board: Board) -> Array:
     """``(N, 3)`` float64, the corners of a board in its frame, in metres."""
     first = 1 if board.kind == "charuco" else 0  # the origin is a ChArUco board's outer corner
     x, y = np.meshgrid(np.arange(first, board.columns), np.arange(first, board.rows))
-    points = board.square * np.stack([x, y, np.zeros(x.shape)], axis=-1).reshape(-1, 3)
-    if board.kind != "aprilgrid":
-        return np.asarray(points, np.float64)
-    # The corners of a tag in OpenCV's order, which starts at the lower right as Kalibr prints it.
-    around = board.marker * np.array([[1, 0, 0], [0, 0, 0], [0, 1, 0], [1, 1, 0]])
-    return np.asarray((points[:, None] + around).reshape(-1, 3))
+    points = np.stack([x, y, np.zeros(x.shape)], axis=-1).reshape(-1, 3) * board.square
+    if board.kind == "aprilgrid":
+        # OpenCV's order of a tag's corners starts at the lower right of a tag as Kalibr prints it.
+        tag = np.array([[1, 0, 0], [0, 0, 0], [0, 1, 0], [1, 1, 0]]) * board.marker
+        points = (points[:, None] + tag).reshape(-1, 3)
+    return np.asarray(points, np.float64)
 
 
 def find_corners(board: Board, image: Image, name: str = "") -> View | None:
     """Find a board in an ``(H, W)`` uint8 image; None if too few corners are visible."""
-    find = {
-        "checkerboard": _find_checkerboard,
-        "charuco": _find_charuco,
-        "aprilgrid": _find_aprilgrid,
-    }[board.kind]
+    find = {"checkerboard": _checkerboard, "charuco": _charuco, "aprilgrid": _aprilgrid}[board.kind]
     found = find(board, image)
     return None if found is None else _refined(board, image, View(name, *found))
 
@@ -192,8 +183,8 @@ def other_board(board: Board, images: Sequence[Image]) -> str:
         return ""
     if found.kind == board.kind and found.columns == board.columns:  # some rows may be out of view
         found = replace(found, rows=max(found.rows, board.rows))
-    family, given = (re.sub(r"_\d+$", "", each.dictionary) for each in (found, board))
-    if found.kind != "charuco" or family == given:
+    given, tags = (_dictionary(each.dictionary).bytesList for each in (board, found))
+    if found.kind != "charuco" or np.array_equal(given[: len(tags)], tags):  # it contains them
         found = replace(found, dictionary=board.dictionary)
     ratio = found.marker / found.square
     same_layout = replace(found, square=board.square, marker=board.marker) == board
@@ -207,7 +198,7 @@ def other_board(board: Board, images: Sequence[Image]) -> str:
     return f"the images show {article} {found}: give {options}"
 
 
-def _find_checkerboard(board: Board, image: Image) -> _Found:
+def _checkerboard(board: Board, image: Image) -> tuple[NDArray[np.int64], Array] | None:
     small, times = _reduced(image)
     size, flags = (board.columns, board.rows), cv2.CALIB_CB_NORMALIZE_IMAGE
     found, xy = cv2.findChessboardCornersSB(small, size, flags=flags)
@@ -223,20 +214,22 @@ def _reduced(image: Image) -> tuple[Image, float]:
     return cast("Image", small), times
 
 
-def _find_charuco(board: Board, image: Image) -> _Found:
+def _charuco(board: Board, image: Image) -> tuple[NDArray[np.int64], Array] | None:
     size, markers = (board.columns, board.rows), _dictionary(board.dictionary)
     layout = cv2.aruco.CharucoBoard(size, board.square, board.marker, markers)
-    for legacy in (False, True):  # OpenCV before 4.6 began boards of even height with a marker
+    ids, xy = np.empty(0, np.int64), np.empty((0, 2))
+    # OpenCV before 4.6 began boards of even height with a marker. The wrong layout fits fewer tags.
+    for legacy in (False, True)[: 2 - board.rows % 2]:
         layout.setLegacyPattern(legacy)
-        xy, ids, _, _ = cv2.aruco.CharucoDetector(layout).detectBoard(image)
-        if ids is not None and len(ids) >= _FEWEST_CORNERS:
-            rows = np.asarray(ids, np.int64).ravel()
-            if np.ptp(board_points(board)[rows, :2], axis=0).all():  # a line of corners has no pose
-                return rows, xy.reshape(-1, 2).astype(np.float64)
-    return None
+        at, numbers, _, _ = cv2.aruco.CharucoDetector(layout).detectBoard(image)
+        if numbers is not None and len(numbers) > len(ids):
+            ids, xy = numbers.ravel().astype(np.int64), at.reshape(-1, 2).astype(np.float64)
+    if len(ids) < _FEWEST_CORNERS or not np.ptp(board_points(board)[ids, :2], axis=0).all():
+        return None  # corners in one line have no pose
+    return ids, xy
 
 
-def _find_aprilgrid(board: Board, image: Image) -> _Found:
+def _aprilgrid(board: Board, image: Image) -> tuple[NDArray[np.int64], Array] | None:
     for border in _BORDERS:
         numbers, xy = _find_tags(image, _TAGS, border)
         known = numbers < board.columns * board.rows
@@ -250,12 +243,14 @@ def _find_aprilgrid(board: Board, image: Image) -> _Found:
     return None
 
 
-def _find_tags(image: Image, dictionary: str, border: int) -> tuple[NDArray[np.int64], Array]:
-    """The numbers, ``(N,)``, and corners, ``(N, 4, 2)`` pixels, of the tags in an image."""
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.markerBorderBits = border
-    detector = cv2.aruco.ArucoDetector(_dictionary(dictionary), parameters)
-    corners, numbers, _ = detector.detectMarkers(image)
+def _find_tags(
+    image: Image, dictionary: str, border: int, most: int | None = None
+) -> tuple[NDArray[np.int64], Array]:
+    """The numbers, ``(N,)``, and corners, ``(N, 4, 2)`` pixels, of those of the first ``most`` tags
+    of a dictionary that an image shows."""
+    tags, parameters = _dictionary(dictionary), cv2.aruco.DetectorParameters()
+    tags.bytesList, parameters.markerBorderBits = tags.bytesList[:most], border
+    corners, numbers, _ = cv2.aruco.ArucoDetector(tags, parameters).detectMarkers(image)
     found = np.empty(0) if numbers is None else numbers
     return found.ravel().astype(np.int64), np.array(corners, np.float64).reshape(-1, 4, 2)
 
@@ -306,18 +301,18 @@ def _recognised_checkerboard(images: Sequence[Image]) -> Board | None:
 def _recognised_tags(images: Sequence[Image]) -> Board | None:
     """The ChArUco board or AprilGrid in the image with the most tags, with squares of 0.1 m."""
     counts = [
-        (len(_find_tags(image, *family)[0]), image, family)
+        (len(_find_tags(image, *family, _TRIED_TAGS)[0]), image, family)
         for image, family in product(images, _FAMILIES)
     ]
     n, image, (family, border) = max(counts, key=itemgetter(0))
     if n < _RECOGNISED_TAGS:
         return None
-    numbers, xy = _find_tags(image, family.replace("_50", "_1000"), border)
-    kinds: list[tuple[Kind, int]] = [("charuco", 1), ("charuco", 0)]
-    kinds += [("aprilgrid", 0)] if family == _TAGS else []
+    tags = _find_tags(image, family, border)
+    kinds: tuple[tuple[Kind, int], ...] = (("charuco", 1), ("charuco", 0), ("aprilgrid", 0))
     layouts = [
-        _layout(kind, first, columns, family, numbers, xy)
+        _layout(kind, first, columns, family, *tags)
         for (kind, first), columns in product(kinds, range(3, _MOST_COLUMNS))
+        if kind == "charuco" or family == _TAGS
     ]
     _, found = max(layouts, key=itemgetter(0))
     return found if found is not None and find_corners(found, image) is not None else None
@@ -326,13 +321,8 @@ def _recognised_tags(images: Sequence[Image]) -> Board | None:
 def _layout(
     kind: Kind, first: int, columns: int, family: str, numbers: NDArray[np.int64], xy: Array
 ) -> tuple[int, Board | None]:
-    """How many tags fit a board with this number of columns, and the board; None if few fit.
-
-    Args:
-        first: the column of tag 0, which is in the first row.
-        family: a dictionary of the family of the tags.
-        numbers, xy: the detected tags, ``(N,)``, and their corners, ``(N, 4, 2)`` pixels.
-    """
+    """How many tags fit a board with this number of columns whose tag 0 is in column ``first`` of
+    the first row, and the board; None if few fit."""
     step = 2 if kind == "charuco" else 1  # a ChArUco board has a tag on every other square
     squares = np.indices((step * numbers.max() // columns + 2, columns)).sum(axis=0)
     at = np.argwhere(squares % step == first)[numbers, ::-1].astype(np.float64)
@@ -344,8 +334,8 @@ def _layout(
     ratio = float(np.median(np.linalg.norm(tags - np.roll(tags, 1, axis=1), axis=2)))
     if not 0.0 < ratio < 1.0:
         return 0, None
-    if family.endswith("_50"):
+    if family.endswith("_1000"):
         least = next(size for size in _SIZES if size > numbers[fits].max())
-        family = family.replace("_50", f"_{least}")
+        family = family.replace("1000", str(least))
     rows = max(3 if kind == "charuco" else 1, int(at[fits, 1].max()) + 1)
     return n, Board(kind, columns, rows, 0.1, 0.1 * ratio, family)

@@ -1,8 +1,8 @@
-"""Warping images to those of a rectified pinhole camera or stereo pair.
+"""Rectification: warping images to those of an undistorted pinhole camera or aligned stereo pair.
 
-The rectified pair looks half-way between the two cameras, turned so that its x axis is the
-baseline. It shows the largest rectangle that both images cover. No pixel is black, because corners
-at a black border would become features that never move. (``cv2.stereoRectify`` estimates that
+The rectified pair looks in the mean direction of the two cameras, turned so that its x axis is the
+baseline. It shows the largest rectangle that both images cover, without black pixels, because
+features on a black border would not move with the scene. (``cv2.stereoRectify`` estimates that
 rectangle from a 9x9 grid, ``cv2.fisheye.stereoRectify`` from four points; both can leave black
 corners.)
 """
@@ -17,17 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.calibration.models import Array, Calibration, CameraModel, project, unproject
-from vslam.camera import Camera
+from vslam.camera import Camera, Image
 from vslam.errors import InputError
 
-Image = NDArray[np.uint8]
 Pixels = TypeVar("Pixels", bound=NDArray[np.generic])
 
 # At 60 degrees off the axis a pinhole image is stretched four times as much as at its centre; a
 # wider view would magnify the border and shrink the centre even more.
 _MAX_HALF_VIEW = np.tan(np.radians(60.0))
 _FARTHEST_M = 20.0  # longest baseline
-_SAME = 1e-5  # radians; with focal lengths below 2000 px, rows agree to 0.02 px
+_SAME = 1e-5  # radians; rows then agree to 0.02 px at focal lengths below 2000 px
 _SAME_PX = 1e-3
 
 
@@ -59,56 +58,37 @@ def rectify(calibration: Calibration) -> Rectification:
     """Compute the rectification; its functions may be called from several threads.
 
     Raises:
-        InputError: the cameras do not look the same way from places side by side, they are swapped,
-            or a distortion cannot be inverted within the image.
+        InputError: the cameras are not side by side or look in different directions, they are
+            swapped, or a distortion cannot be inverted within the image.
     """
-    if calibration.right is None or calibration.T_left_right is None:
-        return _rectify_one(calibration)
-    pair = _rectify_pair(calibration, calibration.right, calibration.T_left_right)
-    return replace(pair, camera=replace(pair.camera, right_delay=calibration.right_delay))
+    left, right, source = calibration.left, calibration.right, calibration.source
+    if right is None or calibration.T_left_right is None:
+        cameras, baseline, rectified = [(left, np.eye(3))], 0.0, left.undistorted
+    else:
+        R_left_right, centre = calibration.T_left_right[:3, :3], calibration.T_left_right[:3, 3]
+        baseline = float(np.linalg.norm(centre))
+        R_left_rectified = _between(R_left_right, centre, source)
+        cameras = [(left, R_left_rectified), (right, R_left_right.T @ R_left_rectified)]
+        rectified = _is_rectified(left, right, R_left_right, centre)
+    if rectified:
+        numbers = (left.fx, left.fy), (left.cx, left.cy), baseline, (left.width, left.height)
+        camera = replace(_camera(source, *numbers), right_delay=calibration.right_delay)
+        return Rectification(camera, np.eye(3), unchanged, unchanged, unchanged, True)
+    camera = _common_view(source, cameras, baseline)
+    maps = [_maps(model, R_own_rectified, camera) for model, R_own_rectified in cameras]
+    return Rectification(
+        replace(camera, right_delay=calibration.right_delay),
+        R_left_rectified=cameras[0][1],
+        left=_linear(maps[0]),
+        right=_linear(maps[1]) if len(maps) == 2 else unchanged,
+        left_depth=_nearest(maps[0]),
+        identity=False,
+    )
 
 
 def unchanged(image: Pixels) -> Pixels:
     """Return the image itself."""
     return image
-
-
-def _rectify_one(calibration: Calibration) -> Rectification:
-    model = calibration.left
-    if model.undistorted:
-        return _as_it_is(calibration.source, model, 0.0)
-    camera = _common_view(calibration.source, [(model, np.eye(3))], 0.0)
-    left = _maps(model, np.eye(3), camera)
-    return Rectification(camera, np.eye(3), _linear(left), unchanged, _nearest(left), False)
-
-
-def _rectify_pair(
-    calibration: Calibration, right: CameraModel, T_left_right: Array
-) -> Rectification:
-    left, source = calibration.left, calibration.source
-    R_left_right, centre = T_left_right[:3, :3], T_left_right[:3, 3]
-    baseline = float(np.linalg.norm(centre))
-    R_left_rectified = _between(R_left_right, centre, source)
-    if _is_rectified(left, right, R_left_right, centre):
-        return _as_it_is(source, left, baseline)
-    R_right_rectified = R_left_right.T @ R_left_rectified
-    pair = [(left, R_left_rectified), (right, R_right_rectified)]
-    camera = _common_view(source, pair, baseline)
-    left_maps, right_maps = (_maps(model, R, camera) for model, R in pair)
-    return Rectification(
-        camera,
-        R_left_rectified,
-        _linear(left_maps),
-        _linear(right_maps),
-        _nearest(left_maps),
-        False,
-    )
-
-
-def _as_it_is(source: str, model: CameraModel, baseline: float) -> Rectification:
-    centre = model.cx, model.cy
-    camera = _camera(source, (model.fx, model.fy), centre, baseline, (model.width, model.height))
-    return Rectification(camera, np.eye(3), unchanged, unchanged, unchanged, True)
 
 
 def _camera(
@@ -138,8 +118,8 @@ def _is_rectified(
 
 
 def _between(R_left_right: Array, centre: Array, source: str) -> Array:
-    """``R_left_rectified``: x along the baseline, z as close as possible to the mean direction of
-    the two cameras."""
+    """``R_left_rectified``: x along the baseline, z as close as possible to the mean viewing
+    direction of the two cameras."""
     import cv2
 
     turn = cv2.Rodrigues(R_left_right)[0].ravel()
@@ -151,21 +131,21 @@ def _between(R_left_right: Array, centre: Array, source: str) -> Array:
         )
     if baseline > _FARTHEST_M:
         raise InputError(
-            f"{source}: the cameras stand {baseline:.4g} m apart, as if a length in millimetres or "
-            "centimetres was taken for metres; write the translation between them in metres (a "
-            "checkerboard calibration has the unit of the squares)."
+            f"{source}: the cameras are {baseline:.4g} m apart, probably because the translation "
+            "between them is in millimetres or centimetres; write it in metres (a checkerboard "
+            "calibration has the unit of the squares)."
         )
     x = centre / baseline
     across = float(half[:, 0] @ x)
     if across < -np.sqrt(0.5):
         raise InputError(
-            f"{source}: the right camera stands {baseline:.3f} m to the left of the left one; swap "
-            "the cameras, or invert the transformation between them."
+            f"{source}: the right camera is {baseline:.3f} m to the left of the left one; swap the "
+            "cameras, or invert the transformation between them."
         )
     if across < np.sqrt(0.5) or np.linalg.norm(turn) > np.pi / 2:
         raise InputError(
-            f"{source}: the cameras do not look the same way from places side by side "
-            f"(turned by {np.degrees(np.linalg.norm(turn)):.0f} degrees, the right one at "
+            f"{source}: the cameras are not side by side or look in different directions (turned "
+            f"by {np.degrees(np.linalg.norm(turn)):.0f} degrees, the right one at "
             f"{np.array2string(centre, precision=3, suppress_small=True)} m); check the "
             "transformation between them."
         )
@@ -175,12 +155,13 @@ def _between(R_left_right: Array, centre: Array, source: str) -> Array:
 
 
 def _common_view(source: str, cameras: list[tuple[CameraModel, Array]], baseline: float) -> Camera:
-    """The pinhole camera of the left image's size that shows the most of what all images cover."""
+    """The pinhole camera, of the left image's size, with the widest view that all images cover."""
     bounds = np.array([_inner_rectangle(model, R, source) for model, R in cameras])
     (x0, y0), (x1, y1) = bounds[:, 0].max(axis=0), bounds[:, 1].min(axis=0)
     if x0 >= x1 or y0 >= y1:
         raise InputError(
-            f"{source}: the cameras have no common view; check the transformation between them."
+            f"{source}: the views of the cameras do not overlap; check the transformation between "
+            "them."
         )
     width, height = cameras[0][0].width, cameras[0][0].height
     focal = max((width - 1) / (x1 - x0), (height - 1) / (y1 - y0))
@@ -194,10 +175,11 @@ def _common_view(source: str, cameras: list[tuple[CameraModel, Array]], baseline
 
 
 def _inner_rectangle(model: CameraModel, R_own_rectified: Array, source: str) -> Array:
-    """Corners ``[[x0, y0], [x1, y1]]``, on the plane z = 1 of the rectified camera, of a rectangle
-    that the image covers. Each side lies where the image's border is nearest to the centre.
+    """Opposite corners ``[[x0, y0], [x1, y1]]``, on the plane z = 1 of the rectified camera, of a
+    rectangle that the image covers: each side touches a border of the image at the pixel nearest to
+    the centre.
 
-    The polynomial of a wide lens may fold the image's corners, which are then ignored.
+    The distortion polynomial of a wide lens may fold the corners of the image, which are ignored.
     """
     found = []
     for k, border in enumerate(_borders(model.width, model.height)):
@@ -213,7 +195,7 @@ def _inner_rectangle(model: CameraModel, R_own_rectified: Array, source: str) ->
 
 
 def _check_view(model: CameraModel, R_own_rectified: Array, camera: Camera, source: str) -> None:
-    """Refuse a view of which the image shows a part twice or not at all."""
+    """Refuse a view parts of which the image shows twice or not at all."""
     xy = np.concatenate(_borders(camera.width, camera.height))
     rays = camera.backproject(xy, np.ones(len(xy))) @ R_own_rectified.T
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -236,8 +218,8 @@ def _borders(width: int, height: int) -> tuple[Array, ...]:
 
 def _folded(source: str) -> InputError:
     return InputError(
-        f"{source}: the distortion folds the image within its border, so its coefficients are "
-        "wrong or in another order; calibrate again, or check the distortion model."
+        f"{source}: the distortion folds the image within its borders, so its coefficients are "
+        "wrong or in the wrong order; calibrate again, or check the distortion model."
     )
 
 

@@ -23,17 +23,12 @@ if TYPE_CHECKING:
 
 _EXAMPLES = """
 [b]Examples[/b]
-
   vslam calibrate board.mp4 --board checkerboard --size 9x6 --square 0.025
-
   vslam calibrate pair.mkv --side-by-side --board charuco --size 7x5 --square 0.04 --marker 0.03
-
   vslam calibrate cam_april/mav0 --board april_6x6.yaml --lens fisheye --out stereo.yaml
 """
 _MOST_SEARCHED = 300  # images, spread evenly; the search takes a minute or two
 _EXAMINED = 10  # images in which another board is looked for
-_BOARD = "Board"  # panel of --help
-
 
 app = typer.Typer()
 
@@ -43,25 +38,25 @@ app = typer.Typer()
 def calibrate(
     given: SourceOptions,
     board: Annotated[
-        str, option(_BOARD, "KIND|FILE", "checkerboard, charuco, aprilgrid, or a target of Kalibr.")
+        str, option("Board", "KIND|FILE", "checkerboard, charuco, aprilgrid, or a Kalibr target.")
     ],
     size: Annotated[
-        str, option(_BOARD, "COLUMNSxROWS", "Inner corners, squares (charuco), tags (aprilgrid).")
+        str, option("Board", "COLUMNSxROWS", "Inner corners, squares (charuco), tags (aprilgrid).")
     ] = "",
     square: Annotated[
         float | None,
         option(
-            _BOARD,
+            "Board",
             "METRES",
             "Side of a square; for an AprilGrid, the distance from one tag to the next. A single "
             "camera that films a checkerboard does not need it.",
         ),
     ] = None,
     marker: Annotated[
-        float | None, option(_BOARD, "METRES", "Side of a marker or tag, without white border.")
+        float | None, option("Board", "METRES", "Side of a marker or tag, without white border.")
     ] = None,
     dictionary: Annotated[
-        str, option(_BOARD, "NAME", "Markers of a ChArUco board: OpenCV's name without DICT_.")
+        str, option("Board", "NAME", "Markers of a ChArUco board: OpenCV's name without DICT_.")
     ] = "5X5_1000",
     lens: Annotated[
         Literal["pinhole", "fisheye"],
@@ -73,8 +68,7 @@ def calibrate(
         ),
     ] = "pinhole",
     out: Annotated[
-        Path,
-        option(OUTPUT, "FILE", "Calibration to write, beside its page; earlier ones are renamed."),
+        Path, option(OUTPUT, "FILE", "Calibration to write, and its page; renames earlier ones.")
     ] = Path("calibration.yaml"),
 ) -> None:
     """Calibrate a camera or a stereo pair from images of a board; exit code 1 if the result is
@@ -152,13 +146,7 @@ def _keep_earlier(*files: Path) -> None:
 
 
 def _board(
-    kind: str,
-    size: str,
-    square: float | None,
-    marker: float | None,
-    dictionary: str,
-    *,
-    stereo: bool,
+    kind: str, size: str, square: float | None, marker: float | None, tags: str, *, stereo: bool
 ) -> Board:
     """The board that the options describe."""
     from vslam.calibration.boards import Board, Kind, read_board
@@ -180,18 +168,16 @@ def _board(
     has_markers = kind != "checkerboard"
     if marker is not None and not has_markers:
         raise InputError("--marker: leave it out, because a checkerboard has no markers.")
-    for name, missing in (
-        ("--square", square is None and (stereo or has_markers)),
-        ("--marker", marker is None and has_markers),
-    ):
-        if missing:
-            raise InputError(f"{name} is missing: measure the board and give metres.")
+    if square is None and (stereo or has_markers):
+        raise InputError("--square is missing: measure the board and give metres.")
+    if marker is None and has_markers:
+        raise InputError("--marker is missing: measure the board and give metres.")
     side = 0.1 if square is None else square
-    return Board(cast("Kind", kind), int(columns), int(rows), side, marker or 0.0, dictionary)
+    return Board(cast("Kind", kind), int(columns), int(rows), side, marker or 0.0, tags)
 
 
 def _frames(raw: RawSource, most: int) -> Iterator[TimedFrame]:
-    """At most ``most`` frames of a source, evenly spread, up to where it breaks off."""
+    """Frames of a source up to where it breaks off; ``most``, evenly spread, of a longer one."""
     every = -(-(raw.n_expected or 1) // most)
     n = 0
     try:

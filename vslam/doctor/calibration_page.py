@@ -51,14 +51,8 @@ def findings_of(found: Estimate) -> list[Finding]:
 def write_page(
     found: Estimate, findings: Sequence[Finding], about: str, text: str, path: Path
 ) -> None:
-    """Write a self-contained HTML page.
-
-    Args:
-        found: the estimate.
-        findings: the verdicts on it.
-        about: a line below the title.
-        text: the calibration file.
-        path: the file to write.
+    """Write a self-contained HTML page with ``about`` below its title and the ``text`` of the
+    calibration file.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -67,10 +61,8 @@ def write_page(
     for side, fit in _sides(found):
         m, n = fit.model, len(fit.views)
         focal, error = f"{m.fx:.2f}, {m.fy:.2f} px", f"{_rms(fit.errors):.3f} px"
-        tiles += [
-            Tile(f"{side}focal length".capitalize(), focal, f"{m.width}x{m.height}"),
-            Tile(f"{side}error".capitalize(), error, f"RMS of {n} views"),
-        ]
+        tiles.append(Tile(f"{side}focal length".capitalize(), focal, f"{m.width}x{m.height}"))
+        tiles.append(Tile(f"{side}error".capitalize(), error, f"RMS of {n} views"))
     if found.pair is not None:
         baseline = float(np.linalg.norm(found.pair.T_left_right[:3, 3]))
         tiles.append(Tile("Baseline", f"{baseline:.4f} m", ""))
@@ -99,10 +91,11 @@ def _camera(side: str, fit: CameraFit) -> list[Finding]:
     if n < _FEW_VIEWS:
         fix = f"film the board in at least {_FEW_VIEWS} different places and directions"
         views = Finding(views.check, "fault", f"{views.measured}, too few", fix)
-    cosines = np.abs(fit.T_camera_board[:, 2, 2])
-    tilted = np.count_nonzero(cosines < np.cos(np.radians(_TILT)))
+    facing = np.abs(fit.T_camera_board[:, 2, 2])  # cosine of the angle
+    tilted = int(np.count_nonzero(facing < np.cos(np.radians(_TILT))))
     cells = _cells(fit)
     full = np.bincount(cells, minlength=_CELLS[0] * _CELLS[1]).reshape(_CELLS) > 0
+    share = float(full.mean())
     parts = {"left": full[:2], "right": full[-2:], "top": full[:, :2], "bottom": full[:, -2:]}
     emptiest = min(parts, key=lambda name: float(parts[name].mean()))
     shared = _shared(cells, np.concatenate(fit.residuals))
@@ -114,8 +107,7 @@ def _camera(side: str, fit: CameraFit) -> list[Finding]:
             "film the board tilted by 20 to 45 degrees in all directions",
         ),
         judge(
-            f"{side}coverage", bool(full.mean() < _COVERED),
-            f"corners in {full.mean():.0%} of the image",
+            f"{side}coverage", share < _COVERED, f"corners in {share:.0%} of the image",
             f"film the board in all parts of the image, above all on the {emptiest}",
         ),
         judge(

@@ -12,8 +12,8 @@ The fields of a line, separated by ``|``, are:
   table's row, or for the part of it in backticks; ``$0`` stands for the head of the column;
 - for each cell of the table's row, the columns of the file whose values it must show, rounded as in
   the cell. The last field also applies to all further cells; an empty one is not compared. A filter
-  in parentheses applies to the columns before it. ``mean x`` and ``sum x`` are over all selected
-  rows.
+  in parentheses applies to the columns before it. ``mean x``, ``median x`` and ``sum x`` are over
+  all selected rows.
 
 The line ``-`` skips a row. Before a paragraph, the comment names columns whose values the paragraph
 must mention.
@@ -26,12 +26,13 @@ import re
 from collections.abc import Iterator
 from itertools import zip_longest
 from pathlib import Path
+from statistics import mean, median
 
 COMMENT = re.compile(r"<!-- from:(.*?)-->[ ]*\n", re.DOTALL)
 TABLE = re.compile(r"(--> *\n)?(?:^ *\|.*\n)+?^ *\|[-| :]+\|\n((?:^ *\|.*\n?)+)", re.MULTILINE)
 DECIMAL = re.compile(r"\d\.\d")
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d,]*(?:\.\d+)?")
-OVER_ROWS = {"mean": lambda x: sum(x) / len(x), "sum": sum}
+OVER_ROWS = {"mean": mean, "median": median, "sum": sum}
 
 
 def lines_of(comment: str) -> list[str]:

@@ -87,7 +87,8 @@ class LoopEdge:
         reason: str = "",
         matched_by: Literal["orb", "learned"] = "orb",
     ) -> LoopEdge:
-        """The edge of a candidate that was rejected for a reason, or was not verified yet."""
+        """A loop edge for a rejected candidate, with the reason, or for one that is not verified
+        yet."""
         return cls(
             candidate.query,
             candidate.match,

@@ -393,7 +393,7 @@ class Map:
 
 
 def loop_of_living(map_: Map, loop: LoopEdge) -> LoopEdge:
-    """The same loop between living keyframes: a culled end is replaced by its parent.
+    """The same loop between living keyframes: a culled keyframe is replaced by its parent.
 
     Raises:
         ValueError: the loop has no pose.

@@ -82,8 +82,8 @@ class PoseUncertainty:
 def relative_covariance(
     first: PoseUncertainty, last: PoseUncertainty, T_last_first: Matrix
 ) -> Matrix:
-    """``(6, 6)`` covariance of the motion between two frames of a drive, in the frame of the camera
-    at the last one: the true motion is ``exp(xi) T_last_first``.
+    """``(6, 6)`` covariance of the motion from an earlier to a later frame of a drive, in the frame
+    of the later camera: the true motion is ``exp(xi) T_last_first``.
 
     Args:
         T_last_first: ``(4, 4)`` the estimated motion, which maps points from the first camera to

@@ -332,7 +332,7 @@ class Slam:
 
     def resume_odometry(self, last: TrackResult) -> None:
         """Continue ``T_odom_camera`` and the uncertainty from the last result of a drive that was
-        resumed from a map without the state of tracking; without this call they begin anew."""
+        resumed from a map without the state of tracking. Without this call both start again."""
         self._session.resume_odometry(last)
 
     def finish(self) -> None:

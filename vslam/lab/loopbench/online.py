@@ -27,8 +27,8 @@ from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME
 
 @dataclass(frozen=True)
 class Window:
-    """The newest images, with which a query is not compared: a number of images, or of seconds if
-    ``timed``."""
+    """The most recent images, which are not compared with a query: a number of images, or of
+    seconds if ``timed``."""
 
     amount: float
     timed: bool

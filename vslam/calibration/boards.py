@@ -259,8 +259,7 @@ def _dictionary(name: str) -> Any:
     number = getattr(cv2.aruco, f"DICT_{name}", None)
     if number is None:
         raise InputError(
-            f"--dictionary {name}: OpenCV has no such markers; give a name such as 4X4_50, "
-            "5X5_1000, ARUCO_ORIGINAL or APRILTAG_36H11."
+            f"--dictionary {name}: OpenCV has no such markers; give a name such as 5X5_1000."
         )
     return cv2.aruco.getPredefinedDictionary(number)
 

@@ -59,8 +59,8 @@ class Calibration:
         right: the right camera, or None.
         T_left_right: ``(4, 4)`` float64, maps points of the right camera to the left one; None
             without a right camera.
-        depth_scale: value of one metre in depth images; None if not in the file.
-        virtual_baseline: metres, converts depth to disparity; None if not in the file.
+        depth_scale: value of a depth pixel at one metre; None if the file has none.
+        virtual_baseline: metres, converts depth to disparity; None if the file has none.
         right_delay: seconds by which the right image is taken later than the left one.
         source: file or files that it was read from, for error messages.
     """
@@ -120,8 +120,8 @@ def unproject(model: CameraModel, xy: Array) -> Array:
 
 
 def without_zeros(lens: Lens, distortion: tuple[float, ...]) -> tuple[float, ...]:
-    """The same distortion without trailing zeros, as far as the lens model allows fewer
-    coefficients."""
+    """The same distortion with the fewest coefficients that the lens model allows: without trailing
+    zeros."""
     for n in N_COEFFICIENTS[lens]:
         if n <= len(distortion) and not any(distortion[n:]):
             return distortion[:n]

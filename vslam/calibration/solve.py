@@ -162,6 +162,7 @@ def fit_camera(board: Board, views: Sequence[View], size: Size, lens: Lens) -> C
     Raises:
         InputError: the views are too few or too similar, or the corners are not of this board.
     """
+    points = board_points(board)
     calibrate: Any = cv2.calibrateCamera
     flags, dtype = cv2.CALIB_FIX_K3, "float32"
     if lens == "fisheye":
@@ -170,17 +171,19 @@ def fit_camera(board: Board, views: Sequence[View], size: Size, lens: Lens) -> C
         calibrate = cv2.fisheye.calibrate
 
     def fit(kept: Sequence[int]) -> CameraFit:
-        own = [board_points(board)[views[k].ids] for k in kept]
-        xy = [views[k].xy for k in kept]
-        both = ([each[None].astype(dtype) for each in every] for every in (own, xy))
+        own = [points[views[k].ids][None].astype(dtype) for k in kept]
+        xy = [views[k].xy[None].astype(dtype) for k in kept]
+        threads = cv2.getNumThreads()
+        cv2.setNumThreads(1)  # threads sum in varying order, and equal images must give equal files
         try:
-            _, K, D, turns, shifts = calibrate(*both, size, None, None, flags=flags)
+            _, K, D, turns, shifts = calibrate(own, xy, size, None, None, flags=flags)
         except cv2.error as error:
             raise InputError(
                 f"the {len(kept)} views do not determine a {lens} camera; film the board in more "
                 "places and tilted in more directions, or try the other --lens."
             ) from error
-        # OpenCV's threads sum in varying order; rounding makes equal images give equal numbers.
+        finally:
+            cv2.setNumThreads(threads)
         fx, fy, cx, cy = (round(float(K[at]), 5) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
         distortion = tuple(round(k, 8) for k in np.ravel(D)[:4].tolist())
         model = CameraModel(fx, fy, cx, cy, *size, lens, distortion)
@@ -188,8 +191,8 @@ def fit_camera(board: Board, views: Sequence[View], size: Size, lens: Lens) -> C
         for T, turn, shift in zip(T_camera_board, turns, shifts, strict=True):
             T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
         residuals = tuple(
-            at - project(model, transform(T, p))
-            for T, p, at in zip(T_camera_board, own, xy, strict=True)
+            views[k].xy - project(model, transform(T, points[views[k].ids]))
+            for k, T in zip(kept, T_camera_board, strict=True)
         )
         return CameraFit(model, tuple(views[k] for k in kept), residuals, T_camera_board)
 

@@ -71,8 +71,7 @@ def calibrate(
         Path, option(OUTPUT, "FILE", "Calibration to write, and its page; renames earlier ones.")
     ] = Path("calibration.yaml"),
 ) -> None:
-    """Calibrate a camera or a stereo pair from images of a board; exit code 1 if the result is
-    doubtful."""
+    """Calibrate a camera or stereo pair from images of a board; exit code 1 if it is doubtful."""
     from vslam.calibration.boards import other_board
     from vslam.calibration.files import write_calibration
     from vslam.calibration.solve import estimate
@@ -109,8 +108,7 @@ def calibrate(
         fix = other_board(made, examined) or "apply the fixes above"
         typer.echo(f"Do not use this calibration, because it has faults; {fix}, and try again.")
         raise typer.Exit(1)
-    options = " --side-by-side" if given.side_by_side else ""
-    options += "" if stereo else " --sensor mono"
+    options = " --side-by-side" * given.side_by_side + " --sensor mono" * (not stereo)
     typer.echo("Next, with a drive:")
     for command in ("doctor", "run"):
         typer.echo(f"  vslam {command} DRIVE{options} --calib {shlex.quote(str(out))}")

@@ -250,8 +250,8 @@ def _associate(estimate: Trajectory, ground_truth: Trajectory) -> tuple[Trajecto
     if not matched:
         raise InputError(
             f"none of the {len(estimate)} poses lies within {1000 * MAX_TIME_DIFFERENCE_S:.0f} ms "
-            f"of one of the ground truth's {len(ground_truth)}; compare files of the same sequence "
-            "and clock."
+            f"of any of the {len(ground_truth)} poses of the ground truth; compare files of the "
+            "same sequence and clock."
         )
     return estimate.select(np.array(matched)), ground_truth.select(np.array(true))
 

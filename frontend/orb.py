@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import OrbConfig
-from vslam.features import Pyramid
+from vslam.features import Pyramid, level_of
 from vslam.frontend.corners import fast_scores, local_maxima, spread
 from vslam.kernels import borrowed, inner_kernel, kernel
 
@@ -196,7 +196,7 @@ def extract_levels(
     for level in range(len(shapes)):
         height, width = shapes[level]
         first = offsets[level]
-        image = pixels[first : first + height * width].reshape(height, width)
+        image = level_of(pixels, offsets, shapes, level)
         here = allowed[first : first + height * width]
         corners = detect_corners(image, here, quota[level], threshold, threshold_min, cell)
         if len(corners) == 0:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera
 from vslam.config import StereoConfig
-from vslam.features import Features, level_pixel
+from vslam.features import Features, level_of, level_pixel
 from vslam.frontend.orb import Extraction
 from vslam.geometry import Matrix
 from vslam.image_motion import rays, row_speeds
@@ -70,8 +70,8 @@ def _row_offsets(xy, octave, u_right, pixels_l, pixels_r, offsets, shapes, half)
             continue
         level = octave[i]
         height, width = shapes[level]
-        image_l = pixels_l[offsets[level] : offsets[level] + height * width].reshape(height, width)
-        image_r = pixels_r[offsets[level] : offsets[level] + height * width].reshape(height, width)
+        image_l = level_of(pixels_l, offsets, shapes, level)
+        image_r = level_of(pixels_r, offsets, shapes, level)
         ratio_x, ratio_y = shapes[0, 1] / width, shapes[0, 0] / height
         x, y = level_pixel(xy[i, 0], ratio_x), level_pixel(xy[i, 1], ratio_y)
         dx = (u_right[i] - xy[i, 0]) / ratio_x

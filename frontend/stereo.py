@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera
 from vslam.config import StereoConfig
-from vslam.features import MIN_DISPARITY, level_pixel
+from vslam.features import MIN_DISPARITY, level_of, level_pixel
 from vslam.frontend.orb import Extraction
 from vslam.kernels import hamming, inline, inner_kernel, kernel
 
@@ -120,8 +120,8 @@ def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, ha
             continue
         level = octave_l[i]
         height, width = shapes[level]
-        image_l = pixels_l[offsets[level] : offsets[level] + height * width].reshape(height, width)
-        image_r = pixels_r[offsets[level] : offsets[level] + height * width].reshape(height, width)
+        image_l = level_of(pixels_l, offsets, shapes, level)
+        image_r = level_of(pixels_r, offsets, shapes, level)
         ratio_x, ratio_y = shapes[0, 1] / width, shapes[0, 0] / height
         x_l, y_l = level_pixel(u, ratio_x), level_pixel(v, ratio_y)
         x_r = level_pixel(xy_r[best, 0], ratio_x)

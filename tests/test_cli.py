@@ -433,7 +433,7 @@ def pipeline(monkeypatch) -> SimpleNamespace:
             compared=tuple(replace(one, trajectory=shaken(one.trajectory)) for one in compared),
         )  # fmt: skip
 
-    def draw_figures(outcome, evaluation, ground_truth, verdict):
+    def draw_figures(outcome, evaluation, verdict):
         calls.evaluation, calls.outcome = evaluation, outcome
         return []  # drawing takes a second
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.geometry import inverse
-from vslam.kernels import inner_kernel, kernel
+from vslam.kernels import inline, inner_kernel, kernel
 from vslam.odometry import PoseUncertainty
 
 MIN_DISPARITY = 0.01  # pixels; smaller disparities are clamped to this
@@ -42,6 +42,14 @@ class Pyramid:
         height, width = self.shapes[index]
         start = self.offsets[index]
         return self.pixels[start : start + height * width].reshape(height, width)
+
+
+@inline
+def level_of(pixels, offsets, shapes, level):
+    """``Pyramid.level`` in a kernel."""
+    height, width = shapes[level]
+    start = offsets[level]
+    return pixels[start : start + height * width].reshape(height, width)
 
 
 @inner_kernel

@@ -23,6 +23,7 @@ from vslam.backend.pose_graph import (
     check_pose_graph,
     essential_graph,
     optimise,
+    parts_of,
 )
 from vslam.backend.similarity_graph import (
     check_similarity_graph,
@@ -106,10 +107,8 @@ def solve(
 def joined_submaps(map_: Map, closed: Sequence[LoopEdge]) -> NDArray[np.int64]:
     """``(n_keyframes,)`` sub-map of each keyframe; sub-maps joined by closed loops count as one."""
     submap = map_.submaps()
-    for edge in closed:
-        one, other = submap[edge.query], submap[edge.match]
-        submap[submap == max(one, other)] = min(one, other)
-    return submap
+    ends = np.array([(edge.query, edge.match) for edge in closed], np.int64).reshape(-1, 2)
+    return parts_of(submap[ends], len(submap))[submap]
 
 
 def _aligned(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:

@@ -25,14 +25,11 @@ if TYPE_CHECKING:
 
 
 def explorer(
-    outcome: RunOutcome,
-    evaluation: Evaluation | None,
-    ground_truth: Trajectory | None,
-    moments: Collection[Moment],
+    outcome: RunOutcome, evaluation: Evaluation | None, moments: Collection[Moment]
 ) -> list[Section]:
     """The section with the explorer, or none if fewer than two frames were tracked. The arguments
     are those of :func:`explorer_data`."""
-    data = explorer_data(outcome, evaluation, ground_truth, moments)
+    data = explorer_data(outcome, evaluation, moments)
     if data is None:
         return []
     program = files("vslam.report").joinpath("explorer.js").read_text("utf-8")
@@ -42,10 +39,7 @@ def explorer(
 
 
 def explorer_data(
-    outcome: RunOutcome,
-    evaluation: Evaluation | None,
-    ground_truth: Trajectory | None,
-    moments: Collection[Moment],
+    outcome: RunOutcome, evaluation: Evaluation | None, moments: Collection[Moment]
 ) -> dict[str, Any] | None:
     """Numbers and images for ``explorer.js``, ready for JSON; None if fewer than two frames were
     tracked.
@@ -56,7 +50,6 @@ def explorer_data(
     Args:
         outcome: the run.
         evaluation: errors of ``outcome.trajectory``, or None.
-        ground_truth: ground truth of the evaluated frames, or None.
         moments: images from a `vslam.run.moments.MomentRecorder`.
     """
     n = len(outcome.trajectory)
@@ -65,11 +58,11 @@ def explorer_data(
     times = outcome.trajectory.timestamps
     T_wc, errors = outcome.trajectory.T_wc, np.full(n, np.nan)
     truth = np.zeros((0, 3))
-    if evaluation is not None and ground_truth is not None:
+    if evaluation is not None and outcome.ground_truth is not None:
         at = np.searchsorted(times, evaluation.timestamps).clip(0, n - 1)
         errors[at] = evaluation.errors_m
         if evaluation.frames == n:  # otherwise only a part of the path has been aligned
-            T_wc, truth = evaluation.T_wc_aligned, ground_truth.T_wc[:, :3, 3]
+            T_wc, truth = evaluation.T_wc_aligned, outcome.ground_truth.T_wc[:, :3, 3]
     states = sorted({str(track.state) for track in outcome.tracks})
     floats = {
         "t": times - times[0],

@@ -34,7 +34,6 @@ from vslam.report.drawing import (
 from vslam.report.summary import stage_names
 from vslam.report.trajectory_figures import gps_map, loop_closing, top_view
 from vslam.run.outcome import RunOutcome
-from vslam.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,27 +44,20 @@ _MAX_BINS = 240  # of the stacked times, so that a bin is one or two pixels wide
 
 
 def draw_figures(
-    outcome: RunOutcome,
-    evaluation: Evaluation | None,
-    ground_truth: Trajectory | None,
-    verdict: LoopEvaluation | None,
+    outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
 ) -> list[page.Figure]:
     """Draw all figures for which this run has data, in the order of the report.
 
     Args:
         outcome: the run.
         evaluation: errors of ``outcome.trajectory``, or None.
-        ground_truth: ground truth of the evaluated frames, or None.
         verdict: evaluation of ``outcome.loops``, or None.
     """
-    return draw(_drawings(outcome, evaluation, ground_truth, verdict))
+    return draw(_drawings(outcome, evaluation, verdict))
 
 
 def _drawings(
-    outcome: RunOutcome,
-    evaluation: Evaluation | None,
-    ground_truth: Trajectory | None,
-    verdict: LoopEvaluation | None,
+    outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
 ) -> Iterator[Drawing]:
     if len(outcome.trajectory) and (outcome.n_tracked or not outcome.tracks):
         caption = "Seen from above, at equal scale; z points ahead of the first camera."
@@ -73,7 +65,7 @@ def _drawings(
             caption += f" Estimate after {evaluation.alignment.upper()} alignment."
         if outcome.compared:
             caption += " Dashed: the detectors of --compare, each after its own alignment."
-        yield "top_view", caption, top_view(outcome, evaluation, ground_truth, verdict)
+        yield "top_view", caption, top_view(outcome, evaluation, verdict)
     if (track := outcome.gps_track) is not None:
         caption = (
             "Seen from above, in metres from the first fix: the trajectory by vision alone, "
@@ -86,7 +78,7 @@ def _drawings(
             "the two keyframes of each loop before its correction; its length is the drift that "
             "the correction removed."
         )
-        yield "loop_closing", caption, loop_closing(outcome, evaluation, ground_truth)
+        yield "loop_closing", caption, loop_closing(outcome, evaluation)
     if evaluation is not None:
         yield (
             "error_along_path",
@@ -94,8 +86,8 @@ def _drawings(
             _error_along_path(outcome, evaluation),
         )
         yield "error_histogram", "Number of frames by error.", _error_histogram(evaluation)
-    if ground_truth is not None and not outcome.sequence.camera.monocular:
-        errors = motion_errors(outcome.tracks, ground_truth, _MOTION_S)
+    if outcome.ground_truth is not None and not outcome.sequence.camera.monocular:
+        errors = motion_errors(outcome.tracks, outcome.ground_truth, _MOTION_S)
         if len(errors.first) > 1:
             yield (
                 "odometry_error",

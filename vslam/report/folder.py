@@ -21,12 +21,7 @@ from vslam.maps.storage import save_map
 from vslam.report.frame_table import write_covariances, write_frames
 from vslam.report.schema import ReportJson
 from vslam.report.summary import evaluate_run, gps_figures, summarize
-from vslam.run.outcome import (
-    RunOutcome,
-    causal_trajectory,
-    matched_ground_truth,
-    odometry_trajectory,
-)
+from vslam.run.outcome import RunOutcome, causal_trajectory, odometry_trajectory
 from vslam.trajectory import write_kitti, write_tum
 
 if TYPE_CHECKING:
@@ -263,7 +258,7 @@ def write_trajectories(written: Results, outcome: RunOutcome) -> None:
         write_tum(file, outcome.trajectory)
     ground_truth = None
     with written.part("the ground truth"):
-        ground_truth = matched_ground_truth(outcome)
+        ground_truth = outcome.ground_truth
     if ground_truth is None:
         return
     if len(ground_truth) == len(outcome.trajectory):
@@ -301,11 +296,10 @@ def _write_pages(
     from vslam.report.render import html, markdown
     from vslam.report.run_page import run_page
 
-    truth = matched_ground_truth(outcome)
     figures: list[Figure] = []
     seen: list[Figure] = []
     with written.file("figures") as file:
-        drawn = draw_figures(outcome, evaluation, truth, verdict)
+        drawn = draw_figures(outcome, evaluation, verdict)
         figures = [replace(figure, file=f"figures/{figure.name}.png") for figure in drawn]
         seen = seen_loops(report, pictures)
         file.mkdir(exist_ok=True)
@@ -316,6 +310,6 @@ def _write_pages(
         page = run_page(report, figures, seen, recordings)
         file.write_text(markdown(page), encoding="utf-8")
     with written.file("report.html") as file:
-        sections = explorer(outcome, evaluation, truth, moments)
+        sections = explorer(outcome, evaluation, moments)
         page = run_page(report, figures, seen, recordings, sections, _config_text(outcome))
         file.write_text(html(page), encoding="utf-8")

@@ -31,7 +31,7 @@ from vslam.report.schema import (
     RevisitEntry,
     StageTime,
 )
-from vslam.run.outcome import RunOutcome, causal_trajectory, matched_ground_truth
+from vslam.run.outcome import RunOutcome, causal_trajectory
 
 _OPTIONS = (
     "perturb", "detector", "seed", "threads", "start", "every", "max_frames", "weights",
@@ -109,7 +109,7 @@ def summarize(
 def _scale_warnings(outcome: RunOutcome, evaluation: Evaluation | None) -> list[str]:
     """A warning if the trajectory of a sensor that knows the scale fits the ground truth only after
     it is scaled."""
-    camera, ground_truth = outcome.sequence.camera, matched_ground_truth(outcome)
+    camera, ground_truth = outcome.sequence.camera, outcome.ground_truth
     if evaluation is None or ground_truth is None or camera.monocular:
         return []
     estimate, truth = (
@@ -152,7 +152,7 @@ def _longest_loss_s(tracks: list[TrackResult]) -> float:
 
 def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
     """The errors of a run's final trajectory, or None, and a remark if not all frames count."""
-    ground_truth = matched_ground_truth(outcome)
+    ground_truth = outcome.ground_truth
     if ground_truth is None:
         return None, "no ground truth"
     if not outcome.tracks:
@@ -168,7 +168,7 @@ def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
 
 def causal_ate(outcome: RunOutcome) -> float | None:
     """ATE of the poses as first estimated; None if it cannot be computed."""
-    ground_truth = matched_ground_truth(outcome)
+    ground_truth = outcome.ground_truth
     if ground_truth is None or not outcome.tracks:
         return None
     try:
@@ -233,7 +233,7 @@ def gps_figures(outcome: RunOutcome) -> GpsFigures | None:
     """The georeferenced trajectory in numbers; None without GPS."""
     if (track := outcome.gps_track) is None:
         return None
-    ate, ground_truth = None, matched_ground_truth(outcome)
+    ate, ground_truth = None, outcome.ground_truth
     if ground_truth is not None:
         with suppress(InputError):
             ate = evaluate_trajectory(track.trajectory, ground_truth, "se3").ate_rmse_m

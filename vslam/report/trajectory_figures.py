@@ -41,19 +41,13 @@ Points = NDArray[np.float64]
 
 
 def top_view(
-    outcome: RunOutcome,
-    evaluation: Evaluation | None,
-    ground_truth: Trajectory | None,
-    verdict: LoopEvaluation | None,
+    outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
 ) -> Figure:
     """Estimate, ground truth, weak and lost frames, closed loops and missed revisits. The estimates
     of the detectors of --compare are dashed, each after its own alignment."""
     figure, axes = _new_map("Top view", outcome, evaluation)
     path = _aligned(outcome, evaluation, outcome.trajectory.T_wc[:, :3, 3])
     x, z = path[:, 0], path[:, 2]
-    if evaluation is not None and ground_truth is not None:
-        truth = ground_truth.T_wc[:, :3, 3]
-        axes.plot(truth[:, 0], truth[:, 2], color=GREY, linewidth=3.4, alpha=0.65, label="truth")
     name = outcome.settings.detector if outcome.compared else "estimate"
     axes.plot(x, z, color=BLUE, label=name)
     for k, (other, color) in enumerate(zip(outcome.compared, cycle(COMPARED), strict=False)):
@@ -105,18 +99,13 @@ def top_view(
     return figure
 
 
-def loop_closing(
-    outcome: RunOutcome, evaluation: Evaluation | None, ground_truth: Trajectory | None
-) -> Figure:
+def loop_closing(outcome: RunOutcome, evaluation: Evaluation | None) -> Figure:
     """Keyframes before the first correction and at the end, in the frame of the ground truth.
 
     Both are transformed by the alignment of the final trajectory, so that every difference between
     them is the effect of loop closing.
     """
     figure, axes = _new_map("Map before and after loop closing", outcome, evaluation)
-    if evaluation is not None and ground_truth is not None:
-        truth = ground_truth.T_wc[:, :3, 3]
-        axes.plot(truth[:, 0], truth[:, 2], color=GREY, linewidth=3.4, alpha=0.65, label="truth")
     before = _aligned(outcome, evaluation, _centres(outcome.corrections[0].T_cw_before))
     after = _aligned(outcome, evaluation, outcome.keyframes.T_wc[:, :3, 3])
     for points, color, label in ((before, AMBER, "before"), (after, BLUE, "after")):
@@ -162,7 +151,11 @@ def gps_map(track: GpsTrack) -> Figure:
 def _new_map(title: str, outcome: RunOutcome, evaluation: Evaluation | None) -> tuple[Figure, Axes]:
     monocular = outcome.sequence.camera.monocular
     unit = "map units" if monocular and evaluation is None else "m"
-    return new_figure(title, f"x ({unit})", f"z ({unit})", SQUARE)
+    figure, axes = new_figure(title, f"x ({unit})", f"z ({unit})", SQUARE)
+    if evaluation is not None and outcome.ground_truth is not None:
+        truth = outcome.ground_truth.T_wc[:, :3, 3]
+        axes.plot(truth[:, 0], truth[:, 2], color=GREY, linewidth=3.4, alpha=0.65, label="truth")
+    return figure, axes
 
 
 def _centres(T_cw: NDArray[np.float64]) -> Points:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -99,6 +100,15 @@ class RunOutcome:
         found = (TrackingState.OK, TrackingState.WEAK)
         return sum(track.state in found for track in self.tracks)
 
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:
+        """The ground truth of the frames of the trajectory; None if there is none."""
+        truth = ground_truth_of(self.sequence)
+        if truth is None:
+            return None
+        done = np.isin(truth.timestamps, self.trajectory.timestamps)
+        return truth.select(np.flatnonzero(done))
+
 
 def causal_trajectory(tracks: list[TrackResult]) -> Trajectory:
     """The pose of each frame as it was tracked, without later corrections by bundle adjustment or
@@ -122,12 +132,3 @@ def ground_truth_of(source: Source) -> Trajectory | None:
         return None
     known = np.flatnonzero(np.isfinite(source.ground_truth).all((1, 2)))
     return Trajectory(source.timestamps, source.ground_truth).select(known)
-
-
-def matched_ground_truth(outcome: RunOutcome) -> Trajectory | None:
-    """The ground truth of the frames of ``outcome.trajectory``; None if there is none."""
-    truth = ground_truth_of(outcome.sequence)
-    if truth is None:
-        return None
-    done = np.isin(truth.timestamps, outcome.trajectory.timestamps)
-    return truth.select(np.flatnonzero(done))

@@ -18,7 +18,6 @@ from vslam.evaluation.trajectories import Evaluation
 from vslam.report.page import Markup, Section
 from vslam.report.render import fill_template
 from vslam.run.outcome import RunOutcome
-from vslam.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from vslam.run.moments import Moment

@@ -30,7 +30,6 @@ from vslam.report.drawing import (
 )
 from vslam.report.summary import evaluate_run
 from vslam.run.outcome import RunOutcome
-from vslam.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -52,9 +52,8 @@ def doctor(
     """Check images, calibration and time stamps before a run; the exit code is 1 if there is a
     fault."""
     from vslam.datasets.frames import first_frames
-    from vslam.doctor.examine import Diagnosis, examine
+    from vslam.doctor.examine import Diagnosis, examine, write_page
     from vslam.doctor.findings import Finding, lines
-    from vslam.doctor.page import write_page
 
     require_data(given)
     thresholds = read_thresholds(config)

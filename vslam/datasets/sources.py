@@ -28,8 +28,8 @@ class SourceOptions(BaseModel):
     Attributes:
         data: folder, file, device number or URL; for a depth camera, its serial number, or empty
             for the first one found; ignored for rendered towns.
-        dataset: one of `vslam.datasets.known_datasets` or of `SOURCES`; None detects it from
-            ``data``.
+        dataset: one of `vslam.datasets.DATASETS` or of `SOURCES`, or a data set of a plug-in; None
+            detects it from ``data``.
         seq: name of the sequence of a data set; None as for `vslam.datasets.open_sequence`.
         calib: calibration files, see `vslam.calibration.files.read_calibration`.
         right: folder of the right images.

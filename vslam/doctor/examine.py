@@ -1,8 +1,10 @@
-"""Examination of a sequence: all its timestamps, and a few frames spread over it."""
+"""Examination of a sequence: all its timestamps, and a few frames spread over it. The result is a
+table of findings, and pictures."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,10 +14,12 @@ from vslam.camera import Camera, DepthImage, Image
 from vslam.config import OrbConfig
 from vslam.datasets.frames import Source
 from vslam.doctor import checks
-from vslam.doctor.findings import Finding, judge
+from vslam.doctor.findings import Finding, judge, sections
 from vslam.doctor.focal_length import Moved, fit_focal_length
 from vslam.doctor.matching import Matches, joined, match_images
-from vslam.errors import UnreadableImageError
+from vslam.errors import UnreadableImageError, counted, write_file
+from vslam.report.page import Figure, Page, Section
+from vslam.report.render import html
 
 _FRAMES = 8  # examined frames, spread over the sequence
 _LAGS = range(-2, 3)  # delays of the right image in frames that are tried
@@ -264,3 +268,27 @@ def _depth_picture(image: Image, depth: checks.Depth) -> Picture:
     drawn[checks.depth_edges(np.nan_to_num(depth.astype(np.float32)))] = _RED
     caption = "Depth edges in red; they lie on the edges of objects if the depth is registered."
     return Picture(caption, np.asarray(drawn, np.uint8))
+
+
+def write_page(diagnosis: Diagnosis, title: str, path: Path) -> None:
+    """Write the page as self-contained HTML: faults with their fixes first, then the other checks.
+
+    Raises:
+        ResultsError: the file cannot be written.
+    """
+    faults = len(diagnosis.faults)
+    figures = [
+        Figure(f"picture-{k}", picture.caption, _jpeg(picture))
+        for k, picture in enumerate(diagnosis.pictures)
+    ]
+    page = Page(
+        title,
+        [counted(faults, "fault") if faults else "no faults"],
+        [*sections(diagnosis.findings), Section("", figures)],
+    )
+    write_file(path, html(page), "name another file with --out")
+
+
+def _jpeg(picture: Picture) -> bytes:
+    data = cv2.imencode(".jpg", picture.image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
+    return bytes(data.tobytes())

@@ -27,7 +27,7 @@ from vslam.machine import give_back_memory, peak_memory_mb, process_age
 from vslam.map import Map
 from vslam.maps.storage import made_with
 from vslam.plugins import reason
-from vslam.run.autosave import NO_AUTOSAVE, Autosave, Unfinished
+from vslam.run.autosave import Autosave, Unfinished
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome, causal_trajectory, ground_truth_of
 from vslam.run.preparation import Played, PreparedFrame, at_their_times
@@ -53,7 +53,7 @@ def run_sequence(
     recorder: Recorder,
     *,
     on_frame: Callable[[TrackResult], None] = lambda result: None,
-    autosave: Autosave = NO_AUTOSAVE,
+    autosave: Autosave | None = None,
     resume: Unfinished | None = None,
     slam: Slam | None = None,
 ) -> RunOutcome:
@@ -73,7 +73,7 @@ def run_sequence(
     them, because their maps were not saved.
 
     Args:
-        autosave: saves the state of the run at intervals.
+        autosave: saves the state of the run at intervals; None saves nothing.
         resume: the saved state of an unfinished run. This run continues at the next frame, and its
             outcome covers both parts.
         slam: the result of ``begin`` for the same settings, if it was already called.
@@ -105,11 +105,13 @@ def run_sequence(
                 result = main.step(played)
                 if (frame := played.prepared) is not None and frame.problem and not frame.dropped:
                     _log.warning("frame %d skipped: %s", result.index, frame.problem)
-                autosave.frame(result)
+                if autosave is not None:
+                    autosave.frame(result)
                 if result.state != TrackingState.DROPPED:
                     n_recorded = _record_frame(recorder, slam, result, played, n_recorded)
                 on_frame(result)
-                autosave.offer(slam, main.so_far)
+                if autosave is not None:
+                    autosave.offer(slam, main.so_far)
                 for other in others:
                     if other.problem is None:
                         with other.recording_failure(f"frame {result.index}"):
@@ -130,7 +132,8 @@ def run_sequence(
         if not end_reasons and main.problem:
             end_reasons.append(main.problem)
         with main.recording_failure("saving the map"):
-            autosave.close(slam, main.so_far, resumable=bool(end_reasons) and main.has_map)
+            if autosave is not None:
+                autosave.close(slam, main.so_far, resumable=bool(end_reasons) and main.has_map)
     seconds = main.seconds()
     give_back_memory()  # writing the results needs memory: the map is copied first
     with main.recording_failure("the final trajectory"):

@@ -120,7 +120,9 @@ class FrameImages:
             self._second = self._read_second()
         except UnreadableImageError as error:
             self.problem = str(error)
-        found = find_corners(self.left, self._second, self._context, self._image_map, self.mask)
+        found = find_corners(
+            self.left, self._second, self._context, self._image_map, self.mask, self.pyramid
+        )
         self.sides = found.sides
         return found
 
@@ -131,6 +133,7 @@ def find_corners(
     context: TrackingContext,
     image_map: ImageMap = map,
     mask: Mask | None = None,
+    pyramid: Pyramid | None = None,
 ) -> Corners:
     """The first step of extraction: the features of each image. If the left image is black, only
     the right image is used, and its features have no stereo match.
@@ -142,13 +145,14 @@ def find_corners(
         mask: the mask of the image whose features are tracked: the left one, or the right one if
             the left one is black. For stereo matching the right image needs no mask, because masked
             pixels of the left image have no features to match.
+        pyramid: the pyramid of the left image, if it has already been built.
     """
     camera, config = context.camera, context.config
     allowed = None if mask is None else mask.levels
     if second is None:
-        return _corners_alone(left, context, Side.LEFT, allowed)
+        return _corners_alone(left, context, Side.LEFT, allowed, pyramid)
     if camera.depth:
-        (found,) = extract_in_any_light([left], config, allowed=allowed)
+        (found,) = extract_in_any_light([left], config, allowed=allowed, pyramid=pyramid)
         return Corners(found, depth=np.asarray(second, np.float32))
     right_image = np.asarray(second, np.uint8)
     sides = compare_sides(left, right_image, config.stereo)
@@ -156,7 +160,8 @@ def find_corners(
         alone = _corners_alone(right_image, context, Side.RIGHT, allowed)
         return alone._replace(sides=sides)
     pair = balanced(left, right_image, sides)
-    found, right = extract_in_any_light(pair, config, image_map, allowed)
+    built = pyramid if pair[0] is left else None  # it may have been brightened
+    found, right = extract_in_any_light(pair, config, image_map, allowed, built)
     return Corners(found, right, sides=sides)
 
 
@@ -187,9 +192,13 @@ def matched(
 
 
 def _corners_alone(
-    image: Image, context: TrackingContext, side: Side, allowed: Pyramid | None
+    image: Image,
+    context: TrackingContext,
+    side: Side,
+    allowed: Pyramid | None,
+    pyramid: Pyramid | None = None,
 ) -> Corners:
-    (found,) = extract_in_any_light([image], context.config, allowed=allowed)
+    (found,) = extract_in_any_light([image], context.config, allowed=allowed, pyramid=pyramid)
     return Corners(found, side=side)
 
 

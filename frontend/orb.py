@@ -46,7 +46,10 @@ class Extraction:
 
 
 def extract(
-    image: NDArray[np.uint8], config: OrbConfig, allowed: Pyramid | None = None
+    image: NDArray[np.uint8],
+    config: OrbConfig,
+    allowed: Pyramid | None = None,
+    pyramid: Pyramid | None = None,
 ) -> Extraction:
     """Extract up to ``config.n_features`` ORB features from an ``(H, W)`` uint8 image.
 
@@ -54,8 +57,9 @@ def extract(
 
     Args:
         allowed: 1 for pixels where a corner may lie, 0 for the others; None allows all pixels.
+        pyramid: the pyramid of the image, if it has already been built.
     """
-    pyramid = build_pyramid(image, config)
+    pyramid = pyramid or build_pyramid(image, config)
     xy, octave, angle, descriptors = extract_levels(
         pyramid.pixels,
         pyramid.offsets,

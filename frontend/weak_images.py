@@ -38,6 +38,7 @@ def extract_in_any_light(
     config: Config,
     image_map: ImageMap = map,
     allowed: Pyramid | None = None,
+    pyramid: Pyramid | None = None,
 ) -> list[Extraction]:
     """Extract the ORB features of ``(H, W)`` uint8 images that were taken at the same time. Noisy
     images are filtered first, and the contrast of faint ones is raised. All images are processed in
@@ -47,11 +48,13 @@ def extract_in_any_light(
         image_map: applies a function to all images, one after the other or in parallel; the result
             is the same.
         allowed: where the first image may have corners, see ``extract``.
+        pyramid: the pyramid of the first image, if it has already been built.
     """
-    weak = config.weak_images
+    weak, first = config.weak_images, images[0]
 
     def found_in(image: Grey) -> Extraction:
-        return extract(image, config.orb, allowed if image is images[0] else None)
+        built = pyramid if image is first else None
+        return extract(image, config.orb, allowed if image is images[0] else None, built)
 
     images = without_noise(images, weak)
     found = list(image_map(found_in, images))

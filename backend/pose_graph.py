@@ -78,8 +78,6 @@ def essential_graph(
     loops: Collection[LoopEdge],
     config: PoseGraphConfig,
     *,
-    weak: Collection[int] = (),
-    unpredicted: Collection[int] = (),
     driven: bool = False,
 ) -> PoseGraph:
     """The essential graph of a map, to be built *before* the new loop changes the map.
@@ -93,13 +91,11 @@ def essential_graph(
     culled, the living keyframe that its pose is stored relative to takes its place. If several
     loops then connect the same keyframes, only the last one is used.
 
+    A tree edge across a restart of the map, whose ends share hardly any landmarks, was not measured
+    but predicted. If there was no prediction either, it is always WEAK.
+
     Args:
         loops: all closed loops, the new one last; each has a pose.
-        weak: keyframes at which the map was restarted after tracking was lost, including culled
-            ones. A tree edge across such a restart, whose ends share hardly any landmarks, was not
-            measured but predicted.
-        unpredicted: restarts for which there was no prediction either; tree edges across them are
-            always WEAK.
         driven: whether the camera is on a vehicle. If so, a predicted edge is trusted as far as the
             motion of a car can be predicted over that time (GAP); otherwise the camera may have
             been carried anywhere (WEAK).
@@ -115,7 +111,8 @@ def essential_graph(
     seen = set(map(tuple, pairs.tolist()))
     # The kind of each edge by its two ends; later entries overwrite earlier ones.
     kind = dict.fromkeys(map(tuple, pairs[shared >= config.min_shared].tolist()), COVISIBLE)
-    restarts, unpredicted_restarts = (np.array(sorted(k), np.int64) for k in (weak, unpredicted))
+    restarts = np.array(map_.restarts, np.int64)
+    unpredicted_restarts = np.array(map_.unpredicted_restarts, np.int64)
     for child, parent in zip(living.tolist(), map_.parents[living].tolist(), strict=True):
         if parent >= 0:
             pair = (min(parent, child), max(parent, child))

@@ -188,11 +188,11 @@ def _read_config(folder: Path) -> None:
 
 def _read_report(folder: Path) -> None:
     from vslam.lab.overview.render import write_overview
-    from vslam.report.finished_run import read_report
     from vslam.report.render import html, markdown
     from vslam.report.run_page import run_page
+    from vslam.report.schema import ReportJson
 
-    report = read_report(folder)
+    report = ReportJson.read(folder / "report.json")
     page = run_page(report)
     html(page)
     markdown(page)

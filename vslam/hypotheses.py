@@ -83,14 +83,7 @@ def solve(
         monocular: optimise similarities, because scale drifts, too.
     """
     predicted = hypothesis is Hypothesis.PREDICTED
-    graph = essential_graph(
-        map_,
-        [*closed, edge],
-        config,
-        weak=map_.restarts,
-        unpredicted=map_.unpredicted_restarts,
-        driven=predicted,
-    )
+    graph = essential_graph(map_, [*closed, edge], config, driven=predicted)
     T_cw = map_.arrays.T_cw[: map_.n_keyframes]
     if monocular:
         S_wc = inverses(T_cw) if predicted else _aligned_similarities(map_, closed, edge)

@@ -223,15 +223,16 @@ def _beside(run: Path, name: str) -> Path:
 
 def _graph(run: Path) -> tuple[PoseGraph, Map]:
     """The pose graph of a run, or of a map file with the default weights."""
-    from vslam.config import Config
+    from vslam.backend.pose_graph import essential_graph
+    from vslam.config import Config, load_config
     from vslam.maps.storage import load_map
-    from vslam.report.finished_run import graph_of_map, pose_graph, read_run
+    from vslam.report.finished_run import read_run
 
-    if run.is_file():
-        stored = load_map(run)
-        return graph_of_map(stored.map, stored.loops, Config()), stored.map
-    finished = read_run(run)
-    return pose_graph(finished), finished.map
+    is_file = run.is_file()
+    stored = load_map(run) if is_file else read_run(run)
+    config = Config() if is_file else load_config(run / "config.json")
+    graph = essential_graph(stored.map, stored.loops, config.pose_graph, driven=True)
+    return graph, stored.map
 
 
 def _reconstruction_of_file(path: Path) -> Reconstruction:

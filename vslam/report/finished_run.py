@@ -1,15 +1,13 @@
-"""Read the folder of a finished run: its map, images and pose graph."""
+"""Read the folder of a finished run: its map and images."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 
-from vslam.backend.pose_graph import PoseGraph, essential_graph
 from vslam.camera import Camera, same_camera
-from vslam.config import Config, load_config
 from vslam.datasets.frames import Source, TimedFrame, frames_at
 from vslam.datasets.sources import LIVE, open_source
 from vslam.errors import InputError
@@ -48,16 +46,9 @@ def read_run(folder: Path | str) -> FinishedRun:
     stored = load_map(folder / "map.npz")
     if not stored.map.n_keyframes:
         raise InputError(f"{folder / 'map.npz'}: the map is empty; name a run that has one.")
-    return FinishedRun(folder, read_report(folder), stored.map, stored.camera, stored.loops)
-
-
-def read_report(folder: Path | str) -> ReportJson:
-    """Read ``report.json`` of a run.
-
-    Raises:
-        InputError: it is missing, damaged or of another version of vslam.
-    """
-    return ReportJson.read(Path(folder) / "report.json")
+    return FinishedRun(
+        folder, ReportJson.read(folder / "report.json"), stored.map, stored.camera, stored.loops
+    )
 
 
 def open_images(
@@ -108,27 +99,4 @@ def _other_images(run: FinishedRun) -> InputError:
     return InputError(
         f"{run.report.dataset} {run.report.sequence}: the times or the camera differ from those of "
         f"{run.folder}; use --data to name the data that the run was made on."
-    )
-
-
-def pose_graph(run: FinishedRun) -> PoseGraph:
-    """The essential graph of a run's final map, with its measured loop edges and the weights that
-    the run used.
-
-    Raises:
-        InputError: the run's thresholds cannot be read.
-    """
-    config = load_config(run.folder / "config.json")
-    return graph_of_map(run.map, run.loops, config)
-
-
-def graph_of_map(map_: Map, loops: Collection[LoopEdge], config: Config) -> PoseGraph:
-    """The essential graph of a finished map."""
-    return essential_graph(
-        map_,
-        loops,
-        config.pose_graph,
-        weak=map_.restarts,
-        unpredicted=map_.unpredicted_restarts,
-        driven=True,
     )

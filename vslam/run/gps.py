@@ -59,10 +59,7 @@ def locate(stored: StoredMap, fixes: Fixes, config: PoseGraphConfig) -> GpsTrack
     T_c_reference = table.T_c_reference.copy()
     T_c_reference[:, :3, 3] *= growth[:, None]
     table = table._replace(T_c_reference=T_c_reference)
-    graph = essential_graph(
-        map_, stored.loops, config, weak=map_.restarts, unpredicted=map_.unpredicted_restarts,
-        driven=True,
-    )  # fmt: skip
+    graph = essential_graph(map_, stored.loops, config, driven=True)
     positions, datum = _positions(table, map_.arrays.T_cw[: map_.n_keyframes], fixes)
     metric = not stored.camera.monocular
     found = anchor(graph, map_.timestamps[: map_.n_keyframes], positions, config, metric=metric)

@@ -133,38 +133,6 @@ def close_ratio(state: PolicyState, tracked_close: int, frame: int) -> float:
     return float(share ** (1 / max(1, frame - state.first_frame)))
 
 
-@dataclass(frozen=True)
-class PlaceEvidence:
-    """How well the map already covers a place that a frame has returned to.
-
-    Attributes:
-        n_inliers: number of landmarks tracked in the frame.
-        n_shared: number of these landmarks that an old keyframe observes, namely the one that
-            observes the most of them.
-        n_place: number of landmarks of that keyframe that at least three keyframes observe.
-    """
-
-    n_inliers: int
-    n_shared: int
-    n_place: int
-
-
-def is_known_place(evidence: PlaceEvidence, config: KeyframeConfig) -> bool:
-    """Whether a keyframe here would repeat an old one: the frame tracks as many landmarks as a
-    frame next to the old keyframe should, and shares enough of them with the old keyframe.
-
-    A lack of close points is no reason to map a known place again, because the old keyframe did not
-    provide more of them. A minimum number of inliers is required, because the last keyframe of a
-    map has few landmarks that three keyframes observe: beyond the end of the map, both ratios would
-    hold until the camera is lost.
-    """
-    return (
-        evidence.n_inliers >= config.known_min_inliers
-        and evidence.n_inliers >= config.max_tracked_ratio * evidence.n_place
-        and evidence.n_shared >= config.known_ratio * evidence.n_place
-    )
-
-
 class KeyframePolicy:
     """Decides whether a tracked frame becomes a keyframe."""
 
@@ -213,9 +181,26 @@ class KeyframePolicy:
             return needs_monocular_keyframe(evidence, self._config)
         return needs_keyframe(evidence, self._config, depth=camera.depth)
 
-    def is_known(self, evidence: PlaceEvidence) -> bool:
-        """Whether an old keyframe makes a new one unnecessary."""
-        return is_known_place(evidence, self._config)
+    def is_known(self, *, n_inliers: int, n_shared: int, n_place: int) -> bool:
+        """Whether a keyframe here would repeat an old one: the frame tracks as many landmarks as a
+        frame next to the old keyframe should, and shares enough of them with the old keyframe.
+
+        A lack of close points is no reason to map a known place again, because the old keyframe did
+        not provide more of them. A minimum number of inliers is required, because the last keyframe
+        of a map has few landmarks that three keyframes observe: beyond the end of the map, both
+        ratios would hold until the camera is lost.
+
+        Args:
+            n_inliers: number of landmarks tracked in the frame.
+            n_shared: number of these landmarks that an old keyframe observes, namely the one that
+                observes the most of them.
+            n_place: number of landmarks of that keyframe that at least three keyframes observe.
+        """
+        return (
+            n_inliers >= self._config.known_min_inliers
+            and n_inliers >= self._config.max_tracked_ratio * n_place
+            and n_shared >= self._config.known_ratio * n_place
+        )
 
     def is_due(self, index: int, evidence: KeyframeEvidence) -> bool:
         """Whether frame ``index``, which was tracked by patches, is to become a keyframe. A

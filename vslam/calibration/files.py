@@ -16,7 +16,7 @@ from vslam.calibration.formats import (
     read_ros,
 )
 from vslam.calibration.models import Calibration, CameraModel
-from vslam.errors import InputError, ResultsError
+from vslam.errors import InputError, write_file
 
 _Reader = Callable[[Sequence[Document], Size | None], Calibration]
 # The keys of each format, its reader and the largest number of its files. The first format with all
@@ -88,12 +88,7 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
         lines += ["right:", *_camera_lines(calibration.right)]
         lines += ["T_left_right:  # maps points of the right camera to the left one; metres"]
         lines += [f"  - {row}" for row in calibration.T_left_right.tolist()]
-    try:
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise ResultsError(
-            f"{path}: cannot be written ({error.strerror}); name another file with --out."
-        ) from error
+    write_file(path, "\n".join(lines) + "\n", "name another file with --out")
 
 
 def _camera_lines(model: CameraModel) -> list[str]:

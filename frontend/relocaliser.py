@@ -26,14 +26,8 @@ from vslam.map import Map
 from vslam.map_view import LocalMap, local_map
 
 Locate = Callable[[Image | None, Features, Map], list[LoopCandidate]]
-
-
-class Recognise(Protocol):
-    """Finds the pose of a frame at one of the candidates if ORB descriptors do not match there."""
-
-    def __call__(
-        self, map_: Map, image: Image | None, features: Features, candidates: list[LoopCandidate]
-    ) -> Sighting | None: ...
+# Finds the pose of a frame at one of the candidates if ORB descriptors do not match there.
+Recognise = Callable[[Map, Image | None, Features, list[LoopCandidate]], Sighting | None]
 
 
 class MapAccess(Protocol):

@@ -96,7 +96,7 @@ class Searchable(NamedTuple):
     Attributes:
         xy: ``(N, 2)`` pixels.
         octave: ``(N,)``.
-        u_right: ``(N,)`` columns in the right image, NaN without one.
+        u_right: ``(N,)`` columns in the right image, NaN for features without a stereo match.
         descriptor: ``(N, 4)`` the 32 bytes of each descriptor as four integers.
         grid: the features sorted by image cell.
     """
@@ -260,7 +260,7 @@ def count_elsewhere(u: NDArray[np.floating], width: int) -> int:
 
     Args:
         u: ``(N,)`` columns of the inliers, pixels.
-        width: of the image, pixels.
+        width: width of the image, pixels.
     """
     columns = np.sort(u)
     ends = np.searchsorted(columns, columns + width / 3, side="right")

@@ -193,7 +193,7 @@ def _refine_depths(depth, a12, a13, a23, b12, b13, b23):
         r3 = l2 * l2 + l3 * l3 - 2.0 * b23 * l2 * l3 - a23
         if abs(r1) + abs(r2) + abs(r3) < 1e-15 * (a12 + a13 + a23):
             return
-        p, q = l1 - b12 * l2, l2 - b12 * l1  # half the derivatives of r1 by l1, l2
+        p, q = l1 - b12 * l2, l2 - b12 * l1  # half the derivatives of r1 with respect to l1, l2
         r, s = l1 - b13 * l3, l3 - b13 * l1
         t, v = l2 - b23 * l3, l3 - b23 * l2
         # J = [[p, q, 0], [r, 0, s], [0, t, v]]; Cramer's rule.
@@ -295,8 +295,8 @@ def ransac_pose(points, uvr, inverse_sigma2, intrinsics, seed, min_inliers, max_
             ``min_inliers`` inliers has been missed.
 
     Returns:
-        ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers of the best pose, which may be fewer than
-        ``min_inliers``.
+        ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers of the best pose. There may be fewer inliers
+        than ``min_inliers``.
     """
     fx, fy, cx, cy, _, _ = intrinsics
     n = len(points)

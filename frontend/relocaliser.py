@@ -29,7 +29,8 @@ Locate = Callable[[Image | None, Features, Map], list[LoopCandidate]]
 
 
 class Recognise(Protocol):
-    """Finds the pose of a frame at one of the candidates if ORB descriptors do not match there."""
+    """Finds the pose of a frame near one of the candidate keyframes by other means than ORB
+    descriptors. Returns None if it finds none."""
 
     def __call__(
         self, map_: Map, image: Image | None, features: Features, candidates: list[LoopCandidate]
@@ -66,9 +67,9 @@ class Relocaliser:
     def relocalise_if_needed(self, frame: Frame, found: Found, owner: MapAccess) -> Found:
         """Relocalise a frame that is lost or doubtful.
 
-        A lost frame is relocalised only while no keyframe is being mapped. For a doubtful frame,
-        wait until the keyframe is mapped; the frame keeps its tracked pose unless relocalisation
-        finds more than ``relocalization.better`` times as many inliers.
+        A lost frame is relocalised only while no keyframe is being mapped. A doubtful frame waits
+        until the keyframe is mapped. It keeps its tracked pose unless relocalisation finds more
+        than ``relocalization.better`` times as many inliers.
 
         Args:
             found: the result of tracking the frame.

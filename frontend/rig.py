@@ -78,8 +78,8 @@ class RigCalibration:
         frame.delay_removed = True
 
     def correct_offset(self, frame: Frame) -> None:
-        """Update the disparities of a frame from the offset that they contain to the current
-        one."""
+        """Replace the disparity offset that the disparities of a frame contain by the current
+        offset."""
         change = self.disparity_offset - frame.disparity_offset
         if change == 0.0:
             return

@@ -61,8 +61,9 @@ class Found:
 
     @classmethod
     def at_start(cls, frame: Frame, *, begun: bool) -> Found:
-        """The result for a frame before tracking starts: OK with all landmarks that the frame
-        created if it has started a map (``begun``), otherwise LOST."""
+        """The result for a frame before tracking starts. If the frame has started a map
+        (``begun``), the state is OK and all landmarks that the frame created are inliers; otherwise
+        the state is LOST."""
         n_landmarks = int(np.count_nonzero(frame.landmark >= 0))
         state = TrackingState.OK if begun else TrackingState.LOST
         return cls(state, n_landmarks, n_landmarks)
@@ -94,7 +95,7 @@ class Tracker:
     Attributes:
         status: what is known about the position of the camera.
         last: the last frame that was tracked; None before the first.
-        lost_frames: number of frames lost since then.
+        lost_frames: number of frames lost since ``last``.
     """
 
     def __init__(self, context: TrackingContext) -> None:
@@ -311,8 +312,8 @@ def result_of(
     stage_ms: dict[str, float],
     odometry: Odometry,
 ) -> TrackResult:
-    """The result for a frame that the library returns to its caller; ``stage_ms`` holds the time of
-    each stage in milliseconds."""
+    """The ``TrackResult`` of a frame, which the library returns to its caller. ``stage_ms`` gives
+    the time of each stage in milliseconds."""
     return TrackResult(
         index=frame.index,
         timestamp=frame.timestamp,

@@ -49,7 +49,8 @@ class LoopConsistency:
         candidates.
 
         Returns:
-            The candidates with enough keyframes, and a rejected edge for each of the others.
+            The candidates whose place enough consecutive keyframes resembled, and a rejected edge
+            for each other candidate.
         """
         self._turn += 1
         series: dict[frozenset[int], ResembledPlace] = {}

@@ -25,8 +25,8 @@ class SiameseDetector:
     """A :class:`vslam.loopclosure.detector.LoopDetector` by the image descriptors of a network.
 
     If the images of keyframes are stored (``images``), the network computes the descriptor of a
-    keyframe only when the camera comes within reach of it (:func:`beyond_reach`) or is lost. On a
-    drive that never returns to a place, the network does not run at all.
+    keyframe only when the camera comes within reach of the keyframe (:func:`beyond_reach`) or is
+    lost. On a drive that never returns to a place, the network does not run at all.
 
     Descriptors are rows of a matrix that grows by half when it is full. The matrix has no columns
     until the network has computed the first descriptor.
@@ -183,7 +183,7 @@ class SiameseDetector:
 
     def _local_ratings(self, p: NDArray[np.float32], query: DescriptorMaps) -> NDArray[np.float32]:
         """``(N,)`` similarity by local descriptors of the keyframes that are most similar according
-        to ``p``, -1 for the others."""
+        to ``p``, -1 for the other keyframes."""
         assert self._images is not None
         rating = np.full(len(p), -1.0, np.float32)
         for keyframe in np.argsort(-p, kind="stable")[: self._config.reranked].tolist():
@@ -201,7 +201,7 @@ class SiameseDetector:
     ) -> list[LoopCandidate]:
         """The candidates with the highest ``rating`` ``(N,)``, which is -1 for keyframes that are
         not candidates. Of several covisible keyframes, only the best becomes a candidate, because
-        the others would displace candidates at other places."""
+        further keyframes of one place would displace candidates at other places."""
         rating = rating.copy()
         found: list[LoopCandidate] = []
         most = self._config.max_candidates

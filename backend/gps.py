@@ -172,7 +172,8 @@ def align(T_wk: Array, positions: Positions, *, metric: bool, seed: int = 0) -> 
 
     The scale of a metric map is estimated as well, because a calibrated baseline that is 1 % too
     long makes the map 1 % too large. The estimate is the mean of the scale of the fixes and of the
-    scale 1 of the calibration, weighted by their uncertainties (``_METRIC`` for the calibration).
+    scale 1 of the calibration, weighted by their inverse variances (``_METRIC`` is the standard
+    deviation of the calibration).
 
     Args:
         T_wk: ``(N, 4, 4)`` poses of the keyframes in the map.

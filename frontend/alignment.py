@@ -173,16 +173,16 @@ def align(seen, reference, centre, which, warp, iterations, max_shift, min_corre
         seen: ``(N, PATCH_PIXELS)`` uint8 patches of the frame.
         reference: ``(P, PATCH_PIXELS)`` uint8 patches of keyframes.
         centre: ``(P, 2)`` float32, position of the landmark in each reference patch, pixels from
-            its middle.
-        which: ``(N,)`` index of the reference of each seen patch.
+            the middle of the patch.
+        which: ``(N,)`` index of the reference patch that each seen patch is compared with.
         warp: ``(N, 2, 2)`` float32, see ``warps``.
         iterations: maximum number of Gauss-Newton steps.
         max_shift: largest shift in x and in y, pixels of the seen patch.
         min_correlation: least normalised cross-correlation of an accepted alignment.
 
     Returns:
-        ``(N, 2)`` float32 shift from the middle of the seen patch, in its pixels; NaN if the
-        alignment failed.
+        ``(N, 2)`` float32 position of the landmark relative to the middle of the seen patch, in
+        pixels of this patch; NaN if the alignment failed.
     """
     n = len(seen)
     shift = np.full((n, 2), np.nan, np.float32)

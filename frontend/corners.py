@@ -159,8 +159,8 @@ def spread(x, y, score, width, height, quota):
         for i in range(n):
             kept[i] = i
         return kept
-    # Cells of size ``low`` are small enough, because each corner has its own cell of size 1. Cells
-    # of size ``high`` are too large, because there are fewer of them than the quota.
+    # At first, cells of size ``low`` are small enough, because each corner has its own cell of size
+    # 1. Cells of size ``high`` are too large, because the image has fewer of them than the quota.
     low, high = 1, int(np.sqrt(width * height / quota)) + 2
     is_occupied = np.empty(width * height, np.uint8)
     while high - low > 1:

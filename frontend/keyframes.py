@@ -155,9 +155,10 @@ def is_known_place(evidence: PlaceEvidence, config: KeyframeConfig) -> bool:
     frame next to the old keyframe should, and shares enough of them with the old keyframe.
 
     A lack of close points is no reason to map a known place again, because the old keyframe did not
-    provide more of them. A minimum number of inliers is required, because the last keyframe of a
-    map has few landmarks that three keyframes observe: beyond the end of the map, both ratios would
-    hold until the camera is lost.
+    provide more of them. Both conditions are relative to counts of the old keyframe. If the old
+    keyframe is the last one of a map, these counts are small, because few of its landmarks are
+    observed by three keyframes. Beyond the end of the map, both conditions would then hold until
+    the camera is lost. Therefore a minimum number of inliers is required as well.
     """
     return (
         evidence.n_inliers >= config.known_min_inliers

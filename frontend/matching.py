@@ -21,8 +21,8 @@ ORIENTATION_BINS = 30
 @kernel
 def predict_view(T, xyz, normal, distance_range, intrinsics, width, height, scales, window):
     """Predict where landmarks appear in an image (ORB-SLAM, V-D). A landmark is visible if it
-    projects into the image, its distance is in its range (with a tolerance of 20 %), and its
-    viewing direction is at most 60 degrees from its mean viewing direction.
+    projects into the image, its distance from the camera is in ``distance_range`` (with a tolerance
+    of 20 %), and the camera views it from at most 60 degrees off its mean viewing direction.
 
     Args:
         T: ``(4, 4)`` pose of the camera (world to camera).

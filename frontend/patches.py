@@ -159,7 +159,7 @@ def newest_rows(a, keyframes, ids):
 
     Returns:
         ``(L,)`` int64 row in the map's arrays and ``(L,)`` int64 index into ``keyframes``; -1 where
-        none of them observes the landmark.
+        none of ``keyframes`` observes the landmark.
     """
     found, view = np.full(len(ids), -1, np.int64), np.full(len(ids), -1, np.int64)
     newest = keyframes.max()

@@ -272,7 +272,8 @@ def _square(jacobian, hessian):
 @inner_kernel
 def _step(seen, template, jacobian, hessian, error, m, contrast):
     """``(6,)`` Gauss-Newton step that reduces the differences between ``seen`` and the templates;
-    ``error`` is negative for windows outside the image."""
+    ``error`` must be negative for windows outside the image, and receives the norm of the
+    differences of the other windows."""
     inside = 0
     scale = np.float32(1.0 / contrast)
     valid_errors = np.empty(m)

@@ -26,8 +26,8 @@ _MIN_SHARE = 0.25  # least share of the pixels from which a gain is estimated
 _MIN_RANGE = 4.0  # grey levels; over a smaller range, rounding dominates the gain
 _N_QUANTILES = 11  # number of quantiles that are compared between the two images
 # Largest difference between the quantiles of the two images, each scaled to a range of 1. If the
-# images differ by a gain, it is at most 0.07 for 95 % of the images of KITTI; if only one image
-# shows the sky, it is at least 0.22.
+# images differ by a gain, the difference is at most 0.07 for 95 % of the images of KITTI; if only
+# one image shows the sky, the difference is at least 0.22.
 _MAX_DEVIATION = 0.12
 _MIN_VISIBLE_RANGE = 16.0  # least range of the grey values of an image that is not black
 

@@ -2,10 +2,9 @@
 must agree.
 
 ORB-SLAM (T-RO 2015, VII-A) requires that consecutive keyframes resemble overlapping places, which
-is evidence from appearance. Geometry gives stronger evidence: each verified loop implies by how
-much the map has drifted, and the loops of neighbouring keyframes must imply the same drift.
-ORB-SLAM3 (T-RO 2021, section VI) also verifies a loop first and then confirms it with other
-keyframes.
+is evidence from appearance. Geometry gives stronger evidence: each verified loop implies how much
+the map has drifted, and the loops of neighbouring keyframes must imply the same drift. ORB-SLAM3
+(T-RO 2021, section VI) also verifies a loop first and then confirms it with other keyframes.
 """
 
 from __future__ import annotations

@@ -98,7 +98,7 @@ def locate(
     Args:
         xy: ``(N, 2)`` keypoints, pixels of camera image a.
         coarse: coarse matches from a to b.
-        reach: half width of a window, fine cells.
+        reach: half width of a window, in fine cells.
         least: least cosine of a match.
     """
     rows, columns, _ = a.coarse.shape

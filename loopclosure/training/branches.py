@@ -77,7 +77,9 @@ class CapsuleShape(BaseModel):
     depth: int = Field(16, ge=1, description="Dimension of an output capsule.")
     iterations: int = Field(3, ge=1, description="Iterations of the routing.")
     over: Literal["primary", "output"] = "primary"
-    kept: int | None = Field(None, description="Places kept for each type; None before pruning.")
+    kept: int | None = Field(
+        None, description="Number of places kept per type; None before pruning."
+    )
 
     @model_validator(mode="after")
     def _flat_images_keep_their_height(self) -> CapsuleShape:

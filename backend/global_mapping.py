@@ -45,8 +45,8 @@ class GlobalSnapshot:
 def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
     """Copy all living keyframes and landmarks into a bundle problem.
 
-    The first keyframe is fixed. So is the first keyframe of every other part of the map that no
-    landmark connects to it, because the position of that part is otherwise undetermined.
+    The first keyframe of each connected part of the map is fixed, because nothing else determines
+    the position of the part. Keyframes are connected if they observe a common landmark.
     """
     living = map_.living_keyframes()
     landmarks = map_.living_landmarks().astype(np.int32)

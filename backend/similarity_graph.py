@@ -2,10 +2,10 @@
 VII-C; Strasdat et al., "Scale drift-aware large scale monocular SLAM", RSS 2010).
 
 Each keyframe has a similarity ``S_wc``, a ``(4, 4)`` matrix with the scale in its upper left 3x3
-block, so that ``@`` composes similarities. It maps points from the camera frame, in the unit that
-the map has around the keyframe before the correction, to the world. Initially all scales are 1;
-only loop edges measure other scales. GTSAM optimises the graph with its built-in Similarity3
-factors.
+block, so that ``@`` composes similarities. It maps points from the camera frame to the world.
+Lengths in the camera frame are in the unit that the map has around the keyframe before the
+correction. Initially all scales are 1; only loop edges measure other scales. GTSAM optimises the
+graph with its built-in Similarity3 factors.
 """
 
 from __future__ import annotations

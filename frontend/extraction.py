@@ -104,7 +104,7 @@ class FrameImages:
         return matched(self.find_corners(), self._context)
 
     def extracted_with(self, keypoints: Keypoints) -> Extracted:
-        """The features, and additional ones at given positions and levels of the left image."""
+        """The features, and additional features at given positions and levels of the left image."""
         return matched(self.find_corners(), self._context, keypoints)
 
     @cached_property
@@ -138,8 +138,8 @@ def find_corners(
 
     Args:
         left: ``(H, W)`` uint8.
-        second: ``(H, W)``: the right image, uint8; for an RGB-D camera the depth in metres,
-            float32; None if there is only the left image.
+        second: ``(H, W)`` uint8 right image, or float32 depth image of an RGB-D camera in metres;
+            None if there is only the left image.
         mask: the mask of the image whose features are tracked: the left image, or the right image
             if the left one is black. Stereo matching needs no mask of the right image, because
             masked pixels of the left image have no features to match.

@@ -33,7 +33,7 @@ class FeatureSource(Protocol):
     def extracted(self) -> Extracted: ...
 
     def extracted_with(self, keypoints: Keypoints) -> Extracted:
-        """The features, and additional ones at given positions and levels of the left image."""
+        """The features, and additional features at given positions and levels of the left image."""
         ...
 
     @property
@@ -64,7 +64,8 @@ class Frame:
         delay_removed: whether the columns in the right image have been corrected for its delay.
         shift: ``(N, 2)`` float32, pixels from each feature to its aligned position, NaN where the
             match was not aligned; None if no match was aligned.
-        twist: ``(6,)`` velocity of the camera when the frame was tracked, per second; None if
+        twist: ``(6,)`` velocity per second when the frame was tracked: ``exp(twist dt)`` maps
+            points from the camera frame at one time to the camera frame dt seconds later. None if
             unknown.
         source: the images that ``extract`` takes the features from; None after extraction. Before
             extraction, ``features`` has one entry for each landmark that was found by its patch.

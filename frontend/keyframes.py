@@ -113,8 +113,8 @@ def needs_monocular_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig)
 def count_close(
     state: PolicyState, tracked_close: int, frame: int, config: KeyframeConfig
 ) -> PolicyState:
-    """The state after a frame with index ``frame`` that tracks ``tracked_close`` close points. It
-    changes only if this is the first frame after a keyframe.
+    """The state after a frame with index ``frame`` that tracks ``tracked_close`` close points. The
+    state changes only if this is the first frame after a keyframe.
 
     A single frame may track few close points by chance; only several in a row show that close
     points are scarce. So an exponential moving average is kept, and it starts at a high value.

@@ -138,7 +138,8 @@ def _widened(array: NDArray, n: int) -> NDArray:
 
 def certainty_of(frame: Frame, config: AlignmentConfig) -> NDArray[np.uint8] | int:
     """``(N,)`` uint8, the factor by which the variance of each feature's position is smaller than
-    that of a keypoint (``Arrays.certainty``); 1 for all features of a frame without a pyramid.
+    the variance of a keypoint's position (``Arrays.certainty``); 1 for all features of a frame
+    without a pyramid.
 
     The position of an aligned match is accurate. The position of a feature without a match counts
     as accurate, too, because a landmark that is created from the feature is defined by this

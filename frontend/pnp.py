@@ -75,8 +75,8 @@ def solve_p3p(points, rays, T_cw):
         if abs(n0) < 1e-14 * (abs(n1) + abs(n2)):
             continue
         w1, w2 = -n1 / n0, -n2 / n0  # l1 = w1 l2 + w2 l3
-        # Substituting l3 = t l2 into l' D l = 0, where D is D1 or D2, gives a quadratic in t. It
-        # is better conditioned for the matrix that contributes less to D0.
+        # Substituting l3 = t l2 into l' D l = 0, where D is D1 or D2, gives a quadratic in t. The
+        # quadratic is better conditioned for the matrix that contributes less to D0.
         D = D1 if abs(g) > 1.0 else D2
         A = D[0, 0] * w2 * w2 + 2.0 * D[0, 2] * w2 + D[2, 2]
         B = 2.0 * (D[0, 0] * w1 * w2 + D[0, 1] * w2 + D[0, 2] * w1 + D[1, 2])

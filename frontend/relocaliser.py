@@ -46,8 +46,8 @@ class MapAccess(Protocol):
         ...
 
     def merge(self) -> Map:
-        """Wait until no keyframe is being mapped, make the last one visible to tracking, and return
-        the map."""
+        """Wait until no keyframe is being mapped, make the last keyframe visible to tracking, and
+        return the map."""
         ...
 
 
@@ -121,7 +121,7 @@ def relocalise(
 
     The descriptors of the frame are matched with the landmarks of the place, and a pose is
     estimated by P3P inside RANSAC, which needs no stereo. Then all landmarks of the surroundings
-    are searched for near their projections, first in a wide window, then in the usual one.
+    are searched for near their projections, first in wide windows, then in the usual windows.
 
     Args:
         frame: receives the pose and the matches on success; otherwise both are reset.

@@ -65,8 +65,7 @@ class RigCalibration:
         the delay of the right image. Calling this again has no effect.
 
         Args:
-            twist: ``(6,)`` velocity of the points relative to the camera, per second; None if
-                unknown.
+            twist: ``(6,)`` velocity, see ``Frame.twist``; None if unknown.
         """
         self.correct_offset(frame)
         delay = self._camera.right_delay
@@ -96,7 +95,7 @@ class RigCalibration:
         """Measure the delay in a tracked frame.
 
         Args:
-            twist: ``(6,)`` velocity between the previous frame and this one, per second; None if
+            twist: ``(6,)`` mean velocity since the previous frame, see ``Frame.twist``; None if
                 unknown.
         """
         self.delay.add(frame.features, frame.row_offset, twist, self._scales)

@@ -146,7 +146,7 @@ class DelayState:
         length: number of frames in a full group.
         solution: ``(1 + P,)`` the delay in seconds and the P coefficients of the polynomial,
             estimated when the last group became full.
-        twist: ``(6,)`` velocity before the last frame, per second.
+        twist: ``(6,)`` velocity before the last frame, see ``Frame.twist``.
         waiting: ``(7 + P, 7 + P)`` moments of the last frame, which is not in a group yet.
         group: ``(2 + P, 2 + P)`` moments of the group that is being filled.
         groups: ``(G, 2 + P, 2 + P)`` moments of the full groups.
@@ -242,9 +242,8 @@ class SideDelay:
         Args:
             features: the N features of the frame.
             row_offset: ``Extracted.row_offset``; if None, the frame is skipped.
-            twist: ``(6,)`` velocity per second: ``exp(twist dt)``, with the elapsed time dt, maps
-                points from the previous camera frame to this one. If None (unknown), the frame is
-                skipped.
+            twist: ``(6,)`` mean velocity since the previous frame, see ``Frame.twist``. If it is
+                None (unknown), the frame is skipped.
             scales: ``(levels,)`` pyramid scale factors.
         """
         state = self._state

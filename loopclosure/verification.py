@@ -4,8 +4,8 @@ The steps are those of ORB-SLAM (T-RO 2015, VII-B; for stereo T-RO 2017, III-D):
 descriptors of two keyframes, estimate a motion by RANSAC, match all landmarks of the place near
 their projections, and refine the pose. ORB-SLAM then only counts inliers, but a facade or a car
 that looks like another one has many inliers, too. The tests here therefore also look for evidence
-against the loop: the inliers must be spread over the image, and on each side most landmarks of the
-other side that should be visible must be found.
+against the loop: the inliers must be spread over the image, and in each keyframe most of the other
+side's landmarks that should be visible must be found.
 """
 
 from __future__ import annotations

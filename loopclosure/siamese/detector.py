@@ -43,10 +43,11 @@ class SiameseDetector:
 
         Args:
             learned: thresholds for local descriptors; None uses the defaults.
-            images: the store of keyframe images. With it, keyframes must reach the similarity
-                ``config.offered``, and the most similar ones are ranked again by local descriptors,
-                because at night the correct place is often among them but not first. Without it
-                (None), keyframes must reach ``config.threshold`` and are ranked by similarity.
+            images: the store of keyframe images. With a store, candidates must reach the similarity
+                ``config.offered``, and the most similar keyframes are ranked again by local
+                descriptors, because at night the correct place is often among these keyframes but
+                not the first. Without a store (None), candidates must reach ``config.threshold``
+                and are ranked by similarity.
         """
         self.name = network.name
         self._network = network
@@ -66,7 +67,8 @@ class SiameseDetector:
             self._store_descriptor(keyframe, image)
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
-        """See :class:`LoopDetector`. The similarity of a candidate is at least the threshold."""
+        """See :class:`LoopDetector`. The similarity of a candidate is at least the threshold (see
+        ``images``)."""
         if keyframe >= len(self._row) or not (self._described[keyframe] or self._stored(keyframe)):
             return []
         eligible = self._searchable(map_)
@@ -144,7 +146,7 @@ class SiameseDetector:
         return self._images is not None and keyframe in self._images
 
     def _without_descriptor(self, keyframes: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Ids of those keyframes of a ``(n,)`` mask that have no descriptor yet."""
+        """Ids of the keyframes in a ``(n,)`` bool mask that have no descriptor yet."""
         return np.flatnonzero(keyframes & ~self._described[: len(keyframes)])
 
     def _describe(self, keyframes: Iterable[int]) -> None:

@@ -33,8 +33,8 @@ def aligned(alike: Tensor, most: Tensor) -> Tensor:
     which compares whole images only.)
 
     Args:
-        alike: ``(..., V, V)`` scalar products of the views.
-        most: ``(..., V, V)`` products of their lengths.
+        alike: ``(..., V, V)`` scalar products of the views' descriptors.
+        most: ``(..., V, V)`` products of the lengths of the views' descriptors.
     """
     views = alike.shape[-1]
     v = torch.arange(views, device=alike.device)

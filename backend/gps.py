@@ -273,8 +273,8 @@ def _chi2(positions: Positions, T_enu_k: Array, scale: Array) -> Array:
 
 def _local_scale(T_wk: Array, T_enu_k: Array, scale: Array, part: NDArray[np.int64]) -> Array:
     """``(N,)`` metres per unit of the map at each keyframe: the length of the path around the
-    keyframe, within its part of the map, in ENU divided by that in the map. Where the path has no
-    length, the previous ``scale`` is returned."""
+    keyframe in ENU, divided by the length of the same path in the map. The path stays within the
+    keyframe's part of the map. Where its length is 0, the previous ``scale`` is returned."""
     scale = scale.copy()
     for label in np.unique(part):
         inside = np.flatnonzero(part == label)

@@ -208,9 +208,10 @@ class DelayState:
 class SideDelay:
     """Least-squares estimate of the delay of the right image from all frames so far.
 
-    The velocity at a frame is the mean of the velocities before and after it, so a frame is added
-    only when the next one is tracked. Until then its moments are kept; the velocity can be applied
-    to them later, because image velocities are linear in the twist.
+    The velocity at a frame is the mean of the velocities before and after the frame, so a frame is
+    added only when the next frame is tracked. Until then the moments of the frame are kept. The
+    velocity can be applied to these moments later, because image velocities are linear in the
+    twist.
 
     Attributes:
         seconds: time by which the right image is later than the left one.

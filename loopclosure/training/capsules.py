@@ -46,7 +46,8 @@ def route(
         iterations: at least 1.
         over: axis of the softmax. With ``primary``, the coupling coefficients sum to 1 over i, as
             in the paper; with ``output``, over j, as in Sabour et al.
-        alive: ``(I,)`` bool; the other capsules are ignored, as if they were removed.
+        alive: ``(I,)`` bool; capsules where it is False are ignored, as if they were removed. None
+            keeps all.
 
     Returns:
         Output capsules ``v`` ``(N, J, D)``, and the coupling coefficients as numerators ``e``

@@ -29,8 +29,9 @@ class Corners(NamedTuple):
 
     Attributes:
         found: the features of the image of ``side``.
-        right: the features of the right image, for stereo matching; None if there is none.
-        depth: ``(H, W)`` float32 metres, of an RGB-D camera; else None.
+        right: the features of the right image, for stereo matching; None if there is no right
+            image, or if the left one is black.
+        depth: ``(H, W)`` float32 depth image of an RGB-D camera, metres; None for other cameras.
         side: see ``Extracted``.
         sides: the comparison of the left and the right image; None without a right image.
     """
@@ -50,7 +51,7 @@ class FrameImages:
         left: ``(H, W)`` uint8.
         mask: the mask of the left image; None if all pixels are used.
         pyramid: the pyramid of the left image; None if frames are not tracked by patches.
-        coarse: ``coarse_levels`` of that pyramid, or None.
+        coarse: ``coarse_levels`` of ``pyramid``; None if ``pyramid`` is None.
         sides: the comparison of the left and the right image; None if there is no right image, or
             it has not been read.
         problem: why the second image could not be read, so that only the left one is used; None if
@@ -103,7 +104,7 @@ class FrameImages:
         return matched(self.find_corners(), self._context)
 
     def extracted_with(self, keypoints: Keypoints) -> Extracted:
-        """The features, and additional ones at given positions and levels of the left image."""
+        """The features, and additional features at given positions and levels of the left image."""
         return matched(self.find_corners(), self._context, keypoints)
 
     @cached_property
@@ -140,11 +141,11 @@ def find_corners(
 
     Args:
         left: ``(H, W)`` uint8.
-        second: ``(H, W)``: the right image, uint8; for an RGB-D camera the depth in metres,
-            float32; None if there is only the left image.
-        mask: the mask of the image whose features are tracked: the left one, or the right one if
-            the left one is black. For stereo matching the right image needs no mask, because masked
-            pixels of the left image have no features to match.
+        second: ``(H, W)`` uint8 right image, or float32 depth image of an RGB-D camera in metres;
+            None if there is only the left image.
+        mask: the mask of the image whose features are tracked: the left image, or the right image
+            if the left one is black. Stereo matching needs no mask of the right image, because
+            masked pixels of the left image have no features to match.
         pyramid: the pyramid of the left image, if it has already been built.
     """
     camera, config = context.camera, context.config

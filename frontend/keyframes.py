@@ -27,11 +27,11 @@ class KeyframeEvidence:
         untracked_close: number of close stereo features that track no landmark; None for a frame
             that was tracked by patches and has no features. It is then assumed to be large enough.
         mapping_idle: whether local mapping of the last keyframe is finished and merged.
-        gained_close: number of close points that the first frame after a keyframe tracks, a running
-            mean over the last keyframes; infinite if unknown.
+        gained_close: running mean, over the last keyframes, of the number of close points that the
+            first frame after a keyframe tracks; infinite if unknown.
         first_close: number of close points that the first frame after the last keyframe tracks.
-        close_ratio: factor by which the number of tracked close points has changed per frame since
-            that frame.
+        close_ratio: factor, at most 1, by which the number of tracked close points has fallen per
+            frame since the first frame after the last keyframe.
     """
 
     seconds_since_keyframe: float
@@ -62,10 +62,11 @@ def needs_keyframe(
 
     A lack of close points is a reason for a keyframe only if a keyframe would provide more. On a
     motorway, close points are scarce and leave the view before they are seen twice, so that even
-    the first frame after a keyframe tracks too few of them. In that case a frame needs only a share
-    of the close points that this first frame tracked, provided that enough far points constrain the
-    pose: at least as many as the close points that would otherwise be required. In fog there are no
-    far points, so the full number of close points is required.
+    the first frame after a keyframe tracks too few of them. In that case a frame needs only a
+    fraction of the close points that such a first frame tracks on average (``gained_close``),
+    provided that enough far points constrain the pose: at least as many as the close points that
+    would otherwise be required. In fog there are no far points, so the full number of close points
+    is required.
 
     Args:
         depth: whether the camera is RGB-D. Nearly all points that it sees are close and mapped at
@@ -112,8 +113,8 @@ def needs_monocular_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig)
 def count_close(
     state: PolicyState, tracked_close: int, frame: int, config: KeyframeConfig
 ) -> PolicyState:
-    """The state after a frame with index ``frame`` that tracks ``tracked_close`` close points. It
-    changes only if this is the first frame after a keyframe.
+    """The state after a frame with index ``frame`` that tracks ``tracked_close`` close points. The
+    state changes only if this is the first frame after a keyframe.
 
     A single frame may track few close points by chance; only several in a row show that close
     points are scarce. So an exponential moving average is kept, and it starts at a high value.

@@ -187,7 +187,7 @@ def extract_levels(
         allowed: 1 for pixels where a corner may lie, 0 for the others; empty allows all pixels.
         quota: ``(L,)`` int64, greatest number of features per level.
         threshold, threshold_min, cell: see ``local_maxima``.
-        inside: ``DISC``.
+        inside: ``DISC``, the disc for ``orientations``.
         pattern: ``PATTERN``, ``(256, 4)`` int8 test points xa, ya, xb, yb.
 
     Returns:

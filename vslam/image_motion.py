@@ -15,7 +15,7 @@ from vslam.camera import Camera
 from vslam.features import MIN_DISPARITY, shifted_columns
 from vslam.geometry import Matrix
 
-_ROUNDS = 3  # of a fixed-point iteration, since speed and disparity depend on each other
+_ROUNDS = 3  # of a fixed-point iteration, because speed and disparity depend on each other
 
 
 def rays(
@@ -62,7 +62,7 @@ def columns_without_delay(
     Args:
         xy: ``(N, 2)`` pixels in the left image.
         u_right: ``(N,)`` columns in the right image; NaN stays NaN.
-        twist: ``(6,)`` of the points relative to the camera, per second.
+        twist: ``(6,)`` twist of the points relative to the camera, per second.
     """
     x, y = rays(xy, camera)
     measured = xy[:, 0].astype(np.float64) - u_right

@@ -282,7 +282,8 @@ class Map:
         return of_arrays | {name: column[: self.n_keyframes] for name, column in of_keyframes}
 
     def with_columns(self, columns: dict[str, NDArray]) -> Map:
-        """This map with other columns, named as by ``columns``; they are not copied."""
+        """This map with other arrays as its columns, named as in ``columns()``. The arrays are not
+        copied."""
         other = copy.copy(self)
         other.arrays = Arrays(**{name: columns[name] for name in Arrays._fields})
         other.keyframes = KeyframeTable(**{name: columns[name] for name in KeyframeTable._fields})

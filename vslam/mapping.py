@@ -3,8 +3,8 @@
 ``Mapper`` owns the map. Each keyframe is mapped by a job in another thread. The *merge*, which
 makes the job's result visible to tracking, happens at a fixed frame index, however long the job
 takes. Between two merges tracking reads a ``MapView``, a copy that the last merge made. Every
-method that needs the merged map performs the merge itself, and a merge also updates the frames that
-are held.
+method that needs the merged map performs the merge itself. A merge also updates the frames that
+were passed to ``Mapper.hold``.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ class Mapper:
         Args:
             frame: the next frame, not tracked yet.
             last: the last tracked frame; None before the first.
-            twist: ``(6,)`` of the points relative to the camera, per second; None if unknown.
+            twist: ``(6,)`` twist of the points relative to the camera, per second; None if unknown.
         """
         self.hold(last, frame)
         self.merge_if_due(frame.index)
@@ -172,8 +172,8 @@ class Mapper:
 
         Args:
             tracked: False for a pose that is only predicted.
-            near: the keyframe near which relocalisation found the frame, which becomes the
-                reference; -1 without relocalisation.
+            near: the keyframe near which the frame was relocalised; it becomes the reference. -1 if
+                the frame was not relocalised.
         """
         if near >= 0:
             self.refer_to(near)

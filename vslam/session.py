@@ -35,7 +35,7 @@ class OpenedMap:
         frames: poses of the drive's earlier frames; None for a new drive.
         checkpoint: state from which the drive continues with identical results, or None.
         drives: sources of the images of the earlier drives, such as "kitti 06".
-        world: the map's place in the world of a ground truth; None if unknown.
+        world: the transformation of the map into the frame of a ground truth; None if unknown.
     """
 
     map: Map | None = None

@@ -138,7 +138,7 @@ class Slam:
             path: the map file, or the folder of a run.
             config: as for a new map; None uses the thresholds that the map was made with.
             detector: the detector that the map was made with, as a name or an object; None uses
-                the shipped detector of the name in the file.
+                the detector that the file names.
             resume: as for a new map.
             options: ``threads``, ``images`` and ``localize``, as for a new map.
 
@@ -332,7 +332,8 @@ class Slam:
 
     def resume_odometry(self, last: TrackResult) -> None:
         """Continue ``T_odom_camera`` and the uncertainty from the last result of a drive that was
-        resumed from a map without the state of tracking. Without this call both start again."""
+        resumed from a map without the state of tracking. Without this call, the odometry starts at
+        the identity, with no uncertainty."""
         self._session.resume_odometry(last)
 
     def finish(self) -> None:
@@ -363,7 +364,7 @@ class Slam:
 
     @property
     def world(self) -> World | None:
-        """The place of the loaded map in the world of a ground truth; None if unknown."""
+        """The transformation of the loaded map into a ground truth's frame; None if unknown."""
         return self._session.opened.world
 
     @property

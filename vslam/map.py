@@ -3,8 +3,9 @@
 A *row* is one keypoint of one keyframe; the rows of a keyframe are consecutive. The table of rows
 is also the table of observations: ``landmark[row]`` is the landmark that the keypoint observes, and
 ``next_row`` links the rows of each landmark into a chain. Covisibility is not stored, but counted
-from the rows when it is needed. The use of arrays instead of objects follows DPVO's PatchGraph. Ids
-of keyframes are never reused; ids of landmarks change only when dead landmarks are dropped. Arrays
+from the rows when it is needed. The use of arrays instead of objects follows DPVO's PatchGraph. The
+entries of culled keyframes and of culled or merged landmarks remain, marked as dead. Ids of
+keyframes are never reused; ids of landmarks change only when dead landmarks are dropped. Arrays
 grow by half their size.
 
 To add a column, declare it in ``Arrays`` or ``KeyframeTable`` with an empty array of its dtype and

@@ -349,8 +349,8 @@ class Mapper:
             yield map_
 
     def _make_room(self, map_: Map, frame: Frame) -> None:
-        """Drop dead landmarks if there are many. This changes the ids of the others, so it must
-        wait for a running global bundle adjustment, which refers to landmarks by id."""
+        """Drop dead landmarks if there are many. The ids of the other landmarks then change, so
+        nothing is dropped during a global bundle adjustment, which refers to landmarks by id."""
         if not self._closing.is_adjusting and map_.many_dead_landmarks:
             drop_dead_landmarks(map_, (*self._held, frame))
 

@@ -26,8 +26,10 @@ from numpy.typing import NDArray
 
 from vslam.geometry import Matrix, inverse, orthonormalised
 
-# Chosen on four rendered drives so that the squared errors over 1 s and 10 s match the covariances,
-# and tested on four others (docs/research/uncertainty.md).
+# Factors on the computed covariances of the local error and of the drift, and the correlation of
+# consecutive steps of the drift. They were chosen on four rendered drives so that the squared
+# errors over 1 s and 10 s match the covariances, and tested on four others
+# (docs/research/uncertainty.md).
 LOCAL, DRIFT, CORRELATION = 1.8, 3.3, 0.5
 # Standard deviations of the acceleration of a lost camera, in m/s^2 and rad/s^2.
 ACCELERATION, TURNING = 2.0, 1.0

@@ -178,7 +178,8 @@ class LoopClosing:
 
     @contextmanager
     def _failure_reported(self, what: str) -> Iterator[None]:
-        """Report a failure instead of raising it, for steps that fail without changing the map."""
+        """Report an exception in the block instead of raising it; used for steps that leave the map
+        unchanged when they fail."""
         try:
             yield
         except Exception as error:

@@ -2,8 +2,9 @@
 columns if the right camera exposes later than the left one.
 
 The velocities are those of Longuet-Higgins and Prazdny (Proc. R. Soc. B, 1980), eq. 2.9 to 2.11,
-for the point (x, y, 1) z of the left camera. The twist [v, w] here is that of the points relative
-to the camera, hence the signs. In the right camera x is smaller by the baseline divided by z.
+for the point (x, y, 1) z of the left camera. The paper uses the motion of the camera. Here, the
+twist [v, w] is that of the points relative to the camera, so all signs are reversed. In the right
+camera x is smaller by the baseline divided by z.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Functions that connect a frame with the map through observations, landmarks and places.
 
-The caller must ensure that no other thread writes the map meanwhile.
+The caller must ensure that no other thread writes the map while one of them runs.
 """
 
 from __future__ import annotations

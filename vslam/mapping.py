@@ -288,7 +288,8 @@ class Mapper:
             start.second.twist = start.twist
 
     def find_old_place(self, frame: Frame) -> OldPlace | None:
-        """The old place that the frame has returned to, or None (``find_old_place``)."""
+        """The old place that the frame has returned to; None if there is none
+        (``map_frames.find_old_place``)."""
         return find_old_place(self.merge(), frame, self._config.keyframes.known_after_s)
 
     def use_existing_keyframe(self, place: OldPlace, frame: PlacedFrame) -> None:

@@ -56,7 +56,7 @@ class Calibration:
 
     Attributes:
         left: the left camera, or the only one.
-        right: the right camera, or None.
+        right: the right camera; None for a single camera.
         T_left_right: ``(4, 4)`` float64, maps points of the right camera to the left one; None
             without a right camera.
         depth_scale: value of a depth pixel at one metre; None if the file has none.

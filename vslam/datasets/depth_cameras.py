@@ -28,7 +28,8 @@ class Grabbed:
     Attributes:
         timestamp: seconds.
         left: left or colour image, ``(H, W)`` uint8, or ``(H, W, 3)`` uint8 red, green, blue.
-        second: right image, ``(H, W)`` uint8; or depth, ``(H, W)`` uint16; or None.
+        second: right image, ``(H, W)`` uint8, or depth, ``(H, W)`` uint16; None if only the left
+            camera is used.
     """
 
     timestamp: float

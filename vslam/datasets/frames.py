@@ -141,7 +141,8 @@ class Source(_Frames):
         n_expected: the number of frames, approximate for a stream; None if unknown.
         live: whether frames arrive in real time and are lost if they are not read, as from a
             camera.
-        ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames without a pose, or None.
+        ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames without a pose; None without
+            ground truth.
         rectify_mask: rectifies an ``(H, W)`` uint8 mask of the original left images; None if the
             images are not rectified by vslam.
 

@@ -36,7 +36,7 @@ def checked_files(
 
     Args:
         timestamps: ``(N,)`` float64 seconds.
-        ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of the left camera, or None.
+        ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of the left camera; None without ground truth.
         sides: N left images, optionally followed by N right images or N depth images.
         depth_scale: depth image units per metre; None if there are no depth images.
 
@@ -276,7 +276,8 @@ def size_text(shape: tuple[int, ...]) -> str:
 
 
 def with_depth(camera: Camera, calibration: Calibration) -> Camera:
-    """The camera for RGB-D images, with the calibration's virtual baseline or that of a Kinect."""
+    """The camera for RGB-D images, with the virtual baseline of the calibration if there is one,
+    otherwise with the baseline of a Kinect."""
     baseline = calibration.virtual_baseline or _VIRTUAL_BASELINE
     return replace(camera, baseline=baseline, depth=True)
 

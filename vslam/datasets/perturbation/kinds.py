@@ -31,7 +31,8 @@ class Pair:
         index: index of the frame.
         t: seconds since the first frame.
         left: ``(H, W)`` uint8.
-        second: the right image, ``(H, W)`` uint8, a depth image, ``(H, W)`` float32, or None.
+        second: the right image, ``(H, W)`` uint8, or the depth image, ``(H, W)`` float32; None for
+            a monocular source.
         clean: both images before any law changed them.
     """
 
@@ -43,7 +44,7 @@ class Pair:
 
     @property
     def right(self) -> Image | None:
-        """The right image, or None."""
+        """The right image; None if the source has none."""
         if self.second is None or self.second.dtype != np.uint8:
             return None
         return np.asarray(self.second, np.uint8)

@@ -172,7 +172,7 @@ def _read_csv(path: Path) -> NDArray[np.float64]:
 
 
 def _read_oxts(folder: Path) -> NDArray[np.float64]:
-    """Rows as `_read_csv`, with seconds since the first packet, as in KITTI odometry."""
+    """Rows as `_read_csv` returns them. As in KITTI odometry, times count from the first packet."""
     if (folder / "oxts").is_dir():
         folder = folder / "oxts"
     files = sorted((folder / "data").glob("*.txt"))

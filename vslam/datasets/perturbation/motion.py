@@ -102,7 +102,7 @@ def _motion(shutter_ms: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 KINDS = {
     "motion": LawKind(
-        _motion, "ms", 50.0, 1.0, 1000.0, "exposure time, which blurs turns", most=1000.0,
+        _motion, "ms", 50.0, 1.0, 1000.0, "exposure time; turning the camera blurs", most=1000.0,
         logarithmic=True, drawn=False, needs=("neighbours",), of_scene=True,
     ),
 }  # fmt: skip

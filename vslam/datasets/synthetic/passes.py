@@ -24,7 +24,7 @@ from vslam.datasets.synthetic.town import Town
 _NEAR, _LEFT = 60.0, 75.0  # m: distances at which a place is reached, and at which it is left
 _AGAIN, _STRETCH = 60, 15  # frames: shortest time until a revisit, and its shortest duration
 _SHADOW_MAPS = 8  # number of shadow maps that are kept
-_CLOUD = 12.0  # frames; a cloud hides the sun while it moves between two passes
+_CLOUD = 12.0  # frames around the start of a pass in which a cloud hides the sun, which then moves
 _CAR_REACH = np.array([1.1, 2.7])  # half the width and length of the largest car, m
 
 

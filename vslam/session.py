@@ -125,12 +125,14 @@ class Session:
         """The state of all parts between two frames, or None if no checkpoint is possible now.
 
         It is None before the first frame is tracked, when only localising, while a keyframe is
-        being mapped, while a monocular map begins, and during a global bundle adjustment.
+        being mapped, while a monocular map begins, while a found loop is not closed yet, and during
+        a global bundle adjustment.
         """
         tracker, policy = self.tracker.state(), self.mode.state()
         if tracker is None or policy is None:
             return None
-        if self.closing.is_adjusting or not self.mapper.is_merged:
+        mapper = self.mapper
+        if self.closing.is_adjusting or not mapper.is_merged or mapper.has_found_loop:
             return None
         return Checkpoint(
             tracker,

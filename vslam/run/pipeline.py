@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -225,13 +226,19 @@ class _Run:
             result = self.slam.skip(timestamp)
             self.skipped.append(f"frame {len(self.tracks)}: {frame.problem}")
         else:
-            result = self.slam.step_images(frame.images, timestamp, frame.stage_ms)
-            if self.settings.realtime:
-                self.latency_ms.append(1e3 * (time.perf_counter() - played.arrived))
+            result = self.slam.step_images(
+                frame.images,
+                timestamp,
+                frame.stage_ms,
+                partial(self._add_latency, played.arrived) if self.settings.realtime else None,
+            )
         self.step_s += time.perf_counter() - start
         self.tracks.append(result)
         self._log.append(result)
         return result
+
+    def _add_latency(self, arrived: float, _: TrackResult) -> None:
+        self.latency_ms.append(1e3 * (time.perf_counter() - arrived))
 
     def finish(self) -> None:
         """Complete all mapping."""

@@ -217,13 +217,14 @@ def at_their_times(
             advance.
     """
     if settings.realtime:
-        with ThreadPoolExecutor(2, "side") as pool:
+        with ThreadPoolExecutor(2, "side") as pool, ThreadPoolExecutor(1, "corners") as corners:
             image_map = map if settings.threads == 1 else pool.map
 
             def prepare(number: int, frame: TimedFrame) -> PreparedFrame:
                 prepared = prepare_frame(frame, context, image_map)
-                if prepared.images is not None and 0 <= next_extraction() <= begin + number:
-                    prepared.images.find_corners()
+                is_due = 0 <= next_extraction() <= begin + number
+                if prepared.images is not None and is_due and settings.threads > 1:
+                    corners.submit(prepared.images.find_corners)
                 return prepared
 
             yield from play(frames, prepare, settings.threads, live=live)

@@ -1,9 +1,10 @@
 """Loop closing: from the loop candidates of a keyframe to a corrected map (ORB-SLAM, section VII).
 
-While a method runs, no other thread may write the map. The search for a loop only reads it and runs
-in parallel with tracking (``Mapper``). The global bundle adjustment after a loop runs in parallel,
-too, on a snapshot. Its result is merged after a number of keyframes that depends only on the size
-of the problem, so that the same input always gives the same map.
+No other thread may write the map while a method of ``LoopClosing`` runs. The search for a loop only
+reads the map and runs in parallel with tracking (``Mapper``). The global bundle adjustment after a
+loop also runs in parallel, on a snapshot of the map. Its result is merged after a number of
+keyframes that depends only on the size of the problem, so that the same input always gives the same
+map.
 """
 
 from __future__ import annotations
@@ -49,8 +50,8 @@ class LoopClosing:
         verifier: decides which candidates are loops.
         edges: the outcome of every candidate, in order.
         corrections: the loops that were closed.
-        closed: the edges of all closed loops, in the current units of the map; those of a loaded
-            map come first.
+        closed: the edges of all closed loops, in the current units of the map; the loops of a
+            loaded map come first.
         problems: one sentence for each failure that did not harm the map.
     """
 
@@ -142,8 +143,17 @@ class LoopClosing:
         return self._global is not None
 
     def count_reused_keyframe(self, keyframe: int) -> bool:
-        """Count a frame that reused an old keyframe instead of becoming one, where ``keyframe`` is
-        the newest keyframe; returns whether the global bundle adjustment must be merged now."""
+        """Count a frame that made an old keyframe the reference instead of becoming a keyframe.
+
+        Such frames count as keyframes when the time to merge the global bundle adjustment is
+        determined.
+
+        Args:
+            keyframe: id of the newest keyframe.
+
+        Returns:
+            Whether the global bundle adjustment must be merged now.
+        """
         self._followed += 1
         return self._is_due(keyframe)
 
@@ -156,8 +166,8 @@ class LoopClosing:
         return self._global is not None and keyframe + self._followed >= self._global.due
 
     def conclude(self, map_: Map) -> None:
-        """At the end of a drive, close a verified loop that no second keyframe has confirmed yet,
-        if an earlier keyframe confirms it."""
+        """At the end of a drive, close a verified loop that still waits for another keyframe to
+        confirm it, if an earlier keyframe does so (``LoopConsistency.confirmed_by_earlier``)."""
         gates, found, edges = self._config.verification, None, []
         with self._failure_reported("Looking for loops"):
             for edge in self._consistency.confirmed_by_earlier(map_, self._camera, gates):
@@ -184,7 +194,8 @@ class LoopClosing:
 
     @contextmanager
     def _failure_reported(self, what: str) -> Iterator[None]:
-        """Report a failure instead of raising it, for steps that fail without changing the map."""
+        """Report an exception in the block instead of raising it; used for steps that leave the map
+        unchanged when they fail."""
         try:
             yield
         except Exception as error:
@@ -194,8 +205,8 @@ class LoopClosing:
                 _log.warning(problem)
 
     def _solve(self, map_: Map, edge: LoopEdge) -> tuple[LoopEdge, _Loop | None]:
-        """Solve the pose graph with a verified loop. Returns the outcome for ``edges`` and the
-        loop, which is None if it contradicts the rest of the graph."""
+        """Solve the pose graph with a verified loop. Returns the outcome for ``edges``, and the
+        loop, or None if the loop contradicts the rest of the graph."""
         start = time.perf_counter()
         solution = self._solution(map_, edge, Hypothesis.PREDICTED)
         if not solution.verdict.consistent and solution.has_gaps:
@@ -212,7 +223,7 @@ class LoopClosing:
             self._global = None
         keyframes = solution.graph.keyframes
         before = map_.arrays.T_cw[keyframes]
-        # Fusion makes both sides covisible, so their neighbours are collected before it.
+        # Collected before fusion, which makes both sides of the loop covisible.
         query_side = [edge.query, *strong_neighbours(map_, edge.query, self._config)]
         match_side = [edge.match, *strong_neighbours(map_, edge.match, self._config)]
         self.closed.append(edge)
@@ -222,7 +233,7 @@ class LoopClosing:
         edge = replace(edge, reason="closed")
         seconds = time.perf_counter() - loop.start
         self.corrections.append(LoopCorrection(edge, keyframes, before, solution.T_cw, seconds))
-        self._consistency.reset()  # it remembers places of the map before the correction
+        self._consistency.reset()  # the correction has moved the places that it remembers
         with self._failure_reported("Global bundle adjustment after a loop"):
             self._global = self._start_global(map_, edge.query)
 

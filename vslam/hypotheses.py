@@ -80,7 +80,8 @@ def solve(
     Args:
         closed: loops that were closed before, in the map's present units.
         edge: the new loop, with its pose.
-        monocular: optimise similarities, because scale drifts, too.
+        monocular: whether to optimise similarities instead of rigid motions, because the scale of
+            a monocular map drifts.
     """
     predicted = hypothesis is Hypothesis.PREDICTED
     graph = essential_graph(map_, [*closed, edge], config, driven=predicted)
@@ -140,7 +141,7 @@ def _aligned_similarities(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge)
 def _moving_submap(
     map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge
 ) -> tuple[int, NDArray[np.int64]]:
-    """The end of a loop whose sub-map moves, and the keyframes of that sub-map, which are none if
+    """The end of a loop whose sub-map moves, and the ``(N,)`` keyframes of that sub-map. N is 0 if
     both ends lie in the same sub-map."""
     submap = joined_submaps(map_, closed)
     if submap[edge.query] == submap[edge.match]:

@@ -3,9 +3,9 @@
 ``Mapper`` owns the map. Each keyframe is mapped by a job in another thread. The *merge*, which
 makes the job's result visible to tracking, happens at a fixed frame index, however long the job
 takes. Between two merges tracking reads a ``MapView``, a copy that the last merge made. Every
-method that needs the merged map performs the merge itself, and a merge also updates the frames that
-are held. After the merge, a search for loops at the keyframe reads the map in the other thread. A
-loop that it finds is closed before the map changes the next time.
+method that needs the merged map performs the merge itself. A merge also updates the frames that
+were passed to ``Mapper.hold``. After the merge, the other thread searches the map for loops at the
+keyframe. A loop that it finds is closed before the next change of the map.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from vslam.starter import TwoViewStart
 from vslam.states import MapperState
 from vslam.trajectory import Trajectory
 
-_CLOSE_AFTER_FRAMES = 10  # a loop found at a keyframe is closed by then if no keyframe follows
+_CLOSE_AFTER_FRAMES = 10  # a found loop is closed this long after its keyframe, or at the next one
 
 
 class Mapper:
@@ -170,7 +170,7 @@ class Mapper:
         Args:
             frame: the next frame, not tracked yet.
             last: the last tracked frame; None before the first.
-            twist: ``(6,)`` of the points relative to the camera, per second; None if unknown.
+            twist: ``(6,)`` twist of the points relative to the camera, per second; None if unknown.
         """
         self.hold(last, frame)
         self.merge_if_due(frame.index)
@@ -181,8 +181,8 @@ class Mapper:
 
         Args:
             tracked: False for a pose that is only predicted.
-            near: the keyframe near which relocalisation found the frame, which becomes the
-                reference; -1 without relocalisation.
+            near: the keyframe near which the frame was relocalised; it becomes the reference. -1 if
+                the frame was not relocalised.
         """
         if near >= 0:
             self.refer_to(near)
@@ -195,8 +195,8 @@ class Mapper:
         self._counts.add(visible, found)
 
     def merge_if_due(self, frame: int) -> None:
-        """Merge if the last keyframe is at least ``merge_after_frames`` older than this frame, and
-        close a loop that was found at it if it is much older."""
+        """Merge if the last keyframe is at least ``merge_after_frames`` older than this frame. If
+        it is at least ``_CLOSE_AFTER_FRAMES`` older, close a loop that was found at it."""
         age = frame - self.last_frame
         if age >= self._config.keyframes.merge_after_frames:
             self._merge_mapping()
@@ -204,8 +204,8 @@ class Mapper:
             self._settle()
 
     def merge(self) -> Map:
-        """Wait for the running mapping job, make its result visible to tracking, wait for the
-        search for loops, and return the map.
+        """Wait for the running mapping job and make its result visible to tracking; then wait for
+        the search for loops and return the map.
 
         Raises:
             RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
@@ -214,8 +214,9 @@ class Mapper:
         return self.complete()
 
     def complete(self) -> Map:
-        """Wait for the running mapping job, without making its result visible to tracking, and for
-        the search for loops, and return the map. Calling this does not change any result.
+        """Wait for the running mapping job and for the search for loops, and return the map. The
+        result of mapping does not become visible to tracking, so calling this does not change any
+        result.
 
         Raises:
             RuntimeError: as ``merge``.
@@ -336,7 +337,8 @@ class Mapper:
             start.second.twist = start.twist
 
     def find_old_place(self, frame: Frame) -> OldPlace | None:
-        """The old place that the frame has returned to, or None (``find_old_place``)."""
+        """The old place that the frame has returned to; None if there is none
+        (``map_frames.find_old_place``)."""
         return find_old_place(self._settle(), frame, self._config.keyframes.known_after_s)
 
     def use_existing_keyframe(self, place: OldPlace, frame: PlacedFrame) -> None:
@@ -397,8 +399,8 @@ class Mapper:
             yield map_
 
     def _make_room(self, map_: Map, frame: Frame) -> None:
-        """Drop dead landmarks if there are many. This changes the ids of the others, so it must
-        wait for a running global bundle adjustment, which refers to landmarks by id."""
+        """Drop dead landmarks if there are many. The ids of the other landmarks then change, so
+        nothing is dropped during a global bundle adjustment, which refers to landmarks by id."""
         if not self._closing.is_adjusting and map_.many_dead_landmarks:
             drop_dead_landmarks(map_, (*self._held, frame))
 

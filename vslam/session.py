@@ -33,9 +33,10 @@ class OpenedMap:
     Attributes:
         map: the stored map; None for a new one.
         frames: poses of the drive's earlier frames; None for a new drive.
-        checkpoint: state from which the drive continues with identical results, or None.
+        checkpoint: state from which the drive continues with identical results; None for a new
+            drive, or if the map was saved without one.
         drives: sources of the images of the earlier drives, such as "kitti 06".
-        world: the map's place in the world of a ground truth; None if unknown.
+        world: the transformation of the map into the frame of a ground truth; None if unknown.
     """
 
     map: Map | None = None
@@ -57,7 +58,7 @@ def open_map(
     is None.
 
     Args:
-        localize: do not change the map; otherwise a new drive begins in it.
+        localize: only localise in the map, without changing it.
         resume: continue the map's last drive instead of starting a new one.
 
     Raises:

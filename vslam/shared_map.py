@@ -61,8 +61,8 @@ class SharedMap:
             self._job = self._future.result
 
     def start_reading(self, job: Callable[[Map], T]) -> Callable[[], T]:
-        """Start a job that only reads the map; returns a function that waits for its result. The
-        caller must call it before the map is written again."""
+        """Start a job that only reads the map; returns a function that waits for the job's result.
+        That function must be called before the map is written again."""
         map_ = self.map
         if self._executor is None:
             return cache(lambda: job(map_))

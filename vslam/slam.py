@@ -138,7 +138,7 @@ class Slam:
             path: the map file, or the folder of a run.
             config: as for a new map; None uses the thresholds that the map was made with.
             detector: the detector that the map was made with, as a name or an object; None uses
-                the shipped detector of the name in the file.
+                the detector that the file names.
             resume: as for a new map.
             options: ``threads``, ``images`` and ``localize``, as for a new map.
 
@@ -205,9 +205,9 @@ class Slam:
             timestamp: seconds, later than that of the last call.
             mask: ``(H, W)`` uint8 or bool, 0 where the left image must not be used, for example
                 where it shows the hood of the car; None uses the whole image.
-            on_pose: called with the result as soon as the pose is known, before the frame becomes a
-                keyframe (``is_keyframe`` is not decided yet), which takes much longer than
-                tracking. What it raises is passed on.
+            on_pose: called with the result as soon as the pose is known, because inserting a
+                keyframe takes much longer than tracking. Whether the frame becomes a keyframe
+                (``is_keyframe``) may not be decided yet. Exceptions of ``on_pose`` are passed on.
 
         Raises:
             ValueError: the images have another size or type, or the timestamp is not finite or not
@@ -353,7 +353,8 @@ class Slam:
 
     def resume_odometry(self, last: TrackResult) -> None:
         """Continue ``T_odom_camera`` and the uncertainty from the last result of a drive that was
-        resumed from a map without the state of tracking. Without this call both start again."""
+        resumed from a map without the state of tracking. Without this call, the odometry starts at
+        the identity, with no uncertainty."""
         self._session.resume_odometry(last)
 
     def finish(self) -> None:
@@ -384,7 +385,7 @@ class Slam:
 
     @property
     def world(self) -> World | None:
-        """The place of the loaded map in the world of a ground truth; None if unknown."""
+        """The transformation of the loaded map into a ground truth's frame; None if unknown."""
         return self._session.opened.world
 
     @property

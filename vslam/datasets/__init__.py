@@ -12,7 +12,7 @@ from vslam.datasets.frames import Source
 from vslam.errors import InputError, did_you_mean
 
 _DEFAULT_NAME = "00"  # of KITTI and of the rendered towns
-DATASETS = ("kitti", "euroc", "tum", "synthetic")  # without those of plug-ins
+DATASETS = ("kitti", "euroc", "tum", "synthetic")  # plug-ins may add others
 
 
 def open_sequence(

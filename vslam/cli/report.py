@@ -33,8 +33,9 @@ def report(
         typer.Option(
             metavar="NAME=FILE",
             help="Trajectory of another system, in the format of KITTI or TUM. "
-            "NAME@SEQ@PERTURB=FILE also names its sequence and perturbation. It is aligned like "
-            "the runs of its sequence; if its name ends in ', mono', the scale is fitted, too.",
+            "NAME@SEQ@PERTURB=FILE also names its sequence and perturbation. The trajectory is "
+            "aligned like the runs of the sequence; a NAME that ends in ', mono' also fits the "
+            "scale.",
         ),
     ] = None,
     baseline: Annotated[

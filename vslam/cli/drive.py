@@ -110,7 +110,7 @@ def drive(
         raise ResultsError(f"{folder}: ended early: {outcome.interrupted}{fix}.")
     if gps_error and not why:
         raise ResultsError(
-            f"{folder}: all results but the georeferenced trajectory were written: {gps_error}"
+            f"{folder}: no trajectory by GPS, all other results were written: {gps_error}"
         )
     if why or outcome.interrupted:
         raise typer.Exit(1)

@@ -30,8 +30,10 @@ def explorer(
     ground_truth: Trajectory | None,
     moments: Collection[Moment],
 ) -> list[Section]:
-    """The section with the explorer, or none if fewer than two frames were tracked. The arguments
-    are those of :func:`explorer_data`."""
+    """The section with the explorer; no section if fewer than two frames were tracked.
+
+    The arguments are those of :func:`explorer_data`.
+    """
     data = explorer_data(outcome, evaluation, ground_truth, moments)
     if data is None:
         return []

@@ -23,7 +23,8 @@ def open_drives(
 ) -> list[ImageSource]:
     """Open ``drive:ROUTE[seed=101,aliased=1,change=0.5,every=10]``, ``kitti:`` or ``fabmap:``.
 
-    Every ``every``-th frame of a built-in route is rendered on first use, for the left camera.
+    The left images of a built-in route are rendered on first use, with ``every=10`` only those of
+    every tenth frame.
 
     Args:
         cache: folder of rendered towns.

@@ -24,7 +24,7 @@ def render_views(
     """Render the left images of some frames into a tree in KITTI's layout, unless they exist.
 
     The images are identical to those of `render_sequence`. Poses and times of the whole drive are
-    written; the file of poses comes last, so that it exists only if all images do.
+    written, too. The file of poses is written last, so that it exists only if all images do.
 
     Args:
         route: the drive.

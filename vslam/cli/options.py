@@ -83,14 +83,23 @@ Thresholds = Annotated[
 Weights = Annotated[
     list[str] | None,
     option(
-        METHOD, "NAME=FILE", "Weights for a detector; repeat for several.", unset="the shipped ones"
+        METHOD,
+        "NAME=FILE",
+        "Weights of a detector; repeat the option for several detectors.",
+        unset="the shipped ones",
     ),
 ]
 Detectors = Annotated[
     str,
-    option(METHOD, "NAMES", "Loop detectors, separated by commas; the first is the baseline."),
+    option(
+        METHOD,
+        "NAMES",
+        "Loop detectors, separated by commas; the others are compared with the first.",
+    ),
 ]
-Seeds = Annotated[int, option(METHOD, "N", "Number of seeds per random perturbation.", min=1)]
+Seeds = Annotated[
+    int, option(METHOD, "N", "Number of seeds of each perturbation with random numbers.", min=1)
+]
 Jobs = Annotated[
     int,
     option(EXECUTION, "N", "Number of runs at a time; with 1, speeds can be compared.", min=1),
@@ -241,7 +250,7 @@ def _source_options(
         option(
             INPUT,
             "NUMBER",
-            "Value of a depth pixel at one metre.",
+            "Pixel value that stands for a depth of one metre.",
             unset="from the calibration, data set or encoding",
         ),
     ] = None,

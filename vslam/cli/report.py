@@ -51,7 +51,8 @@ def report(
         bool,
         flag(
             OUTPUT,
-            "Write no report; serve a page of all runs, for this machine only, until Ctrl-C.",
+            "Instead of writing a report, serve a page of all runs, for this machine only, until "
+            "Ctrl-C.",
             "--serve",
         ),
     ] = False,

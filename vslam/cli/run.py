@@ -101,7 +101,7 @@ def run(
     ] = "",
     map_file: Annotated[
         Path | None,
-        option(MAP, "FILE|FOLDER", "Continue this map, or the map of this run.", "--map"),
+        option(MAP, "FILE|FOLDER", "Continue the map in a file, or the map of a run.", "--map"),
     ] = None,
     localize: Annotated[
         bool, flag(MAP, "Localise in the map without changing it.", "--localize")

@@ -87,7 +87,7 @@ def stress(
     ] = None,
     seeds: Seeds = 3,
     steps: Annotated[
-        int, option(METHOD, "N", "Bisection steps of each search.", min=1, max=10)
+        int, option(METHOD, "N", "Number of bisection steps in each search.", min=1, max=10)
     ] = 5,
     max_lost: Annotated[
         float,

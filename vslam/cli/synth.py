@@ -126,7 +126,7 @@ def synth(
         flag(OUTPUT, "Only list the routes and what has been rendered.", "--list"),
     ] = False,
     clean: Annotated[
-        bool, flag(OUTPUT, "Delete rendered images, of ROUTE or of all routes.", "--clean")
+        bool, flag(OUTPUT, "Delete the rendered images of ROUTE, or of all routes.", "--clean")
     ] = False,
     verify: Annotated[
         bool, flag(OUTPUT, "Verify all checksums and render damaged frames again.", "--verify")

@@ -216,7 +216,7 @@ def _figures_in_map(outcome: RunOutcome) -> MapFigures | None:
     inside, tracks = outcome.in_map, outcome.tracks
     if inside is None:
         return None
-    # A lost frame is searched for only while no keyframe is being mapped.
+    # Relocalisation of a lost frame is attempted only while no keyframe is being mapped.
     lost = [track for track in tracks if track.state == TrackingState.LOST]
     found = [track for track in tracks if track.relocalised]
     sought = sum("relocalise" in track.stage_ms for track in lost) + len(found)

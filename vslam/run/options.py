@@ -17,10 +17,10 @@ OPTIONS = "run.json"
 
 
 class RunOptions(SourceOptions):
-    """The options as given on the command line. In the file, paths are absolute.
+    """The options as given on the command line. In ``run.json``, paths are absolute.
 
     Attributes:
-        plugins: the package of each plug-in that the other options name; set only in the file.
+        plugins: the package of each plug-in that the other options name; set only in ``run.json``.
     """
 
     perturb: str = "none"

@@ -268,7 +268,7 @@ def _record_frame(
     played: Played[PreparedFrame],
     n_recorded: int,
 ) -> int:
-    """Record a frame, and the map if no job is changing it; returns the number of recorded
+    """Record a frame, and the map if mapping does not change it now; returns the number of recorded
     loops."""
     recorder.frame(result)
     images = None if played.prepared is None else played.prepared.images

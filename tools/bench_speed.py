@@ -389,7 +389,7 @@ def section(
     reading: dict[str, float],
     measured: dict[str, list[dict[str, float]]],
 ) -> str:
-    """The section of a case."""
+    """The section of the page about a case."""
     return (
         f"## {case.title}\n\n{case.frames} frames. "
         f"Reading both images: {reading[FULL]:.1f} ms CPU, by OpenCV {reading[ORBSLAM3]:.1f}.\n\n"

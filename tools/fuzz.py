@@ -243,8 +243,8 @@ _HEADER_VALUES = [
 
 
 def _mutate_meaning(data: bytes, rng: np.random.Generator, name: str) -> bytes:
-    """Change one or two values in arrays or in the header; the types and shapes of the arrays
-    stay."""
+    """Change one or two values in arrays or in the header, but not the types and shapes of the
+    arrays."""
     with np.load(io.BytesIO(data)) as file:
         arrays = {name: file[name].copy() for name in file.files}
     for _ in range(int(rng.integers(1, 3))):

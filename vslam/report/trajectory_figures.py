@@ -177,7 +177,7 @@ def _lines(ends: Points) -> Collection[Points]:
 
 
 def _at_frames(outcome: RunOutcome, path: Points, frames: NDArray[np.int64]) -> Points:
-    """``(F, 3)`` positions of some frames of the run, from the ``path`` of all of them."""
+    """``(F, 3)`` positions of some frames of the run, taken from the ``path`` of all frames."""
     times = np.array([outcome.tracks[k].timestamp for k in frames])
     index = np.searchsorted(outcome.trajectory.timestamps, times)
     return path[np.minimum(index, len(path) - 1)]

@@ -118,7 +118,7 @@ def odometry_trajectory(tracks: list[TrackResult]) -> Trajectory:
 
 
 def ground_truth_of(source: Source) -> Trajectory | None:
-    """The ground truth of all frames that have one; None if there is none."""
+    """The poses of all frames that have ground truth; None if no frame has."""
     if source.ground_truth is None:
         return None
     known = np.flatnonzero(np.isfinite(source.ground_truth).all((1, 2)))

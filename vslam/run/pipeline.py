@@ -185,7 +185,7 @@ class _Run:
 
     @property
     def has_map(self) -> bool:
-        """Whether the map is complete, once the run is finished."""
+        """Whether the finished run has a complete map."""
         try:
             self.slam.map  # noqa: B018
         except RuntimeError:

@@ -118,8 +118,11 @@ def calibration_warnings(camera: Camera, calib: Sequence[Path], name: str) -> li
 
 
 def delay_warnings(delay: SideDelay, camera: Camera) -> list[str]:
-    """A warning if the delay of the right camera that the rows of stereo matches show differs from
-    the delay in the calibration."""
+    """A warning if the measured delay of the right camera differs from that in the calibration.
+
+    Args:
+        delay: the delay, measured by the rows of stereo matches.
+    """
     if not delay.is_wrong:
         return []
     known = camera.right_delay

@@ -21,7 +21,7 @@ _CELL_BYTES, _FRAME_BYTES, _SCRATCH_FRAME_BYTES = 100_000, 1_000, 45_000
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a grid needs.
+    """Time and disk space that a grid needs.
 
     Attributes:
         seconds: wall time if all jobs are always busy.

@@ -130,7 +130,7 @@ def open_scorer(name: str, weights: Path | None, vocabulary: Vocabulary) -> Scor
 
 
 class NetworkScorer:
-    """One of ``NETWORKS``, run on one thread.
+    """A scorer that runs one of ``NETWORKS`` on one thread.
 
     Attributes:
         parameters: number of learned parameters.

@@ -125,8 +125,8 @@ def _best_images(
 
 
 def thinned(curve: PrecisionRecall) -> Curve:
-    """A curve reduced to the best precision at equal steps of recall, and its end, where every pair
-    is accepted.
+    """Reduce a curve to equal steps of recall, each with its best precision, and to the end of the
+    curve, where every pair is accepted.
 
     Equal steps in the number of pairs would not show the curve of a good detector: it ranks the few
     true pairs before thousands of false ones, so that nearly the whole curve would lie within the
@@ -228,11 +228,11 @@ def epipolar_inliers(a: DescribedImage, b: DescribedImage) -> int:
 
 
 def sequence_scores(scores: Matrix) -> Matrix:
-    """The mean score along the best line that ends at each query and gallery image.
+    """Scores of sequences instead of single images, as in SeqSLAM (Milford and Wyeth, ICRA 2012).
 
-    A sequence recognises a stretch of road instead of a single image. As in SeqSLAM (Milford and
-    Wyeth, ICRA 2012), the scores of a query and its predecessors are added along lines through the
-    gallery, one for each speed.
+    A sequence recognises a stretch of road. For each query and gallery image, the scores of the
+    query and its predecessors are added along lines through the gallery that end at this image, one
+    line for each speed. The result is the mean score along the best line.
 
     Args:
         scores: ``(Q, G)`` of queries and images in driving order; higher is more similar.

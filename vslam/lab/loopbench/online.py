@@ -127,7 +127,7 @@ class Judged:
 
     @property
     def near(self) -> NDArray[np.bool_]:
-        """``(N,)`` bool, whether there is a match that is neither right nor far."""
+        """``(N,)`` bool, whether the match was taken near the place but is not marked."""
         return np.isfinite(self.score) & ~self.right & ~self.far
 
 

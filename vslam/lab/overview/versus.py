@@ -124,8 +124,9 @@ def _cell(row: Row | None, measure: str) -> str:
 
 
 def _points(report: OverviewJson, rows: Rows, names: list[str]) -> Iterator[str]:
-    """Sentences on the total of lost frames and loops over the drives that all systems share, then
-    on the comparison of each system with its baseline, the first system that shares a drive."""
+    """Sentences that give the totals of lost frames and loops over the drives that all systems
+    share, and sentences that compare each system with its baseline, which is the first system that
+    shares a drive with it."""
     shared = set.intersection(*(set(rows[name]) for name in names))
     runs = {
         name: [

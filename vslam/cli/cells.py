@@ -31,7 +31,7 @@ class Systems:
 
     Attributes:
         detectors: loop detectors of vslam.
-        weights: weight files of some of them.
+        weights: weight files by detector, for detectors that do not use the shipped weights.
         others: command templates of other systems by name (:mod:`vslam.lab.stress.external`).
     """
 

@@ -174,7 +174,7 @@ def merge(
 
 
 def _thresholds_of(stored: list[StoredMap], files: list[Path]) -> Config:
-    """The thresholds of the first map; a message lists the maps that were made with other ones."""
+    """The thresholds of the first map; a message lists the maps that were made with others."""
     from vslam.config import as_config
 
     thresholds = stored[0].thresholds

@@ -1,6 +1,6 @@
 """The checks, as functions of images, matches and timestamps.
 
-They share one file because each is short, and so that their thresholds are in one place.
+The checks are short and share this file, so that their thresholds are in one place.
 """
 
 from __future__ import annotations

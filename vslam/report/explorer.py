@@ -1,7 +1,7 @@
 """The explorer in a report: pose, state and error of every frame, and images of some keyframes.
 
 A frame adds 47 bytes to the page, an image with its keypoints about 10,000. ``explorer.js`` uses no
-plotting library, because that (Plotly: 4.7 MB) would be larger than the rest of the page.
+plotting library, because a library (Plotly: 4.7 MB) would be larger than the rest of the page.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ def explorer_data(
 
     Args:
         outcome: the run.
-        evaluation: errors of ``outcome.trajectory``, or None.
-        ground_truth: ground truth of the evaluated frames, or None.
+        evaluation: errors of ``outcome.trajectory``; None if they cannot be computed.
+        ground_truth: ground truth of the evaluated frames; None if there is none.
         moments: images from a `vslam.run.moments.MomentRecorder`.
     """
     n = len(outcome.trajectory)

@@ -54,9 +54,9 @@ def draw_figures(
 
     Args:
         outcome: the run.
-        evaluation: errors of ``outcome.trajectory``, or None.
-        ground_truth: ground truth of the evaluated frames, or None.
-        verdict: evaluation of ``outcome.loops``, or None.
+        evaluation: errors of ``outcome.trajectory``; None if they cannot be computed.
+        ground_truth: ground truth of the evaluated frames; None if there is none.
+        verdict: evaluation of ``outcome.loops``; None if a frame has no ground truth.
     """
     return draw(_drawings(outcome, evaluation, ground_truth, verdict))
 

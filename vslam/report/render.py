@@ -135,8 +135,8 @@ def _is_shown(part: Part) -> bool:
 def show(sections: Iterable[Section], console: Console) -> None:
     """Print sections to a terminal.
 
-    Sentences are wrapped at the width of the console. Tables and values are not, because a broken
-    number cannot be read and a broken command cannot be copied.
+    Sentences are wrapped at the width of the console. Tables and values are not wrapped, because a
+    broken number cannot be read and a broken command cannot be copied.
     """
 
     def say(text: str, *, style: str = "", indent: str = "") -> None:

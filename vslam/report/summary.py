@@ -53,9 +53,9 @@ def summarize(
 
     Args:
         outcome: the run.
-        evaluation: errors of ``outcome.trajectory``, or None.
-        verdict: evaluation of ``outcome.loops``, or None.
-        evo_command: command that repeats the evaluation, or None.
+        evaluation: errors of ``outcome.trajectory``; None if they cannot be computed.
+        verdict: evaluation of ``outcome.loops``; None if a frame has no ground truth.
+        evo_command: command that repeats the evaluation; None if evo cannot evaluate the run.
         remark: why there is no evaluation, or how many frames it covers.
     """
     frames = len(outcome.tracks)

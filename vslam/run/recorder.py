@@ -167,7 +167,7 @@ class Viewer:
 
     Attributes:
         address: URL of the viewer's page; empty for a window.
-        sink: rerun's object that a recording is sent to.
+        sink: rerun's object to which a recording is sent.
     """
 
     address: str

@@ -134,7 +134,8 @@ class Judged:
 def judge(
     decisions: Decisions, relation: NDArray[np.int8], searchable: NDArray[np.int64]
 ) -> Judged:
-    """Compare decisions with the ground truth, the relation ``(N, N)`` int8 of the images.
+    """Compare decisions with the ground truth: ``relation`` ``(N, N)`` int8 tells which images show
+    the same place (:class:`vslam.lab.loopbench.sets.QuerySet`).
 
     Raises:
         InputError: no image has a marked image before the window.

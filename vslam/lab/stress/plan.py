@@ -82,7 +82,8 @@ class Plan:
         steps: number of bisections in each search.
         baseline: the system with which the errors of a preset are compared.
         repeated: systems that are not deterministic and therefore run with every seed.
-        preset: ``kitti-c`` for its fixed severities, or None.
+        preset: ``kitti-c``, whose fixed severities are tested instead of ``laws``; None without a
+            preset.
     """
 
     clean: list[Cell]

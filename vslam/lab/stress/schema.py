@@ -1,4 +1,4 @@
-"""The schema of ``stress.json``. It has no times and no machine, so equal runs give equal bytes."""
+"""The schema of ``stress.json``, without times and machine: equal runs give equal bytes."""
 
 from __future__ import annotations
 

@@ -208,7 +208,7 @@ def _logarithmic(axes: Axes) -> None:
 
 
 def _light(perturb: str) -> str:
-    return "images as they are" if perturb == "none" else perturb
+    return "unperturbed images" if perturb == "none" else perturb
 
 
 def _identifier(name: str) -> str:

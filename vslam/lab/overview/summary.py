@@ -249,7 +249,7 @@ def _words(found: Comparison, better: list[Pair], worse: list[Pair]) -> str:
 
     first, second, shown = found.first, found.second, COMPARED[found.measure]
     what = shown.title
-    light = {"none": ", images as they are", ALL: " over all conditions"}.get(
+    light = {"none": ", unperturbed images", ALL: " over all conditions"}.get(
         found.perturb, f", {found.perturb}"
     )
     n, untied = len(found.pairs), len(better) + len(worse)

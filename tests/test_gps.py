@@ -375,7 +375,7 @@ def test_what_was_computed_is_kept_where_gps_says_too_little(call, kitti_tree, f
     code, _, err = call("run", "--data", kitti_tree, *WORDS, "--no-report", "--gps", rough)
     assert code == 1
     assert len(err.splitlines()) == 1
-    assert "all other results are there: the drive is too short for GPS" in err
+    assert "all other results were written: the drive is too short for GPS" in err
     run = tmp_path / "runs" / "latest"
     assert (run / "trajectory.tum").is_file()
     assert not (run / "gps.json").exists()

@@ -149,7 +149,9 @@ def test_a_result_that_fails_costs_itself_alone(tmp_path, monkeypatch, name):
         write_results(tmp_path, outcome)
     says = str(error.value)
     assert says.startswith(f"{tmp_path}: {cost} failed (KeyError: 'a fault")
-    assert says.endswith("all other results are there; this is a fault of vslam, please report it.")
+    assert says.endswith(
+        "all other results were written; this is a fault of vslam, please report it."
+    )
     assert "\n" not in says
     lost = {"report.md", "report.html", "figures"} if name == "summarize" else set()
     assert {path.name for path in tmp_path.iterdir()} == ALL - set(cost.split(", ")) - lost

@@ -26,8 +26,8 @@ TOPICS = {
     "left/camera_info": CameraInfo,
     "right/camera_info": CameraInfo,
 }
-MOST_WAITING = 5  # pairs; older ones are dropped where tracking takes longer than a frame
-APART_S = 0.005  # most that the stamps of a pair may differ by
+MOST_WAITING = 5  # pairs of images; older pairs are dropped while tracking is too slow
+APART_S = 0.005  # largest difference between the stamps of a pair
 
 
 def message_type(name: str) -> Any:

@@ -74,6 +74,7 @@ def doctor(
 
 
 def _free(path: Path) -> Path:
-    """The path itself, or with the first number that gives a path that does not exist."""
+    """The path if it does not exist, else the first of ``doctor-2.html``, ``doctor-3.html``, ...
+    that does not exist."""
     numbered = (path.with_stem(f"{path.stem}-{n}") for n in count(2))
     return next(one for one in chain((path,), numbered) if not one.exists())

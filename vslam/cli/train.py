@@ -98,7 +98,7 @@ def train(
         ),
     ] = None,
     pixels: Annotated[
-        str | None, option(METHOD, "SIDE|HxW", "Size of the images; smaller ones train faster.")
+        str | None, option(METHOD, "SIDE|HxW", "Size of the images; smaller images train faster.")
     ] = None,
     allow_test_data: Annotated[
         bool,

@@ -22,9 +22,9 @@ from vslam.report.page import Figure, Page, Section
 from vslam.report.render import html
 
 _FRAMES = 8  # examined frames, spread over the sequence
-_LAGS = range(-2, 3)  # delays of the right image in frames that are tried
-# To check the focal length: pairs of frames, frames from the first to the second of a pair, and the
-# smallest number of common points and the largest number that is used.
+_LAGS = range(-2, 3)  # delays of the right image, in frames, that are tried
+# To check the focal length: number of pairs of frames, number of frames from the first to the
+# second of a pair, and least and largest number of common points.
 _TURNS, _LATER = 16, 4
 _FEWEST, _MOST = 30, 200
 _PICTURES = 2
@@ -58,7 +58,7 @@ class Diagnosis:
 def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
     """Run all checks that apply to a stereo, RGB-D or monocular sequence.
 
-    They examine rectified images, as a run uses them.
+    The checks examine rectified images, as a run uses them.
     """
     frames = np.unique(np.linspace(0, len(sequence) - 1, _FRAMES).round().astype(int)).tolist()
     read: dict[int, tuple[Image, Image | DepthImage | None]] = {}
@@ -99,8 +99,8 @@ def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
 
 
 def _examine_mask(sequence: Source, lefts: dict[int, Image]) -> tuple[list[Finding], list[Picture]]:
-    """Measure which share of the first image the mask hides, and draw this part in red; nothing
-    without a mask."""
+    """Measure which share of the first image the mask hides, and draw this part in red; return
+    empty lists without a mask."""
     frame = next(iter(lefts), None)
     read = None if frame is None else sequence.stored[frame].mask
     if frame is None or read is None:
@@ -147,7 +147,7 @@ def _pairs(sequence: Source, lefts: dict[int, Image], lag: int) -> list[_Pair]:
 def _examine_stereo(
     sequence: Source, lefts: dict[int, Image], *, few_features: bool
 ) -> tuple[list[Finding], list[Picture]]:
-    inner = dict(list(lefts.items())[1:-1:2])  # with frames before and after them
+    inner = dict(list(lefts.items())[1:-1:2])  # frames that have frames before and after them
     by_lag = {lag: _pairs(sequence, inner if lag else lefts, lag) for lag in _LAGS}
     pairs = by_lag[0]
     if not any(len(pair.matches) for pair in pairs):
@@ -155,7 +155,7 @@ def _examine_stereo(
         measured = "no pair of images has 12 matches"
         finding = Finding("stereo", "fault", measured, fix)
         if few_features:
-            finding = Finding("stereo", "unknown", f"{measured}, because they have few features")
+            finding = Finding("stereo", "unknown", f"{measured}: the images have few features")
         return [finding], [_stereo_picture(pair) for pair in pairs[:1]]
     synchronised, lag = checks.check_synchronisation(_rows_by_lag(by_lag))
     pairs = by_lag[lag]  # the other checks need synchronised images

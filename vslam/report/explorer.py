@@ -1,7 +1,7 @@
 """The explorer in a report: pose, state and error of every frame, and images of some keyframes.
 
 A frame adds 47 bytes to the page, an image with its keypoints about 10,000. ``explorer.js`` uses no
-plotting library, because that (Plotly: 4.7 MB) would be larger than the rest of the page.
+plotting library, because a library (Plotly: 4.7 MB) would be larger than the rest of the page.
 """
 
 from __future__ import annotations
@@ -26,8 +26,10 @@ if TYPE_CHECKING:
 def explorer(
     outcome: RunOutcome, evaluation: Evaluation | None, moments: Collection[Moment]
 ) -> list[Section]:
-    """The section with the explorer, or none if fewer than two frames were tracked. The arguments
-    are those of :func:`explorer_data`."""
+    """The section with the explorer; no section if fewer than two frames were tracked.
+
+    The arguments are those of :func:`explorer_data`.
+    """
     data = explorer_data(outcome, evaluation, moments)
     if data is None:
         return []
@@ -48,7 +50,7 @@ def explorer_data(
 
     Args:
         outcome: the run.
-        evaluation: errors of ``outcome.trajectory``, or None.
+        evaluation: errors of ``outcome.trajectory``; None if they cannot be computed.
         moments: images from a `vslam.run.moments.MomentRecorder`.
     """
     n = len(outcome.trajectory)

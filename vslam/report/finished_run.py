@@ -23,8 +23,11 @@ _WITHOUT_IMAGES = "export g2o, euroc or ply --no-colours, which need no images"
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """The content of a run's folder. ``map`` has no removed keyframes; ``loops`` are the closed
-    ones, with the relative poses that verification measured."""
+    """The content of a run's folder.
+
+    ``map`` contains no culled keyframes. ``loops`` are the closed loops, with the relative poses
+    that verification measured.
+    """
 
     folder: Path
     report: ReportJson
@@ -59,11 +62,12 @@ def open_images(
     """Open the images of a run again, with the options in its ``run.json``.
 
     Args:
-        data: the present location of the data, if it has moved.
+        data: the location of the data if it has moved; None for the location in ``run.json``.
         on_render: as in :func:`vslam.datasets.open_sequence`.
 
     Raises:
-        InputError: the images are missing, are of another camera, or came from a live camera.
+        InputError: the images are missing, are of another camera, or came from a live camera, or
+            the map was made from several drives.
     """
     if set(run.map.sessions) != {run.map.scalars.session}:  # the report is of the last drive
         raise InputError(

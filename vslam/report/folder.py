@@ -42,9 +42,9 @@ def create_run_folder(
 ) -> Path:
     """Create ``out/<YYYYmmdd-HHMMSS>-<dataset>-<sequence>-<perturb>-<detector>``.
 
-    The first changed threshold is appended, with the number of further ones, and a number if the
-    name is in use. ``out/latest`` becomes a symbolic link to the folder if the file system has
-    such links.
+    If thresholds differ from the defaults, the first of them is appended, with the number of
+    further ones. If the name is in use, a number is appended. ``out/latest`` becomes a symbolic
+    link to the folder if the file system supports such links.
 
     Raises:
         InputError: the folder cannot be created.
@@ -89,7 +89,7 @@ def write_results(
 ) -> ReportJson:
     """Evaluate a complete or interrupted run and write all results.
 
-    The most valuable files are written first, and one that fails does not affect the others:
+    The most valuable files are written first. If a file cannot be written, the others still are:
 
     - trajectories: ``trajectory_kitti.txt``, ``trajectory.tum``, ``ground_truth_kitti.txt``,
       ``keyframes.tum``, ``trajectory_causal.tum`` (poses as first estimated), ``covariance.csv``
@@ -102,7 +102,7 @@ def write_results(
 
     Args:
         folder: an existing folder; files of an earlier report are replaced.
-        outcome: the run; all its frames may be lost, or there may be none.
+        outcome: the run, which may have lost all frames or have no frames.
         moments: images of keyframes for the HTML page.
         pictures: pictures of closed loops; some become ``figures/loop-<frame>-<frame>.jpg``.
         pages: whether to write the pages.
@@ -110,7 +110,7 @@ def write_results(
         map_file: a second place to write the map to.
 
     Raises:
-        ResultsError: some results could not be written; all others are complete.
+        ResultsError: some results could not be written; all others were written.
     """
     written = Results(folder)
     evaluation, remark = _write_data(written, outcome, ply=ply, map_file=map_file)
@@ -128,7 +128,7 @@ def write_results(
 
 
 class Results:
-    """Writes the results of a run; the failure of one does not prevent the others."""
+    """Writes the results of a run, and continues with the others if one cannot be written."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -144,7 +144,7 @@ class Results:
 
     @contextlib.contextmanager
     def file(self, name: str) -> Iterator[Path]:
-        """The path at which to write a file or folder, which is removed if that fails."""
+        """Yield the path at which to write a file or folder, which is removed if writing fails."""
         path = self.folder / name
         with self.part(name):
             try:
@@ -155,10 +155,10 @@ class Results:
                 raise
 
     def require_all(self) -> None:
-        """Fail if a part has failed.
+        """Check that all parts have succeeded.
 
         Raises:
-            ResultsError: names the parts and their errors.
+            ResultsError: some parts failed; the message names them and their errors.
         """
         if not self._failed:
             return
@@ -174,7 +174,7 @@ class Results:
         else:
             remedy = "free some space or name another folder with --out"
         raise ResultsError(
-            f"{self.folder}: {failed}, all other results are there; {remedy}."
+            f"{self.folder}: {failed}, all other results were written; {remedy}."
         ) from first
 
 
@@ -187,8 +187,11 @@ def _reason(error: Exception) -> str:
 def _write_data(
     written: Results, outcome: RunOutcome, *, ply: bool, map_file: Path | None
 ) -> tuple[Evaluation | None, str | None]:
-    """Write trajectories, maps and tables; return the result of ``evaluate_run``, which also gives
-    the place of the map in the ground truth."""
+    """Write trajectories, maps and tables; return the result of ``evaluate_run``.
+
+    The evaluation also gives the transform from the map to the ground truth, which the map file
+    contains.
+    """
     write_trajectories(written, outcome)
     with written.file("keyframes.tum") as file:
         write_tum(file, outcome.keyframes)
@@ -251,7 +254,8 @@ def _config_text(outcome: RunOutcome) -> str:
 
 def write_trajectories(written: Results, outcome: RunOutcome) -> None:
     """Write the final trajectory in both formats, and the ground truth of the same frames. If some
-    frames have none, it is written only in the TUM format, which has times."""
+    frames have no ground truth, it is written only in the TUM format, because only this format has
+    times."""
     with written.file("trajectory_kitti.txt") as file:
         write_kitti(file, outcome.trajectory.T_wc)
     with written.file("trajectory.tum") as file:
@@ -270,7 +274,7 @@ def write_trajectories(written: Results, outcome: RunOutcome) -> None:
 
 
 def _evo_command(folder: Path, outcome: RunOutcome, evaluation: Evaluation | None) -> str | None:
-    """The command that repeats the evaluation with evo; None if evo cannot."""
+    """The command that repeats the evaluation with evo; None if evo cannot evaluate this run."""
     if evaluation is None or evaluation.on_one_line:
         return None
     if evaluation.frames == len(outcome.trajectory):
@@ -289,7 +293,7 @@ def _write_pages(
     moments: Collection[Moment],
     pictures: Collection[LoopPicture],
 ) -> None:
-    """Write the figures, and pages with the figures that could be drawn."""
+    """Write the figures, and the pages, which contain the figures that could be drawn."""
     from vslam.report.explorer import explorer
     from vslam.report.figures import draw_figures
     from vslam.report.loop_tables import seen_loops

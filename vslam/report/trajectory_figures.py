@@ -42,8 +42,8 @@ Points = NDArray[np.float64]
 def top_view(
     outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
 ) -> Figure:
-    """Estimate, ground truth, weak and lost frames, closed loops and missed revisits. The estimates
-    of the detectors of --compare are dashed, each after its own alignment."""
+    """Draw estimate, ground truth, weak and lost frames, closed loops and missed revisits. The
+    trajectories of the detectors of --compare are dashed, each after its own alignment."""
     figure, axes = _new_map("Top view", outcome, evaluation)
     path = _aligned(outcome, evaluation, outcome.trajectory.T_wc[:, :3, 3])
     x, z = path[:, 0], path[:, 2]
@@ -52,7 +52,7 @@ def top_view(
     for k, (other, color) in enumerate(zip(outcome.compared, cycle(COMPARED), strict=False)):
         its_own = None if evaluation is None else evaluate_run(other)[0]
         points = _aligned(other, its_own, other.trajectory.T_wc[:, :3, 3])
-        # Shifted dashes keep all of several coinciding paths visible.
+        # The dashes of each path are shifted, so that coinciding paths all stay visible.
         dashes = (2.0 * k, (2.0, 2.0 * len(outcome.compared)))
         axes.plot(
             points[:, 0],
@@ -99,10 +99,10 @@ def top_view(
 
 
 def loop_closing(outcome: RunOutcome, evaluation: Evaluation | None) -> Figure:
-    """Keyframes before the first correction and at the end, in the frame of the ground truth.
+    """Draw the keyframes before the first correction and at the end.
 
-    Both are transformed by the alignment of the final trajectory, so that every difference between
-    them is the effect of loop closing.
+    Both are transformed to the frame of the ground truth by the alignment of the final trajectory,
+    so that every difference between them is the effect of loop closing.
     """
     figure, axes = _new_map("Map before and after loop closing", outcome, evaluation)
     before = _aligned(outcome, evaluation, _centres(outcome.corrections[0].T_cw_before))
@@ -134,7 +134,7 @@ def loop_closing(outcome: RunOutcome, evaluation: Evaluation | None) -> Figure:
 
 
 def gps_map(track: GpsTrack) -> Figure:
-    """The trajectory with and without GPS, and the fixes."""
+    """Draw the trajectory with and without GPS, and the fixes."""
     figure, axes = new_figure("With GPS", "east (m)", "north (m)", SQUARE)
     used = track.anchored.used
     fixes, refused = track.fixes[used], track.fixes[~used]
@@ -162,14 +162,14 @@ def _centres(T_cw: NDArray[np.float64]) -> Points:
 
 
 def _lines(ends: Points) -> Collection[Points]:
-    """x and z of ``(M, 2, 3)`` lines, joined to one polyline with gaps (NaN)."""
+    """x and z of ``(M, 2, 3)`` lines, as one polyline in which NaN separates the lines."""
     gaps = np.full((len(ends), 1, 3), np.nan)
     points = np.concatenate([ends, gaps], axis=1).reshape(-1, 3)
     return points[:, 0], points[:, 2]
 
 
 def _at_frames(outcome: RunOutcome, path: Points, frames: NDArray[np.int64]) -> Points:
-    """``(F, 3)`` positions of some frames of the run, from the ``path`` of all of them."""
+    """``(F, 3)`` positions of some frames of the run, taken from the ``path`` of all frames."""
     times = np.array([outcome.tracks[k].timestamp for k in frames])
     index = np.searchsorted(outcome.trajectory.timestamps, times)
     return path[np.minimum(index, len(path) - 1)]

@@ -17,7 +17,7 @@ from vslam.geometry import inverses
 from vslam.maps.stored_map import StoredMap
 from vslam.trajectory import Trajectory, bridge_gaps
 
-_LONGEST_S = 0.5  # between two frames; at longer intervals no position is interpolated
+_LONGEST_S = 0.5  # between two frames; over longer intervals, no position is interpolated
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,7 @@ class GpsTrack:
         trajectory: poses of the frames, camera to ENU, in metres.
         geodetic: ``(N, 3)`` their latitude and longitude (degrees) and altitude (m).
         datum: ``(3,)`` latitude, longitude and altitude of the origin, which is the first fix.
-        visual: ``(N, 3)`` the visual trajectory aligned with ENU as a whole, without other use of
-            GPS.
+        visual: ``(N, 3)`` the trajectory by vision alone, aligned with the fixes as a whole.
         fixes: ``(M, 3)`` the fixes at the time of tracked frames, in ENU.
         anchored: the keyframes in ENU, and which fixes were used.
     """
@@ -46,7 +45,7 @@ def locate(stored: StoredMap, fixes: Fixes, config: PoseGraphConfig) -> GpsTrack
     """Georeference a finished drive. The map is not changed.
 
     Args:
-        stored: the map with the poses of its last drive's frames.
+        stored: the map, with the poses of the frames of its last drive.
 
     Raises:
         InputError: fewer than three fixes belong to tracked frames, or the drive is too short.
@@ -83,7 +82,8 @@ def _in_map(
 
     Args:
         T_kw: ``(K, 4, 4)`` poses of the keyframes.
-        scale: ``(K,)`` factors for the lengths around each keyframe.
+        scale: ``(K,)`` factors by which the translations from each keyframe to its frames are
+            multiplied; None leaves them unchanged.
     """
     T_ck = table.T_c_reference.copy()
     if scale is not None:
@@ -98,8 +98,11 @@ def _in_map(
 def _positions(
     table: FrameTable, T_kw: NDArray[np.float64], fixes: Fixes
 ) -> tuple[Positions, NDArray[np.float64]]:
-    """The fixes between tracked frames, each with the position of the camera at its time relative
-    to the keyframe of the frame before, and the datum."""
+    """The fixes between tracked frames, and the datum.
+
+    Each fix gets the interpolated position of the camera at its time, in the frame of the keyframe
+    to which the previous frame refers.
+    """
     at = np.searchsorted(table.timestamp, fixes.times, "right") - 1
     at[fixes.times == table.timestamp[-1]] -= 1
     inside = (at >= 0) & (at + 1 < len(table.timestamp))

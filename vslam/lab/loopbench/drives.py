@@ -26,7 +26,8 @@ def open_drives(
 ) -> list[ImageSource]:
     """Open ``drive:ROUTE[seed=101,aliased=1,change=0.5,every=10]``, ``kitti:`` or ``fabmap:``.
 
-    Every ``every``-th frame of a built-in route is rendered on first use, for the left camera.
+    The left images of a built-in route are rendered on first use, with ``every=10`` only those of
+    every tenth frame.
 
     Args:
         cache: folder of rendered towns.
@@ -93,7 +94,7 @@ def render_views(
     """Render the left images of some frames into a tree in KITTI's layout, unless they exist.
 
     The images are identical to those of `render_sequence`. Poses and times of the whole drive are
-    written; the file of poses comes last, so that it exists only if all images do.
+    written, too. The file of poses is written last, so that it exists only if all images do.
 
     Args:
         root: root of the tree, which must not be used for other routes or variations.

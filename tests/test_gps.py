@@ -400,7 +400,7 @@ def test_fixes_before_a_stream_are_refused(corridor, tmp_path, fixes):
     require_overlap(good, source, fixes)
     early = Fixes(good.times - 100.0, good.geodetic, good.sigma)
     with pytest.raises(
-        InputError, match=r"to -97\.300 s but the images are from 0\.200 s on; give"
+        InputError, match=r"to -97\.300 s but the images are from 0\.200 s on; both"
     ):
         require_overlap(early, source, fixes)
     with pytest.raises(InputError, match="cannot be used with a live camera"):

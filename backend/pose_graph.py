@@ -91,14 +91,15 @@ def essential_graph(
     culled, the living keyframe that its pose is stored relative to takes its place. If several
     loops then connect the same keyframes, only the last one is used.
 
-    A tree edge across a restart of the map, whose ends share hardly any landmarks, was not measured
-    but predicted. If there was no prediction either, it is always WEAK.
+    If the camera was lost between the two keyframes of a tree edge and they share hardly any
+    landmarks, their relative pose was not measured, but at best predicted. The kind of this edge is
+    GAP if the pose was predicted and ``driven`` is true, otherwise WEAK.
 
     Args:
         loops: all closed loops, the new one last; each has a pose.
-        driven: whether the camera is on a vehicle. If so, a predicted edge is trusted as far as the
-            motion of a car can be predicted over that time (GAP); otherwise the camera may have
-            been carried anywhere (WEAK).
+        driven: whether the camera is on a vehicle. Then a GAP edge is trusted as far as the motion
+            of a car can be predicted over the time between its two keyframes. A camera that is not
+            on a vehicle may have been carried anywhere, so a WEAK edge says almost nothing.
 
     Raises:
         ValueError: a loop has no pose.

@@ -50,9 +50,9 @@ def map_stereo_points(
 def triangulate_with_neighbours(
     map_: Map, keyframe: int, camera: Camera, config: Config
 ) -> NDArray[np.int32]:
-    """Match the features without a landmark of a keyframe and of its covisible keyframes along
-    epipolar lines, and triangulate the matches (ORB-SLAM, VI-C). Returns the ``(N,)`` ids of the
-    new landmarks."""
+    """Match features of a keyframe with features of its covisible keyframes along epipolar lines,
+    and triangulate the matches (ORB-SLAM, VI-C). Only features that observe no landmark yet are
+    matched. Returns the ``(N,)`` ids of the new landmarks."""
     neighbours, _ = map_.covisible(keyframe)
     created = [np.empty(0, np.int32)]
     limit, min_baseline = config.mapping.neighbours, camera.baseline

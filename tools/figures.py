@@ -89,7 +89,8 @@ class Stamp:
 
 class Report(NamedTuple):
     """The result of a check, as sentences: ``faults`` must be repaired, ``older`` names files that
-    another version of the method made, and ``typed`` names pages with tables without a source."""
+    are missing or were made by another version of the SLAM method (``vslam.METHOD_VERSION``), and
+    ``typed`` names pages with tables without a source."""
 
     faults: list[str]
     older: list[str]

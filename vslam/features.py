@@ -124,7 +124,7 @@ class Extracted:
 
     @classmethod
     def nothing(cls) -> Extracted:
-        """The result for a frame without images."""
+        """The result of extraction for a frame without images: no features."""
         return cls(Features.none())
 
 

@@ -90,7 +90,7 @@ def open_map(
 
 @dataclass(frozen=True)
 class Session:
-    """The parts of SLAM that have a state, and the map that the drive began in."""
+    """The parts of SLAM that have a state, and the map, new or stored, in which the drive began."""
 
     context: TrackingContext
     closing: LoopClosing

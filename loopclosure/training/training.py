@@ -254,8 +254,8 @@ class _Training:
         return value
 
     def _augmented(self, a: NDArray[np.int64], b: NDArray[np.int64], first: int) -> torch.Tensor:
-        """Augmented images of the pairs, ``(2 N, 3, H, W)``; ``first`` is the number of the first
-        pair in the epoch."""
+        """Augmented images of N successive pairs of the epoch, ``(2 N, 3, H, W)``; ``first`` is the
+        index, in the epoch, of the first of these pairs."""
         settings, epoch = self.settings, self.progress.epoch
 
         def augmented(job: tuple[int, int, int]) -> NDArray[np.uint8]:

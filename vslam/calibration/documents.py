@@ -46,7 +46,7 @@ class Document:
         return Document(f"{self.source}: {key}", values)
 
     def text(self, key: str) -> str:
-        """The word at a key."""
+        """The value at a key, which must be a scalar, as text."""
         value = self._value(key)
         if not isinstance(value, str):
             raise InputError(f"{self.source}: {key} must be one word.")

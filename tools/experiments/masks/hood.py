@@ -63,7 +63,11 @@ def main() -> None:
 
 
 def draw_hood(height: int, width: int, rows: float) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """``(H, W)`` texture of a hood, and its mask: 0 below an arc, which covers a share ``rows``."""
+    """``(H, W)`` texture of a hood, and its mask: 0 on the hood, 255 elsewhere.
+
+    The upper edge of the hood is an arc. In the middle column of the image, the hood covers the
+    share ``rows`` of all rows.
+    """
     texture = np.random.default_rng(0).integers(20, 230, (height // 4, width // 4), dtype=np.uint8)
     texture = cv2.resize(cv2.GaussianBlur(texture, (0, 0), 1.0), (width, height))
     arc = height * (1.0 - rows * (1.0 - (np.arange(width) / width - 0.5) ** 2))

@@ -159,8 +159,9 @@ def decision_curve(judged: Judged, *, near_is_wrong: bool = True) -> PrecisionRe
     """Precision and recall over images, with each distinct score as the threshold.
 
     Args:
-        near_is_wrong: count unmarked matches near the place as wrong, as the literature does; False
-            leaves them out.
+        near_is_wrong: whether a match that was taken near the place of the query, but is not marked
+            as the same place (``Judged.near``), counts as wrong, as in the literature. If False,
+            such matches are left out.
     """
     wrong = judged.far | (judged.near & near_is_wrong)
     counted = judged.right | wrong

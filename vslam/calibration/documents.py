@@ -46,7 +46,7 @@ class Document:
         return Document(f"{self.source}: {key}", values)
 
     def text(self, key: str) -> str:
-        """The word at a key."""
+        """The text at a key, which must not hold a list or a section."""
         value = self._value(key)
         if not isinstance(value, str):
             raise InputError(f"{self.source}: {key} must be one word.")
@@ -135,8 +135,9 @@ def read_document(path: Path) -> Document:
 def _flat(value: object) -> list[str]:
     """Flatten nested lists of text.
 
-    Nested YAML aliases can expand a few lines into gigabytes or form a cycle. A list with more
-    items than any matrix therefore becomes "no number", which the caller refuses.
+    Nested YAML aliases can expand a few lines into gigabytes or form a cycle. If there are more
+    than ``_MOST_STEPS`` lists and items, far more than in any matrix, the result is therefore the
+    text "no number", which the caller refuses. An item that is not text also becomes "no number".
     """
     found: list[str] = []
     waiting = [value]

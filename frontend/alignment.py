@@ -99,9 +99,9 @@ def find_patches(
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
 
     Returns:
-        ``(N, 2)`` float32 vector from each expected position, rounded to a whole pixel of its
-        octave, to the position where the patch was found, in pixels of the octave; NaN if the patch
-        was not found.
+        ``(N, 2)`` float32 shift of each patch, in pixels of its octave: the position where it was
+        found, minus the expected position. The expected position is first rounded to a whole pixel
+        of the octave. NaN if the patch was not found.
     """
     view, size = known.view[at], known.size[at]
     warp = warps(T_cw, xyz, known.T_cw, view, size, scales[octave], intrinsics)

@@ -1,9 +1,9 @@
 """Merging the maps of several drives by loops between them.
 
-A map is appended to another one as a sub-map at an unknown place, and the other map's detector
-proposes candidates for each of its keyframes. They are verified and closed as usual: the first loop
-moves the sub-map to its place, later loops correct drift and fuse landmarks, and a global bundle
-adjustment concludes the merge.
+Each further map is appended to the first as a sub-map at an unknown place. For each keyframe of the
+appended map, the detector of the first map proposes candidates. These are verified and closed as
+usual: the first loop moves the sub-map to its place, later loops correct drift and fuse landmarks,
+and a global bundle adjustment concludes the merge.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ class FocalFit:
 
 
 def fit_focal_length(several: Sequence[Moved], camera: Camera) -> FocalFit:
-    """Find the factor between 0.5 and 2 that fits the motion best.
+    """Find the focal length that fits the motion best, between 0.5 and 2 times the calibrated one.
 
     Args:
         several: at least one pair of frames, each with at least three points.

@@ -180,7 +180,7 @@ def _columns(rows: Sequence[Row]) -> list[str]:
 
 
 def rich_table(table: Table, gap: int) -> RichTable:
-    """A table of rich in which no cell is cut off; headings are broken at commas and brackets.
+    """A ``rich`` table in which no cell is cut off; headings are broken at commas and brackets.
 
     Args:
         table: the cells.

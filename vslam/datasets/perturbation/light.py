@@ -172,7 +172,8 @@ def _dark(level: float, stream: RandomStream) -> Law:
 
 
 def _blackout(period: float, stream: RandomStream) -> Law:
-    """One blackout at a random time in every period; the two kinds alternate."""
+    """One blackout at a random time in every period. Short blackouts after which the light rises
+    slowly alternate with long ones after which it rises fast (``_BLACKOUTS``)."""
 
     def curve(frame: int, t: float) -> NDArray[np.float64]:
         if t < _LIT_S:

@@ -160,14 +160,15 @@ class NetworkScorer:
 
 
 class LocalDescriptorCache:
-    """Coarse local descriptors of images, computed once per image."""
+    """Local descriptors of images, computed once per image. Only the coarse ones are kept; see
+    ``DescriptorMaps``."""
 
     def __init__(self, network: LocalDescriptors | None = None) -> None:
         self._network = network
         self._kept: dict[bytes, DescriptorMaps] = {}
 
     def of(self, image: Image) -> DescriptorMaps:
-        """Coarse descriptors of a grey image ``(H, W)``.
+        """The coarse local descriptors of a grey image ``(H, W)``, without the fine ones.
 
         Raises:
             InputError: the network cannot be read.

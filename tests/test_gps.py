@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from vslam.backend.gps import Positions, align, anchor
 from vslam.backend.pose_graph import TREE, WEAK, PoseGraph, edge_sigmas
 from vslam.config import Config
-from vslam.datasets.fixes import DEFAULT_SIGMA_M, Fixes, read_fixes, to_enu, to_geodetic
+from vslam.datasets.fixes import DEFAULT_SIGMA_M, read_fixes, to_enu, to_geodetic
 from vslam.errors import InputError
 from vslam.geometry import inverses, se3_exp
 from vslam.trajectory import read_trajectory
@@ -106,6 +106,24 @@ def test_fixes_of_a_bag_are_read(tmp_path, kind, name):
     assert fixes.sigma.tolist() == [[1.0, 2.0, 3.0], [DEFAULT_SIGMA_M] * 3]
 
 
+CALIBRATIONS = {
+    # The IMU looks ahead, left and up, as the laser does; the camera right, down and ahead.
+    "calib_imu_to_velo.txt": "R: 1 0 0 0 1 0 0 0 1\nT: -0.81 0.32 -0.8\n",
+    "calib_velo_to_cam.txt": "calib_time: 15-Mar-2012 11:37:16\nR: 0 -1 0 0 0 -1 1 0 0\n"
+    "T: 0 -0.08 -0.27\ndelta_f: 0 0\n",
+}
+
+
+def test_the_calibration_of_kitti_raw_gives_the_antenna(tmp_path):
+    folder = oxts(tmp_path / "2011_09_26" / "drive" / "oxts")
+    assert not read_fixes(folder).antenna.any()
+    for name, text in CALIBRATIONS.items():
+        (tmp_path / "2011_09_26" / name).write_text(text)
+    for path in (folder, folder.parent):
+        assert read_fixes(path).antenna == pytest.approx([-0.32, 0.72, -1.08])
+        assert read_fixes(path, (1.0, 2.0, 3.0)).antenna.tolist() == [1.0, 2.0, 3.0]
+
+
 def test_metres_to_latitude_and_back():
     enu = np.array([[0.0, 0.0, 0.0], [100.0, -2000.0, 30.0]])
     geodetic = to_geodetic(enu, DATUM)
@@ -136,6 +154,13 @@ BAD = {
     "no packets": (lambda folder: folder, "no data/*.txt"),
     "unequal": (lambda folder: oxts(folder / "oxts", times=2), "2 times for 3 fixes"),
     "no stamps": (lambda folder: oxts(folder / "oxts", times=0), "0 times for 3 fixes"),
+    "calibration": (
+        lambda folder: [
+            oxts(folder / "day" / "drive" / "oxts"),
+            *[(folder / "day" / name).write_text("R: 1 0\nT: 0 0 0\n") for name in CALIBRATIONS],
+        ][0],
+        "not a calibration of KITTI raw",
+    ),
     "no topic": (lambda folder: bag_of(folder / "a.bag", [], topics=()), "the bag has none"),
     "two topics": (
         lambda folder: bag_of(folder / "a.bag", [(1, 0, 48.0, 0)], topics=("/a", "/b")),
@@ -194,12 +219,14 @@ def graph_of(T_wc, seconds):
     )
 
 
-def measured(true, sigma=1.0, seed=0):
-    """Fixes of all keyframes with a second between them, and their true positions."""
+def measured(true, sigma=1.0, seed=0, antenna=(0.0, 0.0, 0.0)):
+    """Fixes of all keyframes with a second between them, and the true positions of the camera."""
     enu = true[:, :3, 3] @ R_ENU_CAMERA.T + np.array([50.0, -20.0, 3.0])
-    noise = np.random.default_rng(seed).normal(0.0, sigma, enu.shape)
+    fixes = enu + true[:, :3, :3] @ np.array(antenna) @ R_ENU_CAMERA.T
+    fixes += np.random.default_rng(seed).normal(0.0, sigma, enu.shape)
     n, three = len(true), np.full(enu.shape, sigma)
-    return Positions(np.arange(n) * 1.0, np.arange(n), np.zeros((n, 3)), enu + noise, three), enu
+    zeros, lever = np.zeros((n, 3)), np.tile(antenna, (n, 1))
+    return Positions(np.arange(n) * 1.0, np.arange(n), zeros, lever, fixes, three), enu
 
 
 def jumped(positions, at):
@@ -302,6 +329,21 @@ def test_the_scale_of_a_monocular_map_is_found_where_it_drifts():
     assert anchored.scale[30:-30] == pytest.approx(wanted[30:-30], rel=0.05)
 
 
+@pytest.mark.parametrize("metric", [True, False])
+def test_the_antenna_need_not_be_at_the_camera(metric):
+    """It is behind and above the camera, on a drive that turns through more than 90 degrees."""
+    true, found = drive(300, turn=0.1, drift=0.5)
+    if not metric:
+        found[:, :3, 3] *= 0.2
+    positions, enu = measured(true, 0.05, antenna=(0.0, -1.5, -1.5))
+    graph = graph_of(found, positions.seconds)
+    known = anchor(graph, positions.seconds, positions, CONFIG, metric=metric)
+    ignored = replace(positions, lever=np.zeros_like(positions.lever))
+    without = anchor(graph, positions.seconds, ignored, CONFIG, metric=metric)
+    assert error_of(known, enu) < 0.1
+    assert error_of(without, enu) > 1.5
+
+
 def test_each_part_of_a_map_is_aligned_by_itself():
     """After a loss of the camera, nothing is known about where the next part lies."""
     true, found = drive(300)
@@ -398,7 +440,7 @@ def test_fixes_before_a_stream_are_refused(corridor, tmp_path, fixes):
     source = open_from("video", tmp_path / "drive.mkv", calib=calib, sensor="mono", start=2)
     good = read_fixes(fixes)
     require_overlap(good, source, fixes)
-    early = Fixes(good.times - 100.0, good.geodetic, good.sigma)
+    early = replace(good, times=good.times - 100.0)
     with pytest.raises(
         InputError, match=r"to -97\.300 s but the images are from 0\.200 s on; give"
     ):

@@ -295,6 +295,10 @@ def _gps(report: ReportJson) -> Section:
     latitude, longitude, altitude = found.datum
     rows = [
         ("origin", f"{latitude:.7f}°, {longitude:.7f}°, {altitude:.1f} m"),
+        (
+            "antenna",
+            "{:g}, {:g}, {:g} m right of, below and ahead of the camera".format(*found.antenna),
+        ),
         ("fixes of tracked frames", f"{found.fixes}, {found.refused} of them refused"),
         ("distance of the fixes used (RMS)", _number(found.residual_m, "m")),
         ("scale of the map", f"{found.metres_per_unit:.4g} m per unit"),

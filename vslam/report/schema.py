@@ -158,7 +158,8 @@ class GpsFigures(Record):
     """The georeferenced trajectory in numbers, also written as ``gps.json``.
 
     ``datum``: origin of the local east-north-up frame, the first fix, as latitude and longitude in
-    degrees and altitude in metres. ``fixes``: number of fixes at tracked frames, of which
+    degrees and altitude in metres. ``antenna``: its position in the frame of the left camera (x
+    right, y down, z forward), in metres. ``fixes``: number of fixes at tracked frames, of which
     ``refused`` failed the chi-square test. ``residual_m``: root mean square distance of the other
     fixes from the trajectory. ``metres_per_unit``: mean scale of the map. ``ate_rmse_m``: ATE of
     ``trajectory_enu.tum`` after SE3 alignment, None without ground truth. ``level``: False if the
@@ -166,6 +167,7 @@ class GpsFigures(Record):
     """
 
     datum: tuple[float, float, float]
+    antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)
     fixes: int
     refused: int
     residual_m: float

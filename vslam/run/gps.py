@@ -30,7 +30,8 @@ class GpsTrack:
         datum: ``(3,)`` latitude, longitude and altitude of the origin, which is the first fix.
         visual: ``(N, 3)`` the visual trajectory aligned with ENU as a whole, without other use of
             GPS.
-        fixes: ``(M, 3)`` the fixes at the time of tracked frames, in ENU.
+        fixes: ``(M, 3)`` the fixes at the time of tracked frames, in ENU: positions of the antenna.
+        antenna: ``(3,)`` position of the antenna in the frame of the camera, in metres.
         anchored: the keyframes in ENU, and which fixes were used.
     """
 
@@ -39,6 +40,7 @@ class GpsTrack:
     datum: NDArray[np.float64]
     visual: NDArray[np.float64]
     fixes: NDArray[np.float64]
+    antenna: NDArray[np.float64]
     anchored: Anchored
 
 
@@ -74,6 +76,7 @@ def locate(stored: StoredMap, fixes: Fixes, config: PoseGraphConfig) -> GpsTrack
         datum=datum,
         visual=visual @ S[:3, :3].T + S[:3, 3],
         fixes=positions.enu,
+        antenna=fixes.antenna,
         anchored=found,
     )
 
@@ -101,8 +104,8 @@ def _in_map(
 def _positions(
     table: FrameTable, T_kw: NDArray[np.float64], fixes: Fixes
 ) -> tuple[Positions, NDArray[np.float64]]:
-    """The fixes between tracked frames, each with the position of the camera at its time relative
-    to the keyframe of the frame before, and the datum."""
+    """The fixes between tracked frames, each with the positions of the camera and the antenna at
+    its time relative to the keyframe of the frame before, and the datum."""
     at = np.searchsorted(table.timestamp, fixes.times, "right") - 1
     at[fixes.times == table.timestamp[-1]] -= 1
     inside = (at >= 0) & (at + 1 < len(table.timestamp))
@@ -117,11 +120,15 @@ def _positions(
         )
     before, after, elapsed = before[inside], after[inside], elapsed[inside]
     share = ((fixes.times[inside] - table.timestamp[before]) / elapsed)[:, None]
-    centres = _in_map(table, T_kw).T_wc[:, :3, 3]
-    world = (1.0 - share) * centres[before] + share * centres[after]
+    T_wc = _in_map(table, T_kw).T_wc
+    centres, levers = (
+        (1.0 - share) * at_frames[before] + share * at_frames[after]
+        for at_frames in (T_wc[:, :3, 3], T_wc[:, :3, :3] @ fixes.antenna)
+    )
     keyframe = table.reference[before]
-    T = T_kw[keyframe]
-    arm = np.einsum("mij,mj->mi", T[:, :3, :3], world) + T[:, :3, 3]
+    R, t = T_kw[keyframe, :3, :3], T_kw[keyframe, :3, 3]
+    arm = np.einsum("mij,mj->mi", R, centres) + t
+    lever = np.einsum("mij,mj->mi", R, levers)
     geodetic = fixes.geodetic[inside]
-    enu = to_enu(geodetic, geodetic[0])
-    return Positions(fixes.times[inside], keyframe, arm, enu, fixes.sigma[inside]), geodetic[0]
+    enu, sigma = to_enu(geodetic, geodetic[0]), fixes.sigma[inside]
+    return Positions(fixes.times[inside], keyframe, arm, lever, enu, sigma), geodetic[0]

@@ -122,6 +122,9 @@ def test_the_calibration_of_kitti_raw_gives_the_antenna(tmp_path):
     for path in (folder, folder.parent):
         assert read_fixes(path).antenna == pytest.approx([-0.32, 0.72, -1.08])
         assert read_fixes(path, (1.0, 2.0, 3.0)).antenna.tolist() == [1.0, 2.0, 3.0]
+    (tmp_path / "2011_09_26" / "calib_imu_to_velo.txt").write_text("R: 1 0\nT: 0 0 0\n")
+    with pytest.raises(InputError, match=r"imu_to_velo\.txt: not a calibration of KITTI raw"):
+        read_fixes(folder)
 
 
 def test_metres_to_latitude_and_back():
@@ -154,13 +157,6 @@ BAD = {
     "no packets": (lambda folder: folder, "no data/*.txt"),
     "unequal": (lambda folder: oxts(folder / "oxts", times=2), "2 times for 3 fixes"),
     "no stamps": (lambda folder: oxts(folder / "oxts", times=0), "0 times for 3 fixes"),
-    "calibration": (
-        lambda folder: [
-            oxts(folder / "day" / "drive" / "oxts"),
-            *[(folder / "day" / name).write_text("R: 1 0\nT: 0 0 0\n") for name in CALIBRATIONS],
-        ][0],
-        "not a calibration of KITTI raw",
-    ),
     "no topic": (lambda folder: bag_of(folder / "a.bag", [], topics=()), "the bag has none"),
     "two topics": (
         lambda folder: bag_of(folder / "a.bag", [(1, 0, 48.0, 0)], topics=("/a", "/b")),
@@ -364,12 +360,14 @@ def test_each_part_of_a_map_is_aligned_by_itself():
 @pytest.fixture
 def fixes(corridor, tmp_path):
     times = corridor.timestamps - corridor.timestamps[0]
-    enu = corridor.T_wc[:, :3, 3] @ R_ENU_CAMERA.T
+    enu = (corridor.T_wc[:, :3, 3] + corridor.T_wc[:, :3, :3] @ ANTENNA) @ R_ENU_CAMERA.T
     enu = enu + np.random.default_rng(0).normal(0.0, 0.01, enu.shape)
     enu[10] += 3.0
     return csv_of(tmp_path / "fixes.csv", times, enu, 0.01)
 
 
+# Above and behind the camera.
+ANTENNA = np.array([0.2, -0.5, -1.5])
 WORDS = ("--detector", "none", "--no-record", "--quiet", "--threads", 1)
 
 
@@ -377,7 +375,8 @@ WORDS = ("--detector", "none", "--no-record", "--quiet", "--threads", 1)
 def test_a_run_with_gps_lies_on_the_earth(call, corridor, kitti_tree, fixes, tmp_path):
     code, _, err = call("run", "--data", kitti_tree, *WORDS, "--out", "without")
     assert code == 0, err
-    code, _, err = call("run", "--data", kitti_tree, *WORDS, "--gps", fixes)
+    at = ",".join(map(str, ANTENNA))
+    code, _, err = call("run", "--data", kitti_tree, *WORDS, "--gps", fixes, "--gps-antenna", at)
     assert code == 0, err
     run, without = tmp_path / "runs" / "latest", tmp_path / "without" / "latest"
     for name in ("trajectory.tum", "trajectory_odom.tum", "keyframes.tum", "map.npz"):
@@ -386,6 +385,7 @@ def test_a_run_with_gps_lies_on_the_earth(call, corridor, kitti_tree, fixes, tmp
     assert "GPS" not in (without / "report.html").read_text()
 
     figures = json.loads((run / "gps.json").read_text())
+    assert figures["antenna"] == ANTENNA.tolist()
     assert figures["fixes"] == 28
     assert figures["refused"] == 1
     assert figures["datum"] == pytest.approx([48.0, 11.0, 500.0], abs=0.1)
@@ -405,6 +405,7 @@ def test_a_run_with_gps_lies_on_the_earth(call, corridor, kitti_tree, fixes, tmp
     assert figures["ate_rmse_m"] < 0.1
     page = (run / "report.md").read_text()
     assert "28, 1 of them refused" in page
+    assert "0.20 m right of, -0.50 m below, -1.50 m ahead of the camera" in page
     assert "27 fixes" in page
     assert (run / "figures" / "gps_map.png").is_file()
     assert "too straight" in page or figures["level"]
@@ -421,6 +422,22 @@ def test_what_was_computed_is_kept_where_gps_says_too_little(call, kitti_tree, f
     run = tmp_path / "runs" / "latest"
     assert (run / "trajectory.tum").is_file()
     assert not (run / "gps.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--gps-antenna", "1,2,3"), "name the fixes of this antenna with --gps"),
+        (("--gps", "fixes.csv", "--gps-antenna", "1,2"), "--gps-antenna 1,2: give three numbers"),
+        (("--gps", "fixes.csv", "--gps-antenna", "-1,x,2"), "give three numbers"),
+        (("--gps", "fixes.csv", "--gps-antenna", "-1,inf,2"), "give three numbers"),
+    ],
+)
+def test_a_place_that_no_antenna_has_is_refused(call, kitti_tree, words, said):
+    code, _, err = call("run", "--data", kitti_tree, *words)
+    assert code == 2
+    assert len(err.splitlines()) == 1
+    assert said in err
 
 
 def test_localising_takes_no_gps(call, kitti_tree, fixes):

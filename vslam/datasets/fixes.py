@@ -88,14 +88,13 @@ def read_fixes(path: Path, antenna: Sequence[float] | None = None) -> Fixes:
         ) from error
     if not path.exists():
         raise InputError(f"--gps {path}: no such file or folder; name a CSV file, a bag or oxts.")
-    known = np.zeros(3)
     if path.suffix in _BAGS or (path / "metadata.yaml").is_file():
         rows = read_fixes_of_bag(path)
     elif path.is_dir():
         folder = path / "oxts" if (path / "oxts").is_dir() else path
         rows = _read_oxts(folder)
         if antenna is None:
-            known = _antenna_of_kitti(folder.resolve().parents[1])
+            antenna = _antenna_of_kitti(folder.resolve().parent.parent)
     else:
         rows = _read_csv(path)
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
@@ -108,8 +107,8 @@ def read_fixes(path: Path, antenna: Sequence[float] | None = None) -> Fixes:
             f"{position[1]:g}; give degrees, from -90 to 90 and from -180 to 180."
         )
     sigma = np.where(rows[:, 4:] > 0.0, rows[:, 4:], DEFAULT_SIGMA_M)
-    at = known if antenna is None else np.array(antenna, np.float64)
-    return Fixes(rows[:, 0], rows[:, 1:4], sigma, at)
+    antenna = (0.0, 0.0, 0.0) if antenna is None else antenna
+    return Fixes(rows[:, 0], rows[:, 1:4], sigma, np.array(antenna, np.float64))
 
 
 def require_overlap(fixes: Fixes, source: Source, path: Path) -> None:
@@ -213,16 +212,16 @@ def _read_oxts(folder: Path) -> NDArray[np.float64]:
     return np.column_stack([seconds, rows[:, :3], sigma])
 
 
-def _antenna_of_kitti(folder: Path) -> NDArray[np.float64]:
-    """``(3,)`` position in the left grey camera of the point that OXTS packets give the position
-    of, by the calibration in the folder of a day of KITTI raw; zeros if the folder has none.
+def _antenna_of_kitti(folder: Path) -> Sequence[float] | None:
+    """The position that OXTS packets refer to (the inertial unit's) in the left grey camera, by the
+    calibration in the folder of a day of KITTI raw; None if there is none.
 
     The rotation of the rectification is left out: it is less than a degree.
     """
-    point = np.zeros(3)
     paths = [folder / name for name in ("calib_imu_to_velo.txt", "calib_velo_to_cam.txt")]
     if not all(path.is_file() for path in paths):
-        return point
+        return None
+    point = np.zeros(3)
     for path in paths:
         try:
             lines = dict(line.split(":", 1) for line in path.read_text().splitlines() if line)
@@ -230,7 +229,8 @@ def _antenna_of_kitti(folder: Path) -> NDArray[np.float64]:
             point = R.reshape(3, 3) @ point + t.reshape(3)
         except (OSError, ValueError, KeyError) as error:
             raise InputError(
-                f"--gps: {path}: not a calibration of KITTI raw; unpack it again, or name the "
-                "position of the antenna with --gps-antenna."
+                f"{path}: not a calibration of KITTI raw; unpack it again, or give the position "
+                "of the antenna with --gps-antenna."
             ) from error
-    return point
+    x, y, z = point.tolist()
+    return x, y, z

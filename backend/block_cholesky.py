@@ -73,7 +73,7 @@ def _analyse(n, pairs):
     position = np.full(n, -1, np.int64)
     first = np.zeros(n + 1, np.int64)
     for step in range(n):
-        # Minimum degree; of several, the one with the lowest index, that is, the oldest.
+        # Choose a block of minimum degree; a tie goes to the lowest index, the oldest keyframe.
         chosen, least = -1, n
         for i in range(n):
             if position[i] < 0 and degree[i] < least:

@@ -32,8 +32,9 @@ class BundleProblem:
         uvr: ``(O, 3)`` float64 observed u, v, u_right; NaN u_right for a monocular observation.
         inverse_sigma2: ``(O,)`` float64, inverse variance of u and v.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
-        disparity_weight: ``(O,)`` float64, standard deviation of u and v over that of the
-            disparity; None uses the weight in ``intrinsics`` for all observations.
+        disparity_weight: ``(O,)`` float64, ratio of the standard deviation of u and v to the
+            standard deviation of the disparity; None uses the ratio in ``intrinsics`` for all
+            observations.
     """
 
     T_cw: NDArray[np.float64]
@@ -128,7 +129,7 @@ def adjust(
 
 
 def observations_of(problem: BundleProblem, use: NDArray[np.bool_] | None) -> Observations:
-    """The observations of a problem as arguments of kernels; for ``use`` see ``adjust``."""
+    """The observations of a problem as arguments of kernels. ``use`` is explained in ``adjust``."""
     return Observations(
         problem.first,
         problem.camera,

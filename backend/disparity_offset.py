@@ -26,7 +26,7 @@ from vslam.map_kernels import collect_landmarks
 
 STEP = 0.2  # pixels between the three offsets for which the cost is computed
 ITERATIONS = 15
-TOLERANCE = 1e-5  # relative; a change of the offset by STEP changes the cost by some thousandths
+TOLERANCE = 1e-5  # least relative decrease of the cost; STEP changes the cost by some thousandths
 
 
 def map_and_calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:

@@ -30,8 +30,9 @@ def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config)
 
 
 def fusion_neighbours(map_: Map, keyframe: int, config: Config) -> list[int]:
-    """The best covisible keyframes of a keyframe, and the best five covisible keyframes of each of
-    them (ORB-SLAM2)."""
+    """Ids of the ``mapping.fuse_neighbours`` keyframes that share most landmarks with a keyframe,
+    and of the five keyframes that share most landmarks with each of these neighbours
+    (ORB-SLAM2)."""
     first, _ = map_.covisible(keyframe)
     chosen = first[: config.mapping.fuse_neighbours].tolist()
     known = {keyframe, *chosen}

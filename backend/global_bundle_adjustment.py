@@ -1,9 +1,9 @@
 """Bundle adjustment of hundreds of keyframes with loops.
 
-Problem, loss and steps are those of ``bundle_adjustment``; only the reduced camera system is
-different. Keyframes that share no landmark are not coupled, so the system is stored as sparse 6x6
-blocks and factorised by ``block_cholesky`` (Triggs et al., "Bundle adjustment - a modern
-synthesis", section 6.3).
+The problem, the loss and the steps are those of ``bundle_adjustment``; only the reduced camera
+system is solved differently. Keyframes that share no landmark are not coupled, so the system is
+stored as sparse 6x6 blocks and factorised by ``block_cholesky`` (Triggs et al., "Bundle adjustment
+- a modern synthesis", section 6.3).
 """
 
 from __future__ import annotations
@@ -113,10 +113,10 @@ def adjust_globally(
 def working_order(first, rank, n_cameras):
     """Sort points and observations for cache-friendly access to the reduced camera system.
 
-    The observations of a point are sorted by the elimination order of their cameras, so that of any
-    two observations, the first gives the column of their block and the second gives the row. Points
-    are sorted by their first camera, so that blocks that are written in sequence are close together
-    in memory.
+    The observations of a point are sorted by the elimination order of their cameras, so that the
+    earlier of two observations gives the column of their block, and the later one gives the row.
+    Points are sorted by their first camera, so that blocks that are written in sequence are close
+    together in memory.
 
     Args:
         first: ``(P + 1,)`` as in ``BundleProblem``.
@@ -157,7 +157,7 @@ def coupled_cameras(first, camera, used, n_free):
     """``(M, 2)`` int64 pairs of free cameras that observe a common point, without repetitions."""
     start, points = points_of_cameras(first, camera, used, n_free)
     met = np.empty(n_free, np.int64)
-    last = np.full(n_free, -1)  # the last camera i with which each camera was paired
+    last = np.full(n_free, -1)  # the last camera ``i`` that each camera was paired with
     count = 0
     for i in range(n_free):
         count += cameras_met(i, start, points, first, camera, used, n_free, last, met)
@@ -175,8 +175,8 @@ def coupled_cameras(first, camera, used, n_free):
 
 @inner_kernel
 def points_of_cameras(first, camera, used, n_free):
-    """Points that each free camera observes. Those of camera k are
-    ``points[start[k]:start[k + 1]]``. Returns ``start`` int64 and ``points`` ``(N,)`` int32."""
+    """Points that each free camera observes, as ``start`` int64 and ``points`` ``(N,)`` int32:
+    camera k observes ``points[start[k]:start[k + 1]]``."""
     start = np.zeros(n_free + 2, np.int64)
     for o in range(len(camera)):
         if camera[o] < n_free and used[o]:

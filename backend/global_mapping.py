@@ -23,15 +23,15 @@ from vslam.map_kernels import refresh_landmarks, unlink
 
 @dataclass(frozen=True)
 class GlobalSnapshot:
-    """A copy of the map as a bundle problem, and the ids of what it contains.
+    """A copy of the map as a bundle problem, and the ids of its cameras, points and observations.
 
     Attributes:
         problem: the bundle problem; free keyframes come first, fixed ones last.
         keyframes: ``(K,)`` int64, id of each camera of the problem.
         landmarks: ``(P,)`` int32, id of each point.
         rows: ``(O,)`` int64, row of each observation in the map's arrays.
-        n_keyframes, n_landmarks: sizes of the map at the time of the snapshot. Keyframes and
-            landmarks with these ids or greater ones are newer than the snapshot.
+        n_keyframes, n_landmarks: numbers of keyframes and landmarks ever created at the time of the
+            snapshot. Ids from these numbers on are newer than the snapshot.
     """
 
     problem: BundleProblem
@@ -45,8 +45,8 @@ class GlobalSnapshot:
 def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
     """Copy all living keyframes and landmarks into a bundle problem.
 
-    The first keyframe is fixed. So is the first keyframe of every other part of the map that no
-    landmark connects to it, because the position of that part is otherwise undetermined.
+    The first keyframe of each connected part of the map is fixed, because nothing else determines
+    the position of the part. Keyframes are connected if they observe a common landmark.
     """
     living = map_.living_keyframes()
     landmarks = map_.living_landmarks().astype(np.int32)

@@ -32,13 +32,13 @@ GATE = 11.34  # chi-square with three degrees of freedom that 1 % of correct fix
 _MEDIAN = 2.366  # median of this chi-square distribution
 _CAUCHY = 2.0  # smallest scale of the Cauchy loss, in standard deviations
 _NARROWING = 3.0  # factor by which this scale shrinks from one optimisation to the next
-_DRIFT = 0.02  # tolerance of RANSAC for the drift of the map, as a share of the map's radius
-_DRAWS, _MOST_DRAWN = 1000, 500  # RANSAC: number of samples, and of fixes that they are drawn from
+_DRIFT = 0.02  # tolerance of RANSAC for the drift of the map, as a fraction of the map's radius
+_DRAWS, _MOST_DRAWN = 1000, 500  # RANSAC: number of samples, and number of fixes to draw from
 _UP_WEIGHT = 1e-3  # see _umeyama
 _METRIC = 0.02  # standard deviation of the scale of a metric map, from errors of its calibration
-_MAX_UNSURE = 0.1  # largest accepted standard deviation of the directions of an alignment, rad
+_MAX_UNSURE = 0.1  # largest accepted uncertainty of the two directions of an ``Alignment``, rad
 _LOOSE = np.array([0.3, 0.3, 0.3, 100.0, 100.0, 100.0])  # standard deviations of priors, rad and m
-_STRETCH = 0.1  # ``stretch`` of a monocular map while its local scale is being estimated
+_STRETCH = 0.1  # ``_optimised(stretch=...)`` of a monocular map while its local scale is estimated
 _WINDOW = 25  # keyframes before and after a keyframe from which its local scale is estimated
 
 Array = NDArray[np.float64]
@@ -46,14 +46,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Positions:
-    """M positions of the antenna that were measured by GPS.
+    """M positions of an antenna that GPS measured, and the SLAM estimates of the same positions.
 
     Attributes:
-        seconds: ``(M,)`` times.
-        keyframe: ``(M,)`` int64, index of the keyframe in whose frame ``arm`` and ``lever`` are.
+        seconds: ``(M,)`` times of the measurements, seconds.
+        keyframe: ``(M,)`` int64, index of the keyframe in whose frame ``arm`` and ``lever``
+            are given.
         arm: ``(M, 3)`` estimated position of the camera, in units of the map.
         lever: ``(M, 3)`` from the camera to the antenna, in metres.
-        enu: ``(M, 3)`` measured position east, north and up of a datum, in metres.
+        enu: ``(M, 3)`` measured position in metres east, north and up of a reference point.
         sigma: ``(M, 3)`` standard deviations of ``enu`` in metres.
     """
 
@@ -70,8 +71,8 @@ class Positions:
 
     @property
     def crowding(self) -> Array:
-        """``(M,)`` number of positions in a window of ``CORRELATION_S`` around each position,
-        itself included."""
+        """``(M,)`` number of positions within a window of ``CORRELATION_S`` around each position,
+        including that position."""
         times = np.sort(self.seconds)
         first = np.searchsorted(times, self.seconds - 0.5 * CORRELATION_S, "left")
         last = np.searchsorted(times, self.seconds + 0.5 * CORRELATION_S, "right")
@@ -85,7 +86,7 @@ class Anchored:
     Attributes:
         T_enu_k: ``(N, 4, 4)`` poses of the keyframes, in metres.
         scale: ``(N,)`` metres per unit of the map at each keyframe.
-        used: ``(M,)`` bool, the fixes that passed the test.
+        used: ``(M,)`` bool, the fixes that passed the chi-square test.
         residual_m: root mean square distance of the used fixes from the trajectory.
         S_enu_w: ``(4, 4)`` alignment of the whole map before the optimisation.
         level: False if the fixes lie on a straight line, so that the camera was assumed to be
@@ -108,9 +109,9 @@ def anchor(
 
     Args:
         graph: the essential graph of the map.
-        seconds: ``(N,)`` times of its keyframes.
-        metric: whether the unit of the map is the metre, except for errors of the calibration.
-            Otherwise (monocular map), the scale and its drift are estimated without a prior.
+        seconds: ``(N,)`` times of the keyframes.
+        metric: whether the unit of the map is the metre up to errors of the calibration. For a
+            monocular map it is not; then the scale and its drift are estimated without a prior.
 
     Raises:
         InputError: the drive is too short for its direction to be known.
@@ -159,9 +160,9 @@ class Alignment:
     """A similarity from the map to ENU, and its uncertainty.
 
     Attributes:
-        S_enu_w: ``(4, 4)``.
+        S_enu_w: ``(4, 4)`` similarity from the map to ENU.
         unsure: standard deviation of the direction of the drive, rad.
-        unsure_about: standard deviation of the rotation about this direction, rad.
+        unsure_about: standard deviation of the rotation about the direction of the drive, rad.
     """
 
     S_enu_w: Array
@@ -172,13 +173,14 @@ class Alignment:
 def align(T_wk: Array, positions: Positions, *, metric: bool, seed: int = 0) -> Alignment:
     """Align a map with its fixes by RANSAC.
 
-    A baseline that is 1 % too long makes a metric map 1 % too large. So the scale of a metric map
-    is estimated as well, from the fixes and the calibration, weighted by their uncertainty
-    (``_METRIC`` is that of the calibration).
+    The scale of a metric map is estimated as well, because a calibrated baseline that is 1 % too
+    long makes the map 1 % too large. The estimate is the mean of the scale of the fixes and of the
+    scale 1 of the calibration, weighted by their inverse variances (``_METRIC`` is the standard
+    deviation of the calibration).
 
     Args:
         T_wk: ``(N, 4, 4)`` poses of the keyframes in the map.
-        positions: at least three.
+        positions: at least three GPS positions.
         metric: see ``anchor``.
         seed: seed of the random samples.
     """
@@ -220,11 +222,12 @@ def align(T_wk: Array, positions: Positions, *, metric: bool, seed: int = 0) -> 
 
 
 def _umeyama(p: Array, q: Array, up: Array, fixed: float | None) -> Array:
-    """``(..., 4, 4)`` similarities that map ``(..., M, 3)`` points p to q. Their scale is ``fixed``
-    or, if that is None, estimated.
+    """``(..., 4, 4)`` similarities that map ``(..., M, 3)`` points p to q. Their scale is
+    ``fixed``; if ``fixed`` is None, the scale is estimated.
 
     Points on a line do not determine the rotation about this line. In this case the upward axes
-    ``up`` of the camera determine it; their weight is too small to matter otherwise.
+    ``up`` of the camera determine it. In all other cases these axes have too little weight to
+    matter.
     """
     p_mean, q_mean = p.mean(axis=-2), q.mean(axis=-2)
     p0, q0 = p - p_mean[..., None, :], q - q_mean[..., None, :]
@@ -279,8 +282,9 @@ def _chi2(positions: Positions, T_enu_k: Array, scale: Array) -> Array:
 
 
 def _local_scale(T_wk: Array, T_enu_k: Array, scale: Array, part: NDArray[np.int64]) -> Array:
-    """``(N,)`` metres per unit of the map: the ratio of the lengths of the path around each
-    keyframe, within its part of the map; the previous ``scale`` if this path has no length."""
+    """``(N,)`` metres per unit of the map at each keyframe: the length of the path around the
+    keyframe in ENU, divided by the length of the same path in the map. The path stays within the
+    keyframe's part of the map. Where its length is 0, the previous ``scale`` is returned."""
     scale = scale.copy()
     for label in np.unique(part):
         inside = np.flatnonzero(part == label)
@@ -307,8 +311,8 @@ def _optimised(
     """``(N, 4, 4)`` poses that best agree with edges and fixes, starting from ``T_enu_k``.
 
     Args:
-        cauchy: scale of the Cauchy loss of fixes, in their standard deviations; None for a Gaussian
-            loss.
+        cauchy: scale of the Cauchy loss of the fixes, in standard deviations of the fixes; None
+            uses a Gaussian loss.
         stretch: relative standard deviation of the lengths of edges, in addition to
             ``edge_sigmas``.
     """
@@ -320,7 +324,8 @@ def _optimised(
     for i, T in enumerate(T_enu_k):
         pose = gtsam.Pose3(T)
         start.insert(i, pose)
-        # Determines the poses of parts without fixes, and rotations about a straight drive.
+        # This prior determines the poses of parts without fixes, and the rotation about a straight
+        # drive.
         if graph.fixed[i]:
             factors.add(gtsam.PriorFactorPose3(i, pose, loose))
     edges, T_i_j = graph.edges, graph.T_i_j.copy()

@@ -26,8 +26,9 @@ RECENT_KEYFRAMES = 3  # a landmark is on probation for this many keyframes (ORB-
 
 
 def map_keyframe(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Run local mapping for a keyframe that was just inserted and linked to its landmarks: culling
-    of landmarks, triangulation, fusion, local bundle adjustment and culling of keyframes."""
+    """Run local mapping for a keyframe that was just inserted and linked to its landmarks: cull
+    recent landmarks, triangulate and fuse landmarks, run local bundle adjustment, and cull
+    keyframes."""
     cull_recent_landmarks(map_, keyframe, camera, config)
     triangulate_with_neighbours(map_, keyframe, camera, config)
     refresh_keyframe(map_, keyframe)
@@ -38,7 +39,8 @@ def map_keyframe(map_: Map, keyframe: int, camera: Camera, config: Config) -> No
 
 
 def refresh_keyframe(map_: Map, keyframe: int) -> None:
-    """Recompute descriptor, normal and distance range of the landmarks that a keyframe observes."""
+    """Recompute the descriptor, normal and distance range of each landmark that a keyframe
+    observes."""
     refresh_landmarks(map_.arrays, map_.landmarks_of(keyframe), map_.scales)
 
 
@@ -89,7 +91,8 @@ def adjust_locally(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
 def local_window(
     map_: Map, keyframe: int, config: Config
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
-    """Ids of the free keyframes, fixed keyframes and landmarks of local bundle adjustment."""
+    """Ids of the free keyframes, the fixed keyframes and the landmarks of local bundle
+    adjustment."""
     strong = strong_neighbours(map_, keyframe, config)
     window = np.concatenate([[keyframe], strong])[: config.mapping.max_ba_keyframes]
     landmarks, others = window_landmarks(
@@ -100,7 +103,8 @@ def local_window(
     if 0 in window:
         fixed = np.concatenate([[0], fixed])
     if len(fixed) == 0 and len(free) > 1:
-        # The sub-map is not connected to the rest, so its oldest keyframe defines its frame.
+        # No fixed keyframe connects the window to the map, so the oldest keyframe of the window is
+        # held fixed.
         free, fixed = free[1:], free[:1]
     return free.astype(np.int64), fixed.astype(np.int64), landmarks
 
@@ -108,7 +112,8 @@ def local_window(
 def strong_neighbours(map_: Map, keyframe: int, config: Config) -> NDArray[np.int64]:
     """Ids of the neighbours of a keyframe in the covisibility graph, most shared landmarks first.
 
-    If all neighbours share too few landmarks, the best one is returned (ORB-SLAM, III-D).
+    Neighbours that share few landmarks are left out; if all do, the best one is returned (ORB-SLAM,
+    III-D).
     """
     neighbours, shared = map_.covisible(keyframe)
     return neighbours[(shared >= config.mapping.min_shared) | (np.arange(len(shared)) == 0)]
@@ -187,7 +192,7 @@ def cull_keyframes(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
     restarts = map_.restarts
     for neighbour in neighbours[shared >= config.mapping.min_shared]:
         if neighbour == 0 or neighbour in restarts:
-            continue  # it defines the frame of its sub-map
+            continue  # the first keyframe of a sub-map defines its frame
         seen, redundant = count_redundant(map_.arrays, int(neighbour), camera.bf, close)
         if redundant > config.mapping.redundant_ratio * seen:
             map_.cull_keyframe(int(neighbour))
@@ -195,9 +200,9 @@ def cull_keyframes(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
 
 @kernel
 def count_redundant(a, keyframe, bf, close_depth):
-    """Number of close landmarks of a keyframe, and number of these that at least three other
-    keyframes observe at a finer or about the same scale. If ``bf`` is 0 (monocular camera), all
-    landmarks count as close."""
+    """Number of close landmarks of a keyframe, and number of those close landmarks that at least
+    three other keyframes observe at a finer or about the same scale. If ``bf`` is 0 (monocular
+    camera), all landmarks count as close."""
     seen, redundant = 0, 0
     for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
         landmark = a.landmark[row]

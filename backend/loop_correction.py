@@ -17,9 +17,10 @@ def move_keyframes(
 
     The anchor of a landmark is the keyframe that first observed it (ORB-SLAM, VII-C) or, if that
     keyframe was culled, the oldest one that observes it. A landmark whose anchor is not among
-    ``keyframes`` does not move. Relative to the anchor nothing changes, so the distance range is
-    kept and the normal is rotated with the anchor; this is exact if all observers move alike.
-    Culled keyframes need no update, because their poses are stored relative to living keyframes.
+    ``keyframes`` does not move. The landmark keeps its position relative to the anchor, so its
+    distance range stays the same and its normal is rotated with the anchor. Both are exact only if
+    all keyframes that observe the landmark move alike. Culled keyframes need no update, because
+    their poses are stored relative to living keyframes.
 
     Args:
         keyframes: ``(N,)`` ids of living keyframes.
@@ -52,17 +53,18 @@ def carry_landmarks_by(map_: Map, motion: NDArray[np.float64], moved: NDArray[np
     """Move all landmarks by the motions of their anchors.
 
     Args:
-        motion: ``(K, 4, 4)`` world-to-world motion of each keyframe. If it is a similarity, the
-            caller must refresh the normals and distance ranges of the landmarks.
-        moved: ``(K,)`` bool, keyframes that have a motion.
+        motion: ``(K, 4, 4)`` transform, in the world frame, of the landmarks anchored in each
+            keyframe. After a similarity, the caller must refresh the normals and distance ranges of
+            the landmarks.
+        moved: ``(K,)`` bool, whether each keyframe moves; ``motion`` is ignored where False.
     """
     _carry(map_.arrays, np.arange(map_.n_landmarks), motion, moved)
 
 
 @kernel
 def _motions(T_cw_old, T_cw_new, moved):
-    """``(K, 4, 4)`` world-to-world motion of each keyframe: a point p that is fixed to the keyframe
-    moves to ``motion p``."""
+    """``(K, 4, 4)`` motion of each keyframe in the world frame: a point p that is fixed to the
+    keyframe moves to ``motion p``."""
     motion = np.zeros((len(moved), 4, 4))
     for k in range(len(moved)):
         if moved[k]:

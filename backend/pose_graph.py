@@ -21,7 +21,7 @@ from vslam.loops import LoopEdge
 from vslam.map import Map, loop_of_living
 from vslam.map_kernels import covisible_pairs
 
-TREE, COVISIBLE, WEAK, LOOP, GAP = range(5)  # kinds of edges
+TREE, COVISIBLE, WEAK, LOOP, GAP = range(5)  # kinds of edges, see ``essential_graph``
 HOLD = 1e-6  # standard deviation of the prior that fixes a keyframe, m and rad
 
 
@@ -78,8 +78,6 @@ def essential_graph(
     loops: Collection[LoopEdge],
     config: PoseGraphConfig,
     *,
-    weak: Collection[int] = (),
-    unpredicted: Collection[int] = (),
     driven: bool = False,
 ) -> PoseGraph:
     """The essential graph of a map, to be built *before* the new loop changes the map.
@@ -93,13 +91,11 @@ def essential_graph(
     culled, the living keyframe that its pose is stored relative to takes its place. If several
     loops then connect the same keyframes, only the last one is used.
 
+    A tree edge across a restart of the map, whose ends share hardly any landmarks, was not measured
+    but predicted. If there was no prediction either, it is always WEAK.
+
     Args:
         loops: all closed loops, the new one last; each has a pose.
-        weak: keyframes at which the map was restarted after tracking was lost, including culled
-            ones. A tree edge across such a restart, whose ends share hardly any landmarks, was not
-            measured but predicted.
-        unpredicted: restarts for which there was no prediction either; tree edges across them are
-            always WEAK.
         driven: whether the camera is on a vehicle. If so, a predicted edge is trusted as far as the
             motion of a car can be predicted over that time (GAP); otherwise the camera may have
             been carried anywhere (WEAK).
@@ -115,7 +111,8 @@ def essential_graph(
     seen = set(map(tuple, pairs.tolist()))
     # The kind of each edge by its two ends; later entries overwrite earlier ones.
     kind = dict.fromkeys(map(tuple, pairs[shared >= config.min_shared].tolist()), COVISIBLE)
-    restarts, unpredicted_restarts = (np.array(sorted(k), np.int64) for k in (weak, unpredicted))
+    restarts = np.array(map_.restarts, np.int64)
+    unpredicted_restarts = np.array(map_.unpredicted_restarts, np.int64)
     for child, parent in zip(living.tolist(), map_.parents[living].tolist(), strict=True):
         if parent >= 0:
             pair = (min(parent, child), max(parent, child))
@@ -158,8 +155,8 @@ def essential_graph(
 
 def connectivity(map_: Map) -> NDArray[np.int64]:
     """``(n_keyframes,)`` int64, how well each keyframe is connected to the earlier part of the map:
-    the largest number of landmarks that any earlier keyframe shares with this or any later one; 0
-    for the first keyframe."""
+    the largest number of landmarks that any earlier keyframe shares with this keyframe or any later
+    one; 0 for the first keyframe."""
     living = map_.living_keyframes()
     pairs, shared = covisible_pairs(map_.arrays, living, map_.n_keyframes, 1)
     most = np.zeros(map_.n_keyframes, np.int64)
@@ -188,9 +185,9 @@ def edge_sigmas(
 
     Drift is modelled as a random walk, so the variance of a tree or covisibility edge grows with
     its length. All these edges are derived from one measurement, the estimated path. If they were
-    treated as independent, a path with more edges would be stiffer. Therefore each variance is
-    multiplied by the number of edges that cover the path at its ends, so that the edges together
-    are as stiff as the drift model, regardless of their number.
+    treated as independent, a path with more edges would be stiffer. Therefore the variance of each
+    edge is multiplied by the number of edges that cover the path at the ends of the edge. Together
+    the edges are then as stiff as the drift model, regardless of their number.
 
     The translation of a GAP edge may be wrong by a share of the predicted distance, or by the
     distance that a slow car drives in that time. Nothing is known about a WEAK edge.
@@ -355,8 +352,8 @@ def check_edge_errors(
 
 @kernel
 def edge_errors(T_cw, edges, T_i_j, sigmas):
-    """``(E,)`` chi-square of each edge: the squared norm of the logarithm of its residual motion
-    after division by the standard deviations."""
+    """``(E,)`` chi-square of each edge: the logarithm of the residual motion is divided by the
+    standard deviations, and its squared norm is returned."""
     chi2 = np.empty(len(edges))
     for e in range(len(edges)):
         T = compose(T_cw[edges[e, 0]], inverse(T_cw[edges[e, 1]]))

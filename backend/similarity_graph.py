@@ -2,10 +2,10 @@
 VII-C; Strasdat et al., "Scale drift-aware large scale monocular SLAM", RSS 2010).
 
 Each keyframe has a similarity ``S_wc``, a ``(4, 4)`` matrix with the scale in its upper left 3x3
-block, so that ``@`` composes similarities. It maps points from the camera frame, in the unit that
-the map has around the keyframe before the correction, to the world. Initially all scales are 1;
-only loop edges measure other scales. GTSAM optimises the graph with its built-in Similarity3
-factors.
+block, so that ``@`` composes similarities. It maps points from the camera frame to the world.
+Lengths in the camera frame are in the unit that the map has around the keyframe before the
+correction. Initially all scales are 1; only loop edges measure other scales. GTSAM optimises the
+graph with its built-in Similarity3 factors.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ def rigid(S: Matrix) -> Matrix:
 def optimise_similarities(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfig) -> Matrix:
     """``(N, 4, 4)`` similarities that best agree with the edges, starting from ``S_wc``.
 
-    Losses and method are those of ``pose_graph.optimise``. Fixed keyframes keep their scale, too.
+    Losses and optimiser are those of ``pose_graph.optimise``. Fixed keyframes keep their scale as
+    well as their pose.
     """
     import gtsam
 
@@ -127,7 +128,7 @@ def move_keyframes_similarly(
     """
     a, n = map_.arrays, map_.n_keyframes
     motion = np.zeros((n, 4, 4))
-    motion[keyframes] = S_wc @ a.T_cw[keyframes]  # old to new world coordinates
+    motion[keyframes] = S_wc @ a.T_cw[keyframes]  # from old to new world coordinates
     moved = np.zeros(n, np.bool_)
     moved[keyframes] = True
     a.T_cw[keyframes] = inverses(rigid(S_wc))

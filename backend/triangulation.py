@@ -23,8 +23,8 @@ def map_stereo_points(
 ) -> NDArray[np.int32]:
     """Create landmarks from the close stereo features of a keyframe that observe no landmark yet.
 
-    If fewer than ``mapping.min_stereo_points`` features are close, the nearest features up to this
-    number are used (ORB-SLAM2, section III-E).
+    If fewer than ``mapping.min_stereo_points`` features are close, the nearest
+    ``min_stereo_points`` features are used (ORB-SLAM2, section III-E).
 
     Args:
         far: whether to use far features as well.
@@ -50,9 +50,9 @@ def map_stereo_points(
 def triangulate_with_neighbours(
     map_: Map, keyframe: int, camera: Camera, config: Config
 ) -> NDArray[np.int32]:
-    """Match the features of a keyframe that have no landmark with those of its covisible keyframes
-    along epipolar lines, and triangulate them (ORB-SLAM, VI-C). Returns the ``(N,)`` ids of the new
-    landmarks."""
+    """Match the features without a landmark of a keyframe and of its covisible keyframes along
+    epipolar lines, and triangulate the matches (ORB-SLAM, VI-C). Returns the ``(N,)`` ids of the
+    new landmarks."""
     neighbours, _ = map_.covisible(keyframe)
     created = [np.empty(0, np.int32)]
     limit, min_baseline = config.mapping.neighbours, camera.baseline
@@ -106,11 +106,11 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
         scales: ``(levels,)`` pyramid scale factors.
         min_baseline: least distance between the cameras, in units of the map.
         max_distance: largest Hamming distance of a match, bits.
-        max_cosine: greatest cosine of the parallax of a match without stereo.
+        max_cosine: greatest cosine of the parallax angle of a match without stereo depth.
 
     Returns:
-        ``(N, 3)`` positions in the world, ``(N,)`` int64 rows of the observations of keyframe
-        ``k1``, and those of ``k2``.
+        ``(N, 3)`` positions in the world, and twice ``(N,)`` int64: the rows of the observations in
+        keyframe ``k1`` and in keyframe ``k2``.
     """
     fx, fy, cx, cy, bf, _ = intrinsics
     T1, T2 = a.T_cw[k1], a.T_cw[k2]
@@ -194,8 +194,8 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
                 T2, point, a.xy[row_2], a.u_right[row_2], scales[a.octave[row_2]], intrinsics
             )
         ):
-            # The ratio of the distances must agree with the ratio of the scales, up to one level
-            # times a factor of 1.5.
+            # The ratio of the distances must agree with the ratio of the scales up to a factor of
+            # 1.5 times the scale of one level.
             for m in range(3):
                 from_1[m], from_2[m] = point[m] - centre_1[m], point[m] - centre_2[m]
             far = np.sqrt(dot3(from_1, from_1) / dot3(from_2, from_2))
@@ -233,7 +233,7 @@ def perpendicular(t):
 @kernel
 def direction(u, v):
     """Direction of the line through the origin and (u, v), as a number in [0, 2) that grows with
-    the angle of the line from 0 to 180 degrees. Needs no trigonometric functions."""
+    the angle of the line from 0 to 180 degrees. It is computed without trigonometric functions."""
     if v < 0.0 or (v == 0.0 and u < 0.0):
         u, v = -u, -v
     if u > 0.0:
@@ -243,17 +243,18 @@ def direction(u, v):
 
 @kernel
 def sorted_about_epipole(x, y, gate, intrinsics, across):
-    """Index features by the epipolar planes that pass within their gate.
+    """Index features by the directions of the epipolar planes that they can match.
 
-    All epipolar planes contain the baseline. Seen along the baseline, a plane is a line through the
-    origin, and the square around a feature whose half side is the gate is a parallelogram. The
-    parallelogram covers an interval of directions, or all directions if the epipole is inside.
+    All epipolar planes contain the baseline, so in a view along the baseline each plane is a line
+    through the origin. A feature matches planes that cross a square around it, whose half side is
+    the square root of ``gate``. In the view along the baseline this square is a parallelogram. It
+    covers an interval of directions, or all directions if the epipole is inside.
 
     Args:
         x, y: ``(n,)`` float32, pixels.
         gate: ``(n,)`` float32, greatest squared distance from the epipolar line, pixels squared.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
-        across: ``(2, 3)``, axes of the view along the baseline, see ``perpendicular``.
+        across: ``(2, 3)``, the two axes of the view along the baseline, see ``perpendicular``.
 
     Returns:
         ``start`` ``(SECTIONS + 1,)`` and ``items`` int32: the features near a plane whose direction
@@ -326,11 +327,12 @@ def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_
     more parallax than the two rays have, the stereo point of that keyframe is used instead.
 
     Args:
-        depth_1, depth_2: stereo depths of the features, NaN without one.
+        depth_1, depth_2: stereo depths of the features; NaN for a feature without stereo depth.
         ray_1, ray_2: ``(3,)`` rays, see ``world_ray``.
         centre_1, centre_2: ``(3,)`` positions of the cameras in the world.
         baseline: baseline of the stereo pair.
-        max_cosine: greatest cosine of the parallax of two rays without stereo.
+        max_cosine: greatest cosine of the angle between two rays if neither feature has a stereo
+            depth.
 
     Returns:
         Whether the landmark was triangulated: False if there is neither enough parallax nor a
@@ -339,7 +341,7 @@ def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_
     dot = dot3(ray_1, ray_2)
     square_1, square_2 = dot3(ray_1, ray_1), dot3(ray_2, ray_2)
     cosine = dot / np.sqrt(square_1 * square_2)
-    # Parallax of the stereo pair, as seen from the stereo point.
+    # Angle between the rays of the left and the right camera at the stereo point.
     angle_1 = 2.0 * np.arctan(0.5 * baseline / (depth_1 * np.sqrt(square_1)))
     angle_2 = 2.0 * np.arctan(0.5 * baseline / (depth_2 * np.sqrt(square_2)))
     stereo_1, stereo_2 = depth_1 > 0.0, depth_2 > 0.0  # False for NaN

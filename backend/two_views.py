@@ -2,8 +2,8 @@
 
 Two views determine the direction of a translation but not its length. So the unit of length is
 chosen such that the median depth of the landmarks is ``initialization.median_depth``. With the
-value 15, a unit is roughly a metre in a street, so that thresholds of the configuration in metres
-are of the right order of magnitude; the scale is not metric.
+default of 15, a unit is roughly a metre in a street, so that thresholds that the configuration
+gives in metres have the right order of magnitude. The scale is still unknown.
 """
 
 from __future__ import annotations

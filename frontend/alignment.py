@@ -24,8 +24,8 @@ HALF = 4  # half width of the window that is compared, pixels
 SIDE = 2 * HALF + 1
 WIDE = SIDE + 2  # one more pixel on each side, for the gradients
 MIN_VARIANCE = 1.0  # grey levels squared; a patch with a smaller variance has no texture
-MIN_CORNERNESS = 0.05  # determinant of the 2x2 normal matrix over the product of its diagonal
-STILL = 0.03  # pixels; the iteration ends with a smaller step
+MIN_CORNERNESS = 0.05  # least determinant of the 2x2 normal matrix over its diagonal product
+STILL = 0.03  # pixels; the iteration ends when a step is smaller
 
 
 def align_frame(
@@ -35,7 +35,7 @@ def align_frame(
     intrinsics: NDArray[np.float64],
     config: AlignmentConfig,
 ) -> NDArray[np.float32] | None:
-    """Align the matches of a frame.
+    """Align the matches of a frame with the patches of their landmarks.
 
     Args:
         known: patches of the landmarks that can be aligned.
@@ -99,8 +99,9 @@ def find_patches(
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
 
     Returns:
-        ``(N, 2)`` float32 shift from the pixel of the octave nearest to the expected position, in
-        pixels of the octave; NaN if the patch was not found.
+        ``(N, 2)`` float32 vector from each expected position, rounded to a whole pixel of its
+        octave, to the position where the patch was found, in pixels of the octave; NaN if the patch
+        was not found.
     """
     view, size = known.view[at], known.size[at]
     warp = warps(T_cw, xyz, known.T_cw, view, size, scales[octave], intrinsics)
@@ -172,16 +173,16 @@ def align(seen, reference, centre, which, warp, iterations, max_shift, min_corre
         seen: ``(N, PATCH_PIXELS)`` uint8 patches of the frame.
         reference: ``(P, PATCH_PIXELS)`` uint8 patches of keyframes.
         centre: ``(P, 2)`` float32, position of the landmark in each reference patch, pixels from
-            its middle.
-        which: ``(N,)`` index of the reference of each seen patch.
+            the middle of the patch.
+        which: ``(N,)`` index of the reference patch that each seen patch is compared with.
         warp: ``(N, 2, 2)`` float32, see ``warps``.
         iterations: maximum number of Gauss-Newton steps.
         max_shift: largest shift in x and in y, pixels of the seen patch.
         min_correlation: least normalised cross-correlation of an accepted alignment.
 
     Returns:
-        ``(N, 2)`` float32 shift from the middle of the seen patch, in its pixels; NaN if the
-        alignment failed.
+        ``(N, 2)`` float32 position of the landmark relative to the middle of the seen patch, in
+        pixels of this patch; NaN if the alignment failed.
     """
     n = len(seen)
     shift = np.full((n, 2), np.nan, np.float32)

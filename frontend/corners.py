@@ -140,15 +140,15 @@ def local_maxima(scores, margin, threshold, threshold_min, cell):
 
 @kernel
 def spread(x, y, score, width, height, quota):
-    """Choose up to ``quota`` evenly spread corners: the best corner of each cell, for the largest
-    cells of which at least ``quota`` contain a corner.
+    """Choose up to ``quota`` evenly spread corners: the best corner of each cell of a grid. The
+    cells are as large as possible while at least ``quota`` of them contain a corner.
 
     The cell size is found by bisection, as in Bailo et al. ("Efficient adaptive non-maximal
     suppression", PRL 2018).
 
     Args:
         x, y, score: ``(n,)`` corners in row order, see ``local_maxima``.
-        width, height: of the image, pixels.
+        width, height: size of the image, pixels.
 
     Returns:
         ``(m,)`` int64 indices of the chosen corners, ascending.
@@ -159,8 +159,8 @@ def spread(x, y, score, width, height, quota):
         for i in range(n):
             kept[i] = i
         return kept
-    # Each corner has a cell of size 1 to itself. There are fewer cells of size ``high`` than the
-    # quota.
+    # At first, cells of size ``low`` are small enough, because each corner has its own cell of size
+    # 1. Cells of size ``high`` are too large, because the image has fewer of them than the quota.
     low, high = 1, int(np.sqrt(width * height / quota)) + 2
     is_occupied = np.empty(width * height, np.uint8)
     while high - low > 1:
@@ -226,7 +226,7 @@ def occupies(x, y, width, height, size, quota, is_occupied):
 @inner_kernel
 def occupy(x, y, score, width, size, best_of_cell):
     """Write the index of the best corner of each cell of ``size`` x ``size`` pixels into
-    ``best_of_cell``: the first of those with equal scores, -1 for an empty cell."""
+    ``best_of_cell``: the first one if several have equal scores, -1 for an empty cell."""
     columns = (width + size - 1) // size
     best_of_cell[:] = -1
     inverse = np.float32(1.0 / size)

@@ -51,7 +51,8 @@ def depth_around(xy, radius, depth, max_ratio):
 
     Args:
         radius: ``(N,)`` int64, half width of the neighbourhood that is checked, pixels.
-        max_ratio: largest accepted ratio of the farthest to the nearest known depth in it.
+        max_ratio: largest accepted ratio of the farthest to the nearest known depth in the
+            neighbourhood.
 
     Returns:
         ``(N,)`` float32 metres; 0 where the depth is unknown or the ratio is exceeded.

@@ -29,8 +29,9 @@ class Corners(NamedTuple):
 
     Attributes:
         found: the features of the image of ``side``.
-        right: the features of the right image, for stereo matching; None if there is none.
-        depth: ``(H, W)`` float32 metres, of an RGB-D camera; else None.
+        right: the features of the right image, for stereo matching; None if there is no right
+            image, or if the left one is black.
+        depth: ``(H, W)`` float32 depth image of an RGB-D camera, metres; None for other cameras.
         side: see ``Extracted``.
         sides: the comparison of the left and the right image; None without a right image.
     """
@@ -50,7 +51,7 @@ class FrameImages:
         left: ``(H, W)`` uint8.
         mask: the mask of the left image; None if all pixels are used.
         pyramid: the pyramid of the left image; None if frames are not tracked by patches.
-        coarse: ``coarse_levels`` of that pyramid, or None.
+        coarse: ``coarse_levels`` of ``pyramid``; None if ``pyramid`` is None.
         sides: the comparison of the left and the right image; None if there is no right image, or
             it has not been read.
         problem: why the second image could not be read, so that only the left one is used; None if
@@ -103,7 +104,7 @@ class FrameImages:
         return matched(self.find_corners(), self._context)
 
     def extracted_with(self, keypoints: Keypoints) -> Extracted:
-        """The features, and additional ones at given positions and levels of the left image."""
+        """The features, and additional features at given positions and levels of the left image."""
         return matched(self.find_corners(), self._context, keypoints)
 
     @cached_property
@@ -120,7 +121,9 @@ class FrameImages:
             self._second = self._read_second()
         except UnreadableImageError as error:
             self.problem = str(error)
-        found = find_corners(self.left, self._second, self._context, self._image_map, self.mask)
+        found = find_corners(
+            self.left, self._second, self._context, self._image_map, self.mask, self.pyramid
+        )
         self.sides = found.sides
         return found
 
@@ -131,24 +134,26 @@ def find_corners(
     context: TrackingContext,
     image_map: ImageMap = map,
     mask: Mask | None = None,
+    pyramid: Pyramid | None = None,
 ) -> Corners:
     """The first step of extraction: the features of each image. If the left image is black, only
     the right image is used, and its features have no stereo match.
 
     Args:
         left: ``(H, W)`` uint8.
-        second: ``(H, W)``: the right image, uint8; for an RGB-D camera the depth in metres,
-            float32; None if there is only the left image.
-        mask: the mask of the image whose features are tracked: the left one, or the right one if
-            the left one is black. For stereo matching the right image needs no mask, because masked
-            pixels of the left image have no features to match.
+        second: ``(H, W)`` uint8 right image, or float32 depth image of an RGB-D camera in metres;
+            None if there is only the left image.
+        mask: the mask of the image whose features are tracked: the left image, or the right image
+            if the left one is black. Stereo matching needs no mask of the right image, because
+            masked pixels of the left image have no features to match.
+        pyramid: the pyramid of the left image, if it has already been built.
     """
     camera, config = context.camera, context.config
     allowed = None if mask is None else mask.levels
     if second is None:
-        return _corners_alone(left, context, Side.LEFT, allowed)
+        return _corners_alone(left, context, Side.LEFT, allowed, pyramid)
     if camera.depth:
-        (found,) = extract_in_any_light([left], config, allowed=allowed)
+        (found,) = extract_in_any_light([left], config, allowed=allowed, pyramid=pyramid)
         return Corners(found, depth=np.asarray(second, np.float32))
     right_image = np.asarray(second, np.uint8)
     sides = compare_sides(left, right_image, config.stereo)
@@ -156,7 +161,8 @@ def find_corners(
         alone = _corners_alone(right_image, context, Side.RIGHT, allowed)
         return alone._replace(sides=sides)
     pair = balanced(left, right_image, sides)
-    found, right = extract_in_any_light(pair, config, image_map, allowed)
+    built = pyramid if pair[0] is left else None  # it may have been brightened
+    found, right = extract_in_any_light(pair, config, image_map, allowed, built)
     return Corners(found, right, sides=sides)
 
 
@@ -187,9 +193,13 @@ def matched(
 
 
 def _corners_alone(
-    image: Image, context: TrackingContext, side: Side, allowed: Pyramid | None
+    image: Image,
+    context: TrackingContext,
+    side: Side,
+    allowed: Pyramid | None,
+    pyramid: Pyramid | None = None,
 ) -> Corners:
-    (found,) = extract_in_any_light([image], context.config, allowed=allowed)
+    (found,) = extract_in_any_light([image], context.config, allowed=allowed, pyramid=pyramid)
     return Corners(found, side=side)
 
 

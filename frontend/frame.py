@@ -33,7 +33,7 @@ class FeatureSource(Protocol):
     def extracted(self) -> Extracted: ...
 
     def extracted_with(self, keypoints: Keypoints) -> Extracted:
-        """The features, and additional ones at given positions and levels of the left image."""
+        """The features, and additional features at given positions and levels of the left image."""
         ...
 
     @property
@@ -52,7 +52,7 @@ class Frame:
         timestamp: seconds.
         image: ``(H, W)`` uint8 image of the camera, for loop detectors that need it; None before
             ``extract``, or if the frame has no image.
-        features, grid: the N features of that image, and a grid to search them by position.
+        features, grid: the N features of the image, and a grid to search them by position.
         pyramid, row_offset, side: see ``Extracted``.
         T_camera_left: ``(4, 4)`` transform from the left camera to the camera: the identity, or
             ``Camera.T_right_left``.
@@ -64,10 +64,11 @@ class Frame:
         delay_removed: whether the columns in the right image have been corrected for its delay.
         shift: ``(N, 2)`` float32, pixels from each feature to its aligned position, NaN where the
             match was not aligned; None if no match was aligned.
-        twist: ``(6,)`` velocity of the camera when the frame was tracked, per second; None if
+        twist: ``(6,)`` velocity per second when the frame was tracked: ``exp(twist dt)`` maps
+            points from the camera frame at one time to the camera frame dt seconds later. None if
             unknown.
         source: the images that ``extract`` takes the features from; None after extraction. Before
-            it, ``features`` has one entry for each landmark that was found by its patch.
+            extraction, ``features`` has one entry for each landmark that was found by its patch.
         coarse: ``coarse_levels`` of the image, to which the next frame is aligned; None if frames
             are not aligned.
         mask: the mask of the image; None if all pixels are used.

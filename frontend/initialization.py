@@ -28,7 +28,7 @@ from vslam.reprojection import CHI2_MONO, stack_uvr
 CHI2_LINE = 3.841  # 95 % quantile with 1 degree of freedom: distance of a point from a line
 # Matches per sample. The eight-point algorithm needs all of them; a homography needs only four.
 SAMPLE = 8
-# Points with less parallax (0.36 degrees) are counted, but not mapped (ORB-SLAM).
+# Points whose parallax is less than this (0.36 degrees) are counted, but not mapped (ORB-SLAM).
 MAX_COSINE = 0.99998
 
 
@@ -332,12 +332,13 @@ def _triangulate(
     """Triangulate N matches.
 
     Returns:
-        ``(N, 3)`` points in the frame of camera 1; ``(N,)`` bool, whether each one lies in front of
-        both cameras and its reprojection errors are small; ``(N,)`` cosine of its parallax.
+        ``(N, 3)`` points in the frame of camera 1; ``(N,)`` bool, whether each point lies in front
+        of both cameras and has small reprojection errors; ``(N,)`` cosine of the parallax angle of
+        each point.
     """
     R, t = T_2_1[:3, :3], T_2_1[:3, 3]
     ray_1 = camera.backproject(xy_1, np.ones(len(xy_1)))
-    ray_2 = camera.backproject(xy_2, np.ones(len(xy_2))) @ R  # in camera 1
+    ray_2 = camera.backproject(xy_2, np.ones(len(xy_2))) @ R  # in the frame of camera 1
     centre_2 = -R.T @ t
     # Midpoint of the shortest segment between the rays.
     aa, bb, ab = _squared(ray_1), _squared(ray_2), np.einsum("ni,ni->n", ray_1, ray_2)

@@ -27,11 +27,11 @@ class KeyframeEvidence:
         untracked_close: number of close stereo features that track no landmark; None for a frame
             that was tracked by patches and has no features. It is then assumed to be large enough.
         mapping_idle: whether local mapping of the last keyframe is finished and merged.
-        gained_close: number of close points that the first frame after a keyframe tracks, a running
-            mean over the last keyframes; infinite if unknown.
+        gained_close: running mean, over the last keyframes, of the number of close points that the
+            first frame after a keyframe tracks; infinite if unknown.
         first_close: number of close points that the first frame after the last keyframe tracks.
-        close_ratio: factor by which the number of tracked close points has changed per frame since
-            that frame.
+        close_ratio: factor, at most 1, by which the number of tracked close points has fallen per
+            frame since the first frame after the last keyframe.
     """
 
     seconds_since_keyframe: float
@@ -62,10 +62,11 @@ def needs_keyframe(
 
     A lack of close points is a reason for a keyframe only if a keyframe would provide more. On a
     motorway, close points are scarce and leave the view before they are seen twice, so that even
-    the first frame after a keyframe tracks too few of them. In that case a frame needs only a share
-    of the close points that this first frame tracked, provided that enough far points constrain the
-    pose: at least as many as the close points that would otherwise be required. In fog there are no
-    far points, so the full number of close points is required.
+    the first frame after a keyframe tracks too few of them. In that case a frame needs only a
+    fraction of the close points that such a first frame tracks on average (``gained_close``),
+    provided that enough far points constrain the pose: at least as many as the close points that
+    would otherwise be required. In fog there are no far points, so the full number of close points
+    is required.
 
     Args:
         depth: whether the camera is RGB-D. Nearly all points that it sees are close and mapped at
@@ -112,8 +113,8 @@ def needs_monocular_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig)
 def count_close(
     state: PolicyState, tracked_close: int, frame: int, config: KeyframeConfig
 ) -> PolicyState:
-    """The state after a frame with index ``frame`` that tracks ``tracked_close`` close points. It
-    changes only if this is the first frame after a keyframe.
+    """The state after a frame with index ``frame`` that tracks ``tracked_close`` close points. The
+    state changes only if this is the first frame after a keyframe.
 
     A single frame may track few close points by chance; only several in a row show that close
     points are scarce. So an exponential moving average is kept, and it starts at a high value.
@@ -131,38 +132,6 @@ def close_ratio(state: PolicyState, tracked_close: int, frame: int) -> float:
         return 1.0
     share = tracked_close / state.first_close
     return float(share ** (1 / max(1, frame - state.first_frame)))
-
-
-@dataclass(frozen=True)
-class PlaceEvidence:
-    """How well the map already covers a place that a frame has returned to.
-
-    Attributes:
-        n_inliers: number of landmarks tracked in the frame.
-        n_shared: number of these landmarks that an old keyframe observes, namely the one that
-            observes the most of them.
-        n_place: number of landmarks of that keyframe that at least three keyframes observe.
-    """
-
-    n_inliers: int
-    n_shared: int
-    n_place: int
-
-
-def is_known_place(evidence: PlaceEvidence, config: KeyframeConfig) -> bool:
-    """Whether a keyframe here would repeat an old one: the frame tracks as many landmarks as a
-    frame next to the old keyframe should, and shares enough of them with the old keyframe.
-
-    A lack of close points is no reason to map a known place again, because the old keyframe did not
-    provide more of them. A minimum number of inliers is required, because the last keyframe of a
-    map has few landmarks that three keyframes observe: beyond the end of the map, both ratios would
-    hold until the camera is lost.
-    """
-    return (
-        evidence.n_inliers >= config.known_min_inliers
-        and evidence.n_inliers >= config.max_tracked_ratio * evidence.n_place
-        and evidence.n_shared >= config.known_ratio * evidence.n_place
-    )
 
 
 class KeyframePolicy:
@@ -213,9 +182,26 @@ class KeyframePolicy:
             return needs_monocular_keyframe(evidence, self._config)
         return needs_keyframe(evidence, self._config, depth=camera.depth)
 
-    def is_known(self, evidence: PlaceEvidence) -> bool:
-        """Whether an old keyframe makes a new one unnecessary."""
-        return is_known_place(evidence, self._config)
+    def is_known(self, *, n_inliers: int, n_shared: int, n_place: int) -> bool:
+        """Whether a keyframe here would repeat an old one: the frame tracks as many landmarks as a
+        frame next to the old keyframe should, and shares enough of them with the old keyframe.
+
+        A lack of close points is no reason to map a known place again, because the old keyframe did
+        not provide more of them. A minimum number of inliers is required, because the last keyframe
+        of a map has few landmarks that three keyframes observe: beyond the end of the map, both
+        ratios would hold until the camera is lost.
+
+        Args:
+            n_inliers: number of landmarks tracked in the frame.
+            n_shared: number of these landmarks that an old keyframe observes, namely the one that
+                observes the most of them.
+            n_place: number of landmarks of that keyframe that at least three keyframes observe.
+        """
+        return (
+            n_inliers >= self._config.known_min_inliers
+            and n_inliers >= self._config.max_tracked_ratio * n_place
+            and n_shared >= self._config.known_ratio * n_place
+        )
 
     def is_due(self, index: int, evidence: KeyframeEvidence) -> bool:
         """Whether frame ``index``, which was tracked by patches, is to become a keyframe. A

@@ -16,7 +16,7 @@ from vslam.frontend.orb import build_pyramid
 
 # Least distance between a feature and a masked pixel, in pixels of the feature's level. Corner
 # detection and alignment read no pixels farther away (a patch is shifted by at most two pixels), so
-# the edge of the mask affects neither.
+# neither is affected by the edge of the mask.
 REACH = 4
 _WINDOW = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
 
@@ -55,6 +55,6 @@ class Mask:
 
     def filled(self, image: Image) -> Image:
         """A copy of an ``(H, W)`` uint8 image in which masked pixels have the mean grey value of
-        the others, for networks that read the whole image."""
+        the other pixels, for networks that read the whole image."""
         mean = np.uint8(image[self.used].mean()) if self.used.any() else np.uint8(0)
         return np.where(self.used, image, mean)

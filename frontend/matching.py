@@ -21,8 +21,8 @@ ORIENTATION_BINS = 30
 @kernel
 def predict_view(T, xyz, normal, distance_range, intrinsics, width, height, scales, window):
     """Predict where landmarks appear in an image (ORB-SLAM, V-D). A landmark is visible if it
-    projects into the image, its distance is in its range (with a tolerance of 20 %), and its
-    viewing direction is at most 60 degrees from its mean viewing direction.
+    projects into the image, its distance from the camera is in ``distance_range`` (with a tolerance
+    of 20 %), and the camera views it from at most 60 degrees off its mean viewing direction.
 
     Args:
         T: ``(4, 4)`` pose of the camera (world to camera).
@@ -96,7 +96,7 @@ class Searchable(NamedTuple):
     Attributes:
         xy: ``(N, 2)`` pixels.
         octave: ``(N,)``.
-        u_right: ``(N,)`` columns in the right image, NaN without one.
+        u_right: ``(N,)`` columns in the right image, NaN for features without a stereo match.
         descriptor: ``(N, 4)`` the 32 bytes of each descriptor as four integers.
         grid: the features sorted by image cell.
     """
@@ -260,7 +260,7 @@ def count_elsewhere(u: NDArray[np.floating], width: int) -> int:
 
     Args:
         u: ``(N,)`` columns of the inliers, pixels.
-        width: of the image, pixels.
+        width: width of the image, pixels.
     """
     columns = np.sort(u)
     ends = np.searchsorted(columns, columns + width / 3, side="right")

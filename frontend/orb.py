@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import OrbConfig
-from vslam.features import Pyramid
+from vslam.features import Pyramid, level_of
 from vslam.frontend.corners import fast_scores, local_maxima, spread
 from vslam.kernels import borrowed, inner_kernel, kernel
 
@@ -46,7 +46,10 @@ class Extraction:
 
 
 def extract(
-    image: NDArray[np.uint8], config: OrbConfig, allowed: Pyramid | None = None
+    image: NDArray[np.uint8],
+    config: OrbConfig,
+    allowed: Pyramid | None = None,
+    pyramid: Pyramid | None = None,
 ) -> Extraction:
     """Extract up to ``config.n_features`` ORB features from an ``(H, W)`` uint8 image.
 
@@ -54,8 +57,9 @@ def extract(
 
     Args:
         allowed: 1 for pixels where a corner may lie, 0 for the others; None allows all pixels.
+        pyramid: the pyramid of the image, if it has already been built.
     """
-    pyramid = build_pyramid(image, config)
+    pyramid = pyramid or build_pyramid(image, config)
     xy, octave, angle, descriptors = extract_levels(
         pyramid.pixels,
         pyramid.offsets,
@@ -183,7 +187,7 @@ def extract_levels(
         allowed: 1 for pixels where a corner may lie, 0 for the others; empty allows all pixels.
         quota: ``(L,)`` int64, greatest number of features per level.
         threshold, threshold_min, cell: see ``local_maxima``.
-        inside: ``DISC``.
+        inside: ``DISC``, the disc for ``orientations``.
         pattern: ``PATTERN``, ``(256, 4)`` int8 test points xa, ya, xb, yb.
 
     Returns:
@@ -196,7 +200,7 @@ def extract_levels(
     for level in range(len(shapes)):
         height, width = shapes[level]
         first = offsets[level]
-        image = pixels[first : first + height * width].reshape(height, width)
+        image = level_of(pixels, offsets, shapes, level)
         here = allowed[first : first + height * width]
         corners = detect_corners(image, here, quota[level], threshold, threshold_min, cell)
         if len(corners) == 0:

@@ -54,7 +54,7 @@ def track_patches(
 
     Args:
         pyramid: the pyramid of the image.
-        T_cw: ``(4, 4)`` initial pose; its projections may be off by about two pixels.
+        T_cw: ``(4, 4)`` initial pose. Landmarks projected with it may be off by about two pixels.
         mask: the mask of the image; None if all pixels are used.
     """
     known, camera, scales = view.patches, context.camera, context.scales

@@ -57,7 +57,7 @@ def _cut(pixels, offsets, shapes, xy, octave):
 class RecentPatches:
     """Stores the patches of the newest keyframes.
 
-    Frames without an image pyramid (those of an RGB-D camera, for example) have none.
+    Frames without an image pyramid, for example frames of an RGB-D camera, have no patches.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -86,8 +86,8 @@ class RecentPatches:
         self.add(KeyframePatches(keyframe, pixels, shift))
 
     def add(self, patches: KeyframePatches) -> None:
-        """Store the patches of another keyframe; if all slots are full, they replace those of the
-        oldest keyframe."""
+        """Store the patches of another keyframe; if all slots are full, the patches of the oldest
+        keyframe are replaced."""
         slot, n = self._next, len(patches.pixels)
         if n > self._shift.shape[1]:
             self._pixels = _widened(self._pixels, n)
@@ -138,11 +138,12 @@ def _widened(array: NDArray, n: int) -> NDArray:
 
 def certainty_of(frame: Frame, config: AlignmentConfig) -> NDArray[np.uint8] | int:
     """``(N,)`` uint8, the factor by which the variance of each feature's position is smaller than
-    that of a keypoint (``Arrays.certainty``); 1 for all features of a frame without a pyramid.
+    the variance of a keypoint's position (``Arrays.certainty``); 1 for all features of a frame
+    without a pyramid.
 
-    The position of an aligned match is accurate. So is that of a feature without a match, because
-    the position itself defines the landmark that is created from the feature. A match that was not
-    aligned is off by about half a pixel.
+    The position of an aligned match is accurate. The position of a feature without a match counts
+    as accurate, too, because a landmark that is created from the feature is defined by this
+    position. A match that was not aligned is off by about half a pixel.
     """
     if frame.pyramid is None:
         return 1
@@ -159,7 +160,7 @@ def newest_rows(a, keyframes, ids):
 
     Returns:
         ``(L,)`` int64 row in the map's arrays and ``(L,)`` int64 index into ``keyframes``; -1 where
-        none of them observes the landmark.
+        none of ``keyframes`` observes the landmark.
     """
     found, view = np.full(len(ids), -1, np.int64), np.full(len(ids), -1, np.int64)
     newest = keyframes.max()

@@ -75,8 +75,8 @@ def solve_p3p(points, rays, T_cw):
         if abs(n0) < 1e-14 * (abs(n1) + abs(n2)):
             continue
         w1, w2 = -n1 / n0, -n2 / n0  # l1 = w1 l2 + w2 l3
-        # Substituting l3 = t l2 into l' D l = 0, where D is D1 or D2, gives a quadratic in t. It
-        # is better conditioned for the matrix that contributes less to D0.
+        # Substituting l3 = t l2 into l' D l = 0, where D is D1 or D2, gives a quadratic in t. The
+        # quadratic is better conditioned for the matrix that contributes less to D0.
         D = D1 if abs(g) > 1.0 else D2
         A = D[0, 0] * w2 * w2 + 2.0 * D[0, 2] * w2 + D[2, 2]
         B = 2.0 * (D[0, 0] * w1 * w2 + D[0, 1] * w2 + D[0, 2] * w1 + D[1, 2])
@@ -193,7 +193,7 @@ def _refine_depths(depth, a12, a13, a23, b12, b13, b23):
         r3 = l2 * l2 + l3 * l3 - 2.0 * b23 * l2 * l3 - a23
         if abs(r1) + abs(r2) + abs(r3) < 1e-15 * (a12 + a13 + a23):
             return
-        p, q = l1 - b12 * l2, l2 - b12 * l1  # half the derivatives of r1 by l1, l2
+        p, q = l1 - b12 * l2, l2 - b12 * l1  # half the derivatives of r1 with respect to l1, l2
         r, s = l1 - b13 * l3, l3 - b13 * l1
         t, v = l2 - b23 * l3, l3 - b23 * l2
         # J = [[p, q, 0], [r, 0, s], [0, t, v]]; Cramer's rule.
@@ -295,8 +295,8 @@ def ransac_pose(points, uvr, inverse_sigma2, intrinsics, seed, min_inliers, max_
             ``min_inliers`` inliers has been missed.
 
     Returns:
-        ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers of the best pose, which may be fewer than
-        ``min_inliers``.
+        ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers of the best pose. There may be fewer inliers
+        than ``min_inliers``.
     """
     fx, fy, cx, cy, _, _ = intrinsics
     n = len(points)

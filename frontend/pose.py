@@ -33,8 +33,8 @@ def optimise_pose(
         uvr: ``(N, 3)`` float64 observed u, v, u_right; NaN u_right for a monocular observation.
         inverse_sigma2: ``(N,)`` float64, inverse variance of a pixel coordinate.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
-        disparity_weight: ``(N,)`` float64, standard deviation of u and v over that of the
-            disparity; None uses the weight in ``intrinsics``.
+        disparity_weight: ``(N,)`` float64, ratio of the standard deviation of u and v to the
+            standard deviation of the disparity; None uses the ratio in ``intrinsics``.
 
     Returns:
         ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers; no inliers if fewer than three observations
@@ -55,8 +55,9 @@ def pose_covariance(
 ) -> NDArray[np.float64]:
     """Covariance of an optimised pose relative to the landmarks.
 
-    It is the inverse of the normal matrix times the variance factor of the observations, which is
-    estimated from their residuals (Hartley and Zisserman, Multiple View Geometry, 5.2 and A6.3.2).
+    The covariance is the inverse of the normal matrix times the variance factor of the
+    observations. The variance factor is estimated from the residuals (Hartley and Zisserman,
+    Multiple View Geometry, 5.2 and A6.3.2).
 
     Args:
         T_cw: ``(4, 4)`` optimised pose.

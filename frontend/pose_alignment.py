@@ -29,7 +29,7 @@ WINDOW = 4  # pixels along each side
 PIXELS = WINDOW * WINDOW
 ITERATIONS = 10
 MIN_WINDOWS, MAX_WINDOWS = 20, 256
-MIN_CORRELATION = 0.6  # between all windows and the image; below it, the alignment has failed
+MIN_CORRELATION = 0.6  # least correlation of all windows with the image; else the alignment failed
 # The iteration ends when a step rotates the image by less than STILL pixels of the level and moves
 # the camera by less than STILL_M units of the map.
 STILL, STILL_M = 0.02, 0.005
@@ -37,8 +37,8 @@ ROBUST = 1.5  # Huber threshold of a window's error, as a multiple of the median
 
 
 def coarse_levels(pyramid: Pyramid) -> Pyramid:
-    """The images for the alignment of frames, coarsest first: the smallest level of a pyramid at
-    half size, this level, and the middle level."""
+    """The three images for the alignment of frames, coarsest first: the smallest level of a pyramid
+    reduced to half size, the smallest level itself, and the middle level."""
     height, width = pyramid.shapes[0]
     last, middle = len(pyramid.shapes) - 1, len(pyramid.shapes) // 2
     smallest = pyramid.level(last)
@@ -62,7 +62,7 @@ def coarse_shapes(shapes: NDArray[np.int64]) -> NDArray[np.int64]:
 def coarse_pyramid(
     pixels: NDArray[np.uint8], shapes: NDArray[np.int64], size: tuple[int, int]
 ) -> Pyramid:
-    """``coarse_levels`` from the pixels and shapes of its levels.
+    """Rebuild the result of ``coarse_levels`` from the pixels and shapes of its levels.
 
     Args:
         size: height and width of the whole image, pixels.
@@ -86,7 +86,7 @@ def align_pose(
     intrinsics: NDArray[np.float64],
     size: tuple[int, int],
 ) -> Matrix:
-    """Pose of a frame by sparse image alignment to another one.
+    """Pose of a frame by sparse image alignment to another frame.
 
     Args:
         now, before: ``coarse_levels`` of the frame and of the other frame.
@@ -272,7 +272,8 @@ def _square(jacobian, hessian):
 @inner_kernel
 def _step(seen, template, jacobian, hessian, error, m, contrast):
     """``(6,)`` Gauss-Newton step that reduces the differences between ``seen`` and the templates;
-    ``error`` is negative for windows outside the image."""
+    ``error`` must be negative for windows outside the image, and receives the norm of the
+    differences of the other windows."""
     inside = 0
     scale = np.float32(1.0 / contrast)
     valid_errors = np.empty(m)

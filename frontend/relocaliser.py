@@ -26,14 +26,9 @@ from vslam.map import Map
 from vslam.map_view import LocalMap, local_map
 
 Locate = Callable[[Image | None, Features, Map], list[LoopCandidate]]
-
-
-class Recognise(Protocol):
-    """Finds the pose of a frame at one of the candidates if ORB descriptors do not match there."""
-
-    def __call__(
-        self, map_: Map, image: Image | None, features: Features, candidates: list[LoopCandidate]
-    ) -> Sighting | None: ...
+# Finds the pose of a frame near one of the candidates by other means than ORB descriptors; returns
+# None if it finds none.
+Recognise = Callable[[Map, Image | None, Features, list[LoopCandidate]], Sighting | None]
 
 
 class MapAccess(Protocol):
@@ -45,8 +40,8 @@ class MapAccess(Protocol):
         ...
 
     def merge(self) -> Map:
-        """Wait until no keyframe is being mapped, make the last one visible to tracking, and return
-        the map."""
+        """Wait until no keyframe is being mapped, make the last keyframe visible to tracking, and
+        return the map."""
         ...
 
 
@@ -66,9 +61,9 @@ class Relocaliser:
     def relocalise_if_needed(self, frame: Frame, found: Found, owner: MapAccess) -> Found:
         """Relocalise a frame that is lost or doubtful.
 
-        A lost frame is relocalised only while no keyframe is being mapped. For a doubtful frame,
-        wait until the keyframe is mapped; the frame keeps its tracked pose unless relocalisation
-        finds more than ``relocalization.better`` times as many inliers.
+        A lost frame is relocalised only while no keyframe is being mapped. A doubtful frame waits
+        until the keyframe is mapped. It keeps its tracked pose unless relocalisation finds more
+        than ``relocalization.better`` times as many inliers.
 
         Args:
             found: the result of tracking the frame.
@@ -120,7 +115,7 @@ def relocalise(
 
     The descriptors of the frame are matched with the landmarks of the place, and a pose is
     estimated by P3P inside RANSAC, which needs no stereo. Then all landmarks of the surroundings
-    are searched for near their projections, first in a wide window, then in the usual one.
+    are searched for near their projections, first in wide windows, then in the usual windows.
 
     Args:
         frame: receives the pose and the matches on success; otherwise both are reset.

@@ -65,8 +65,7 @@ class RigCalibration:
         the delay of the right image. Calling this again has no effect.
 
         Args:
-            twist: ``(6,)`` velocity of the points relative to the camera, per second; None if
-                unknown.
+            twist: ``(6,)`` velocity, see ``Frame.twist``; None if unknown.
         """
         self.correct_offset(frame)
         delay = self._camera.right_delay
@@ -78,8 +77,8 @@ class RigCalibration:
         frame.delay_removed = True
 
     def correct_offset(self, frame: Frame) -> None:
-        """Update the disparities of a frame from the offset that they contain to the current
-        one."""
+        """Replace the disparity offset that the disparities of a frame contain by the current
+        offset."""
         change = self.disparity_offset - frame.disparity_offset
         if change == 0.0:
             return
@@ -96,7 +95,7 @@ class RigCalibration:
         """Measure the delay in a tracked frame.
 
         Args:
-            twist: ``(6,)`` velocity between the previous frame and this one, per second; None if
+            twist: ``(6,)`` mean velocity since the previous frame, see ``Frame.twist``; None if
                 unknown.
         """
         self.delay.add(frame.features, frame.row_offset, twist, self._scales)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera
 from vslam.config import StereoConfig
-from vslam.features import Features, level_pixel
+from vslam.features import Features, level_of, level_pixel
 from vslam.frontend.orb import Extraction
 from vslam.geometry import Matrix
 from vslam.image_motion import rays, row_speeds
@@ -30,12 +30,12 @@ from vslam.kernels import inner_kernel, kernel
 
 EVERY = 8  # every 8th feature is measured, about a hundred per image
 ROUNDS = 3  # maximum number of Gauss-Newton steps
-STILL = 0.05  # pixels; the iteration ends with a smaller step
+STILL = 0.05  # pixels; the iteration ends when a step is smaller
 LARGEST = 3.0  # pixels of the feature's level; a match with a larger shift is wrong
 HUBER_PX = 0.3
 FRAMES_OF_A_GROUP, FEWEST_GROUPS, MOST_GROUPS = 5, 5, 16
 _DEGREE = 3  # degree of the polynomial in the image coordinates
-_P = (_DEGREE + 1) * (_DEGREE + 2) // 2  # number of its coefficients
+_P = (_DEGREE + 1) * (_DEGREE + 2) // 2  # number of coefficients of this polynomial
 # Shapes of the arrays of ``DelayState``.
 _SOLUTION, _TWIST, _WAITING, _GROUP = (1 + _P,), (6,), (7 + _P, 7 + _P), (2 + _P, 2 + _P)
 
@@ -70,8 +70,8 @@ def _row_offsets(xy, octave, u_right, pixels_l, pixels_r, offsets, shapes, half)
             continue
         level = octave[i]
         height, width = shapes[level]
-        image_l = pixels_l[offsets[level] : offsets[level] + height * width].reshape(height, width)
-        image_r = pixels_r[offsets[level] : offsets[level] + height * width].reshape(height, width)
+        image_l = level_of(pixels_l, offsets, shapes, level)
+        image_r = level_of(pixels_r, offsets, shapes, level)
         ratio_x, ratio_y = shapes[0, 1] / width, shapes[0, 0] / height
         x, y = level_pixel(xy[i, 0], ratio_x), level_pixel(xy[i, 1], ratio_y)
         dx = (u_right[i] - xy[i, 0]) / ratio_x
@@ -85,8 +85,8 @@ def _row_shift(image_l, image_r, x, y, dx, half):
     the level; NaN if the patch has too little texture or is not found. The search starts at the
     horizontal shift ``dx``.
 
-    Uses inverse compositional Lucas-Kanade (Baker and Matthews, IJCV 2004), so the gradients are
-    those of the left patch.
+    Uses inverse compositional Lucas-Kanade (Baker and Matthews, IJCV 2004), so gradients are
+    computed only in the left patch.
     """
     height, width = image_l.shape
     edge = half + 1
@@ -146,7 +146,7 @@ class DelayState:
         length: number of frames in a full group.
         solution: ``(1 + P,)`` the delay in seconds and the P coefficients of the polynomial,
             estimated when the last group became full.
-        twist: ``(6,)`` velocity before the last frame, per second.
+        twist: ``(6,)`` velocity before the last frame, see ``Frame.twist``.
         waiting: ``(7 + P, 7 + P)`` moments of the last frame, which is not in a group yet.
         group: ``(2 + P, 2 + P)`` moments of the group that is being filled.
         groups: ``(G, 2 + P, 2 + P)`` moments of the full groups.
@@ -185,7 +185,7 @@ class DelayState:
         frame.
 
         Raises:
-            ValueError: the length of ``numbers`` is not that of a state.
+            ValueError: ``numbers`` does not have the length of a state.
         """
         if not numbers:
             return cls.nothing()
@@ -208,9 +208,10 @@ class DelayState:
 class SideDelay:
     """Least-squares estimate of the delay of the right image from all frames so far.
 
-    The velocity at a frame is the mean of the velocities before and after it, so a frame is added
-    only when the next one is tracked. Until then its moments are kept; the velocity can be applied
-    to them later, because image velocities are linear in the twist.
+    The velocity at a frame is the mean of the velocities before and after the frame, so a frame is
+    added only when the next frame is tracked. Until then the moments of the frame are kept. The
+    velocity can be applied to these moments later, because image velocities are linear in the
+    twist.
 
     Attributes:
         seconds: time by which the right image is later than the left one.
@@ -242,9 +243,8 @@ class SideDelay:
         Args:
             features: the N features of the frame.
             row_offset: ``Extracted.row_offset``; if None, the frame is skipped.
-            twist: ``(6,)`` velocity per second: ``exp(twist dt)``, with the elapsed time dt, maps
-                points from the previous camera frame to this one. If None (unknown), the frame is
-                skipped.
+            twist: ``(6,)`` mean velocity since the previous frame, see ``Frame.twist``. If it is
+                None (unknown), the frame is skipped.
             scales: ``(levels,)`` pyramid scale factors.
         """
         state = self._state
@@ -303,7 +303,7 @@ class SideDelay:
         if state.n_group == state.length:
             state.groups = np.concatenate([state.groups, state.group[None]])
             state.group, state.n_group = np.zeros_like(state.group), 0
-            if len(state.groups) == MOST_GROUPS:  # merge them in pairs
+            if len(state.groups) == MOST_GROUPS:  # merge neighbours in pairs
                 state.groups = state.groups[::2] + state.groups[1::2]
                 state.length *= 2
             self._solve()

@@ -21,13 +21,13 @@ Grey = NDArray[np.uint8]
 
 _STRIDE = 8  # a few thousand pixels determine the quantiles to within a grey level
 _LOW, _HIGH = 0.05, 0.95  # quantiles between which the images are compared
-_BELOW_CLIPPED = 0.98  # upper quantile, as a fraction of the share of pixels not overexposed
+_BELOW_CLIPPED = 0.98  # upper quantile, as a fraction of the share of unclipped pixels
 _MIN_SHARE = 0.25  # least share of the pixels from which a gain is estimated
 _MIN_RANGE = 4.0  # grey levels; over a smaller range, rounding dominates the gain
 _N_QUANTILES = 11  # number of quantiles that are compared between the two images
 # Largest difference between the quantiles of the two images, each scaled to a range of 1. If the
-# images differ by a gain, it is at most 0.07 for 95 % of the images of KITTI; if only one image
-# shows the sky, it is at least 0.22.
+# images differ by a gain, the difference is at most 0.07 for 95 % of the images of KITTI; if only
+# one image shows the sky, the difference is at least 0.22.
 _MAX_DEVIATION = 0.12
 _MIN_VISIBLE_RANGE = 16.0  # least range of the grey values of an image that is not black
 
@@ -38,8 +38,9 @@ class Sides:
 
     Attributes:
         darker_stops: by how many stops the right image is darker than the left one, negative if it
-            is brighter; 0 if they differ by less than the threshold, or not by a gain.
-        black: the side whose image is black while the other one is not; empty if there is none.
+            is brighter; 0 if the difference is below the threshold or is not a gain.
+        black: the side whose image is black while the other image is not; empty if there is no such
+            side.
     """
 
     darker_stops: float = 0.0
@@ -114,7 +115,7 @@ def _shares(image: Grey) -> NDArray[np.float64]:
 
 def _quantiles(shares: NDArray[np.float64], *at: float) -> list[float]:
     # Pixels with the same grey value are assumed to be spread evenly between it and the next one,
-    # so that quantiles vary smoothly even if only few grey values occur.
+    # so that quantiles vary smoothly even if the image has only few grey values.
     values: list[float] = np.interp(at, shares, np.arange(256) + 0.5).tolist()
     return values
 
@@ -128,9 +129,9 @@ def _is_black(side: NDArray[np.float64], other: NDArray[np.float64], config: Ste
 
 
 def _stops(left: NDArray[np.float64], right: NDArray[np.float64], config: StereoConfig) -> float:
-    """Binary logarithm of the gain from the right to the left image, given their ``_shares``; 0 if
-    it is below the threshold, or if dark and bright pixels differ by different gains. The images
-    are compared below an upper quantile that excludes pixels that are overexposed in either one."""
+    """Binary logarithm of the gain from the right to the left image, given the ``_shares`` of both.
+    It is 0 if the gain is below the threshold, or if dark and bright pixels have different gains.
+    Quantiles that are overexposed in either image are not compared."""
     below = config.clipped_from - 1
     top, unclipped = _HIGH, float(min(left[below], right[below]))
     if unclipped <= top:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera
 from vslam.config import StereoConfig
-from vslam.features import MIN_DISPARITY, level_pixel
+from vslam.features import MIN_DISPARITY, level_of, level_pixel
 from vslam.frontend.orb import Extraction
 from vslam.kernels import hamming, inline, inner_kernel, kernel
 
@@ -62,7 +62,7 @@ class _Side(NamedTuple):
 
 @kernel
 def rows_to_features(xy, octave, scales, height):
-    """Index features by the rows in which they may match. Those of row r are
+    """Index features by the rows in which they may match: the features of row r are
     ``items[start[r]:start[r + 1]]``, with ``start`` ``(height + 1,)`` int64."""
     start = np.zeros(height + 1, np.int64)
     n = len(xy)
@@ -87,8 +87,8 @@ def rows_to_features(xy, octave, scales, height):
 
 @kernel
 def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, half, reach):
-    """``u_right`` ``(N,)`` float32, NaN without a match, and ``(N,)`` float32 SAD of each match, -1
-    without one."""
+    """``u_right`` ``(N,)`` float32 and ``(N,)`` float32 SAD of each match; NaN and -1 for features
+    without a match."""
     xy_l, octave_l, descriptors_l, pixels_l = left
     xy_r, octave_r, descriptors_r, pixels_r = right
     n = len(xy_l)
@@ -99,8 +99,8 @@ def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, ha
     for i in range(n):
         u, v = xy_l[i, 0], xy_l[i, 1]
         row = int(v)
-        # Few features of a row are candidates, and a branch would often be mispredicted, so they
-        # are listed without one.
+        # Candidates are listed without a branch, because a test whether each feature of the row is
+        # a candidate would often be mispredicted.
         n_candidates = 0
         for k in range(start[row], start[row + 1]):
             j = items[k]
@@ -120,8 +120,8 @@ def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, ha
             continue
         level = octave_l[i]
         height, width = shapes[level]
-        image_l = pixels_l[offsets[level] : offsets[level] + height * width].reshape(height, width)
-        image_r = pixels_r[offsets[level] : offsets[level] + height * width].reshape(height, width)
+        image_l = level_of(pixels_l, offsets, shapes, level)
+        image_r = level_of(pixels_r, offsets, shapes, level)
         ratio_x, ratio_y = shapes[0, 1] / width, shapes[0, 0] / height
         x_l, y_l = level_pixel(u, ratio_x), level_pixel(v, ratio_y)
         x_r = level_pixel(xy_r[best, 0], ratio_x)
@@ -142,7 +142,7 @@ def drop_outliers(u_right, sad, octave):
 
     Args:
         u_right: ``(N,)`` float32; NaN is written for removed matches.
-        sad: ``(N,)`` float32, SAD of each match, -1 without one.
+        sad: ``(N,)`` float32, SAD of each match, -1 for features without a match.
         octave: ``(N,)`` uint8, sorted.
     """
     first = 0
@@ -164,9 +164,9 @@ def drop_outliers(u_right, sad, octave):
 
 @kernel
 def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
-    """Offset from ``x_r`` at which the patches agree best, in pixels of the level, and their SAD.
-    The offset is NaN if a patch would leave the image or the minimum is at an end of the search
-    range."""
+    """Offset from ``x_r`` at which the patches agree best, in pixels of the level, and the SAD at
+    this offset. The offset is NaN if a patch would leave the image or the minimum is at an end of
+    the search range."""
     height, width = image_l.shape
     if (
         y_l < half
@@ -263,7 +263,7 @@ def refine_shift(image_l, image_r, x_l, y_l, x_r, shift, half):
                 b0, b1 = np.float32(b[k]), np.float32(b[k + 1])
                 b2, b3 = np.float32(b[k + 2]), np.float32(b[k + 3])
                 value = b1 + part * (b2 - b1)
-                # Central difference, interpolated in the same way.
+                # Central difference, interpolated with the same weights as the grey value.
                 slope = np.float32(0.5) * (b2 - b0 + part * ((b3 - b1) - (b2 - b0)))
                 numerator += slope * (np.float32(a[k]) - value)
                 denominator += slope * slope

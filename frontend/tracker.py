@@ -61,8 +61,9 @@ class Found:
 
     @classmethod
     def at_start(cls, frame: Frame, *, begun: bool) -> Found:
-        """The result for a frame before tracking starts: OK with all landmarks that the frame
-        created if it has started a map (``begun``), otherwise LOST."""
+        """The result for a frame before tracking starts. If the frame has started a map
+        (``begun``), the state is OK and all landmarks that the frame created are inliers; otherwise
+        the state is LOST."""
         n_landmarks = int(np.count_nonzero(frame.landmark >= 0))
         state = TrackingState.OK if begun else TrackingState.LOST
         return cls(state, n_landmarks, n_landmarks)
@@ -93,8 +94,8 @@ class Tracker:
 
     Attributes:
         status: what is known about the position of the camera.
-        last: the last frame that was tracked; None before the first.
-        lost_frames: number of frames lost since then.
+        last: the last frame that was tracked; None before a frame was tracked.
+        lost_frames: number of frames lost since ``last``.
     """
 
     def __init__(self, context: TrackingContext) -> None:
@@ -108,7 +109,8 @@ class Tracker:
 
     @property
     def twist(self) -> Matrix | None:
-        """``(6,)`` velocity of the camera when it was last tracked, per second; None if unknown."""
+        """``(6,)`` velocity when the camera was last tracked, see ``Frame.twist``; None if
+        unknown."""
         return self._resumed_twist if self.last is None else self.last.twist
 
     def predict(self, timestamp: float, frames: FramePoses, view: MapView) -> Matrix:
@@ -210,8 +212,7 @@ class Tracker:
         """Continue a drive whose last frame is not available.
 
         Args:
-            twist: ``(6,)`` velocity of the camera at the end of the drive, per second; None if
-                unknown.
+            twist: ``(6,)`` velocity at the end of the drive, see ``Frame.twist``; None if unknown.
         """
         self.status, self._resumed_twist = TrackerStatus.RESUMED, twist
 
@@ -257,7 +258,8 @@ class Tracker:
 
     def _track_previous_frame(self, frame: Frame, T_cw: Matrix, view: MapView) -> int:
         """Track against the last frame with the predicted pose. If the motion is unknown or this
-        fails, track against the reference keyframe. Returns the number of inliers."""
+        fails, track against the reference keyframe. If this fails too and the motion is known,
+        ``_track_predicted``. Returns the number of inliers."""
         if self.last is None and self.status is not TrackerStatus.RESUMED:
             return 0
         if self.last is not None and self.last.twist is not None:
@@ -311,8 +313,8 @@ def result_of(
     stage_ms: dict[str, float],
     odometry: Odometry,
 ) -> TrackResult:
-    """The result for a frame that the library returns to its caller; ``stage_ms`` holds the time of
-    each stage in milliseconds."""
+    """The ``TrackResult`` of a frame, which the library returns to its caller. ``stage_ms`` gives
+    the time of each stage in milliseconds."""
     return TrackResult(
         index=frame.index,
         timestamp=frame.timestamp,

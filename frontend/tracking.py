@@ -84,8 +84,8 @@ def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:
 def track_motion(
     frame: Frame, previous: Frame, T_cw: NDArray[np.float64], context: TrackingContext
 ) -> tuple[int, int]:
-    """Project the points that the previous frame saw with the predicted pose, match them near
-    their projections, and optimise the pose.
+    """Use the predicted pose to project the points that the previous frame saw, match these points
+    near their projections, and optimise the pose.
 
     In addition to landmarks, close stereo points of the previous frame that are not in the map are
     used (the visual-odometry points of ORB-SLAM2). They stabilise the pose and are then discarded.
@@ -243,8 +243,8 @@ def predict_landmarks(
     mask: Mask | None,
     context: TrackingContext,
 ) -> tuple[Matrix, Matrix, NDArray[np.int64]]:
-    """``predict_view`` for the landmarks of a local map. Landmarks on masked pixels are not
-    visible."""
+    """Predict where the landmarks of a local map appear (``predict_view``). Landmarks on masked
+    pixels are not visible."""
     camera = context.camera
     uvr, radius, octave = predict_view(
         T_camera_w,

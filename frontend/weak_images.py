@@ -26,7 +26,7 @@ Grey = NDArray[np.uint8]
 ROW_STRIDE = 32  # noise is measured in every 32nd row: 15,000 pixels of a KITTI image
 # For Gaussian noise, median abs(I[x-1] - 2 I[x] + I[x+1]) = 0.6745 sqrt(6) sigma.
 _SECOND_DIFFERENCE = 0.6745 * 6.0**0.5
-_SPIKE_DEVIATIONS, LEAST_SPIKE = 4.0, 32.0  # least height of a spike: in sigma, in grey levels
+_SPIKE_DEVIATIONS, LEAST_SPIKE = 4.0, 32.0  # least height of a spike, in sigma and in grey levels
 _MEDIAN = 5  # side of the median filter that removes spikes, pixels
 _GAUSSIAN = 2.0 * np.pi**0.5  # a Gaussian blur of s pixels divides the noise by 2 sqrt(pi) s
 _BLOCK = 16  # side of the blocks in which contrast is measured, pixels
@@ -38,6 +38,7 @@ def extract_in_any_light(
     config: Config,
     image_map: ImageMap = map,
     allowed: Pyramid | None = None,
+    pyramid: Pyramid | None = None,
 ) -> list[Extraction]:
     """Extract the ORB features of ``(H, W)`` uint8 images that were taken at the same time. Noisy
     images are filtered first, and the contrast of faint ones is raised. All images are processed in
@@ -47,11 +48,13 @@ def extract_in_any_light(
         image_map: applies a function to all images, one after the other or in parallel; the result
             is the same.
         allowed: where the first image may have corners, see ``extract``.
+        pyramid: the pyramid of the first image, if it has already been built.
     """
-    weak = config.weak_images
+    weak, first = config.weak_images, images[0]
 
     def found_in(image: Grey) -> Extraction:
-        return extract(image, config.orb, allowed if image is images[0] else None)
+        built = pyramid if image is first else None
+        return extract(image, config.orb, allowed if image is images[0] else None, built)
 
     images = without_noise(images, weak)
     found = list(image_map(found_in, images))
@@ -80,13 +83,13 @@ def without_noise(images: Sequence[Grey], config: WeakImageConfig) -> Sequence[G
 def grain(image, stride, least):
     """Estimate the noise and the spikes of an ``(H, W)`` uint8 image from every ``stride``-th row.
 
-    Noise is estimated from the median of absolute second differences along a row, which is robust
-    against edges; their mean (Immerkaer, CVIU 1996) is not.
+    Noise is estimated from the median of absolute second differences along a row. The median is
+    robust against edges; the mean (Immerkaer, CVIU 1996) is not.
 
     Returns:
-        Standard deviation of the noise, grey levels; share of the pixels that are brighter than
-        both neighbours, or darker than both, by more than ``least`` grey levels and more than four
-        standard deviations.
+        Standard deviation of the noise, grey levels; share of the pixels that are spikes, that is,
+        brighter than both neighbours or darker than both by more than ``least`` grey levels and
+        more than four standard deviations.
     """
     height, width = image.shape
     counts = np.zeros(1021, np.int64)

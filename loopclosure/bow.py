@@ -1,9 +1,9 @@
 """Loop detection by bag of words.
 
-Candidates are chosen as in ORB-SLAM (Mur-Artal et al., T-RO 2015, sections III-E and VII-A). They
-share many words with the query, score no lower than the query's covisible keyframes, and represent
-the groups of covisible keyframes with the highest total scores. One pass over the inverted index
-gives the scores of all keyframes.
+Candidates are chosen as in ORB-SLAM (Mur-Artal et al., T-RO 2015, sections III-E and VII-A). A
+candidate shares many words with the query and belongs to one of the groups of covisible keyframes
+with the highest total scores. Its score is at least the lowest score among the keyframes that are
+covisible with the query. One pass over the inverted index gives the scores of all keyframes.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class BowDetector:
         """Store the words of a keyframe; the image is ignored.
 
         Raises:
-            ValueError: the id is not greater than that of every earlier keyframe.
+            ValueError: the id is not greater than the ids of all earlier keyframes.
         """
         if keyframe < self._n_keyframes:
             raise ValueError(
@@ -57,9 +57,9 @@ class BowDetector:
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
         """Candidates for a keyframe that was added.
 
-        They are keyframes in the map that are neither recent nor covisible with it, and they score
-        at least as high as its lowest-scoring covisible keyframe. Without covisible keyframes, any
-        score suffices.
+        Candidates are keyframes in the map that are neither recent nor covisible with the query.
+        Their scores are at least the lowest score among the keyframes that are covisible with the
+        query; if there are none, any score suffices.
         """
         config = self.config
         entries = self._entries(keyframe)
@@ -186,8 +186,8 @@ def choose_candidates(
     """Choose candidates by shared words, scores and groups of covisible keyframes.
 
     1. A keyframe passes if it shares at least ``common_words_ratio`` times as many words as the
-       keyframe that shares most. The ``max_groups`` keyframes with the highest scores, which must
-       be at least ``least_score``, are selected among those that pass.
+       keyframe that shares most. Among the keyframes that pass and score at least ``least_score``,
+       the ``max_groups`` keyframes with the highest scores are selected.
     2. Each selected keyframe forms a group with those of its ``group_size`` most covisible
        keyframes that pass. The score of a group is the sum of its members' scores, and its
        representative is the member with the highest score.

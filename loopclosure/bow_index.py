@@ -143,7 +143,8 @@ def post(postings, used, keyframe, words, weights):
 @kernel
 def compare_with_all(postings, n_keyframes, words, weights):
     """``(K,)`` int64: for each keyframe, ``SHARED`` times the number of shared words plus the sum
-    of the smaller weights. With both in one integer, a posting costs one addition."""
+    of the smaller weights. Because both are in one integer, each posting needs only one
+    addition."""
     start, sizes, _, pool = postings
     sums = np.zeros(n_keyframes, np.int64)
     for i in range(len(words)):

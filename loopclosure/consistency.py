@@ -2,10 +2,9 @@
 must agree.
 
 ORB-SLAM (T-RO 2015, VII-A) requires that consecutive keyframes resemble overlapping places, which
-is evidence from appearance. Geometry gives stronger evidence: each verified loop implies by how
-much the map has drifted, and the loops of neighbouring keyframes must imply the same drift.
-ORB-SLAM3 (T-RO 2021, section VI) also verifies a loop first and then confirms it with other
-keyframes.
+is evidence from appearance. Geometry gives stronger evidence: each verified loop implies how much
+the map has drifted, and the loops of neighbouring keyframes must imply the same drift. ORB-SLAM3
+(T-RO 2021, section VI) also verifies a loop first and then confirms it with other keyframes.
 """
 
 from __future__ import annotations
@@ -49,7 +48,8 @@ class LoopConsistency:
         candidates.
 
         Returns:
-            The candidates with enough keyframes, and a rejected edge for each of the others.
+            The candidates whose place enough consecutive keyframes resembled, and a rejected edge
+            for each other candidate.
         """
         self._turn += 1
         series: dict[frozenset[int], ResembledPlace] = {}
@@ -113,7 +113,7 @@ class LoopConsistency:
 
         An earlier keyframe confirms a loop if it is covisible with the query, can be verified at
         the same place, and implies the same drift. ORB-SLAM3 (section VI) also tries covisible
-        keyframes before it waits for later ones.
+        keyframes before it waits for later keyframes.
         """
         oldest = self._turn + 1 - self.config.verified_memory
         for waiting in [edge for turn, edge in reversed(self._verified) if turn >= oldest]:
@@ -144,7 +144,7 @@ class LoopConsistency:
         return False
 
     def agree(self, edge: LoopEdge, other: LoopEdge, map_: Map) -> bool:
-        """Whether two edges imply the same drift at the query of the first."""
+        """Whether two edges imply the same drift at the query of the first edge."""
         position = inverse(map_.keyframe_pose(edge.query))[:3, 3]
         a, b = implied_drift(edge, map_), implied_drift(other, map_)
         twist = se3_log(inverse(_rigid(a)) @ _rigid(b))

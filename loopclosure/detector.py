@@ -43,8 +43,8 @@ class LoopDetector(Protocol):
     def locate(
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
-        """Keyframes in the map that look similar to a frame outside the map, best first. The query
-        of these candidates is -1."""
+        """Keyframes in the map that look similar to a frame outside the map, best first.
+        ``LoopCandidate.query`` is -1, because the frame is no keyframe."""
         ...
 
     def memory(self) -> DetectorMemory:

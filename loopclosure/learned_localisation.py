@@ -30,12 +30,12 @@ from vslam.reprojection import stack_uvr
 
 
 class View(NamedTuple):
-    """What a keyframe of the place contributes to the search.
+    """The descriptors and landmarks of a keyframe of the place.
 
     Attributes:
-        maps: local descriptors of its image.
-        landmarks: ``(N,)`` ids of the landmarks that it observes.
-        xy: ``(N, 2)`` pixels of these landmarks in its image.
+        maps: local descriptors of the keyframe's image.
+        landmarks: ``(N,)`` ids of the landmarks that the keyframe observes.
+        xy: ``(N, 2)`` pixels of these landmarks in the keyframe's image.
     """
 
     maps: DescriptorMaps
@@ -128,7 +128,8 @@ def guided_search(
     camera: Camera,
     config: LearnedMatchingConfig,
 ) -> Sight:
-    """Search for all landmarks of the views near their projections and refine the pose, twice."""
+    """Search for all landmarks of the views near their projections and refine the pose with all
+    matches; then repeat both steps."""
     _, first = np.unique(np.concatenate([view.landmarks for view in views]), return_index=True)
     landmarks = np.concatenate([view.landmarks for view in views])[first]
     xyz = map_.arrays.xyz[landmarks]

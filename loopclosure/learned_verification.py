@@ -39,8 +39,8 @@ class LearnedTrials:
     verification by ORB.
 
     The chosen candidates are those with the most similar images by local descriptors, if they are
-    similar enough. After a failed attempt, only clearly more similar candidates are chosen for the
-    next ``learned.rest`` keyframes.
+    similar enough. After a failed attempt, only candidates that are clearly more similar than the
+    failed one are chosen for the next ``learned.rest`` keyframes.
 
     Attributes:
         state: the outcome of the last attempt.
@@ -51,7 +51,8 @@ class LearnedTrials:
         self.state = VerifierState()
 
     def choose(self, keyframe: int, candidates: Collection[LoopCandidate]) -> set[int]:
-        """Matches of the candidates to try; candidates without a rating are never chosen."""
+        """The keyframe ids ``match`` of the candidates to try. Candidates without a rating are
+        never chosen."""
         config = self._config
         min_alike = config.min_alike
         if keyframe < self.state.resting_until:
@@ -114,7 +115,7 @@ def is_image_redundant(
 
     This is the case if the previous keyframe has an image, because every second image is enough
     even if keyframes are far apart. It is also the case if any keyframe with an image shares most
-    landmarks with it, as in slow motion, in turns, and on revisits of mapped places.
+    landmarks with this keyframe, as in slow motion, in turns, and on revisits of mapped places.
     """
     if keyframe - 1 in images:
         return True
@@ -148,8 +149,8 @@ def verify_learned(
     if isinstance(sight, str):
         return replace(edge, reason=sight)
     feature, landmark = observed_features(map_, query, sight, camera, config)
-    # With a known pose, ORB features may match after all. Their positions are more precise, about a
-    # tenth of a pixel.
+    # Now that the pose is known, ORB features may match. If enough do, their matches are preferred,
+    # because their positions are more precise (about a tenth of a pixel).
     place = collect_landmarks(map_.arrays, np.array(keyframes, np.int64), map_.n_landmarks)
     guided = guided_match(map_, query, place, sight.T_cw, camera, gates)
     if np.count_nonzero(guided.seen) >= gates.min_inliers:
@@ -327,10 +328,11 @@ def _seen_of_query(
     config: LearnedMatchingConfig,
 ) -> tuple[int, int]:
     """Number of landmarks of the query that are found at their projections in the image of a
-    keyframe of the place, and number of those that should be visible in it."""
+    keyframe of the place, and number of landmarks of the query that should be visible in this
+    image."""
     assert edge.T_query_match is not None
     T_match_query = inverse(edge.T_query_match)
-    T_match_query[:3, 3] *= edge.scale  # in the query's unit, like its landmarks
+    T_match_query[:3, 3] *= edge.scale  # in the unit around the query, like the landmarks
     view = view_of(map_, edge.query, images)
     T_wm = inverse(map_.keyframe_pose(edge.match))
     T_wm[:3, 3] *= edge.scale

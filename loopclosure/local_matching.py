@@ -2,8 +2,8 @@
 
 Coarse matches are cells of two images that are mutual nearest neighbours. Fine matching searches
 for each keypoint of one image in the other image, in windows around the positions that nearby
-coarse matches predict; it does not need keypoints there. The position is refined to a fraction of a
-cell and accepted only if the reverse search returns to the keypoint.
+coarse matches predict. The other image needs no keypoints. The position is refined to a fraction of
+a cell and accepted only if the reverse search returns to the keypoint.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class CoarseMatches(NamedTuple):
 
 
 class Located(NamedTuple):
-    """Positions of keypoints of one image in another.
+    """Positions of keypoints of one image in another image.
 
     Attributes:
         xy: ``(N, 2)`` float64 pixels of the camera image, NaN where not found.
@@ -98,7 +98,7 @@ def locate(
     Args:
         xy: ``(N, 2)`` keypoints, pixels of camera image a.
         coarse: coarse matches from a to b.
-        reach: half width of a window, fine cells.
+        reach: half width of a window, in fine cells.
         least: least cosine of a match.
     """
     rows, columns, _ = a.coarse.shape

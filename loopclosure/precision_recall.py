@@ -60,7 +60,8 @@ def curve_of(right: NDArray[np.bool_], score: NDArray[np.float64], total: int) -
     """
     order = np.argsort(-score, kind="stable")
     ranked = score[order]
-    last = np.flatnonzero(np.append(np.diff(ranked) != 0, len(ranked) > 0))  # of each equal score
+    # For each distinct score, the index of the last item with this score.
+    last = np.flatnonzero(np.append(np.diff(ranked) != 0, len(ranked) > 0))
     correct = np.cumsum(right[order])[last]
     precision, recall = correct / (last + 1), correct / total
     return PrecisionRecall(

@@ -20,7 +20,7 @@ from vslam.reprojection import chi_square, chi_square_ratio, residual, unpacked
 REFITS = 4
 SAMPLE_ITERATIONS, REFIT_ITERATIONS = 3, 5
 # Least height of a triangle over its longest side; flatter triangles hardly constrain the rotation
-# about that side.
+# about the longest side.
 MIN_FLATNESS = 0.03
 
 

@@ -4,8 +4,8 @@ The steps are those of ORB-SLAM (T-RO 2015, VII-B; for stereo T-RO 2017, III-D):
 descriptors of two keyframes, estimate a motion by RANSAC, match all landmarks of the place near
 their projections, and refine the pose. ORB-SLAM then only counts inliers, but a facade or a car
 that looks like another one has many inliers, too. The tests here therefore also look for evidence
-against the loop: the inliers must be spread over the image, and on each side most landmarks of the
-other side that should be visible must be found.
+against the loop: the inliers must be spread over the image, and in each keyframe most of the other
+side's landmarks that should be visible must be found.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ def _consensus(
     if found is None:
         return None, 1.0, 0
     T_query_match = found.T_a_b.copy()
-    T_query_match[:3, 3] /= found.scale  # from the query's unit to that of the match
+    T_query_match[:3, 3] /= found.scale  # to the unit around the match
     return T_query_match, found.scale, int(np.count_nonzero(found.inlier))
 
 
@@ -210,8 +210,8 @@ def _observations(map_: Map, rows: NDArray[np.int64]) -> tuple[Matrix, Matrix]:
 
 
 def place_of(map_: Map, match: int, query: int, config: VerificationConfig) -> NDArray[np.int64]:
-    """Ids of the match and its most covisible keyframes, without keyframes covisible with the
-    query."""
+    """Ids of the match and its most covisible keyframes, except keyframes that are covisible with
+    the query."""
     near_query = {query, *map_.covisible(query)[0].tolist()}
     around = [k for k in map_.covisible(match)[0].tolist() if k not in near_query]
     return np.array([match, *around[: config.place_keyframes]], np.int64)
@@ -330,13 +330,14 @@ def reverse_match(
 ) -> GuidedMatches:
     """Search for the landmarks of the query in the image of the match."""
     T_match_query = inverse(T_query_match)
-    T_match_query[:3, 3] *= edge.scale  # in the query's unit, like its landmarks
+    T_match_query[:3, 3] *= edge.scale  # in the unit around the query, like the landmarks
     T_mw = T_match_query @ map_.keyframe_pose(edge.query)
     return guided_match(map_, edge.match, map_.landmarks_of(edge.query), T_mw, camera, config)
 
 
 def seen_of(map_: Map, keyframe: int, guided: GuidedMatches) -> tuple[int, int]:
-    """Number of landmarks of a keyframe that the camera sees, and number that it should see."""
+    """Number of landmarks of a keyframe that guided matching found, and number of landmarks of the
+    keyframe that should be visible."""
     own = np.isin(guided.landmarks, map_.landmarks_of(keyframe))
     return int(np.count_nonzero(guided.seen & own)), int(np.count_nonzero(own))
 

@@ -61,8 +61,8 @@ class Verifier:
     def rate(
         self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
     ) -> list[LoopCandidate]:
-        """Set ``alike`` and ``promising`` of the candidates of a keyframe if this verifier uses
-        them; the order stays the same."""
+        """Set ``alike`` and ``promising`` (see ``LoopCandidate``) of the candidates of a keyframe
+        if this verifier uses them. The order of the candidates stays the same."""
         return candidates
 
     def verify(

@@ -4,7 +4,7 @@ The tree is the hierarchical vocabulary of Nister and Stewenius (CVPR 2006) for 
 (Galvez-Lopez and Tardos, T-RO 2012, section III): each node splits its descriptors into k clusters
 by Hamming distance, the centre of a cluster is the bitwise majority of its descriptors, and the
 leaves are the words. Nodes are numbered breadth first, so that the children of a node are adjacent
-in memory and each step of a descent reads one block of 32 k bytes.
+in memory and each step of a descent reads one block of k descriptors.
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ def from_children(
     parent = np.concatenate([[-1], np.repeat(np.arange(n), children)]).astype(np.int32)
     level = np.zeros(n, np.uint8)
     start, stop, depth = 1, 1 + int(children[0]), 1
-    while start < stop:  # nodes start to stop are those at this depth
+    while start < stop:  # start:stop are the nodes at this depth
         if depth > levels:
             raise ValueError(f"the tree is deeper than {levels} levels")
         level[start:stop] = depth
@@ -190,8 +190,8 @@ def from_children(
 
 
 def save(vocabulary: Vocabulary, path: Path) -> None:
-    """Write a vocabulary as an npz file. It is uncompressed, because the nearly random bits of
-    descriptors do not compress, and because it loads faster.
+    """Write a vocabulary as an npz file. The file is not compressed, because the nearly random bits
+    of descriptors hardly compress and an uncompressed file loads faster.
 
     Raises:
         ResultsError: the file cannot be written.

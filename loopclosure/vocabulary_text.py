@@ -194,7 +194,8 @@ def _check_children(
 
 
 def _breadth_first(parent: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Nodes in breadth-first order, siblings in the order of their lines, and the level of each."""
+    """Nodes in breadth-first order, siblings in the order of their lines, and the level of each
+    node."""
     by_parent = np.argsort(parent, kind="stable")
     n_children = np.bincount(parent[1:], minlength=len(parent))
     first = 1 + np.cumsum(n_children) - n_children  # position of each first child in by_parent

@@ -68,7 +68,7 @@ def train(
     seen_in = np.zeros(n_leaves, np.int64)
     for one in descriptors_of_images:
         seen_in[np.unique(tree.words(one))] += 1
-    # np.maximum only guards the division, because each leaf is the word of a training descriptor.
+    # Each leaf should be the word of a training descriptor; np.maximum only guards the division.
     weight = np.log(len(counts) / np.maximum(seen_in, 1)).astype(np.float32)
     return from_children(branching, levels, nodes, children, weight)
 
@@ -239,7 +239,8 @@ def split_level(data, order, starts, branching, stream, iterations):
         for i in range(n):
             sorted_members[cursor[label[i]]] = members[i]
             cursor[label[i]] += 1
-        # Nodes that became leaves are skipped, so the groups of the others are moved to the left.
+        # Nodes that became leaves are skipped, so the groups of the other nodes are moved to the
+        # left.
         for i in range(n):
             order[filled + i] = sorted_members[i]
         for k in range(n_centres):

@@ -119,7 +119,7 @@ POINTS = (
     Point("result: KITTI poses", "vslam.report.folder.write_kitti", 1, MISSING,
           ("trajectory_kitti.txt",)),
     Point("result: TUM poses", "vslam.report.folder.write_tum", 1, MISSING, ("trajectory.tum",)),
-    Point("result: ground truth", "vslam.report.folder.matched_ground_truth", 1, MISSING,
+    Point("result: ground truth", "vslam.run.outcome.ground_truth_of", 1, MISSING,
           ("ground_truth_kitti.txt",)),
     Point("result: evaluation", "vslam.report.folder.evaluate_run", 1, MISSING),
     Point("result: world", "vslam.report.folder.world_of", 1, MISSING),

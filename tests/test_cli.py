@@ -28,9 +28,9 @@ from vslam.loopclosure.registry import DETECTORS
 from vslam.loopclosure.siamese.weights import NETWORKS
 from vslam.loops import LoopEdge
 from vslam.report import figures
-from vslam.report.finished_run import read_report
 from vslam.report.folder import write_results
 from vslam.report.run_page import option_rows
+from vslam.report.schema import ReportJson
 from vslam.run import pipeline as run_pipeline
 from vslam.run import recorder, warmup
 from vslam.run.autosave import MAP
@@ -433,7 +433,7 @@ def pipeline(monkeypatch) -> SimpleNamespace:
             compared=tuple(replace(one, trajectory=shaken(one.trajectory)) for one in compared),
         )  # fmt: skip
 
-    def draw_figures(outcome, evaluation, ground_truth, verdict):
+    def draw_figures(outcome, evaluation, verdict):
         calls.evaluation, calls.outcome = evaluation, outcome
         return []  # drawing takes a second
 
@@ -475,7 +475,7 @@ def test_changed_thresholds_are_in_the_name_of_the_folder_and_the_summary(call, 
     )
     folder = Path("runs/latest").resolve()
     assert folder.name.endswith("-kitti-00-none-both-orb.n_features=1000+3more")
-    report = read_report(folder)
+    report = ReportJson.read(folder / "report.json")
     assert report.thresholds["tracking.method"] == "patches"
     row = dict(option_rows(report))["thresholds"]
     assert row == ", ".join(f"{name}={value}" for name, value in report.thresholds.items())

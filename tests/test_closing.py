@@ -59,14 +59,17 @@ CARRIED_FROM, CARRIED_TO = 60.0, 90.0
 CARRIED = [*ROUND[:60], *ROUND[90:]]
 
 
-def run(ring, frames, detector="none", *, threads=1, dark=(), finish=True, config=None):
-    """Drive along ``frames`` of the ring, ten a second; ``dark`` ones show nothing."""
+def run(ring, frames, detector="none", *, threads=1, dark=(), finish=True, config=None, look=None):
+    """Drive along ``frames`` of the ring, ten a second; ``dark`` ones show nothing. ``look`` is
+    called after each frame."""
     slam = Slam(CAMERA, config, detector, threads=threads)
     results = []
     for i, k in enumerate(frames):
         image = np.array([[i & 255, i >> 8]], np.uint8)  # tells the oracle which frame it is
         features = Features.none() if i in dark else ring.see(k, 1)
         results.append(slam.step_features(Extracted(features), 0.1 * i, image))
+        if look is not None:
+            look(slam)
     if finish:
         slam.finish()
     return slam, results
@@ -98,6 +101,28 @@ def test_a_closed_loop_takes_the_drift_out(check_map):
     check_map(slam.map)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("threads", [1, 2])
+def test_saving_after_each_frame_changes_no_result_of_a_drive_with_loops(threads):
+    oracle = Oracle(DRIFTING, ROUND)
+    slam, _ = run(DRIFTING, ROUND, oracle, threads=threads, look=Slam.stored_map)
+    assert slam.trajectory().T_wc.tobytes() == closed().trajectory().T_wc.tobytes()
+    assert [edge.reason for edge in slam.loops] == [edge.reason for edge in closed().loops]
+
+
+@pytest.mark.slow
+def test_a_checkpoint_waits_until_a_loop_that_was_found_is_closed():
+    states = []
+
+    def look(slam):
+        stored = slam.stored_map()
+        states.append((len(slam.corrections), stored.checkpoint is None, slam.is_adjusting))
+
+    run(DRIFTING, ROUND, Oracle(DRIFTING, ROUND), look=look)
+    first = next(k for k, (closed_loops, _, _) in enumerate(states) if closed_loops)
+    assert states[first - 1] == (0, True, False)  # found, and not closed yet
+
+
 ZOOMING = Ring.create(focal_error=0.015, zoom=True)
 ENDS_EARLY = ROUND[: LAP + 14]
 
@@ -105,6 +130,7 @@ ENDS_EARLY = ROUND[: LAP + 14]
 @pytest.mark.slow
 def test_a_drive_that_ends_before_the_next_keyframe_asks_an_earlier_one():
     slam, _ = run(ZOOMING, ENDS_EARLY, Oracle(ZOOMING, ENDS_EARLY), finish=False)
+    slam.stored_map()  # waits for the search at the last keyframe
     assert slam.loops[-1].reason == "verified by 1 of 2 keyframes"
     assert errors(slam, ZOOMING, ENDS_EARLY)[-1] > 3.0
     slam.finish()

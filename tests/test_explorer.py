@@ -25,7 +25,7 @@ from vslam.config import as_config
 from vslam.errors import InputError
 from vslam.lab.overview.serve import list_runs, make_server
 from vslam.report.explorer import explorer_data
-from vslam.report.folder import evaluate_run, matched_ground_truth, write_results
+from vslam.report.folder import evaluate_run, write_results
 from vslam.run.moments import MomentRecorder
 
 FRAMES = 150
@@ -91,7 +91,7 @@ def test_the_data_are_those_of_the_run():
     outcome = make_outcome(FRAMES, lost=slice(20, 22))
     evaluation, _ = evaluate_run(outcome)
     moments = filled(30, 5).moments
-    data = explorer_data(outcome, evaluation, matched_ground_truth(outcome), moments)
+    data = explorer_data(outcome, evaluation, moments)
     assert data is not None
     json.dumps(data, allow_nan=False)
     floats = {name: numbers(packed) for name, packed in data["floats"].items()}
@@ -115,17 +115,17 @@ def test_the_data_are_those_of_the_run():
 
 def test_a_run_without_ground_truth_and_a_short_one():
     outcome = make_outcome(20)
-    data = explorer_data(outcome, None, None, [])
+    data = explorer_data(outcome, None, [])
     assert data is not None
     assert np.isnan(numbers(data["floats"]["error"])).all()
     assert data["truth"] == {"x": "", "z": ""}
-    assert explorer_data(make_outcome(1), None, None, []) is None
-    assert explorer_data(make_outcome(20, lost=slice(0, 20)), None, None, []) is None
+    assert explorer_data(make_outcome(1), None, []) is None
+    assert explorer_data(make_outcome(20, lost=slice(0, 20)), None, []) is None
 
 
 def test_every_frame_of_a_long_run_is_there_in_little_space():
     outcome = make_outcome(7001)
-    data = explorer_data(outcome, None, None, [])
+    data = explorer_data(outcome, None, [])
     assert data is not None
     assert len(numbers(data["floats"]["x"])) == 7001
     assert len(json.dumps(data)) < 50 * 7001

@@ -418,7 +418,7 @@ def test_what_was_computed_is_kept_where_gps_says_too_little(call, kitti_tree, f
     code, _, err = call("run", "--data", kitti_tree, *WORDS, "--no-report", "--gps", rough)
     assert code == 1
     assert len(err.splitlines()) == 1
-    assert "all other results are there: the drive is too short for GPS" in err
+    assert "all other results were written: the drive is too short for GPS" in err
     run = tmp_path / "runs" / "latest"
     assert (run / "trajectory.tum").is_file()
     assert not (run / "gps.json").exists()
@@ -459,7 +459,7 @@ def test_fixes_before_a_stream_are_refused(corridor, tmp_path, fixes):
     require_overlap(good, source, fixes)
     early = replace(good, times=good.times - 100.0)
     with pytest.raises(
-        InputError, match=r"to -97\.300 s but the images are from 0\.200 s on; give"
+        InputError, match=r"to -97\.300 s but the images are from 0\.200 s on; both"
     ):
         require_overlap(early, source, fixes)
     with pytest.raises(InputError, match="cannot be used with a live camera"):

@@ -13,9 +13,7 @@ from vslam.frontend.frame import Frame
 from vslam.frontend.keyframes import (
     KeyframeEvidence,
     KeyframePolicy,
-    PlaceEvidence,
     count_close,
-    is_known_place,
     needs_keyframe,
     needs_monocular_keyframe,
 )
@@ -142,7 +140,7 @@ def test_one_camera_needs_no_keyframe_by_time_alone():
     assert decide_monocular(seconds_since_keyframe=1.0, n_inliers=179, mapping_idle=False)
 
 
-KNOWN = PlaceEvidence(n_inliers=150, n_shared=100, n_place=200)
+KNOWN = {"n_inliers": 150, "n_shared": 100, "n_place": 200}
 
 
 @pytest.mark.parametrize(("changes", "known"), [
@@ -153,8 +151,9 @@ KNOWN = PlaceEvidence(n_inliers=150, n_shared=100, n_place=200)
     ({"n_place": 10, "n_inliers": 49, "n_shared": 49}, False),  # the end of a map
 ])  # fmt: skip
 def test_a_place_is_known_that_is_tracked_like_its_old_keyframe(changes, known):
-    config = KeyframeConfig(max_tracked_ratio=0.75, known_ratio=0.5)
-    assert is_known_place(replace(KNOWN, **changes), config) == known
+    config = Config(keyframes=KeyframeConfig(max_tracked_ratio=0.75, known_ratio=0.5))
+    decides = KeyframePolicy(TrackingContext.create(CAMERA, config))
+    assert decides.is_known(**KNOWN | changes) == known
 
 
 # -- the policy -----------------------------------------------------------------------------------
@@ -255,8 +254,8 @@ def test_deciding_changes_nothing(awaited):
     before = one.state()
     assert not one.wants_keyframe(CONTENT)
     assert one.wants_keyframe(replace(CONTENT, seconds_since_keyframe=1.0))
-    assert not one.is_known(replace(KNOWN, n_shared=0))
-    assert one.is_known(KNOWN)
+    assert not one.is_known(**KNOWN | {"n_shared": 0})
+    assert one.is_known(**KNOWN)
     assert one.state() == before
     observe(one, frame(close=10))
     assert (one.state() != before) == awaited
@@ -299,7 +298,7 @@ def test_a_policy_decides_for_one_camera(changes, wanted):
 
 @pytest.mark.parametrize(("n_shared", "known"), [(100, True), (99, False)])
 def test_a_policy_knows_a_place_by_what_it_shares(n_shared, known):
-    assert policy().is_known(replace(KNOWN, n_shared=n_shared)) == known
+    assert policy().is_known(**KNOWN | {"n_shared": n_shared}) == known
 
 
 @pytest.mark.parametrize("awaited", [True, False])

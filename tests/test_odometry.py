@@ -31,7 +31,6 @@ from vslam.odometry import (
 from vslam.report.figures import draw_figures
 from vslam.report.frame_table import write_covariances, write_frames
 from vslam.run.options import RunOptions
-from vslam.run.outcome import matched_ground_truth
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
 from vslam.slam import Slam
@@ -241,12 +240,11 @@ def test_numbers_come_back_as_the_same_uncertainty():
 def test_the_report_draws_the_error_of_odometry_beside_two_sigma(kitti_tree):
     sequence = open_sequence("kitti", kitti_tree, "00")
     outcome = run_sequence(sequence, Perturbation("none"), RunOptions(detector="none"), Recorder())
-    truth = matched_ground_truth(outcome)
-    errors = motion_errors(outcome.tracks, truth, 1.0)
+    errors = motion_errors(outcome.tracks, outcome.ground_truth, 1.0)
     assert len(errors.first) == 18  # of 28 frames in 2.7 s
     assert errors.distance.max() < 0.05
-    drawn = [figure.name for figure in draw_figures(outcome, None, truth, None)]
+    drawn = [figure.name for figure in draw_figures(outcome, None, None)]
     assert "odometry_error" in drawn
     left = replace(sequence, camera=sequence.camera.left_camera())
     alone = replace(outcome, sequence=left)
-    assert "odometry_error" not in [f.name for f in draw_figures(alone, None, truth, None)]
+    assert "odometry_error" not in [f.name for f in draw_figures(alone, None, None)]

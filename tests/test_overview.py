@@ -343,7 +343,7 @@ def test_one_condition_is_not_called_all(two_conditions):
     report = summarize(Found(runs, []))
     assert {c.perturb for c in report.comparisons} == {"none"}
     _, points = versus(report)[0].parts
-    assert points.sentences[2].startswith("ATE, images as they are, both against bow: a tie")
+    assert points.sentences[2].startswith("ATE, unperturbed images, both against bow: a tie")
 
 
 def test_the_winner_is_who_has_the_smaller_errors(two_conditions):

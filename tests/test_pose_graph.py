@@ -24,7 +24,7 @@ from vslam.config import PoseGraphConfig
 from vslam.features import Features
 from vslam.geometry import inverse, inverses, orthonormalised, se3_exp, se3_log
 from vslam.loops import LoopEdge
-from vslam.map import Map
+from vslam.map import UNPREDICTED, Map
 from vslam.map_kernels import covisible_pairs, link_many
 
 CONFIG = PoseGraphConfig()
@@ -276,20 +276,21 @@ def test_edges_past_a_restart_are_weak():
     views = [range(60 * k, 60 * k + 240) for k in range(8)]
     views[4:] = [range(view.start + 1000, view.stop + 1000) for view in views[4:]]
     map_ = make_map(views, T_cw)
-    edges = named(essential_graph(map_, [], CONFIG, weak={4}))
+    map_.begin_submap(4, 3, predicted=True)
+    edges = named(essential_graph(map_, [], CONFIG))
     assert edges[3, 4] == WEAK
     assert list(edges.values()).count(WEAK) == 1
     assert not any(low < 4 <= high for low, high in edges if (low, high) != (3, 4))
     # Its child takes its place when it is culled.
     map_.cull_keyframe(4)
-    graph = essential_graph(map_, [], CONFIG, weak={4})
+    graph = essential_graph(map_, [], CONFIG)
     edges = named(graph)
     assert edges[3, 5] == WEAK
     assert list(edges.values()).count(WEAK) == 1
     e = list(edges).index((3, 5))
     assert graph.sigmas[e].tolist() == [CONFIG.weak_translation, CONFIG.weak_rotation]
     # Driven on, 2 m in the time between: half of it, and so many rad a second.
-    graph = essential_graph(map_, [], CONFIG, weak={4}, driven=True)
+    graph = essential_graph(map_, [], CONFIG, driven=True)
     assert named(graph)[3, 5] == GAP
     assert WEAK not in named(graph).values()
     elapsed = map_.timestamps[5] - map_.timestamps[3]
@@ -299,12 +300,15 @@ def test_edges_past_a_restart_are_weak():
     ]
     assert graph.sigmas[e].tolist() == pytest.approx(expected)
     # Not where nobody knew how fast it went.
-    graph = essential_graph(map_, [], CONFIG, weak={4}, unpredicted={4}, driven=True)
+    map_.keyframes.restart[4] = UNPREDICTED
+    graph = essential_graph(map_, [], CONFIG, driven=True)
     assert named(graph)[3, 5] == WEAK
 
 
 def test_a_tree_edge_past_a_restart_with_landmarks_in_common_is_not_weak():
-    edges = named(essential_graph(line_map(), [], CONFIG, weak={4}))
+    map_ = line_map()
+    map_.begin_submap(4, 3, predicted=True)
+    edges = named(essential_graph(map_, [], CONFIG))
     assert WEAK not in edges.values()
 
 

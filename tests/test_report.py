@@ -26,7 +26,7 @@ from vslam.report.summary import evaluate_run, summarize
 from vslam.report.trajectory_figures import loop_closing, top_view
 from vslam.run.loop_pictures import LoopPicture
 from vslam.run.options import RunOptions
-from vslam.run.outcome import RunOutcome, matched_ground_truth
+from vslam.run.outcome import RunOutcome
 from vslam.trajectory import Trajectory, read_trajectory
 
 FIGURES = {
@@ -234,7 +234,7 @@ def test_all_files_are_written(written: tuple[RunOutcome, Path]) -> None:
 
 def test_json_holds_the_numbers_of_the_run(written: tuple[RunOutcome, Path]) -> None:
     outcome, folder = written
-    truth = matched_ground_truth(outcome)
+    truth = outcome.ground_truth
     assert truth is not None
     evaluation = evaluate_trajectory(outcome.trajectory, truth)
     report = json.loads((folder / "report.json").read_text())
@@ -281,7 +281,7 @@ def test_causal_ate_is_of_the_poses_as_they_were_given(written: tuple[RunOutcome
     given = read_trajectory(folder / "trajectory_causal.tum")
     assert len(given) == report["frames"]
     np.testing.assert_allclose(given.T_wc, [track.T_wc for track in outcome.tracks], atol=1e-8)
-    truth = matched_ground_truth(outcome)
+    truth = outcome.ground_truth
     assert truth is not None
     assert report["causal_ate_rmse_m"] == pytest.approx(
         evaluate_trajectory(given, truth).ate_rmse_m, abs=1e-6
@@ -397,7 +397,7 @@ def test_json_judges_every_loop(looped: tuple[RunOutcome, Path]) -> None:
 
 def test_comparison_is_in_every_text(looped: tuple[RunOutcome, Path]) -> None:
     outcome, folder = looped
-    (other,), truth = outcome.compared, matched_ground_truth(outcome)
+    (other,), truth = outcome.compared, outcome.ground_truth
     assert truth is not None
     expected = evaluate_trajectory(other.trajectory, truth)
     report = ReportJson.model_validate_json((folder / "report.json").read_bytes())
@@ -434,14 +434,14 @@ def test_compared_trajectories_are_in_the_top_view(looped: tuple[RunOutcome, Pat
     T_elsewhere[0, 3] = 40.0
     moved = Trajectory(outcome.trajectory.timestamps, T_elsewhere @ outcome.trajectory.T_wc)
     outcome = replace(outcome, compared=(replace(outcome, trajectory=moved, compared=()),))
-    truth = matched_ground_truth(outcome)
+    truth = outcome.ground_truth
     assert truth is not None
     evaluation = evaluate_trajectory(outcome.trajectory, truth)
-    axes = top_view(outcome, evaluation, truth, None).axes[0]
+    axes = top_view(outcome, evaluation, None).axes[0]
     own, compared = (line for line in axes.lines if line.get_label() == "bow")
     assert "truth" in {line.get_label() for line in axes.lines}
     np.testing.assert_allclose(own.get_xydata(), compared.get_xydata(), atol=1e-6)
-    alone = top_view(outcome, None, None, None).axes[0].lines
+    alone = top_view(outcome, None, None).axes[0].lines
     own, compared = (line for line in alone if line.get_label() == "bow")
     np.testing.assert_allclose(own.get_xdata() + 40.0, compared.get_xdata(), atol=1e-6)
     assert "Dashed: the detectors of --compare" in (folder / "report.html").read_text()
@@ -558,9 +558,9 @@ def test_loops_without_ground_truth() -> None:
         "4 closed",
         "301 candidates rejected",
     )
-    labels = top_view(outcome, None, None, None).axes[0].get_legend_handles_labels()[1]
+    labels = top_view(outcome, None, None).axes[0].get_legend_handles_labels()[1]
     assert labels == ["estimate", "start", "weak (4)", "loop (4)"]
-    labels = loop_closing(outcome, None, None).axes[0].get_legend_handles_labels()[1]
+    labels = loop_closing(outcome, None).axes[0].get_legend_handles_labels()[1]
     assert labels == ["before", "after", "loop, before (3)"]  # the match of one was culled
 
 
@@ -597,7 +597,7 @@ def test_before_is_drawn_in_the_frame_of_the_ground_truth() -> None:
     T[:3, 3] = [50.0, 0.0, -20.0]
     first = outcome.corrections[0]
     turned = replace(first, T_cw_before=first.T_cw_after @ np.linalg.inv(T))
-    truth = matched_ground_truth(outcome)
+    truth = outcome.ground_truth
     assert truth is not None
     trajectory = Trajectory(outcome.trajectory.timestamps, T @ truth.T_wc)
     outcome = replace(outcome, trajectory=trajectory, corrections=[turned])
@@ -605,7 +605,7 @@ def test_before_is_drawn_in_the_frame_of_the_ground_truth() -> None:
         poses = truth.T_wc.copy()
         poses[:, :3, 3] *= scale
         evaluation = evaluate_trajectory(trajectory, Trajectory(truth.timestamps, poses), alignment)
-        axes = loop_closing(outcome, evaluation, truth).axes[0]
+        axes = loop_closing(outcome, evaluation).axes[0]
         (before,) = (line for line in axes.lines if line.get_label() == "before")
         expected = scale * truth.T_wc[outcome.keyframe_frames[turned.keyframes]][:, [0, 2], 3]
         np.testing.assert_allclose(before.get_xydata(), expected, atol=1e-6)
@@ -626,7 +626,7 @@ def test_a_monocular_report_speaks_of_no_stereo_and_no_metres(make, tmp_path: Pa
     assert "stereo" not in text.lower().replace("| stereo ", "")  # a stage of the made-up run
     assert "in units of the map" in text or "Moved" not in text
     assert not re.search(r"\d\.\d\d m\b", text)
-    assert top_view(outcome, None, None, None).axes[0].get_xlabel() == "x (map units)"
+    assert top_view(outcome, None, None).axes[0].get_xlabel() == "x (map units)"
 
 
 def test_frames_lost_before_the_map_began_are_explained(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@ from __future__ import annotations
 import errno
 import re
 from dataclasses import dataclass, field, replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from vslam.maps.storage import load_map
 from vslam.maps.stored_map import StoredMap
 from vslam.report import explorer, figures, folder, render
 from vslam.report.folder import Results, create_run_folder, write_results, write_trajectories
-from vslam.run.outcome import matched_ground_truth
 from vslam.trajectory import Trajectory, read_kitti_poses, read_trajectory
 
 
@@ -62,10 +60,9 @@ def test_ground_truth_of_just_the_frames_done(tmp_path):
     poses[:, 2, 3] = np.arange(5)
     sequence = _Sequence(ground_truth=poses)
     done = np.array([0, 1, 3])  # frame 2 was unreadable, the run ended before frame 4
-    outcome = SimpleNamespace(
-        sequence=sequence, trajectory=Trajectory(sequence.timestamps[done], poses[done])
-    )
-    matched = matched_ground_truth(outcome)
+    trajectory = Trajectory(sequence.timestamps[done], poses[done])
+    outcome = replace(make_outcome(5), sequence=sequence, trajectory=trajectory)
+    matched = outcome.ground_truth
     np.testing.assert_array_equal(matched.timestamps, outcome.trajectory.timestamps)
     write_trajectories(Results(tmp_path), outcome)
     for name in ("trajectory_kitti.txt", "ground_truth_kitti.txt"):
@@ -81,7 +78,8 @@ def test_ground_truth_of_some_frames_keeps_their_times(tmp_path):
     known = poses.copy()
     known[[0, 3]] = np.nan
     sequence = _Sequence(ground_truth=known)
-    outcome = SimpleNamespace(sequence=sequence, trajectory=Trajectory(sequence.timestamps, poses))
+    trajectory = Trajectory(sequence.timestamps, poses)
+    outcome = replace(make_outcome(5), sequence=sequence, trajectory=trajectory)
     write_trajectories(Results(tmp_path), outcome)
     assert not (tmp_path / "ground_truth_kitti.txt").exists()
     truth = read_trajectory(tmp_path / "ground_truth.tum")
@@ -91,10 +89,9 @@ def test_ground_truth_of_some_frames_keeps_their_times(tmp_path):
 
 def test_no_ground_truth(tmp_path):
     sequence = _Sequence()
-    outcome = SimpleNamespace(
-        sequence=sequence, trajectory=Trajectory(sequence.timestamps, np.tile(np.eye(4), (5, 1, 1)))
-    )
-    assert matched_ground_truth(outcome) is None
+    trajectory = Trajectory(sequence.timestamps, np.tile(np.eye(4), (5, 1, 1)))
+    outcome = replace(make_outcome(5), sequence=sequence, trajectory=trajectory)
+    assert outcome.ground_truth is None
     write_trajectories(Results(tmp_path), outcome)
     assert not (tmp_path / "ground_truth_kitti.txt").exists()
 
@@ -152,7 +149,9 @@ def test_a_result_that_fails_costs_itself_alone(tmp_path, monkeypatch, name):
         write_results(tmp_path, outcome)
     says = str(error.value)
     assert says.startswith(f"{tmp_path}: {cost} failed (KeyError: 'a fault")
-    assert says.endswith("all other results are there; this is a fault of vslam, please report it.")
+    assert says.endswith(
+        "all other results were written; this is a fault of vslam, please report it."
+    )
     assert "\n" not in says
     lost = {"report.md", "report.html", "figures"} if name == "summarize" else set()
     assert {path.name for path in tmp_path.iterdir()} == ALL - set(cost.split(", ")) - lost

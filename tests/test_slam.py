@@ -206,6 +206,26 @@ def test_dropping_dead_landmarks_changes_no_byte(corridor, config, dark, monkeyp
     assert bytes_[1] == bytes_[0]
 
 
+def test_the_pose_is_known_before_a_frame_becomes_a_keyframe(corridor):
+    slam = Slam(corridor.camera, EAGER, "none", threads=1)
+    known = []
+
+    def note(result):
+        known.append((result, slam._mapper.n_keyframes))
+
+    results = [
+        slam.step(left, right, timestamp, on_pose=note)
+        for left, right, timestamp in zip(
+            corridor.left[:6], corridor.right[:6], corridor.timestamps[:6], strict=True
+        )
+    ]
+    assert [n for _, n in known] == [1, 1, 2, 3, 4, 5]  # keyframes before that of the frame
+    for (first, _), result in zip(known[1:], results[1:], strict=True):
+        assert (first.is_keyframe, result.is_keyframe) == (False, True)
+        # The insertion merges the keyframe before, which may move the frame a little.
+        np.testing.assert_allclose(first.T_wc, result.T_wc, atol=0.02)
+
+
 def test_the_map_cannot_be_read_while_a_keyframe_is_mapped(corridor):
     slam = Slam(corridor.camera, EAGER, "none", threads=1)
     for k in range(2):

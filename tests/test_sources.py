@@ -163,7 +163,7 @@ def test_a_grey_video_has_no_colours(folder, corridor):
 def test_images_without_a_partner_in_time_are_left_out(corridor, tmp_path):
     pair = {LEFT: corridor.left[:4], RIGHT: corridor.right[:4]}
     write_bag(tmp_path / "lag.bag", "ros1", pair, STAMPS[:4], lag=6_000_000, camera=corridor.camera)
-    with pytest.raises(InputError, match="no images of the same time"):
+    with pytest.raises(InputError, match=r"no images of .* have the same time"):
         open_from("bag", tmp_path / "lag.bag")
 
 

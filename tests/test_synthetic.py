@@ -36,7 +36,7 @@ from vslam.datasets.synthetic.site import ALIASES, Variation
 from vslam.datasets.synthetic.solids import turn
 from vslam.datasets.synthetic.town import build_town
 from vslam.errors import InputError
-from vslam.lab.loopbench import views
+from vslam.lab.loopbench.drives import render_views
 
 CAMERA = Camera(360.0, 360.0, 300.3, 95.7, 0.54, 620, 190)
 BY_DAY = Light(np.array([0.0, -0.8, -0.6]), visibility=1e9, haze=0.0)
@@ -342,7 +342,7 @@ def test_views_are_the_left_images_of_the_drive(route, town, rendered, tmp_path,
     seen = []
     for _ in range(2):
         args = (route, Variation(seed=3), tmp_path, (0, 2))
-        views.render_views(*args, threads=1, on_frame=lambda *at: seen.append(at))
+        render_views(*args, threads=1, on_frame=lambda *at: seen.append(at))
         images = sorted(tmp_path.rglob("*.png"))
         assert [image.name for image in images] == ["000000.png", "000002.png"]
         for image in images:

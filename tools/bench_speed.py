@@ -5,10 +5,14 @@
         [--orbslam3-python PY --vocabulary voc.txt]
 
 A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run
-alternately, one at a time, after a round that is not counted. vslam runs with its report, with
-``--no-report``, with ``--no-report`` and each detector of ``--also`` instead of ``bow``, and in the
-last round with ``--realtime``, which takes as long as the drive. The hand-written parts of the
-page, at its beginning and from "Limits" on, are kept.
+alternately, one at a time; the first round is not counted. In each round, vslam runs
+
+- with its report,
+- with ``--no-report``,
+- with ``--no-report`` and each detector of ``--also`` instead of ``bow``,
+- in the last round, with ``--realtime``, which takes as long as the drive.
+
+The hand-written parts of the page, at its beginning and from "Limits" on, are kept.
 
 Wall time, CPU time and peak memory are those of the whole process, as the operating system reports
 them. vslam.evaluation.trajectories computes the errors of both systems from their trajectory files.
@@ -103,8 +107,8 @@ class OrbSlam3(NamedTuple):
 
 
 class Process(NamedTuple):
-    """A process that has ended: its output, and the resources used by it and its children.
-    ``held``: its memory over time, as (s, MB)."""
+    """A process that has ended: its output, and the resources that it and its children used.
+    ``held``: its memory over time, as pairs (s, MB)."""
 
     output: str
     wall_s: float
@@ -126,8 +130,8 @@ class Run(NamedTuple):
 
 
 def measure(command: list[str], folder: Path) -> Process:
-    """Run a command and measure it. No large package may be imported before that, because the peak
-    memory of a child process starts at that of its parent."""
+    """Run a command and measure it. No large package may be imported before the call, because the
+    peak memory of a child process starts at that of its parent."""
     log = folder / "output.txt"
     # Let Python keep compiled modules, as pip does when it installs them.
     environment = {key: os.environ[key] for key in os.environ if key != "PYTHONDONTWRITEBYTECODE"}
@@ -198,8 +202,8 @@ def reading_ms(case: Case, system: str) -> float:
 
 
 def run_vslam(case: Case, folder: Path, *words: str) -> Run:
-    """Run vslam with more ``words`` on its command line. With --no-report, it gets no ground truth,
-    because ORB-SLAM3 does not evaluate anything either."""
+    """Run vslam, with ``words`` added to its command line. With --no-report, vslam gets no ground
+    truth, because ORB-SLAM3 does not evaluate its trajectory either."""
     data = case.data
     if "--no-report" in words:
         data = folder / "data"
@@ -227,7 +231,8 @@ def run_orbslam3(case: Case, system: OrbSlam3, folder: Path) -> Run:
 def measure_case(
     case: Case, orbslam3: OrbSlam3 | None, repeats: int, also: list[str], scratch: str
 ) -> dict[str, list[Run]]:
-    """All counted runs of each system, each in its own folder in ``scratch``."""
+    """Run all systems on a case, each run in its own folder in ``scratch``; returns the counted
+    runs of each system."""
     runs: dict[str, list[Run]] = {FULL: [], ORBSLAM3: [], LEAN: [], LIVE: []}
     words = {FULL: (), LEAN: ("--no-report",), LIVE: ("--no-report", "--realtime")}
     for name in also:
@@ -282,7 +287,7 @@ def figures(run: Run, case: Case, reading: float) -> dict[str, float]:
     if sequence.ground_truth is not None:
         times = sequence.timestamps
         with suppress(InputError):  # too few frames have a pose
-            # Frames without a pose get an interpolated one, as in ``vslam stress``.
+            # Frames without a pose get an interpolated pose, as in ``vslam stress``.
             estimate = read_poses(run.trajectory, times, np.arange(len(times))).bridged(times)
             errors = evaluate_trajectory(estimate, Trajectory(times, sequence.ground_truth))
             found |= {"ate_m": errors.ate_rmse_m, "rpe_m": errors.rpe_m}
@@ -309,7 +314,7 @@ def comparison(measured: dict[str, list[dict[str, float]]]) -> str:
 
 
 def spread(values: list[float], form: str) -> str:
-    """``median (least - greatest)``, or only the median if both ends look the same."""
+    """``median (least - greatest)``, or only the median if least and greatest look the same."""
     low, high = format(min(values), form), format(max(values), form)
     median = format(statistics.median(values), form)
     return median if low == high else f"{median} ({low} - {high})"
@@ -344,7 +349,8 @@ def rate(case: Case) -> float:
 
 
 def stages(report: dict[str, Any]) -> str:
-    """A table of the wall time of each stage; stages in the thread pool overlap with others."""
+    """A table of the wall time of each stage. Stages in the thread pool overlap with other stages,
+    so the times do not add up to the time of a frame."""
     lines = ["| stage, ms | mean | p50 | p95 | p99 |", "|---|---|---|---|---|"]
     for name, ms in report["stage_ms"].items():
         cells = [f"{ms[key]:.1f}" for key in ("mean", "median", "p95", "p99")]
@@ -353,7 +359,8 @@ def stages(report: dict[str, Any]) -> str:
 
 
 def memory(run: Run) -> str:
-    """Memory per keyframe: the growth from the first frame to the peak, divided by keyframes."""
+    """A sentence on the memory per keyframe: the growth from the first frame to the peak, divided
+    by the number of keyframes."""
     before = [mb for seconds, mb in run.process.held if seconds <= run.report["startup_s"]]
     if not before or not run.report["keyframes"]:
         return "The run was too short to measure the memory of a keyframe."
@@ -382,7 +389,7 @@ def section(
     reading: dict[str, float],
     measured: dict[str, list[dict[str, float]]],
 ) -> str:
-    """The section of a case."""
+    """The section of the page about a case."""
     return (
         f"## {case.title}\n\n{case.frames} frames. "
         f"Reading both images: {reading[FULL]:.1f} ms CPU, by OpenCV {reading[ORBSLAM3]:.1f}.\n\n"
@@ -402,7 +409,7 @@ def profile(case: Case) -> str:
 
 
 def orbslam3_of(options: argparse.Namespace) -> OrbSlam3 | None:
-    """The ORB-SLAM3 that the options name, None without them."""
+    """The ORB-SLAM3 that the options name; None if they name none."""
     given = (options.orbslam3_python, options.vocabulary)
     if not any(given):
         return None

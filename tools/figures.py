@@ -6,13 +6,14 @@
 
 ``figures.toml`` lists every table and figure with the commands that make it. bash runs a command in
 the root of the repository. The command writes the files, under their names, into the folder
-``$OUT``; ``$TOWNS`` is the folder of rendered towns. ``$OUT`` lies in ``runs/figures``, one for
-each version of the method, and is kept, so that an interrupted command continues. The files are
-copied to their places, or to ``build/figures`` with ``--quick``, and ``docs/stamps.json`` there
-gets a stamp for each: commit, version of the method, machine, seed, command and digest. Files with
-a valid stamp of this version are not made again.
+``$OUT``; ``$TOWNS`` is the folder of rendered towns. Each version of the method has its own
+``$OUT`` in ``runs/figures``, which is kept, so that an interrupted command can continue.
 
-sources.py explains how a page names the file that its numbers come from.
+The files are then copied to their places, or to ``build/figures`` with ``--quick``. For each file,
+``docs/stamps.json`` in the same place gets a stamp: commit, version of the method, machine, seed,
+command and digest. Files with a valid stamp of this version are not made again.
+
+sources.py explains how a page names the file from which its numbers come.
 """
 
 from __future__ import annotations
@@ -47,14 +48,14 @@ class Entry:
     """Files that are made together.
 
     Attributes:
-        files: paths, or patterns if there is a ``history``.
+        files: paths; with a ``history``, also patterns.
         run, quick: bash commands that make the files and short variants of them.
         needs: environment variables that must name a path.
         reads: files of other entries that the commands read.
         seed: seed of the random numbers.
         trajectories: whether the files depend on the version of the method.
-        tested: the test that compares the files with the code; they then need no stamp.
-        history: how the files of a finished experiment were made; no command makes them again.
+        tested: the test that compares the files with the code. Such files need no stamp.
+        history: how the files of a finished experiment were made, if no command makes them again.
     """
 
     files: tuple[str, ...]
@@ -68,14 +69,14 @@ class Entry:
     history: str = ""
 
     def paths(self, root: Path) -> list[str]:
-        """The files, with patterns resolved."""
+        """The paths of the files; patterns are replaced by the files that match them."""
         found = [sorted(root.glob(one)) if "*" in one else [root / one] for one in self.files]
         return [path.relative_to(root).as_posix() for path in chain(*found)]
 
 
 @dataclass(frozen=True)
 class Stamp:
-    """How a file was made. Facts about an older file that are not in git's history are None."""
+    """How a file was made. A field is None if git's history does not tell it for an older file."""
 
     digest: str
     commit: str
@@ -87,8 +88,8 @@ class Stamp:
 
 
 class Report(NamedTuple):
-    """The result of a check: ``faults``, which must be repaired, files made by another version of
-    the method (``older``), and pages with tables that name no source (``typed``)."""
+    """The result of a check, as sentences: ``faults`` must be repaired, ``older`` names files that
+    another version of the method made, and ``typed`` names pages with tables without a source."""
 
     faults: list[str]
     older: list[str]
@@ -108,7 +109,7 @@ def read_entries(root: Path = ROOT) -> list[Entry]:
 
 
 def read_stamps(folder: Path) -> dict[str, Stamp]:
-    """The stamps by file; empty without stamps.json."""
+    """The stamps by file; empty if there is no stamps.json."""
     path = folder / STAMPS
     known = json.loads(path.read_text()) if path.exists() else {}
     return {file: Stamp(**one) for file, one in known.items()}
@@ -184,7 +185,7 @@ def _is_done(entry: Entry, target: Path, command: str) -> bool:
 
 
 def _run(entry: Entry, command: str, root: Path, target: Path) -> bool:
-    """Run the command of an entry, copy and stamp its files; whether it succeeded."""
+    """Run the command of an entry, and copy and stamp its files; returns whether it succeeded."""
     from vslam.datasets.synthetic.site import Variation
     from vslam.datasets.synthetic.store import cache_folder, folder_name
 
@@ -226,7 +227,7 @@ def _stamp(path: Path, entry: Entry, command: str, root: Path, method: int) -> S
 
 
 def _commit(root: Path) -> str:
-    """The commit that is checked out, marked if files outside docs/ have been changed."""
+    """The commit that is checked out, with a remark if files outside docs/ were changed since."""
     head = _git(root, "rev-parse", "--short", "HEAD")
     changed = _git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs")
     return f"{head} with changes" if changed else head
@@ -242,8 +243,8 @@ def adopt(root: Path, method: int | None = None) -> list[str]:
 
     Args:
         root: root of the repository.
-        method: version of the method that made the files, with the commands of figures.toml on this
-            machine; if it is None, a stamp has only the commit that wrote the file.
+        method: version of the method with which the commands of figures.toml made the files on this
+            machine; None if unknown, so that a stamp contains only the commit that wrote the file.
     """
     stamps, adopted = read_stamps(root), []
     entries = {file: entry for entry in read_entries(root) for file in entry.paths(root)}
@@ -266,7 +267,7 @@ def adopt(root: Path, method: int | None = None) -> list[str]:
 
 
 def check(root: Path) -> Report:
-    """Check that all files have valid stamps, and that the tables of pages agree with them."""
+    """Check that all files have valid stamps, and that the tables of pages agree with the files."""
     entries = {file: entry for entry in read_entries(root) for file in entry.paths(root)}
     stamps, report = read_stamps(root), Report([], [], [])
     below = (path for path in (root / "docs").rglob("*") if path.suffix in KINDS)
@@ -299,7 +300,7 @@ def check(root: Path) -> Report:
 
 
 def pages(root: Path) -> list[Path]:
-    """README and the pages of the documentation, except those that are made from the code."""
+    """README and the pages of the documentation, except pages that are generated from the code."""
     below = sorted((root / "docs").rglob("*.md"))
     made = root / "docs" / "reference"
     return [root / "README.md", *(page for page in below if made not in page.parents)]
@@ -319,8 +320,8 @@ def origin(stamp: Stamp) -> str:
 
 
 def mark_older(page: Path, text: str, root: Path) -> str:
-    """The text of a page with marks of the files that another version of the method made: a line
-    before each table with such a source, and a note at the end."""
+    """The text of a page with marks for the files that another version of the method made: a line
+    before each table with such a source, and a list of these files at the end."""
     stamps = read_stamps(root)
     older = {
         file: origin(stamps[file])

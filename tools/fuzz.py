@@ -1,8 +1,8 @@
 """Fuzz every reader with damaged files: it must quickly return a result or raise an `InputError`.
 
-Each input is a small valid file, changed by a seeded mutation. Any other outcome is a failure:
-another exception, a crash, more than SECONDS of CPU time or MEGABYTES of memory. Readers run in a
-separate process, so that a crash is recorded like any other failure.
+Each input is a small valid file, changed by a seeded mutation. Failures are any other exception, a
+crash, and more than SECONDS of CPU time or MEGABYTES of memory. Readers run in a separate process,
+so that a crash is recorded like any other failure.
 
 usage: python tools/fuzz.py [--inputs 1000] [--seed 0] [--readers kitti,video] [--keep FOLDER]
 """
@@ -52,9 +52,9 @@ class Reader:
     Attributes:
         write: writes valid files into a folder.
         read: reads the files in a folder.
-        changed: pattern of the files to mutate, one at a time.
-        mutation: function of the file's content, a random generator and the file's name; None for
-            `mutate`.
+        changed: pattern of the files to mutate, one file at a time.
+        mutation: function of content, random generator and file name that returns the changed
+            content; None for `mutate`.
     """
 
     write: Callable[[Path], object]
@@ -67,7 +67,7 @@ class Reader:
 
 
 def _use(source) -> None:
-    """Read every frame of a source; single frames may be unreadable."""
+    """Read every frame of a source; frames that cannot be read are skipped, as in a run."""
     from vslam.errors import InputError, UnreadableImageError
 
     try:
@@ -81,7 +81,7 @@ def _use(source) -> None:
 
 
 def _each(read: Callable[[str], object], names: Iterable[str]) -> None:
-    """Read all files, then raise the error of one that was refused."""
+    """Read all files; if some were refused, raise one of the errors at the end."""
     from vslam.errors import InputError
 
     refused = None
@@ -188,11 +188,11 @@ def _read_config(folder: Path) -> None:
 
 def _read_report(folder: Path) -> None:
     from vslam.lab.overview.render import write_overview
-    from vslam.report.finished_run import read_report
     from vslam.report.render import html, markdown
     from vslam.report.run_page import run_page
+    from vslam.report.schema import ReportJson
 
-    report = read_report(folder)
+    report = ReportJson.read(folder / "report.json")
     page = run_page(report)
     html(page)
     markdown(page)
@@ -243,8 +243,8 @@ _HEADER_VALUES = [
 
 
 def _mutate_meaning(data: bytes, rng: np.random.Generator, name: str) -> bytes:
-    """Change one or two values in arrays or in the header; the types and shapes of the arrays
-    stay."""
+    """Change one or two values in arrays or in the header, but not the types and shapes of the
+    arrays."""
     with np.load(io.BytesIO(data)) as file:
         arrays = {name: file[name].copy() for name in file.files}
     for _ in range(int(rng.integers(1, 3))):
@@ -329,7 +329,7 @@ READERS: dict[str, Reader] = {
 
 
 def mutate(data: bytes, rng: np.random.Generator, name: str) -> bytes:
-    """Apply one to four changes to a file, or sometimes one that is specific to its format."""
+    """Apply one to four changes to a file, or sometimes a single change specific to its format."""
     if name.endswith(".npz") and rng.random() < 0.6:
         return _mutate_npz(data, rng)
     if data[:8] == b"\x89PNG\r\n\x1a\n" and rng.random() < 0.3:
@@ -343,7 +343,7 @@ def mutate(data: bytes, rng: np.random.Generator, name: str) -> bytes:
 
 
 def _place(data: bytes, rng: np.random.Generator) -> int:
-    """A random position; half of them are in the first 256 bytes, where headers are."""
+    """A random position; with probability one half, in the first 256 bytes, where headers are."""
     return int(rng.integers(min(len(data), 256) if rng.random() < 0.5 else len(data)))
 
 
@@ -367,7 +367,7 @@ def _bytes(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _number(data: bytes, rng: np.random.Generator) -> bytes:
-    """Replace a number in a text by another one."""
+    """Replace a number in a text by another number."""
     found = list(re.finditer(rb"-?\d+(\.\d+)?(e[-+]?\d+)?", data))
     if not found:
         return data
@@ -459,7 +459,8 @@ def _reset_peak() -> None:
 
 
 def _work(name: str, first: int, inputs: int, seed: int, scratch: Path) -> None:
-    """Try inputs; print a JSON line with the number of each before it and its outcome after it."""
+    """Try inputs. Print a JSON line with the number of each input before it is read, and a line
+    with the outcome afterwards."""
     from vslam.errors import InputError
 
     logging.disable(logging.CRITICAL)

@@ -1,9 +1,9 @@
 """Kill a run at random moments, every other time during an autosave, and resume it.
 
-``kill -9`` ends the run after a random number of frames, or during the next autosave. Then all its
-files are read, and the run is resumed. The table gives the frame of the kill, the saved frames, the
-lost seconds, the ATE of the whole run, and whether the trajectory is identical, byte for byte, to
-that of the undisturbed run.
+``kill -9`` ends the run after a random number of frames, every other time only during the next
+autosave. Then all its files are read, and the run is resumed. The table gives the frame of the
+kill, the number of saved frames, the seconds of work that were lost, the ATE of the whole run, and
+whether the trajectory is identical, byte for byte, to that of the undisturbed run.
 
     python tools/kill_test.py --kills 10 --autosave 4 -- --dataset synthetic --seq demo
 """
@@ -55,7 +55,7 @@ def is_saving(folder: Path) -> bool:
 
 
 def kill_at(words: list[str], out: Path, frame: int, saving: bool) -> tuple[Path, int, float]:
-    """Start a run and kill it; return its folder, the frames done and the seconds they took."""
+    """Start a run and kill it; return its folder, and number and duration (s) of tracked frames."""
     process = subprocess.Popen([*RUN, *words, *BRIEF, "--out", str(out)])
     folder, begin = out / "latest", 0.0
     while process.poll() is None:
@@ -70,7 +70,7 @@ def kill_at(words: list[str], out: Path, frame: int, saving: bool) -> tuple[Path
 
 
 def saved_frames(folder: Path) -> tuple[int, float]:
-    """Read all files of a killed run; return the saved frames and the seconds spent on them."""
+    """Read all files of a killed run; return number and duration (s) of saved frames."""
     read_trajectory(folder / ONLINE)
     if not (folder / MAP).exists():
         return 0, 0.0

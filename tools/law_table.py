@@ -1,4 +1,4 @@
-"""Write docs/howto/laws.csv: every law of ``--perturb`` with its unit and range."""
+"""Write docs/howto/laws.csv: every kind of perturbation with its unit and range."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ TABLE = Path(__file__).parents[1] / "docs" / "howto" / "laws.csv"
 
 
 def table() -> str:
-    """A row for each law; ``vslam stress`` searches from the weakest to the strongest value."""
+    """A CSV table with a row for each kind of perturbation, including the weakest and the strongest
+    value of a search by ``vslam stress``."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(

@@ -19,9 +19,9 @@ from vslam.geometry import inverses
 from vslam.maps.storage import load_map
 from vslam.maps.stored_map import StoredMap
 
-INCHES, DOTS_PER_INCH = (6.44, 2.7), 200  # of the map, as wide as the picture of a loop
+INCHES, DOTS_PER_INCH = (6.44, 2.7), 200  # size of the map, as wide as the picture of a loop
 MARGIN = 20.0  # metres around the path
-BAR = 20.0  # metres
+BAR = 20.0  # length of the scale bar in metres
 DARK, LIGHT, GREEN = "#111721", "#e8ebf0", "#34d399"
 TIME = LinearSegmentedColormap.from_list("time", ["#fbbf24", "#fb923c", "#6366f1", "#60a5fa"])
 
@@ -36,7 +36,7 @@ def draw(run: Path) -> NDArray[np.uint8]:
 
 
 def _draw_map(stored: StoredMap, ends: list[int], names: tuple[str, str]) -> NDArray[np.uint8]:
-    """Landmarks and path, coloured by time; the map's z axis points to the right."""
+    """Draw landmarks and path, coloured by time; the z axis of the map points to the right."""
     arrays = stored.map.arrays
     path = inverses(arrays.T_cw)[:, [2, 0], 3]
     figure = Figure(INCHES, DOTS_PER_INCH, facecolor=DARK)

@@ -35,7 +35,8 @@ def main() -> None:
 
 
 def tables(report: LoopsJson) -> dict[str, list[Row]]:
-    """The rows of every table, by its name; none if the report has no such results."""
+    """The rows of every table, by the name of the table. A table has no rows if the report has
+    no results for it."""
     cells = report.cells
     ordered = [cell for cell in cells if cell.sequence_right is not None]
     return {

@@ -3,9 +3,9 @@
     python tools/profile_frame.py DATA SEQ FRAMES [--detector bow] [--report]
 
 DATA is a folder in KITTI's format. One thread does all the work, so that its CPU clock measures
-every stage. If a stage calls another one, the time counts only for the inner stage. The total is
-that of the process, from the start of Python to the last file written. Run it twice, so that the
-kernels come from Numba's cache; loading a kernel counts for the first stage that calls it.
+every stage. If a stage calls another stage, the time counts only for the inner stage. The total is
+that of the process, from the start of Python to the last file written. Run the script twice, so
+that the kernels come from Numba's cache; loading a kernel counts for the first stage that calls it.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class StageClock:
 
 
 def table(seconds: dict[str, float], frames: int) -> str:
-    """Milliseconds per frame of each stage, and its share of the process."""
+    """A Markdown table with the milliseconds per frame and the share of each stage."""
     whole = time.process_time()
     rows = [(stage, seconds[stage]) for stage, _ in STAGES]
     rows += [("imports and the rest of the start", whole - sum(s for _, s in rows))]

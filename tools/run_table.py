@@ -26,7 +26,7 @@ def main() -> None:
 
 
 def row_of(run: RunEntry) -> dict[str, object]:
-    """Drive, system, seeds (of the perturbation and of the town) and measures of a run."""
+    """The cells of a run: drive, system, seeds of the perturbation and of the town, measures."""
     measures = {
         name: "" if run.measures[name] is None else f"{run.measures[name]:.{decimals}f}"
         for name, decimals in DECIMALS.items()

@@ -1,4 +1,4 @@
-"""Compare the numbers of pages with the CSV files that they come from.
+"""Compare the numbers on pages with the CSV files from which they come.
 
 A table in Markdown names its source in a comment before it. Each line of the comment describes one
 row of the table, and the last line also all further rows::
@@ -10,10 +10,11 @@ The fields of a line, separated by ``|``, are:
 - the CSV file;
 - a filter that selects a row of the file. ``$1`` stands for the text of the first cell of the
   table's row, or for the part of it in backticks; ``$0`` stands for the head of the column;
-- for each cell of the table's row, the columns of the file whose values it must show, rounded as in
-  the cell. The last field also applies to all further cells; an empty one is not compared. A filter
-  in parentheses applies to the columns before it. ``mean x``, ``median x`` and ``sum x`` are over
-  all selected rows.
+- a field for each further cell of the table's row: the columns of the file whose values the cell
+  must show, rounded as in the cell. The last field also applies to all further cells. A cell with
+  an empty field is not compared. A filter in parentheses applies to the columns before it.
+  ``mean x``, ``median x`` and ``sum x`` stand for the mean, median and sum of column x over all
+  selected rows.
 
 The line ``-`` skips a row. Before a paragraph, the comment names columns whose values the paragraph
 must mention.
@@ -46,7 +47,8 @@ def files_of(comment: str) -> set[str]:
 
 
 def untraced(text: str) -> tuple[int, int]:
-    """The number of tables with decimal numbers but no source, and the number of all tables."""
+    """The number of tables that contain decimal numbers but name no source, and the number of all
+    tables."""
     tables = TABLE.findall(text)
     return sum(not comment and bool(DECIMAL.search(body)) for comment, body in tables), len(tables)
 
@@ -114,7 +116,7 @@ def _is_rounded(shown: str, value: float) -> bool:
 
 def _values(path: Path, filters: str, column: str, row: list[str]) -> list[float | str]:
     """The numbers and texts of the CSV file that a cell must show. ``row`` contains the head of the
-    cell's column, then all cells of its row."""
+    column of the cell, then all cells of the row."""
     with path.open(newline="", encoding="utf-8") as file:
         table = list(csv.DictReader(file))
     found: list[float | str] = []

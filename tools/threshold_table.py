@@ -43,7 +43,7 @@ class Row(NamedTuple):
 
 
 def descriptions(model: type[BaseModel]) -> dict[str, str]:
-    """The docstring below each field of a class, as one line; "" if there is none."""
+    """The docstring below each field of a class, as one line; "" for a field without docstring."""
     (definition,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
     assert isinstance(definition, ast.ClassDef)
     found = {}
@@ -74,7 +74,7 @@ def rows(config: Config, section: str) -> list[Row]:
 
 
 def page(config: Config) -> str:
-    """The page for a configuration: for each section its docstring and a table."""
+    """The page for a configuration, with the docstring and a table for each section."""
     lines = [HEAD]
     for section in type(config).model_fields:
         title, _, rest = (type(getattr(config, section)).__doc__ or "").partition("\n\n")

@@ -4,8 +4,8 @@ This finds errors that the tests cannot: files missing in the wheel, dependencie
 development environment has, and imports that work only in the checkout. It runs the first frames of
 a rendered drive, whose ground truth is exact.
 
-Each additional Python gets its own environment. With ``--runners``, the wheel is also started by
-pipx and uvx, if installed.
+Each Python named by ``--python`` gets its own environment. With ``--runners``, pipx and uvx also
+start the wheel, if they are installed.
 
 usage: python tools/wheel_test.py [--python python3.12 ...] [--runners]
 """

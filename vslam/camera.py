@@ -17,15 +17,15 @@ Image = NDArray[np.uint8]  # (H, W) grey
 DepthImage = NDArray[np.float32]  # (H, W) metres along z, 0 where unknown
 Sensor = Literal["stereo", "mono", "rgbd"]
 
-# Disparities are more accurate than columns and rows, so that the errors of disparities have this
-# weight in the reprojection error (docs/research/motorway.md).
+# Disparities are measured more accurately than columns and rows, so the reprojection error
+# multiplies errors of disparity by this factor (docs/research/motorway.md).
 DISPARITY_WEIGHT = 3.0
 
 # Largest plausible distance of the principal point from the middle, as a share of the image size.
 # A calibration for images of half the size gives 0.25, one for twice the size 0.5.
 _OFF_CENTRE = 0.2
-# A principal point at a share x of the width and y of the height suggests a calibration for another
-# image size only if x / y is below this and above its inverse.
+# A calibration for another image size puts the principal point at nearly the same share x of the
+# width and y of the height: x / y lies between the inverse of this number and this number.
 _SAME_RATIO = 1.25
 _FACTORS = {0.5: "half", 2.0: "twice"}
 _NARROWEST, _WIDEST = 10.0, 150.0  # degrees; plausible fields of view of a camera on a vehicle
@@ -33,8 +33,9 @@ _NARROWEST, _WIDEST = 10.0, 150.0  # degrees; plausible fields of view of a came
 
 @dataclass(frozen=True)
 class Camera:
-    """A rectified stereo pair, whose images have the same focal lengths and corresponding rows, an
-    RGB-D camera, or a single camera.
+    """A rectified stereo pair, an RGB-D camera or a single camera.
+
+    Both images of a stereo pair have the same focal lengths, and a point has the same row in both.
 
     Attributes:
         fx, fy: focal lengths in pixels.
@@ -116,7 +117,7 @@ class Camera:
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:
-        """``(6,)`` float64 ``[fx, fy, cx, cy, bf, disparity_weight]``, the form for kernels."""
+        """``(6,)`` float64 ``[fx, fy, cx, cy, bf, disparity_weight]``, as kernels take it."""
         return np.array([self.fx, self.fy, self.cx, self.cy, self.bf, DISPARITY_WEIGHT])
 
     def project(self, p_c: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -151,8 +152,8 @@ def calibration_doubts(camera: Camera) -> list[str]:
     if not all(_NARROWEST <= angle <= _WIDEST for angle in fields):
         doubts.append(
             f"the focal lengths ({camera.fx:.1f}, {camera.fy:.1f}) give a field of view of "
-            f"{fields[0]:.0f} x {fields[1]:.0f} degrees; the calibration seems to be of images of "
-            "another size, or its focal lengths are not in pixels"
+            f"{fields[0]:.0f} x {fields[1]:.0f} degrees; the calibration seems to belong to images "
+            "of another size, or its focal lengths are not in pixels"
         )
     return doubts
 
@@ -164,7 +165,7 @@ def _cause(across: float, down: float) -> str:
     ratio = across + down  # 1 for a principal point in the middle
     names = [name for factor, name in _FACTORS.items() if abs(ratio / factor - 1.0) < 0.1]
     times = names[0] if names else f"{ratio:.1f} times"
-    return f"the calibration seems to be of images of {times} this size"
+    return f"the calibration seems to belong to images of {times} this size"
 
 
 def field_of_view(camera: Camera) -> tuple[float, float]:
@@ -188,8 +189,9 @@ Made = TypeVar("Made")
 
 
 class ImageMap(Protocol):
-    """Applies a function to the images of a frame: the built-in ``map``, one image after the other,
-    or the ``map`` of a thread pool, in parallel. The results and their order are the same."""
+    """Applies a function to each image of a frame: the built-in ``map`` processes one image after
+    the other, the ``map`` of a thread pool in parallel. Both give the same results in the same
+    order."""
 
     def __call__(
         self, function: Callable[[Given], Made], images: Iterable[Given], /

@@ -1,9 +1,10 @@
 """Loop closing: from the loop candidates of a keyframe to a corrected map (ORB-SLAM, section VII).
 
-While a method runs, no other thread may write the map; usually the mapping job of a keyframe calls
-it. Only the global bundle adjustment after a loop runs in parallel, on a snapshot. Its result is
-merged after a number of keyframes that depends only on the size of the problem, so that the same
-input always gives the same map.
+No other thread may write the map while a method of ``LoopClosing`` runs. The search for a loop only
+reads the map and runs in parallel with tracking (``Mapper``). The global bundle adjustment after a
+loop also runs in parallel, on a snapshot of the map. Its result is merged after a number of
+keyframes that depends only on the size of the problem, so that the same input always gives the same
+map.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,8 +50,8 @@ class LoopClosing:
         verifier: decides which candidates are loops.
         edges: the outcome of every candidate, in order.
         corrections: the loops that were closed.
-        closed: the edges of all closed loops, in the current units of the map; those of a loaded
-            map come first.
+        closed: the edges of all closed loops, in the current units of the map; the loops of a
+            loaded map come first.
         problems: one sentence for each failure that did not harm the map.
     """
 
@@ -80,42 +81,51 @@ class LoopClosing:
     def process(
         self, map_: Map, keyframe: int, features: Features, image: NDArray[np.uint8] | None
     ) -> None:
-        """Look for loops at a keyframe after its local mapping; close the first verified one."""
-        if self._is_due(keyframe):
-            self.finish(map_)
-        found = None
+        """Search for loops at a keyframe, and close the one that is found."""
+        self.merge_adjustment_if_due(map_, keyframe)
+        self.close(map_, self.search(map_, keyframe, features, image))
+
+    def search(
+        self, map_: Map, keyframe: int, features: Features, image: NDArray[np.uint8] | None
+    ) -> LoopSearch:
+        """Search for a loop at a keyframe after its local mapping. The map is only read."""
         with self._failure_reported("Looking for loops"):
             if self.verifier.is_image_redundant(map_, keyframe):
                 image = None  # then no network processes it
             self.detector.add(keyframe, image, features)
             self.verifier.add(map_, keyframe, image)
-            found = self._find(map_, keyframe, self.detector.query(keyframe, map_))
-        if found is not None:
-            self._close(map_, found)
+            return self._find(map_, keyframe, self.detector.query(keyframe, map_))
+        return LoopSearch()
+
+    def close(self, map_: Map, search: LoopSearch) -> None:
+        """Record the outcome of a search, and close the loop that it found, if any."""
+        self.edges += search.edges
+        if search.loop is not None:
+            self._close(map_, search.loop)
 
     def consider(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> None:
         """Verify the candidates of a keyframe, best first, and close the first true loop."""
-        found = self._find(map_, keyframe, candidates)
-        if found is not None:
-            self._close(map_, found)
+        self.close(map_, self._find(map_, keyframe, candidates))
 
-    def _find(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> _Loop | None:
-        """Verify candidates, best first, and return the first true loop. The map is only read."""
+    def _find(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> LoopSearch:
+        """Verify candidates, best first, until one is a true loop. The map is only read."""
         candidates = self.verifier.rate(map_, keyframe, candidates)
         _, rejected = self._consistency.update(keyframe, candidates, map_)
         rejections = {edge.match: edge for edge in rejected}
         tried = [one for one in candidates if one.promising or one.match not in rejections]
         matches = {one.match for one in tried}
-        self.edges += [edge for edge in rejected if edge.match not in matches]
+        edges = [edge for edge in rejected if edge.match not in matches]
         for number, candidate in enumerate(tried):
             edge = self.verifier.verify(map_, candidate, rejections.get(candidate.match))
             edge = self._consistency.confirm(edge, map_)
-            if not edge.accepted:
-                self.edges.append(edge)
-            elif (loop := self._solve(map_, edge)) is not None:
-                self.edges += [_superseded(other) for other in tried[number + 1 :]]
-                return loop
-        return None
+            loop = None
+            if edge.accepted:
+                edge, loop = self._solve(map_, edge)
+            edges.append(edge)
+            if loop is not None:
+                edges += [_superseded(other) for other in tried[number + 1 :]]
+                return LoopSearch(edges, loop)
+        return LoopSearch(edges)
 
     def state(self) -> ClosingState:
         """The state for a checkpoint, without the detector and the images."""
@@ -133,24 +143,39 @@ class LoopClosing:
         return self._global is not None
 
     def count_reused_keyframe(self, keyframe: int) -> bool:
-        """Count a frame that reused an old keyframe instead of becoming one, where ``keyframe`` is
-        the newest keyframe; returns whether the global bundle adjustment must be merged now."""
+        """Count a frame that made an old keyframe the reference instead of becoming a keyframe.
+
+        Such frames count as keyframes when the time to merge the global bundle adjustment is
+        determined.
+
+        Args:
+            keyframe: id of the newest keyframe.
+
+        Returns:
+            Whether the global bundle adjustment must be merged now.
+        """
         self._followed += 1
         return self._is_due(keyframe)
+
+    def merge_adjustment_if_due(self, map_: Map, keyframe: int) -> None:
+        """Merge the result of the global bundle adjustment if it is due at this keyframe."""
+        if self._is_due(keyframe):
+            self.finish(map_)
 
     def _is_due(self, keyframe: int) -> bool:
         return self._global is not None and keyframe + self._followed >= self._global.due
 
     def conclude(self, map_: Map) -> None:
-        """At the end of a drive, close a verified loop that no second keyframe has confirmed yet,
-        if an earlier keyframe confirms it."""
-        gates, found = self._config.verification, None
+        """At the end of a drive, close a verified loop that still waits for another keyframe to
+        confirm it, if an earlier keyframe does so (``LoopConsistency.confirmed_by_earlier``)."""
+        gates, found, edges = self._config.verification, None, []
         with self._failure_reported("Looking for loops"):
             for edge in self._consistency.confirmed_by_earlier(map_, self._camera, gates):
-                if (found := self._solve(map_, edge)) is not None:
+                outcome, found = self._solve(map_, edge)
+                edges.append(outcome)
+                if found is not None:
                     break
-        if found is not None:
-            self._close(map_, found)
+        self.close(map_, LoopSearch(edges, found))
 
     def finish(self, map_: Map) -> None:
         """Wait for the running global bundle adjustment, if there is one, and merge its result.
@@ -169,7 +194,8 @@ class LoopClosing:
 
     @contextmanager
     def _failure_reported(self, what: str) -> Iterator[None]:
-        """Report a failure instead of raising it, for steps that fail without changing the map."""
+        """Report an exception in the block instead of raising it; used for steps that leave the map
+        unchanged when they fail."""
         try:
             yield
         except Exception as error:
@@ -178,18 +204,16 @@ class LoopClosing:
                 self.problems.append(problem)
                 _log.warning(problem)
 
-    def _solve(self, map_: Map, edge: LoopEdge) -> _Loop | None:
-        """Solve the pose graph with a verified loop and append the outcome to ``edges``; None if
-        the loop contradicts the rest of the graph."""
+    def _solve(self, map_: Map, edge: LoopEdge) -> tuple[LoopEdge, _Loop | None]:
+        """Solve the pose graph with a verified loop. Returns the outcome for ``edges``, and the
+        loop, or None if the loop contradicts the rest of the graph."""
         start = time.perf_counter()
         solution = self._solution(map_, edge, Hypothesis.PREDICTED)
         if not solution.verdict.consistent and solution.has_gaps:
             solution = self._solution(map_, edge, Hypothesis.KIDNAPPED)
         if not solution.verdict.consistent:
-            self.edges.append(replace(edge, accepted=False, reason=solution.verdict.reason))
-            return None
-        self.edges.append(replace(edge, reason="closed"))
-        return _Loop(edge, solution, start)
+            return replace(edge, accepted=False, reason=solution.verdict.reason), None
+        return replace(edge, reason="closed"), _Loop(edge, solution, start)
 
     def _close(self, map_: Map, loop: _Loop) -> None:
         """Correct the map by a loop that ``_solve`` accepted."""
@@ -199,7 +223,7 @@ class LoopClosing:
             self._global = None
         keyframes = solution.graph.keyframes
         before = map_.arrays.T_cw[keyframes]
-        # Fusion makes both sides covisible, so their neighbours are collected before it.
+        # Collected before fusion, which makes both sides of the loop covisible.
         query_side = [edge.query, *strong_neighbours(map_, edge.query, self._config)]
         match_side = [edge.match, *strong_neighbours(map_, edge.match, self._config)]
         self.closed.append(edge)
@@ -209,7 +233,7 @@ class LoopClosing:
         edge = replace(edge, reason="closed")
         seconds = time.perf_counter() - loop.start
         self.corrections.append(LoopCorrection(edge, keyframes, before, solution.T_cw, seconds))
-        self._consistency.reset()  # it remembers places of the map before the correction
+        self._consistency.reset()  # the correction has moved the places that it remembers
         with self._failure_reported("Global bundle adjustment after a loop"):
             self._global = self._start_global(map_, edge.query)
 
@@ -262,6 +286,19 @@ class _Loop:
     edge: LoopEdge
     solution: Solution
     start: float
+
+
+@dataclass(frozen=True)
+class LoopSearch:
+    """The outcome of a search for a loop at a keyframe.
+
+    Attributes:
+        edges: the outcome of every candidate.
+        loop: the verified loop, which is still to be closed; None if there is none.
+    """
+
+    edges: list[LoopEdge] = field(default_factory=list)
+    loop: _Loop | None = None
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,10 @@ class Section(BaseModel):
     ``tools/threshold_table.py`` reads these docstrings from the source. Pydantic could do so itself
     (``use_attribute_docstrings``), but that would take 0.1 s at the start of every run.
 
-    Each docstring ends with the source of the value in brackets: [own], or the paper and section
-    that the rule comes from and whether the value is printed there, customary in the programs of
-    the ORB-SLAM family, or our own.
+    Each docstring ends with the source of the threshold in brackets. [own] means that both the rule
+    and the value are our own. Otherwise, the paper and section of the rule are followed by the
+    source of the value: *printed* in that section, *customary* in the programs of the ORB-SLAM
+    family, or *own*.
 
     OS1: Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2: Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017.
     ZS: Zhou and Sun, Sci Rep 15, 7644 (2025).
@@ -73,23 +74,24 @@ class WeakImageConfig(Section):
     """Contrast is measured only in images that yield fewer features than this share of
     `orb.n_features`. [own]"""
     low_contrast: float = Field(6.0, ge=0)
-    """Contrast is raised if it is below this, in grey levels; with 0 it is never raised. The
-    contrast of an image is the median, over its blocks of 16 x 16 pixels, of the standard deviation
-    of the grey values. [own]"""
+    """The contrast of an image is raised if it is below this, in grey levels; with 0 it is never
+    raised. To measure contrast, the image is divided into blocks of 16 x 16 pixels; the contrast is
+    the median of the standard deviations of the grey values in the blocks. [own]"""
     least_detail: float = Field(0.25, ge=0)
     """An image is out of focus, and its contrast is not raised, if its mean absolute second
     difference is below this share of its contrast. Sharp images have 0.4 and more. [own]"""
     raised_contrast: float = Field(12.0, gt=0)
     """Contrast is raised until the grey values in each window have this standard deviation, in grey
-    levels. It is the contrast of KITTI's images on a bright day. [own]"""
+    levels. The default is the contrast of KITTI's images on a bright day. [own]"""
     contrast_window: int = Field(33, ge=3)
     """Side of the window in which contrast is raised, in pixels. [own]"""
     flat_share: float = Field(0.25, gt=0, le=1)
-    """The contrast of flat parts of the image counts as at least this share of the median contrast.
-    A larger share amplifies flat parts less. [own]"""
+    """The contrast of a flat window counts as at least this share of the median over all windows,
+    so that the noise in flat parts of the image is not amplified too much. A larger share amplifies
+    flat parts less. [own]"""
     least_contrast: float = Field(0.15, gt=0)
-    """The contrast of flat parts also counts as at least this, in grey levels. Rounding alone
-    causes as much. [own]"""
+    """The contrast of a flat window also counts as at least this, in grey levels. Rounding alone
+    causes a standard deviation of this size. [own]"""
 
 
 class StereoConfig(Section):
@@ -105,7 +107,7 @@ class StereoConfig(Section):
     keypoint's octave. [OS2 III-A, customary]"""
     balance_from: float = Field(0.3, ge=0)
     """The darker image of the pair is brightened before matching if the gain between the two images
-    is above this, in stops. [own]"""
+    is above this, in stops (factors of two). [own]"""
     max_gain_disagreement: float = Field(0.75, gt=0)
     """A difference in brightness counts as a gain only if the gains of dark and of bright pixels
     differ by at most this, in stops. [own]"""
@@ -113,8 +115,9 @@ class StereoConfig(Section):
     """A pixel is overexposed, and ignored when the gain is measured, if its grey value is at least
     this. Video of limited range (16 to 235) needs about 230. [own]"""
     black_below: float = Field(6.0, gt=0, le=255)
-    """An image is black, and not used, if its 95 % quantile is below this while the other image has
-    contrast, in grey levels. Video of limited range (16 to 235) needs about 22. [own]"""
+    """An image of the pair counts as black, and is not used, if the 95 % quantile of its pixels is
+    below this, in grey levels, while the other image has contrast. Video of limited range (16 to
+    235) needs about 22. [own]"""
     close_depth_baselines: float = Field(40.0, gt=0)
     """A stereo point is close if its depth is below this, in baselines. Keyframes map close points
     from a single stereo pair; most far points are triangulated from several keyframes.
@@ -137,12 +140,12 @@ class DepthConfig(Section):
     """Depth images [OS2, III-A]."""
 
     min_metres: float = Field(0.1, gt=0)
-    """The depth of a pixel is unknown if it is below this, in metres. [own]"""
+    """A measured depth below this, in metres, counts as unknown. [own]"""
     max_metres: float = Field(100.0, gt=0)
-    """The depth of a pixel is unknown if it is above this, in metres. [own]"""
+    """A measured depth above this, in metres, counts as unknown. [own]"""
     edge_radius: float = Field(4.0, ge=0)
     """A keypoint gets a depth only if the depths within this radius agree, in pixels at octave 0.
-    It is one pixel more than the radius of FAST's circle. [own]"""
+    The default is one pixel more than the radius of FAST's circle. [own]"""
     edge_ratio: float = Field(0.07, gt=0)
     """A keypoint lies on a depth edge, and gets no depth, if the depths around it differ by more
     than this share of the nearest depth. [own]"""
@@ -211,13 +214,15 @@ class TrackingConfig(Section):
     min_stereo_start: int = Field(100, ge=10)
     """Number of stereo features that a frame needs to start a map. [OS2 III-B, own]"""
     min_inliers_motion: int = Field(20, ge=3)
-    """The reference keyframe is tried if tracking from the previous frame has fewer inliers than
-    this. [OS1 V-B, customary]"""
+    """A frame is tracked from the reference keyframe if tracking from the previous frame has fewer
+    inliers than this. [OS1 V-B, customary]"""
     min_inlier_ratio: float = Field(0.3, ge=0, le=1)
-    """The reference keyframe is also tried if less than this share of the matches with the previous
-    frame are inliers. [own]"""
+    """A frame is also tracked from the reference keyframe if less than this share of the matches
+    with the previous frame are inliers. [own]"""
     min_inliers_frame: int = Field(10, ge=3)
-    """The local map is not tried for a frame with fewer inliers than this. [OS1 V-B, customary]"""
+    """A frame is matched with the local map only if tracking from the previous frame, from the
+    reference keyframe or with `predicted_window` gives at least this many inliers; otherwise, it is
+    LOST. [OS1 V-B, customary]"""
     min_inliers: int = Field(30, ge=3)
     """A frame with fewer inliers than this in the local map is WEAK: its pose is used, but reported
     as uncertain. [OS1 V-D, customary]"""
@@ -278,7 +283,7 @@ class InitializationConfig(Section):
     """The first landmarks are scaled to this median depth, in map units. [own]"""
     max_rescaling: float = Field(10.0, gt=1)
     """A sub-map is rescaled so that the camera keeps the speed that it had before it was lost,
-    unless this needs a factor larger than this (or smaller than its inverse). [own]"""
+    unless the factor would be larger than this number or smaller than its inverse. [own]"""
     max_seconds: float = Field(1.5, gt=0)
     """Longest time between the two views, in seconds. After that, the next frame becomes the first
     view. [own]"""
@@ -300,7 +305,7 @@ class KeyframeConfig(Section):
     """Too few tracked close points cause a keyframe only if the keyframe could add more new close
     points than this. [OS2 III-E, printed]"""
     min_kept_close: float = Field(0.2, ge=0, le=1)
-    """If a keyframe adds fewer close points than `min_tracked_close` on average, this share of that
+    """If keyframes add on average fewer close points than `min_tracked_close`, this share of the
     average replaces `min_tracked_close` (docs/research/motorway.md). [own]"""
     first_gain: float = Field(2.0, ge=0)
     """Until the number of close points that a keyframe adds has been observed, it is assumed to be
@@ -345,15 +350,17 @@ class MappingConfig(Section):
     """Local mapping and bundle adjustment."""
 
     neighbours: int = Field(10, ge=1)
-    """A new keyframe is triangulated with this many covisible keyframes. [OS1 VI-C, customary]"""
+    """New landmarks are triangulated between a new keyframe and this many covisible keyframes.
+    [OS1 VI-C, customary]"""
     fuse_neighbours: int = Field(10, ge=1)
     """Duplicate landmarks of a new keyframe and of this many covisible keyframes are fused.
     [OS1 VI-C, customary]"""
     monocular_neighbours: int = Field(20, ge=1)
     """Replaces `neighbours` for a monocular camera. [OS1 VI-C, customary]"""
     min_baseline_ratio: float = Field(0.01, ge=0)
-    """With a monocular camera, two keyframes are triangulated only if the distance between them is
-    at least this share of the median depth. [OS1 VI-C, customary]"""
+    """With a monocular camera, landmarks are triangulated between two keyframes only if the
+    distance between the keyframes is at least this share of the median depth.
+    [OS1 VI-C, customary]"""
     min_parallax_cosine: float = Field(0.9998, gt=0, le=1)
     """Upper bound of the cosine of the parallax of a triangulated point; the default corresponds to
     1.1 degrees. A larger value also accepts points with less parallax. [OS1 VI-C, customary]"""
@@ -392,8 +399,8 @@ class VerificationConfig(Section):
     descriptors: Literal["usual", "orb", "learned", "both"] = "usual"
     """Which descriptors verify candidates, whatever detector proposed them: `orb`, `learned` (the
     network's local descriptors), or `both`, which uses the learned ones where ORB fails. `usual`
-    means `orb` for `bow`, `capsule-paper` and plug-ins, and `both` for the other networks and the
-    detector `both`. [own]"""
+    selects `orb` for the detectors `bow` and `capsule-paper` and for plug-ins, and `both` for all
+    other detectors. [own]"""
     match_distance: int = Field(50, ge=0, le=256)
     """Upper bound of the descriptor distance of a match, in bits. [OS1 VII-B, customary]"""
     match_ratio: float = Field(0.8, gt=0, le=1)
@@ -429,8 +436,8 @@ class VerificationConfig(Section):
     """At least this share of the grid cells into which landmarks of the place are projected must
     contain inliers. [own]"""
     min_seen_ratio: float = Field(0.07, ge=0, le=1)
-    """The query must observe at least this share of the landmarks of the match that it should see,
-    and vice versa. [own]"""
+    """Guided search must find at least this share of those landmarks of the match that should be
+    visible in the query, and vice versa. [own]"""
     max_distance: float = Field(15.0, gt=0)
     """Upper bound of the distance between the cameras of query and match, in metres. [own]"""
 
@@ -442,8 +449,8 @@ class LearnedMatchingConfig(Section):
     """Upper bound of the number of candidates that are tried for a keyframe or a lost frame.
     [own]"""
     rated: int = Field(5, ge=0)
-    """If the detector has not compared its candidates by local descriptors, the first candidates
-    are compared before verification, at most this many. [own]"""
+    """If the detector has not compared its candidates by local descriptors, this many of its best
+    candidates are compared before verification. [own]"""
     views: int = Field(2, ge=1)
     """Upper bound of the number of keyframes that are matched at each place. [own]"""
     most_shared: float = Field(0.4, gt=0, le=1)
@@ -453,23 +460,23 @@ class LearnedMatchingConfig(Section):
     """Two images are matched only if their similarity by local descriptors is at least this.
     [own]"""
     rest: int = Field(8, ge=0)
-    """For this many keyframes after a failed attempt, a place is tried only if its similarity
-    exceeds that of the failed attempt by the factor `more_alike`. [own]"""
+    """After a failed attempt, `more_alike` applies to this many keyframes. [own]"""
     more_alike: float = Field(1.1, ge=1)
-    """Lower bound, during these keyframes, of the similarity of a place divided by that of the
-    failed attempt. [own]"""
+    """In the `rest` keyframes after a failed attempt, a place is tried only if its similarity is at
+    least this many times the similarity of the failed attempt. [own]"""
     min_share: float = Field(0.1, ge=0, le=1)
-    """At least this share of the coarse cells must agree with one homography. [own]"""
+    """At least this share of the cells of the network's coarse feature map must agree with one
+    homography. [own]"""
     coarse_alike: float = Field(0.3, ge=-1, le=1)
     """Two coarse descriptors match only if their cosine is at least this. [own]"""
     alike: float = Field(0.5, ge=-1, le=1)
     """Two fine descriptors match only if their cosine is at least this. [own]"""
     reach: int = Field(5, ge=1)
-    """The fine match is searched for up to this far to each side of the coarse match, in fine
-    cells. [own]"""
+    """The fine match is searched for up to this far to each side of the coarse match, in cells of
+    the network's fine feature map. [own]"""
     guided_reach: int = Field(3, ge=1)
-    """A landmark is searched for up to this far to each side of its projection, in fine cells.
-    [own]"""
+    """A landmark is searched for up to this far to each side of its projection, in cells of the
+    network's fine feature map. [own]"""
     sigma: float = Field(1.5, gt=0)
     """Standard deviation of the position of a match, in pixels of the network's image. A larger
     value accepts more distant matches as inliers. [own]"""
@@ -480,21 +487,22 @@ class LearnedMatchingConfig(Section):
     min_consensus: int = Field(40, ge=4)
     """RANSAC must find at least this many inliers. [own]"""
     min_consensus_ratio: float = Field(0.15, ge=0, le=1)
-    """RANSAC must find at least this share of the landmarks searched for as inliers. [own]"""
+    """At least this share of the landmarks that are searched for must be inliers of RANSAC.
+    [own]"""
     min_inliers: int = Field(80, ge=6)
     """At least this many inliers must remain after guided search. [own]"""
     min_elsewhere: int = Field(40, ge=0)
     """At least this many inliers must lie outside the vertical third of the image that has the most
     inliers. [own]"""
     min_seen_ratio: float = Field(0.3, ge=0, le=1)
-    """The query must observe at least this share of the landmarks of the match that it should see,
-    and vice versa. [own]"""
+    """Guided search must find at least this share of those landmarks of the match that should be
+    visible in the query, and vice versa. [own]"""
     fuse_pixels: float = Field(2.0, gt=0)
     """A keypoint can observe a matched landmark only if it lies within this distance of the
     landmark's projection, in pixels at octave 0. [own]"""
     verified_memory: int = Field(10, ge=1)
-    """Replaces `consistency.verified_memory`, if it is greater, when images of keyframes are kept,
-    because not every keyframe has an image. [own]"""
+    """With learned verification, `consistency.verified_memory` is raised to this number if it is
+    smaller, because only some keyframes have an image to verify a loop with. [own]"""
 
 
 class ConsistencyConfig(Section):
@@ -554,12 +562,13 @@ class RelocalizationConfig(Section):
     """A frame comes after a gap if the time since the last tracked frame is above this multiple of
     the usual interval between frames. [own]"""
     doubtful_share: float = Field(0.5, ge=0, le=1)
-    """A frame is doubtful if it tracks less than this share of the landmarks of the reference
-    keyframe and also comes after a gap, could not be predicted, or tracks less than this share of
-    what the previous frame tracked. The whole map is then searched for it. [own]"""
+    """The whole map is searched for a doubtful frame. A frame is doubtful if it tracks less than
+    this share of the landmarks of the reference keyframe and there is a second reason for doubt:
+    it comes after a gap, its pose could not be predicted, or it tracks less than this share of the
+    number of landmarks that the previous frame tracked. [own]"""
     better: float = Field(1.5, ge=1)
-    """A doubtful frame is moved to the place that the search finds if it has more than this many
-    times as many inliers there. [own]"""
+    """A doubtful frame is moved to the place that the search finds if its number of inliers there
+    is more than this many times the number in tracking. [own]"""
     neighbours: int = Field(20, ge=1)
     """The landmarks of this many keyframes around the place are matched. [own]"""
 
@@ -580,7 +589,8 @@ class BowConfig(Section):
     """Loop candidates by bag of words [OS1, III-E and VII-A]."""
 
     min_shared: int = Field(15, ge=1)
-    """Two keyframes are neighbours if they share at least this many landmarks.
+    """Two keyframes are neighbours if they share at least this many landmarks. The neighbours of
+    the query are never candidates. Their lowest score is the least score of a candidate.
     [OS1 III-D, printed]"""
     exclude_recent: int = Field(20, ge=1)
     """This many of the newest keyframes, including the query, are never candidates. [own]"""
@@ -588,14 +598,14 @@ class BowConfig(Section):
     """A candidate must share at least this fraction of the largest number of words that any
     keyframe shares with the query. [OS1 III-E, customary]"""
     group_size: int = Field(10, ge=0)
-    """At most this many of the best covisible keyframes of a candidate join its group.
+    """A candidate forms a group with at most this many of its most covisible keyframes.
     [OS1 III-E, customary]"""
     group_score_ratio: float = Field(0.75, ge=0, le=1)
     """A group is kept if its score is at least this share of the best group's.
     [OS1 III-E, printed]"""
     max_groups: int = Field(30, ge=1)
-    """Upper bound of the number of groups, which are formed around the best keyframes first.
-    [own]"""
+    """Upper bound of the number of groups; groups are formed around the candidates with the highest
+    scores. [own]"""
 
 
 class PoseGraphConfig(Section):
@@ -603,10 +613,10 @@ class PoseGraphConfig(Section):
 
     An edge has less weight if its standard deviation is larger. Drift is modelled as a random walk:
     its standard deviation grows with the square root of the distance travelled. With the default
-    values it is 1.2 % after 400 m, nearly all of it caused by errors of rotation. A gap is an edge
-    over frames in which tracking was lost and the motion was only predicted. Such an edge is weak
-    if there was no prediction, or under the hypothesis that the camera was carried elsewhere
-    meanwhile.
+    values, the drift is 1.2 % after 400 m, and nearly all of it is caused by errors of rotation. A
+    gap is an edge over frames in which tracking was lost and the motion was only predicted. Such an
+    edge is weak if there was no prediction, or under the hypothesis that the camera was carried
+    elsewhere meanwhile.
     """
 
     min_shared: int = Field(100, ge=1)
@@ -674,8 +684,8 @@ class SiameseConfig(Section):
     recent_keyframes: int = Field(10, ge=0)
     """This many of the newest keyframes are never candidates. [own]"""
     min_shared: int = Field(15, ge=1)
-    """Two candidates show the same place if they share at least this many landmarks.
-    [OS1 III-D, printed]"""
+    """Two keyframes show the same place if they share at least this many landmarks; only the best
+    candidate of a place is proposed. [OS1 III-D, printed]"""
     reach: float = Field(20.0, ge=0)
     """If learned descriptors verify the candidates, the query is compared only with keyframes
     within this distance, in metres. The distance grows by `reach_share` of the distance driven

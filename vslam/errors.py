@@ -32,7 +32,7 @@ class DroppedFrameError(UnreadableImageError):
 class BrokenSourceError(InputError):
     """A video, bag or camera ended early: the file is cut off, or the device was unplugged.
 
-    During a run the frames before the break are kept; if there are none, it is an error.
+    During a run the frames before the break are kept; the run fails only if there are none.
     """
 
 
@@ -45,7 +45,7 @@ def write_file(path: Path, content: str | bytes, fix: str = "free some space") -
     if needed.
 
     Raises:
-        ResultsError: it cannot be written; the message ends with ``fix``.
+        ResultsError: the file cannot be written; the message ends with ``fix``.
     """
     part = path.with_name(f"{path.name}.part")
     try:

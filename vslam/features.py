@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.geometry import inverse
-from vslam.kernels import inner_kernel, kernel
+from vslam.kernels import inline, inner_kernel, kernel
 from vslam.odometry import PoseUncertainty
 
 MIN_DISPARITY = 0.01  # pixels; smaller disparities are clamped to this
@@ -25,8 +25,8 @@ class Pyramid:
     """Image pyramid with all levels in one buffer, so that kernels take it as one array.
 
     Attributes:
-        pixels: ``(P + SPARE,)`` uint8, the levels row by row, then padding: vectorised kernels may
-            read, and ignore, up to a register beyond the last pixel.
+        pixels: ``(P + SPARE,)`` uint8, the levels row by row, then padding, because vectorised
+            kernels read up to one register beyond the last pixel and discard those bytes.
         offsets: ``(L,)`` int64, where each level starts.
         shapes: ``(L, 2)`` int64, height and width.
         scales: ``(L,)`` float64, full-resolution pixels per pixel of the level.
@@ -42,6 +42,14 @@ class Pyramid:
         height, width = self.shapes[index]
         start = self.offsets[index]
         return self.pixels[start : start + height * width].reshape(height, width)
+
+
+@inline
+def level_of(pixels, offsets, shapes, level):
+    """``Pyramid.level`` in a kernel."""
+    height, width = shapes[level]
+    start = offsets[level]
+    return pixels[start : start + height * width].reshape(height, width)
 
 
 @inner_kernel
@@ -126,8 +134,8 @@ class KeyframePatches(NamedTuple):
     Attributes:
         keyframe: id of the keyframe.
         pixels: ``(N, PATCH_PIXELS)`` uint8, the square patch around each keypoint, row by row.
-        shift: ``(N, 2)`` float32, from the keypoint to the aligned position of the landmark that it
-            observes, in pixels of its octave.
+        shift: ``(N, 2)`` float32, from each keypoint to the aligned position of its landmark, in
+            pixels of the keypoint's octave.
     """
 
     keyframe: int

@@ -1,4 +1,4 @@
-"""The pose of every frame of a run relative to a keyframe, so that frames follow corrections."""
+"""The pose of every frame relative to a keyframe, so that frames move with corrected keyframes."""
 
 from __future__ import annotations
 

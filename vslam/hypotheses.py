@@ -23,6 +23,7 @@ from vslam.backend.pose_graph import (
     check_pose_graph,
     essential_graph,
     optimise,
+    parts_of,
 )
 from vslam.backend.similarity_graph import (
     check_similarity_graph,
@@ -79,17 +80,11 @@ def solve(
     Args:
         closed: loops that were closed before, in the map's present units.
         edge: the new loop, with its pose.
-        monocular: optimise similarities, because scale drifts, too.
+        monocular: whether to optimise similarities instead of rigid motions, because the scale of
+            a monocular map drifts.
     """
     predicted = hypothesis is Hypothesis.PREDICTED
-    graph = essential_graph(
-        map_,
-        [*closed, edge],
-        config,
-        weak=map_.restarts,
-        unpredicted=map_.unpredicted_restarts,
-        driven=predicted,
-    )
+    graph = essential_graph(map_, [*closed, edge], config, driven=predicted)
     T_cw = map_.arrays.T_cw[: map_.n_keyframes]
     if monocular:
         S_wc = inverses(T_cw) if predicted else _aligned_similarities(map_, closed, edge)
@@ -106,10 +101,8 @@ def solve(
 def joined_submaps(map_: Map, closed: Sequence[LoopEdge]) -> NDArray[np.int64]:
     """``(n_keyframes,)`` sub-map of each keyframe; sub-maps joined by closed loops count as one."""
     submap = map_.submaps()
-    for edge in closed:
-        one, other = submap[edge.query], submap[edge.match]
-        submap[submap == max(one, other)] = min(one, other)
-    return submap
+    ends = np.array([(edge.query, edge.match) for edge in closed], np.int64).reshape(-1, 2)
+    return parts_of(submap[ends], len(submap))[submap]
 
 
 def _aligned(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
@@ -148,7 +141,7 @@ def _aligned_similarities(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge)
 def _moving_submap(
     map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge
 ) -> tuple[int, NDArray[np.int64]]:
-    """The end of a loop whose sub-map moves, and the keyframes of that sub-map, which are none if
+    """The end of a loop whose sub-map moves, and the ``(N,)`` keyframes of that sub-map. N is 0 if
     both ends lie in the same sub-map."""
     submap = joined_submaps(map_, closed)
     if submap[edge.query] == submap[edge.match]:

@@ -2,8 +2,9 @@
 columns if the right camera exposes later than the left one.
 
 The velocities are those of Longuet-Higgins and Prazdny (Proc. R. Soc. B, 1980), eq. 2.9 to 2.11,
-for the point (x, y, 1) z of the left camera. The twist [v, w] here is that of the points relative
-to the camera, hence the signs. In the right camera x is smaller by the baseline divided by z.
+for the point (x, y, 1) z of the left camera. The paper uses the motion of the camera. Here, the
+twist [v, w] is that of the points relative to the camera, so all signs are reversed. In the right
+camera x is smaller by the baseline divided by z.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from vslam.camera import Camera
 from vslam.features import MIN_DISPARITY, shifted_columns
 from vslam.geometry import Matrix
 
-_ROUNDS = 3  # of a fixed-point iteration, since speed and disparity depend on each other
+_ROUNDS = 3  # of a fixed-point iteration, because speed and disparity depend on each other
 
 
 def rays(
@@ -62,7 +63,7 @@ def columns_without_delay(
     Args:
         xy: ``(N, 2)`` pixels in the left image.
         u_right: ``(N,)`` columns in the right image; NaN stays NaN.
-        twist: ``(6,)`` of the points relative to the camera, per second.
+        twist: ``(6,)`` twist of the points relative to the camera, per second.
     """
     x, y = rays(xy, camera)
     measured = xy[:, 0].astype(np.float64) - u_right

@@ -2,15 +2,16 @@
 
 A kernel is compiled once on each machine and kept in Numba's cache. It releases the GIL, so that
 threads of the pipeline run kernels in parallel. ``error_model="numpy"`` and fused multiply-add are
-the only relaxations; without re-association, a result never depends on how a loop was vectorised.
+the only relaxations of floating-point arithmetic. Sums are not re-associated, so a result never
+depends on how a loop was vectorised.
 
 Numba prepares for compilation before it looks into its cache: it imports support for everything
 that it can compile, including scipy for linear algebra, which takes 0.25 s of CPU time. For each
 kernel it also loads the environments of all functions in it, which imports their modules, and
 parses the code that would be needed to inline the kernel into another one. A run that finds all
 kernels in the cache needs none of this. ``_KernelCache`` skips it, or defers it until a kernel is
-compiled, and so loads kernels in a fifth of the time. Its files have Numba's format. Because it
-relies on Numba's internals, other releases of Numba than the tested ones use Numba's own cache.
+compiled, and so loads kernels in a fifth of the time. Its files have Numba's format. It relies on
+Numba's internals, so releases of Numba with which it was not tested use Numba's own cache instead.
 
 A cache problem never ends a run. A checksum detects files that were truncated by a power cut, which
 would abort Python if they were loaded; they are compiled again. If neither the folder of the source

@@ -16,7 +16,7 @@ class LoopCandidate:
 
     Attributes:
         query: keyframe whose place is searched for; -1 for a frame that is not in the map.
-        match: keyframe that shows the same place, alive in the map.
+        match: keyframe of the map that shows the same place; it has not been culled.
         score: the detector's own measure; greater means more similar.
         alike: similarity of the two images by the network's local descriptors. Learned verification
             is tried only for similar images. None if it was not computed.
@@ -49,7 +49,7 @@ class Sighting(NamedTuple):
 
 @dataclass(frozen=True)
 class LoopEdge:
-    """The outcome of a candidate; rejected ones are kept for the report.
+    """The outcome of a loop candidate. Rejected candidates are kept for the report.
 
     Attributes:
         query, match, score, proposed_by: as in the candidate.

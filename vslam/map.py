@@ -3,8 +3,9 @@
 A *row* is one keypoint of one keyframe; the rows of a keyframe are consecutive. The table of rows
 is also the table of observations: ``landmark[row]`` is the landmark that the keypoint observes, and
 ``next_row`` links the rows of each landmark into a chain. Covisibility is not stored, but counted
-from the rows when it is needed. The use of arrays instead of objects follows DPVO's PatchGraph. Ids
-of keyframes are never reused; ids of landmarks change only when dead landmarks are dropped. Arrays
+from the rows when it is needed. The use of arrays instead of objects follows DPVO's PatchGraph. The
+entries of culled keyframes and of culled or merged landmarks remain, marked as dead. Ids of
+keyframes are never reused; ids of landmarks change only when dead landmarks are dropped. Arrays
 grow by half their size.
 
 To add a column, declare it in ``Arrays`` or ``KeyframeTable`` with an empty array of its dtype and
@@ -282,7 +283,8 @@ class Map:
         return of_arrays | {name: column[: self.n_keyframes] for name, column in of_keyframes}
 
     def with_columns(self, columns: dict[str, NDArray]) -> Map:
-        """This map with other columns, named as by ``columns``; they are not copied."""
+        """This map with other arrays as its columns, named as in ``columns()``. The arrays are not
+        copied."""
         other = copy.copy(self)
         other.arrays = Arrays(**{name: columns[name] for name in Arrays._fields})
         other.keyframes = KeyframeTable(**{name: columns[name] for name in KeyframeTable._fields})

@@ -1,6 +1,6 @@
 """Functions that connect a frame with the map through observations, landmarks and places.
 
-The caller must ensure that no other thread writes the map meanwhile.
+The caller must ensure that no other thread writes the map while one of them runs.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ def update_landmarks(frame: Frame, map_: Map) -> None:
     """Update a frame's landmarks: ids of merged landmarks are replaced, ids of dead ones become -1,
     and ``frame.xyz`` is set to their present positions.
 
-    If two tracked landmarks were merged, only the first feature keeps the result.
+    If two tracked landmarks were merged, only the first of the two features keeps the landmark.
     """
     arrays = map_.arrays
     ids = resolve(arrays, frame.landmark)

@@ -14,7 +14,8 @@ from vslam.kernels import hamming, inner_kernel, kernel
 
 @kernel
 def count_shared(a, keyframe, n_keyframes):
-    """``(n_keyframes,)`` int64, landmarks that ``keyframe`` shares with each one; 0 for itself."""
+    """``(n_keyframes,)`` int64, the number of landmarks that each keyframe shares with
+    ``keyframe``; 0 for ``keyframe`` itself."""
     counts = np.zeros(n_keyframes, np.int64)
     for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
         landmark = a.landmark[row]

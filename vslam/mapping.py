@@ -3,8 +3,9 @@
 ``Mapper`` owns the map. Each keyframe is mapped by a job in another thread. The *merge*, which
 makes the job's result visible to tracking, happens at a fixed frame index, however long the job
 takes. Between two merges tracking reads a ``MapView``, a copy that the last merge made. Every
-method that needs the merged map performs the merge itself, and a merge also updates the frames that
-are held.
+method that needs the merged map performs the merge itself. A merge also updates the frames that
+were passed to ``Mapper.hold``. After the merge, the other thread searches the map for loops at the
+keyframe. A loop that it finds is closed before the next change of the map.
 """
 
 from __future__ import annotations
@@ -20,8 +21,7 @@ from numpy.typing import NDArray
 from vslam.backend.disparity_offset import map_and_calibrate
 from vslam.backend.local_mapping import refresh_keyframe
 from vslam.backend.triangulation import map_stereo_points
-from vslam.closing import LoopClosing
-from vslam.features import Features
+from vslam.closing import LoopClosing, LoopSearch
 from vslam.frame_poses import FramePoses, FrameTable
 from vslam.frontend.frame import Frame, PlacedFrame
 from vslam.frontend.patches import RecentPatches, certainty_of
@@ -46,6 +46,8 @@ from vslam.shared_map import SharedMap
 from vslam.starter import TwoViewStart
 from vslam.states import MapperState
 from vslam.trajectory import Trajectory
+
+_CLOSE_AFTER_FRAMES = 10  # a found loop is closed this long after its keyframe, or at the next one
 
 
 class Mapper:
@@ -86,6 +88,8 @@ class Mapper:
         self.rig = rig
         self._patches = RecentPatches(context.config.alignment.keyframes)
         self._is_merged = True
+        self._next_search: Callable[[Map], LoopSearch] | None = None  # starts after the merge
+        self._search: Callable[[], LoopSearch] | None = None
         self._held: tuple[Frame, ...] = ()
         self._counts = LandmarkCounts()
         self.frames = FramePoses(self, frames)
@@ -108,6 +112,11 @@ class Mapper:
     def is_merged(self) -> bool:
         """Whether tracking sees the results of all mapping jobs."""
         return self._is_merged
+
+    @property
+    def has_found_loop(self) -> bool:
+        """Whether a loop was found that is not closed yet; waits for the search."""
+        return self._search is not None and self._search().loop is not None
 
     @property
     def is_mapping(self) -> bool:
@@ -161,7 +170,7 @@ class Mapper:
         Args:
             frame: the next frame, not tracked yet.
             last: the last tracked frame; None before the first.
-            twist: ``(6,)`` of the points relative to the camera, per second; None if unknown.
+            twist: ``(6,)`` twist of the points relative to the camera, per second; None if unknown.
         """
         self.hold(last, frame)
         self.merge_if_due(frame.index)
@@ -172,8 +181,8 @@ class Mapper:
 
         Args:
             tracked: False for a pose that is only predicted.
-            near: the keyframe near which relocalisation found the frame, which becomes the
-                reference; -1 without relocalisation.
+            near: the keyframe near which the frame was relocalised; it becomes the reference. -1 if
+                the frame was not relocalised.
         """
         if near >= 0:
             self.refer_to(near)
@@ -186,32 +195,66 @@ class Mapper:
         self._counts.add(visible, found)
 
     def merge_if_due(self, frame: int) -> None:
-        """Merge if the last keyframe is at least ``merge_after_frames`` older than this frame."""
-        if frame - self.last_frame >= self._config.keyframes.merge_after_frames:
-            self.merge()
+        """Merge if the last keyframe is at least ``merge_after_frames`` older than this frame. If
+        it is at least ``_CLOSE_AFTER_FRAMES`` older, close a loop that was found at it."""
+        age = frame - self.last_frame
+        if age >= self._config.keyframes.merge_after_frames:
+            self._merge_mapping()
+        if age >= _CLOSE_AFTER_FRAMES:
+            self._settle()
 
     def merge(self) -> Map:
-        """Wait for the running mapping job, make its result visible to tracking, and return the
-        map.
+        """Wait for the running mapping job and make its result visible to tracking; then wait for
+        the search for loops and return the map.
 
         Raises:
             RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
         """
-        map_ = self.complete()
-        if not self._is_merged:
-            self._is_merged = True
-            self._renew_view()
-        return map_
+        self._merge_mapping()
+        return self.complete()
 
     def complete(self) -> Map:
-        """Wait for the running mapping job without making its result visible to tracking, and
-        return the map. Calling this does not change any result.
+        """Wait for the running mapping job and for the search for loops, and return the map. The
+        result of mapping does not become visible to tracking, so calling this does not change any
+        result.
 
         Raises:
             RuntimeError: as ``merge``.
         """
+        map_ = self._wait_for_mapping()
+        self._start_search()
+        if self._search is not None and not self.has_found_loop:
+            self._closing.close(map_, self._search())
+            self._search = None
+        return map_
+
+    def _wait_for_mapping(self) -> Map:
         map_ = self._shared.wait()
         self._counts.write(map_)
+        return map_
+
+    def _start_search(self) -> None:
+        """Start the search for loops at the keyframe that was mapped last."""
+        if self._next_search is not None:
+            self._search = self._shared.start_reading(self._next_search)
+            self._next_search = None
+
+    def _merge_mapping(self) -> None:
+        """Make the result of the last mapping job visible to tracking."""
+        if not self._is_merged:
+            self._wait_for_mapping()
+            self._is_merged = True
+            self._renew_view()
+            self._start_search()
+
+    def _settle(self) -> Map:
+        """Merge, close the loop that was found, if any, and return the map."""
+        map_ = self.merge()
+        if self._search is not None:
+            search, self._search = self._search(), None
+            with self._shared.change():
+                self._closing.close(map_, search)
+            self._renew_view()
         return map_
 
     def finish(self) -> None:
@@ -242,7 +285,13 @@ class Mapper:
             self._set_newest(keyframe, frame)
             self.frames.replace(frame.index, keyframe)
             if keyframe > 0:
-                self._start(partial(self._map_keyframe, keyframe, frame.features, frame.image))
+                self._start(partial(self._map_keyframe, keyframe))
+                self._next_search = partial(
+                    self._closing.search,
+                    keyframe=keyframe,
+                    features=frame.features,
+                    image=frame.image,
+                )
             else:
                 self._closing.process(map_, keyframe, frame.features, frame.image)
 
@@ -288,12 +337,13 @@ class Mapper:
             start.second.twist = start.twist
 
     def find_old_place(self, frame: Frame) -> OldPlace | None:
-        """The old place that the frame has returned to, or None (``find_old_place``)."""
-        return find_old_place(self.merge(), frame, self._config.keyframes.known_after_s)
+        """The old place that the frame has returned to; None if there is none
+        (``map_frames.find_old_place``)."""
+        return find_old_place(self._settle(), frame, self._config.keyframes.known_after_s)
 
     def use_existing_keyframe(self, place: OldPlace, frame: PlacedFrame) -> None:
         """Make an existing keyframe the reference instead of inserting the newest frame."""
-        self.merge()
+        self._settle()
         self.last_timestamp = frame.timestamp
         self.refer_to(place.keyframe)
         self.frames.follow_reference(frame.index, frame.T_cw)
@@ -344,13 +394,13 @@ class Mapper:
     @contextmanager
     def _changing(self) -> Iterator[Map]:
         """Yield the merged map for changes. After an exception, the map cannot be used any more."""
-        self.merge()
+        self._settle()
         with self._shared.change() as map_:
             yield map_
 
     def _make_room(self, map_: Map, frame: Frame) -> None:
-        """Drop dead landmarks if there are many. This changes the ids of the others, so it must
-        wait for a running global bundle adjustment, which refers to landmarks by id."""
+        """Drop dead landmarks if there are many. The ids of the other landmarks then change, so
+        nothing is dropped during a global bundle adjustment, which refers to landmarks by id."""
         if not self._closing.is_adjusting and map_.many_dead_landmarks:
             drop_dead_landmarks(map_, (*self._held, frame))
 
@@ -383,11 +433,9 @@ class Mapper:
         if frame.twist is not None:
             frame.twist[:3] *= growth
 
-    def _map_keyframe(
-        self, keyframe: int, features: Features, image: NDArray[np.uint8] | None, map_: Map
-    ) -> None:
+    def _map_keyframe(self, keyframe: int, map_: Map) -> None:
         map_and_calibrate(map_, keyframe, self._camera, self._config)
-        self._closing.process(map_, keyframe, features, image)
+        self._closing.merge_adjustment_if_due(map_, keyframe)
 
     def _start(self, job: Callable[[Map], None]) -> None:
         """Start a mapping job; until the merge, tracking continues with the present view."""

@@ -54,7 +54,8 @@ def merge_maps(
 
     Args:
         maps: two or more maps with the same camera, pyramid and detector.
-        create: creates an empty detector like that of the maps, and the store of its images.
+        create: creates an empty detector of the same kind as that of the maps, and the store of its
+            images.
         on_keyframe: called after each keyframe for which loops were searched.
 
     Raises:
@@ -86,10 +87,10 @@ def join(
     memory: Memory,
     on_keyframe: Callable[[], None] = lambda: None,
 ) -> tuple[StoredMap, list[LoopEdge]] | None:
-    """Join two compact maps; the world frame is that of the first.
+    """Join two compact maps; the joined map has the world frame of the first.
 
     Args:
-        memory: an empty detector like that of the maps, and the store of its images.
+        memory: an empty detector of the same kind as that of the maps, and the store of its images.
 
     Returns:
         The joined map and the loops that were closed between the two, or None if there are none.

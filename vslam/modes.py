@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vslam.frontend.frame import PlacedFrame
-from vslam.frontend.keyframes import KeyframeEvidence, KeyframePolicy, PlaceEvidence
+from vslam.frontend.keyframes import KeyframeEvidence, KeyframePolicy
 from vslam.frontend.tracker import Found, Tracker
 from vslam.frontend.tracking import TrackingContext
 from vslam.mapping import Mapper
@@ -124,7 +124,9 @@ class MapBuilding(Mode):
         place = self._mapper.find_old_place(frame)
         if place is not None:
             n_inliers = int(np.count_nonzero(frame.landmark >= 0))
-            if self.policy.is_known(PlaceEvidence(n_inliers, place.n_shared, place.n_place)):
+            if self.policy.is_known(
+                n_inliers=n_inliers, n_shared=place.n_shared, n_place=place.n_place
+            ):
                 self._mapper.use_existing_keyframe(place, frame)
                 return False
         if not self._match_features(frame):

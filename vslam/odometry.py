@@ -12,9 +12,9 @@ correlated: the drift grows like a random walk with correlated steps (a first-or
 process).
 
 Covariances are those of ``xi = [v, w]``, metres and radians, in the frame of the camera: with an
-estimated pose ``T_cw``, the true one is ``exp(xi) T_cw``. The covariance describes odometry: that
-loop closures reduce the drift is not modelled, nor are the unknown scale of a monocular map and
-errors of the calibration.
+estimated pose ``T_cw``, the true one is ``exp(xi) T_cw``. The covariance describes odometry alone:
+it ignores that loop closures reduce the drift, that the scale of a monocular map is unknown, and
+that the calibration has errors.
 """
 
 from __future__ import annotations
@@ -26,8 +26,10 @@ from numpy.typing import NDArray
 
 from vslam.geometry import Matrix, inverse, orthonormalised
 
-# Chosen on four rendered drives so that the squared errors over 1 s and 10 s match the covariances,
-# and tested on four others (docs/research/uncertainty.md).
+# Factors on the computed covariances of the local error and of the drift, and the correlation of
+# consecutive steps of the drift. They were chosen on four rendered drives so that the squared
+# errors over 1 s and 10 s match the covariances, and tested on four others
+# (docs/research/uncertainty.md).
 LOCAL, DRIFT, CORRELATION = 1.8, 3.3, 0.5
 # Standard deviations of the acceleration of a lost camera, in m/s^2 and rad/s^2.
 ACCELERATION, TURNING = 2.0, 1.0
@@ -59,7 +61,7 @@ class PoseUncertainty:
 
     @classmethod
     def of_numbers(cls, numbers: NDArray[np.float64]) -> PoseUncertainty:
-        """The uncertainty that ``numbers`` was called on."""
+        """Restore an uncertainty from the ``(43,)`` array of ``numbers``."""
         both = np.zeros((2, 6, 6))
         for matrix, values in zip(both, numbers[:-1].reshape(2, -1), strict=True):
             matrix[_UPPER] = values
@@ -138,9 +140,9 @@ class Odometry:
         Args:
             T_now_last: ``(4, 4)`` motion, which maps points from the last camera to this one.
             elapsed: seconds between the two frames.
-            covariance: ``(6, 6)`` of the optimised pose (``pose_covariance``); None if the pose is
-                only predicted with constant velocity. Its error then grows with the square of the
-                time.
+            covariance: ``(6, 6)`` covariance of the optimised pose (``pose_covariance``); None if
+                the pose is only predicted with constant velocity. The error of a predicted pose
+                grows with the square of the time since tracking was lost.
         """
         self.T_odom_camera = orthonormalised(self.T_odom_camera @ inverse(T_now_last))
         A = adjoint(T_now_last)

@@ -88,7 +88,8 @@ class PlugIn:
             ) from error
 
     def _line(self, error: Exception) -> str:
-        """The source line of the package at which it failed; empty if no line of it was running."""
+        """The file and line of the package that raised the error or called the code that raised it;
+        empty if the package appears nowhere in the traceback."""
         package = self.entry_point.module.partition(".")[0]
         lines = [
             f"; {Path(frame.f_code.co_filename).name}, line {line}"

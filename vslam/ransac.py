@@ -47,8 +47,8 @@ def draw_three(state, n):
 
 @kernel
 def draws_needed(inlier_share, confidence, limit):
-    """Number of draws of three, at most ``limit``, until with probability ``confidence`` at least
-    one of them has only inliers (Fischler and Bolles 1981, section II-B)."""
+    """Number of draws of three items after which, with probability ``confidence``, at least one
+    draw contains only inliers; at most ``limit`` (Fischler and Bolles 1981, section II-B)."""
     good = inlier_share**3
     if good >= 1.0:
         return 1

@@ -1,7 +1,7 @@
 """Reprojection errors: the layout of observations and the inlier test.
 
-An observation is a row ``u, v, u_right`` in pixels. ``u_right`` is NaN without a stereo match, by
-which kernels distinguish monocular from stereo observations.
+An observation is a row ``u, v, u_right`` in pixels. ``u_right`` is NaN for a monocular observation,
+that is, for a keypoint without a stereo match.
 
 Kernels that only test for inliers call ``chi_square_ratio``; optimisers, which also need the
 ``residual``, test it with ``chi_square``.
@@ -30,7 +30,7 @@ def stack_uvr(xy: NDArray[np.floating], u_right: NDArray[np.floating]) -> Matrix
 
 @inner_kernel
 def unpacked(intrinsics):
-    """``Camera.intrinsics`` as a tuple, whose values, unlike those of an array, stay in
+    """``Camera.intrinsics`` as a tuple. Unlike the values of an array, those of a tuple stay in
     registers."""
     return (
         intrinsics[0],
@@ -63,9 +63,9 @@ def chi_square_ratio(x, y, z, u, v, u_right, inverse_sigma2, pinhole):
 
 @inner_kernel
 def residual(x, y, z, u, v, u_right, pinhole):
-    """Reprojection error in u, in v and in the negative disparity (weighted; 0 without a stereo
-    match), and whether the observation is stereo. The arguments are those of
-    ``chi_square_ratio``."""
+    """Reprojection errors in u, in v and in the negative disparity, and whether the observation is
+    stereo. The error of the disparity is weighted, and 0 without a stereo match. The arguments are
+    those of ``chi_square_ratio``."""
     fx, fy, cx, cy, bf, disparity_weight = pinhole
     iz = 1.0 / z
     stereo = not np.isnan(u_right)
@@ -75,7 +75,7 @@ def residual(x, y, z, u, v, u_right, pinhole):
 
 @inner_kernel
 def chi_square(r_u, r_v, r_disparity, stereo, inverse_sigma2):
-    """Squared error of a ``residual`` divided by its variance, and the upper limit of an inlier,
-    beyond which the Huber loss is linear."""
+    """Squared error of a ``residual`` divided by its variance, and the largest such value of an
+    inlier. Beyond that value, the Huber loss is linear."""
     chi2 = (r_u * r_u + r_v * r_v + r_disparity * r_disparity) * inverse_sigma2
     return chi2, CHI2_STEREO if stereo else CHI2_MONO

@@ -33,9 +33,10 @@ class OpenedMap:
     Attributes:
         map: the stored map; None for a new one.
         frames: poses of the drive's earlier frames; None for a new drive.
-        checkpoint: state from which the drive continues with identical results, or None.
+        checkpoint: state from which the drive continues with identical results; None for a new
+            drive, or if the map was saved without one.
         drives: sources of the images of the earlier drives, such as "kitti 06".
-        world: the map's place in the world of a ground truth; None if unknown.
+        world: the transformation of the map into the frame of a ground truth; None if unknown.
     """
 
     map: Map | None = None
@@ -57,7 +58,7 @@ def open_map(
     is None.
 
     Args:
-        localize: do not change the map; otherwise a new drive begins in it.
+        localize: only localise in the map, without changing it.
         resume: continue the map's last drive instead of starting a new one.
 
     Raises:
@@ -124,12 +125,14 @@ class Session:
         """The state of all parts between two frames, or None if no checkpoint is possible now.
 
         It is None before the first frame is tracked, when only localising, while a keyframe is
-        being mapped, while a monocular map begins, and during a global bundle adjustment.
+        being mapped, while a monocular map begins, while a found loop is not closed yet, and during
+        a global bundle adjustment.
         """
         tracker, policy = self.tracker.state(), self.mode.state()
         if tracker is None or policy is None:
             return None
-        if self.closing.is_adjusting or not self.mapper.is_merged:
+        mapper = self.mapper
+        if self.closing.is_adjusting or not mapper.is_merged or mapper.has_found_loop:
             return None
         return Checkpoint(
             tracker,

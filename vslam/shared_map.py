@@ -7,8 +7,12 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
 from contextlib import contextmanager
+from functools import cache
+from typing import TypeVar
 
 from vslam.map import Map
+
+T = TypeVar("T")
 
 
 def mapping_executor(threads: int) -> Executor | None:
@@ -55,6 +59,20 @@ class SharedMap:
         else:
             self._future = self._executor.submit(job, map_)
             self._job = self._future.result
+
+    def start_reading(self, job: Callable[[Map], T]) -> Callable[[], T]:
+        """Start a job that only reads the map; returns a function that waits for the job's result.
+        That function must be called before the map is written again."""
+        map_ = self.map
+        if self._executor is None:
+            return cache(lambda: job(map_))
+        future = self._executor.submit(job, map_)
+
+        def result() -> T:
+            wait_for([future])  # after Ctrl-C here, a later call can wait again
+            return future.result()
+
+        return result
 
     def wait(self) -> Map:
         """Wait for the job, if there is one, and return the map.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -138,7 +138,7 @@ class Slam:
             path: the map file, or the folder of a run.
             config: as for a new map; None uses the thresholds that the map was made with.
             detector: the detector that the map was made with, as a name or an object; None uses
-                the shipped detector of the name in the file.
+                the detector that the file names.
             resume: as for a new map.
             options: ``threads``, ``images`` and ``localize``, as for a new map.
 
@@ -189,6 +189,7 @@ class Slam:
         timestamp: float,
         *,
         mask: NDArray[np.uint8] | NDArray[np.bool_] | None = None,
+        on_pose: Callable[[TrackResult], None] | None = None,
     ) -> TrackResult:
         """Track one rectified stereo pair, RGB-D image or monocular image, and insert it as a
         keyframe if it shows something new.
@@ -204,6 +205,9 @@ class Slam:
             timestamp: seconds, later than that of the last call.
             mask: ``(H, W)`` uint8 or bool, 0 where the left image must not be used, for example
                 where it shows the hood of the car; None uses the whole image.
+            on_pose: called with the result as soon as the pose is known, because inserting a
+                keyframe takes much longer than tracking. Whether the frame becomes a keyframe
+                (``is_keyframe``) may not be decided yet. Exceptions of ``on_pose`` are passed on.
 
         Raises:
             ValueError: the images have another size or type, or the timestamp is not finite or not
@@ -216,21 +220,26 @@ class Slam:
             check_mask(mask, self.context.camera)
             of_left = Mask.of(mask, self.context.config.orb)
         images = FrameImages(np.array(left), lambda: second, self.context, mask=of_left)
-        return self.step_images(images, timestamp)
+        return self.step_images(images, timestamp, on_pose=on_pose)
 
     def step_images(
-        self, images: FrameImages, timestamp: float, stage_ms: dict[str, float] | None = None
+        self,
+        images: FrameImages,
+        timestamp: float,
+        stage_ms: dict[str, float] | None = None,
+        on_pose: Callable[[TrackResult], None] | None = None,
     ) -> TrackResult:
         """As ``step``, for images that were prepared before, for example in another thread.
 
         Args:
             images: the images, which are not copied: do not write to them afterwards.
             timestamp, stage_ms: as for ``step_features``.
+            on_pose: as for ``step``.
         """
         frame = self._next_frame(Extracted.nothing(), timestamp, None)
         frame.source, frame.pyramid, frame.coarse = images, images.pyramid, images.coarse
         frame.mask = images.mask
-        return self._step(frame, StageClock(dict(stage_ms or {})))
+        return self._step(frame, StageClock(dict(stage_ms or {})), on_pose)
 
     def step_features(
         self,
@@ -253,7 +262,12 @@ class Slam:
         frame = self._next_frame(extracted, timestamp, image)
         return self._step(frame, StageClock(dict(stage_ms or {})))
 
-    def _step(self, frame: Frame, clock: StageClock) -> TrackResult:
+    def _step(
+        self,
+        frame: Frame,
+        clock: StageClock,
+        on_pose: Callable[[TrackResult], None] | None = None,
+    ) -> TrackResult:
         mapper, tracker = self._mapper, self._tracker
         mapper.admit(frame, tracker.last, tracker.twist)
         clock.lap("wait_for_mapping")
@@ -266,7 +280,10 @@ class Slam:
             if begun:
                 self._odometry.keyframe()
             clock.lap("keyframe")
-            return result_of(frame, found, begun, clock.ms, self._odometry)
+            result = result_of(frame, found, begun, clock.ms, self._odometry)
+            if on_pose is not None:
+                on_pose(result)
+            return result
 
         T_predicted = tracker.predict(frame.timestamp, mapper.frames, mapper.view)
         tracked = tracker.track_patches(frame, T_predicted, mapper.view)
@@ -288,13 +305,17 @@ class Slam:
             self._follow(frame, T_predicted, None)
             placed = mapper.append_pose(frame, tracked=False)
             tracker.lose()
-            is_keyframe = self._mode.begin_after_loss(placed)
         else:
             found_again = found.relocalised or tracker.status is not TrackerStatus.TRACKING
             T_moved = T_predicted if found_again else frame.T_cw
             tracker.accept(frame, found, mapper.frames)
             self._follow(frame, T_moved, covariance_of(frame, self.context))
             placed = mapper.append_pose(frame, tracked=True, near=found.keyframe)
+        if on_pose is not None:
+            on_pose(result_of(frame, found, False, dict(clock.ms), self._odometry))
+        if found.is_lost:
+            is_keyframe = self._mode.begin_after_loss(placed)
+        else:
             is_keyframe = self._mode.update_map(placed, found)
             self.rig.observe(frame, frame.twist)
         # If patches failed for this frame, they will probably fail for the next ones.
@@ -332,7 +353,8 @@ class Slam:
 
     def resume_odometry(self, last: TrackResult) -> None:
         """Continue ``T_odom_camera`` and the uncertainty from the last result of a drive that was
-        resumed from a map without the state of tracking. Without this call both start again."""
+        resumed from a map without the state of tracking. Without this call, the odometry starts at
+        the identity, with no uncertainty."""
         self._session.resume_odometry(last)
 
     def finish(self) -> None:
@@ -363,7 +385,7 @@ class Slam:
 
     @property
     def world(self) -> World | None:
-        """The place of the loaded map in the world of a ground truth; None if unknown."""
+        """The transformation of the loaded map into a ground truth's frame; None if unknown."""
         return self._session.opened.world
 
     @property

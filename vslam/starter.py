@@ -26,7 +26,8 @@ class TwoViewStart:
         first, second: the frames; the first has the pose at which the map begins.
         T_2_1: ``(4, 4)`` maps points of the first camera to the second.
         features: matched features of the first and of the second frame, ``(N,)`` int64 each.
-        points: ``(N, 3)`` the points that they show, in the first camera.
+        points: ``(N, 3)`` the triangulated points of these features, in the frame of the first
+            camera.
         predicted: whether the unit of the map was derived from the speed before the camera was
             lost.
     """
@@ -45,7 +46,7 @@ class TwoViewStart:
 
     def at_speed(self, twist: Matrix | None, max_rescaling: float) -> TwoViewStart:
         """Scale the start of a sub-map so that the camera has the same speed as before it was lost.
-        The sub-map then has approximately the unit of the map before.
+        The sub-map then has approximately the unit of the map before the loss.
 
         Args:
             twist: ``(6,)`` twist of the camera per second before it was lost; None if unknown.

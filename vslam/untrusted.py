@@ -23,8 +23,8 @@ MOST_PIXELS = 2**27
 many."""
 
 _OPENCV_LIMIT = "OPENCV_IO_MAX_IMAGE_PIXELS"
-_ANY_SIZE = 2**27  # bytes; every archive may unpack to this size
-_MOST_PACKED = 20  # a larger archive may unpack to this many times its own size
+_ANY_SIZE = 2**27  # bytes; any archive may unpack to this size
+_MOST_PACKED = 20  # an archive that unpacks to more must have at least 1/20 of the unpacked size
 ARCHIVE_ERRORS = (
     EOFError, ValueError, KeyError, RuntimeError, OverflowError, zlib.error,
     zipfile.BadZipFile, zipfile.LargeZipFile,
@@ -91,11 +91,11 @@ def read_json(array: NDArray[Any]) -> Any:
 
 
 def require_memory(path: Path, what: str) -> None:
-    """Check that an archive unpacks neither to far more than its size nor to more than the free
+    """Check that an archive does not unpack to far more than its own size or to more than the free
     memory. Files that are not archives pass.
 
     Raises:
-        InputError: the archive unpacks to more.
+        InputError: the unpacked archive is too large.
     """
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:

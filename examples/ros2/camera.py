@@ -10,7 +10,7 @@ from vslam import Camera
 
 
 def camera_of(left: Any, right: Any) -> Camera:
-    """The camera of ``image_rect`` topics, by the matrices P of their ``camera_info``.
+    """The camera of a pair of ``image_rect`` topics, from the matrices P of their ``camera_info``.
 
     Args:
         left, right: ``sensor_msgs/CameraInfo``.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from importlib import import_module
 from typing import Any
 
@@ -16,6 +17,7 @@ from tf2_msgs.msg import TFMessage
 
 from vslam import Slam
 from vslam.datasets.bag_messages import grey_of, stamp_of
+from vslam.features import TrackResult
 from vslam.maps.ros import FramePose, odometry_message, static_tf_message, tf_message
 
 TOPICS = {
@@ -24,8 +26,8 @@ TOPICS = {
     "left/camera_info": CameraInfo,
     "right/camera_info": CameraInfo,
 }
-MOST_WAITING = 5  # pairs; older ones are dropped where tracking takes longer than a frame
-APART_S = 0.005  # most that the stamps of a pair may differ by
+MOST_WAITING = 5  # pairs of images; older pairs are dropped while tracking is too slow
+APART_S = 0.005  # largest difference between the stamps of a pair
 
 
 def message_type(name: str) -> Any:
@@ -55,16 +57,19 @@ class SlamNode(Node):
         self.pairs.registerCallback(self.track)
 
     def track(self, left: Image, right: Image, *infos: CameraInfo) -> None:
-        """Track a pair, and publish its pose."""
+        """Track a pair of images."""
         stamp = stamp_of(left)
         try:
             if self.slam is None:
                 self.slam = Slam(camera_of(*infos), detector=self.detector)
                 self.static_tf.publish(static_tf_message(message_type, stamp))
-            result = self.slam.step(grey_of(left), grey_of(right), stamp / 1e9)
+            publish = partial(self.publish, stamp)
+            self.slam.step(grey_of(left), grey_of(right), stamp / 1e9, on_pose=publish)
         except ValueError as error:  # a wrong camera, or a clock that was set back
             self.get_logger().warning(f"a pair of images is left out: {error}")
-            return
+
+    def publish(self, stamp: int, result: TrackResult) -> None:
+        """Publish the pose of a frame, before the frame may become a keyframe."""
         pose = FramePose.of(result, stamp)
         self.odometry.publish(odometry_message(message_type, pose, self.before))
         self.tf.publish(tf_message(message_type, pose))

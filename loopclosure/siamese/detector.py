@@ -25,8 +25,8 @@ class SiameseDetector:
     """A :class:`vslam.loopclosure.detector.LoopDetector` by the image descriptors of a network.
 
     If the images of keyframes are stored (``images``), the network computes the descriptor of a
-    keyframe only when the camera comes within reach of it (:func:`beyond_reach`) or is lost. On a
-    drive that never returns to a place, the network does not run at all.
+    keyframe only when the camera comes within reach of the keyframe (:func:`beyond_reach`) or is
+    lost. On a drive that never returns to a place, the network does not run at all.
 
     Descriptors are rows of a matrix that grows by half when it is full. The matrix has no columns
     until the network has computed the first descriptor.
@@ -43,10 +43,11 @@ class SiameseDetector:
 
         Args:
             learned: thresholds for local descriptors; None uses the defaults.
-            images: the store of keyframe images. With it, keyframes must reach the similarity
-                ``config.offered``, and the most similar ones are ranked again by local descriptors,
-                because at night the correct place is often among them but not first. Without it
-                (None), keyframes must reach ``config.threshold`` and are ranked by similarity.
+            images: the store of keyframe images. With a store, candidates must reach the similarity
+                ``config.offered``, and the most similar keyframes are ranked again by local
+                descriptors, because at night the correct place is often among these keyframes but
+                not the first. Without a store (None), candidates must reach ``config.threshold``
+                and are ranked by similarity.
         """
         self.name = network.name
         self._network = network
@@ -66,7 +67,8 @@ class SiameseDetector:
             self._store_descriptor(keyframe, image)
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
-        """See :class:`LoopDetector`. The similarity of a candidate is at least the threshold."""
+        """See :class:`LoopDetector`. The similarity of a candidate is at least the threshold (see
+        ``images``)."""
         if keyframe >= len(self._row) or not (self._described[keyframe] or self._stored(keyframe)):
             return []
         eligible = self._searchable(map_)
@@ -144,7 +146,7 @@ class SiameseDetector:
         return self._images is not None and keyframe in self._images
 
     def _without_descriptor(self, keyframes: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Ids of those keyframes of a ``(n,)`` mask that have no descriptor yet."""
+        """Ids of the keyframes in a ``(n,)`` bool mask that have no descriptor yet."""
         return np.flatnonzero(keyframes & ~self._described[: len(keyframes)])
 
     def _describe(self, keyframes: Iterable[int]) -> None:
@@ -183,7 +185,7 @@ class SiameseDetector:
 
     def _local_ratings(self, p: NDArray[np.float32], query: DescriptorMaps) -> NDArray[np.float32]:
         """``(N,)`` similarity by local descriptors of the keyframes that are most similar according
-        to ``p``, -1 for the others."""
+        to ``p``, -1 for the other keyframes."""
         assert self._images is not None
         rating = np.full(len(p), -1.0, np.float32)
         for keyframe in np.argsort(-p, kind="stable")[: self._config.reranked].tolist():
@@ -201,7 +203,7 @@ class SiameseDetector:
     ) -> list[LoopCandidate]:
         """The candidates with the highest ``rating`` ``(N,)``, which is -1 for keyframes that are
         not candidates. Of several covisible keyframes, only the best becomes a candidate, because
-        the others would displace candidates at other places."""
+        further keyframes of one place would displace candidates at other places."""
         rating = rating.copy()
         found: list[LoopCandidate] = []
         most = self._config.max_candidates

@@ -34,7 +34,8 @@ def read_fabmap(folder: Path, truth: str = "", side: str = "left") -> list[Image
         side: "left" or "right", the camera to use if the matrix has a row for each pair.
 
     Raises:
-        InputError: there are no images or no matrix, or the matrix has another number of rows.
+        InputError: there are no images or no matrix, or the number of rows of the matrix does not
+            fit the images.
     """
     files = images_in(folder)
     if not files:

@@ -36,7 +36,7 @@ class ImageSource:
         calibration: ``(8,)`` or ``(9,)`` fx fy cx cy k1 k2 p1 p2 [k3]; None if the images are
             rectified.
         is_query: ``(N,)`` bool, images that a benchmark compares with all other images; None for a
-            drive, where each image is compared with much earlier ones.
+            drive, where each image is compared with much earlier images.
         times: ``(N,)`` capture times, seconds; None if unknown.
     """
 
@@ -71,7 +71,7 @@ class ImageSource:
         return image if self.calibration is None else undistorted(image, self.calibration)
 
     def select(self, chosen: NDArray[np.int64]) -> ImageSource:
-        """The source with only the images ``chosen`` ``(M,)``, in this order."""
+        """A source with only the images whose indices are in ``chosen`` ``(M,)``, in this order."""
         return replace(
             self,
             names=tuple(self.names[i] for i in chosen),

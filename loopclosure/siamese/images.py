@@ -80,8 +80,8 @@ def read_grey(source: Path | NDArray[np.uint8], name: str = "") -> NDArray[np.ui
 
 
 def turn_homography(width: int, height: int, degrees: float) -> NDArray[np.float64]:
-    """``(3, 3)`` homography from the pixels of an image to those after the camera has turned to the
-    right without moving.
+    """``(3, 3)`` homography from the pixels of an image to the pixels of the image that the camera
+    would take after a turn by ``degrees`` to the right, without any translation.
 
     The horizontal field of view is assumed to be 80 degrees, as is common on cars. The homography
     only scales vertical coordinates, so it also holds for squashed images.

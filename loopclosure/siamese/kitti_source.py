@@ -40,13 +40,13 @@ def read_kitti(
         root: KITTI root.
         seq: name of the sequence.
         first, last: numbers of the first and the last image, both included.
-        every: step between images; 2 takes every second one.
+        every: step between images; 2 takes every second image.
         frames: ranges of numbers, ``0-249+1500-1699``, instead of ``first`` and ``last``.
         truth: ``.mat`` file with a loop matrix of the whole sequence, which marks the pairs of the
             same place. Unmarked pairs show different places if they are more than 25 m apart;
             otherwise their relation is unknown.
         near: distance in metres, below 25, within which two images show the same place. Published
-            loop matrices mark images up to 20 m apart and more.
+            loop matrices also mark images that are 20 m or more apart.
 
     Raises:
         InputError: the range has no images, poses are missing for them, the matrix or the times do

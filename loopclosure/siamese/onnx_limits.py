@@ -51,7 +51,7 @@ def check_graph(file: bytes) -> None:
     """
     try:
         model = onnx.load_model_from_string(file)
-    except Exception as error:  # protobuf raises types of its own
+    except Exception as error:  # protobuf raises its own exception types
         raise ValueError("not a readable ONNX file") from error
     graph = model.graph
     _check_nodes(model)

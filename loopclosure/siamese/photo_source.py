@@ -25,11 +25,12 @@ _UNLIMITED = 1_000_000
 
 @dataclass(frozen=True)
 class _SpecialSet:
-    """Properties of a set that do not follow from its kind; they come from its notes.
+    """Properties of a set of photographs that do not follow from its kind; they were copied from
+    its notes.
 
     Attributes:
-        reach: photographs of a folder show the same place if their positions in its order differ by
-            at most this number; None for all photographs.
+        reach: photographs of a folder show the same place if their positions in the sorted folder
+            differ by at most this number; None if all photographs of a folder show the same place.
         region: maps the name of a folder to a region; relations between folders of the same region
             are unknown.
         family: family of the set, see ``ImageSource``.
@@ -43,11 +44,11 @@ class _SpecialSet:
 
 
 _SPECIAL_SETS = {
-    # The camera rotates on the spot, so photographs far apart in the order do not overlap.
+    # The camera rotates on the spot, so photographs far apart in the sorted folder do not overlap.
     "pano_rotation": _SpecialSet(reach=1, family="landmarks"),
     # Photographs of one folder show opposite walls of a yard.
     "strecha": _SpecialSet(reach=3, family="landmarks"),
-    # Each folder has the views of one walk in one direction; the folders overlap at their ends.
+    # Each folder has the views of one walk in one direction; the walks overlap at their ends.
     "pano360": _SpecialSet(reach=2, region=lambda folder: folder.split("_")[0]),
     # Folders are several passes along the same floor.
     "ie_tower": _SpecialSet(reach=1, region=lambda folder: folder.split("__")[0]),

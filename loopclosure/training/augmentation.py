@@ -12,8 +12,8 @@ _TURNED, _ZOOMED = 0.5, 0.5  # shares of the images that are turned and zoomed, 
 
 
 class Augmentation(BaseModel):
-    """Strengths of the changes; 0 disables a change. The paper uses projective changes, luminance
-    and masks."""
+    """Strengths of the changes; 0 disables a change. The paper changes perspective and luminance
+    and masks parts of the image."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -22,7 +22,9 @@ class Augmentation(BaseModel):
     )
     shift: float = Field(0.10, ge=0, le=0.5, description="Largest shift, relative to the width.")
     turn: float = Field(0.0, ge=0, le=45, description="Largest turn of the camera, degrees.")
-    zoom: float = Field(0.0, ge=0, le=1, description="Largest log of a zoom, as when driving on.")
+    zoom: float = Field(
+        0.0, ge=0, le=1, description="Largest log of the zoom, which imitates driving on."
+    )
     log_gain: float = Field(0.35, ge=0, description="Standard deviation of the log gain.")
     bias: float = Field(20.0, ge=0, description="Standard deviation of the bias, grey levels.")
     log_gamma: float = Field(0.25, ge=0, description="Standard deviation of log gamma.")
@@ -35,8 +37,8 @@ class Augmentation(BaseModel):
     mirror: bool = Field(True, description="Mirror both images of every second pair.")
 
 
-# Stronger changes of light and occlusion only: rendered pairs already differ in viewpoint, and the
-# noise and blur of a camera average out at the network's resolution.
+# Only changes of light and occlusion are stronger: rendered pairs already differ in viewpoint, and
+# the noise and blur of a camera average out at the network's resolution.
 STRONG = Augmentation(
     homography=0.08, shift=0.12, log_gain=0.5, bias=30.0, log_gamma=0.5, masks=3, mask_area=0.15,
 )  # fmt: skip

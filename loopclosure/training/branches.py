@@ -31,7 +31,7 @@ from vslam.loopclosure.training.lite import (
 )
 from vslam.loopclosure.training.preprocessing import Unrolling, standardised, textured
 
-_LEAST_SHARE = 0.02  # smallest weight of a view; without texture, all views of an image have it
+_LEAST_SHARE = 0.02  # least weight of a view, so that no descriptor is 0 without texture
 
 
 class Layout(NamedTuple):
@@ -60,7 +60,9 @@ class CapsuleShape(BaseModel):
     extractor: Literal["light", "lite0"] = "light"
     pixels: int = Field(227, ge=32, description="Height of the input.")
     width: int | None = Field(None, ge=32, description="Width of the input; None: a square.")
-    views: int = Field(1, ge=1, le=16, description="Parts of the image, from left to right.")
+    views: int = Field(
+        1, ge=1, le=16, description="Number of parts of the image, from left to right."
+    )
     view_width: int | None = Field(None, ge=32, description="Columns of a part; None: all.")
     half_angle: float = Field(
         0.0, ge=0, le=60, description="Degrees from middle to side for unrolling; 0: no unrolling."
@@ -75,7 +77,9 @@ class CapsuleShape(BaseModel):
     depth: int = Field(16, ge=1, description="Dimension of an output capsule.")
     iterations: int = Field(3, ge=1, description="Iterations of the routing.")
     over: Literal["primary", "output"] = "primary"
-    kept: int | None = Field(None, description="Places kept for each type; None before pruning.")
+    kept: int | None = Field(
+        None, description="Number of places kept per type; None before pruning."
+    )
 
     @model_validator(mode="after")
     def _flat_images_keep_their_height(self) -> CapsuleShape:
@@ -151,7 +155,7 @@ class CapsuleShape(BaseModel):
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Rows and columns of the grid of places in a view."""
+        """Rows and columns of the feature grid of a view; a cell of the grid is called a place."""
         height, width = self.view
         if self.extractor == "lite0":
             return lite_grid_side(height), lite_grid_side(width)
@@ -159,7 +163,7 @@ class CapsuleShape(BaseModel):
 
     @property
     def places(self) -> int:
-        """Number of places in the grid of a view."""
+        """Number of places (cells) in the feature grid of a view."""
         rows, columns = self.grid
         return rows * columns
 
@@ -190,8 +194,8 @@ class CapsuleBranch(nn.Module):
     With several views, the descriptor is the concatenation of the views' descriptors from left to
     right. Each is scaled by the share of its view that shows texture, because fog or a covered lens
     does not distinguish places. For lite0, the views are cut from the early features of the whole
-    image. These are computed only once, and at the border of a view they depend on its surroundings
-    instead of padding.
+    image. These features are computed only once, and at the border of a view they depend on the
+    neighbouring pixels of the image instead of padding.
     """
 
     def __init__(self, shape: CapsuleShape) -> None:

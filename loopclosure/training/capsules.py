@@ -2,7 +2,7 @@
 
 Zhou and Sun, Sci Rep 15, 7644 (2025), equations 4 to 9, after Sabour et al., NIPS 2017. There are N
 images, I primary capsules of dimension A, and J output capsules of dimension D. Primary capsules
-have T types (channel groups of the extractor) at P places of a grid: i = t P + p.
+have T types (channel groups of the extractor) at P places (cells of the feature grid): i = t P + p.
 
 All places of a type share their matrices, so ``route`` sums over the places first and never forms
 the prediction vectors. ``tests/reference_routing.py`` implements the paper's equations literally.
@@ -46,13 +46,14 @@ def route(
         iterations: at least 1.
         over: axis of the softmax. With ``primary``, the coupling coefficients sum to 1 over i, as
             in the paper; with ``output``, over j, as in Sabour et al.
-        alive: ``(I,)`` bool; the other capsules are ignored, as if they were removed.
+        alive: ``(I,)`` bool; capsules where it is False are ignored, as if they were removed. None
+            keeps all.
 
     Returns:
         Output capsules ``v`` ``(N, J, D)``, and the coupling coefficients as numerators ``e``
         ``(N, T, J, P)`` and denominators ``total`` ``(N, 1, J, 1)`` or ``(1,)``; see
-        :func:`couplings`. It takes a sixth of the divisions to divide the sums over P instead of
-        ``e``.
+        :func:`couplings`. They are returned undivided, because dividing the sums over P instead of
+        ``e`` takes a sixth of the divisions.
     """
     n, types, places, size = u.shape
     outputs, _, _, depth = W.shape

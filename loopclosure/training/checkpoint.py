@@ -80,8 +80,8 @@ def load_checkpoint(
         ) from error
     except Exception as error:  # torch raises many types
         raise InputError(f"{path}: not a readable checkpoint; remove it to start anew.") from error
-    # The learning rate may change, so that a diverged training can be resumed. So may settings that
-    # are used only at the end.
+    # The learning rate may change, so that a diverged training can be resumed. Settings that are
+    # used only at the end may change, too.
     free = {key: getattr(settings, key) for key in ("learning_rate", "patience", "learned_share")}
     if written.model_copy(update=free) != settings:
         raise InputError(

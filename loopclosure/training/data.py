@@ -182,9 +182,10 @@ def draw_pairs(
     Args:
         chosen: ``(M,)`` images to draw from.
         count: number of pairs.
-        hard: ``(M, K)`` similar images of other places, -1 for none; see :func:`mine`.
+        hard: ``(M, K)`` similar images of other places, filled up with -1; see :func:`mine`.
         hard_share: share of the pairs of different places that are drawn from ``hard``.
-        same_share: share of the pairs that show the same place; they are spread evenly.
+        same_share: share of the pairs that show the same place; these pairs are spread evenly over
+            the list.
         together: number of consecutive pairs whose first images come from the same source.
         emphasis: relative frequency, by source, with which an image is drawn as the first of a
             pair; default 1.

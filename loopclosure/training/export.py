@@ -27,13 +27,13 @@ from vslam.loopclosure.siamese.inference import (
 )
 from vslam.loopclosure.training.siamese import SiameseNetwork, for_inference
 
-TOLERANCE = 1e-4  # for the elements of descriptors of length 1
+TOLERANCE = 1e-4  # largest accepted difference from torch, elements of unit descriptors
 SIMILARITY_TOLERANCE = 0.02  # large, because the square root magnifies rounding at distance 0
 _SMALL = 64  # storing tensors with fewer numbers in half precision gains nothing
 
 
 class _Embedding(nn.Module):
-    """Grey image ``(H, W)`` uint8 to descriptor ``(D,)``."""
+    """Computes the descriptor ``(D,)`` of a grey image ``(H, W)`` uint8."""
 
     def __init__(self, network: SiameseNetwork) -> None:
         super().__init__()
@@ -45,8 +45,9 @@ class _Embedding(nn.Module):
 
 
 class _Comparison(nn.Module):
-    """Descriptors by view of a query ``(V, d)`` and a gallery ``(N, V, d)``, with the lengths
-    ``(N, V)`` of the gallery's views, to similarities ``(N,)``."""
+    """Computes the similarities ``(N,)`` of a query to a gallery from the descriptors of their
+    views, ``(V, d)`` and ``(N, V, d)``, and from the lengths ``(N, V)`` of the gallery's
+    descriptors."""
 
     def __init__(self, network: SiameseNetwork) -> None:
         super().__init__()
@@ -130,7 +131,7 @@ def to_onnx(
     assert program is not None
     model = program.model_proto
     _halve(model.graph)
-    for node in model.graph.node:  # they contain paths of this machine
+    for node in model.graph.node:  # the metadata contains paths of this machine
         del node.metadata_props[:]
     del model.graph.metadata_props[:]
     return model

@@ -50,7 +50,7 @@ def starting_network(
         resuming: whether a checkpoint will replace the weights.
 
     Returns:
-        The network (None for random weights), the settings that fit it, and additions to the model
+        The network (None for random weights), the settings that fit it, and entries for the model
         card.
 
     Raises:
@@ -121,7 +121,7 @@ def resized(network: SiameseNetwork, layout: Layout) -> SiameseNetwork:
 
 
 def _fitted(network: SiameseNetwork, settings: TrainSettings) -> SiameseNetwork:
-    """The network itself if it has the layout of the settings, else a resized one."""
+    """The network itself if it has the layout of the settings, else a resized network."""
     layout = settings.shape.layout
     return network if network.branch.layout == layout else resized(network, layout)
 

@@ -37,8 +37,8 @@ _EARLY = 5  # blocks of the first three stages
 EARLY_STRIDE = 2 * math.prod(stride for _, _, stride, _ in _BLOCKS[:_EARLY])
 _STRIDE = 2 * math.prod(stride for _, _, stride, _ in _BLOCKS)
 _BATCH_NORM_EPSILON = 1e-3
-# Images have standard deviation 1 here, but about half of it in the ImageNet training, where they
-# were scaled as (x - 127) / 128.
+# Images have standard deviation 1 here, but about 0.5 in the ImageNet training, where they were
+# scaled as (x - 127) / 128.
 _DEVIATION = 0.5
 
 

@@ -25,9 +25,10 @@ def cross_entropy(logits: Tensor, same: Tensor) -> Tensor:
 
 
 def contrast(alike: Tensor, same: Tensor, relation: Tensor, temperature: float) -> Tensor:
-    """InfoNCE loss: each pair of the same place against all images of other places in the batch.
+    """InfoNCE loss, which compares each pair of the same place with all images of other places in
+    the batch.
 
-    Van den Oord et al. 2018, symmetric as in CLIP. Not in the paper.
+    The loss is that of van den Oord et al. (2018), symmetric as in CLIP. (Not in the paper.)
 
     Args:
         alike: ``(2 N, 2 N)`` cosines of the images of N pairs; the first images of all pairs come
@@ -115,8 +116,8 @@ def validate(
 def blend(network: SiameseNetwork, before: dict[str, Tensor], share: float) -> None:
     """Interpolate in place between the weights ``before`` (share 0) and the current ones (share 1).
 
-    Weights between those of a network and of its fine-tuned version forget less of the former and
-    keep most of what the latter has learned (WiSE-FT, Wortsman et al., CVPR 2022).
+    Interpolated weights keep most of what fine-tuning has learned, and forget less of what the
+    original network has learned (WiSE-FT, Wortsman et al., CVPR 2022).
     """
     after = network.state_dict()
     mixed = {

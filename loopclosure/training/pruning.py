@@ -43,8 +43,9 @@ def mean_couplings(network: SiameseNetwork, batches: Iterable[Tensor]) -> Tensor
 def lowest(activity: Tensor, fraction: float = 0.2) -> Tensor:
     """``(T, K)`` bool, the least active ``fraction`` of the capsules of each type.
 
-    The paper does not say how many capsules to remove from each type. The number is the same here,
-    so that one dense product still computes all types. Ties are broken by lower index.
+    The paper does not say how many capsules to remove from each type. Here the number is the same
+    for all types, so that one dense product still computes them together. Ties are broken by lower
+    index.
     """
     dropped = round(fraction * activity.shape[1])
     order = torch.argsort(activity, dim=1, stable=True)

@@ -25,15 +25,18 @@ class TrainSettings(BaseModel):
     )
     seed: int = Field(0, ge=0, description="Seed of weights, division, pairs and augmentation.")
     loss: Literal["bce", "bce+contrast"] = Field(
-        "bce", description="Eq. 3 alone, or with the contrast."
+        "bce", description="Cross entropy (Eq. 3) alone, or with InfoNCE."
     )
-    temperature: float = Field(0.07, gt=0, description="Temperature of the contrast.")
+    temperature: float = Field(0.07, gt=0, description="Temperature of InfoNCE.")
     learning_rate: float = Field(3e-4, gt=0, description="Learning rate of Adam. [paper]")
     extractor_rate: float = Field(
         1.0, ge=0, description="Factor for the learning rate of the extractor."
     )
     learned_share: float = Field(
-        1.0, gt=0, le=1, description="Share of the trained change of the weights that is kept."
+        1.0,
+        gt=0,
+        le=1,
+        description="Weight of the trained network in its average with the initial one.",
     )
     frozen: int = Field(0, ge=0, description="Number of first blocks of lite0 that stay fixed.")
     schedule: Literal["constant", "cosine"] = "constant"
@@ -57,12 +60,14 @@ class TrainSettings(BaseModel):
         6, ge=1, description="Epochs without a better validation AP before training stops."
     )
     hard_share: float = Field(
-        0.5, ge=0, le=1, description="Share of the pairs of different places that are mined."
+        0.5, ge=0, le=1, description="Share of the pairs of different places that come from mining."
     )
     mined_images: int = Field(
         4000, ge=2, description="Largest number of images embedded for mining."
     )
-    validation_share: float = Field(0.15, gt=0, lt=1, description="Share of the units.")
+    validation_share: float = Field(
+        0.15, gt=0, lt=1, description="Share of the units for validation."
+    )
     validation_images: int = Field(800, ge=2, description="Largest number of validation images.")
     augmentation: Augmentation = Augmentation()
     prune_share: float = Field(
@@ -87,15 +92,17 @@ _BEST = TrainSettings(
     validation_images=400,
 )
 PRESETS = {
-    # The settings of the paper, which does not state the augmentation strengths and the mining.
+    # The settings of the paper. The strengths of the augmentation and the mining are not stated
+    # there.
     "paper": TrainSettings(),
-    # Every image of a batch is compared with every other, under stronger changes. Most pairs show
-    # the same place, since the contrast takes different places from the other pairs. Half of a
-    # batch comes from one source, because different places look most similar within a source. Small
-    # batches, short epochs and little mining and validation suit the two cores of its training.
+    # The contrastive loss compares every image of a batch with every other image, and the
+    # augmentation is stronger. Most pairs show the same place, because this loss takes images of
+    # different places from the other pairs. Half of a batch comes from one source, because
+    # different places look most similar within a source. Small batches, short epochs and little
+    # mining and validation suit training on two cores.
     "best": _BEST,
-    # The same from ImageNet weights (--weights). Filters for edges and corners stay fixed, and the
-    # rest of the extractor learns slowly.
+    # The same settings for a start from ImageNet weights (--weights). Filters for edges and corners
+    # stay fixed, and the rest of the extractor learns slowly.
     "pretrained": _BEST.model_copy(
         update={
             "shape": CapsuleShape(extractor="lite0", pixels=129),

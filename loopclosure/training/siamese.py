@@ -29,12 +29,12 @@ def aligned(alike: Tensor, most: Tensor) -> Tensor:
     image are shifted to the left or right by up to half of their number, and each of these
     alignments has a cosine over the views that overlap. The result is the soft maximum of these
     cosines, because two alignments fit about equally well if the camera has turned by half the
-    spacing of the views or has driven on. It can slightly exceed 1. (Not in the paper, which
-    compares whole images only.)
+    spacing of the views or has driven on. The result can slightly exceed 1. (Not in the paper,
+    which compares whole images only.)
 
     Args:
-        alike: ``(..., V, V)`` scalar products of the views.
-        most: ``(..., V, V)`` products of their lengths.
+        alike: ``(..., V, V)`` scalar products of the views' descriptors.
+        most: ``(..., V, V)`` products of the lengths of the views' descriptors.
     """
     views = alike.shape[-1]
     v = torch.arange(views, device=alike.device)
@@ -188,7 +188,8 @@ def save_network(
         "shape": network.branch.shape.model_dump_json(),
         "about": json.dumps(about),
     }
-    # write_file replaces the file atomically, and others can read it, unlike a file of save_file.
+    # Unlike save_file, write_file replaces the file atomically and makes it readable by other
+    # users.
     write_file(path, save({k: v.cpu().contiguous() for k, v in tensors.items()}, metadata))
 
 

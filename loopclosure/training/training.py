@@ -175,7 +175,7 @@ def train(
             write_log(folder / "log.csv", progress.history)
     best, about = load_network(weights)
     best.to(torch_device)
-    if before is not None and "learned_share" not in about:  # else an earlier call blended it
+    if before is not None and "learned_share" not in about:  # else an earlier call has blended
         blend(best, before, settings.learned_share)
         about["learned_share"] = settings.learned_share
     figures = calibrated(best, about, collection, validation, settings, weights, torch_device)

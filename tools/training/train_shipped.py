@@ -18,11 +18,11 @@ from its checkpoint, so the same command continues everything; remove a folder t
 The eight stages of ``capsule`` and ``capsule-pruned`` took 58, 37, 51, 14, 44, 24, 10 and 0.5
 minutes on one core, four hours in total, without rendering the 16,600 images.
 
-New weights are not identical to the shipped ones. The shipped ones were also trained on frame 1500
-of KITTI 00, the first of the second range of test frames, which was excluded afterwards. Their
-stage 1 was stopped after 14 of its 16 epochs. Stages 4 and 6 ran with older code: stage 4 computed
-early features separately for each view, and stage 6 used the hard maximum over alignments. Stages 6
-and 7 started from weights in half precision.
+New weights are not identical to the shipped weights, which were made differently. They were also
+trained on frame 1500 of KITTI 00, the first of the second range of test frames, which was excluded
+afterwards. Stage 1 was stopped after 14 of its 16 epochs. Stages 4 and 6 ran with older code: stage
+4 computed early features separately for each view, and stage 6 used the hard maximum over
+alignments. Stages 6 and 7 started from weights in half precision.
 
 ``--paper`` trains the two stages of ``capsule-paper``, the network as the paper describes it, from
 random weights on eight of the towns. The settings are the preset ``paper`` in float32, with less
@@ -43,8 +43,8 @@ from pathlib import Path
 
 _HERE = Path(__file__).parent
 
-# First seed, lateral offsets in metres and turns in degrees of the second views, and the towns:
-# ROUTE:CHANGE, with + for --aliased.
+# First seed, ranges of the lateral offset (m) and of the turn (degrees) of the second views, and
+# the towns as ROUTE:CHANGE, with + for --aliased.
 _TOWNS = (
     (11, "-3.2:1.4", "0:30", "00:0.5 05:0.9 05:0.6+ 02:0.5 demo:1.0 "
                              "00:0.9+ 03:0.3 demo:0.5+ 02:0.95 05:0.3"),
@@ -54,7 +54,7 @@ _TOWNS = (
     (51, "-3.4:-2.0", "20:32", "05:0.0 00:0.1 05:0.3 02:0.2 03:0.2 "
                                "demo:0.4 05:0.5 00:0.4+ 02:0.6 05:0.1+"),
 )  # fmt: skip
-# All second views are in the other lane and turned by 30 degrees, in an unchanged town.
+# All second views are in the opposite lane and turned by 30 degrees, in an unchanged town.
 _VIEW = "view41"
 _VIEW_ARGUMENTS = "05 --seed 41 --pairs 160 --lateral=-3.2:-3.2 --heading 30:30"
 
@@ -88,8 +88,8 @@ class Stage:
         pairs: names of the folders of rendered pairs.
         threads: number of threads of ``vslam train``; None for its default.
         network: name of the network.
-        other_settings: name of the settings file, if it is not ``name``.
-        epochs: number of epochs, if it is not that of the settings.
+        other_settings: name of the settings file; empty if it is ``name``.
+        epochs: number of epochs; None for the number in the settings.
     """
 
     name: str

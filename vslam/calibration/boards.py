@@ -1,5 +1,5 @@
-"""Calibration boards: their geometry, the detection of their corners, and the recognition of
-another board than the expected one.
+"""Calibration boards: their geometry, the detection of their corners, and the recognition of a
+board that differs from the expected one.
 
 A board lies in the plane z = 0 of its frame. The frame of a checkerboard or ChArUco board has x to
 the right, y down and z away from the viewer; that of an AprilGrid is Kalibr's, with y up and z
@@ -35,17 +35,20 @@ _BORDERS = (2, 1)  # black bits around a tag: Kalibr prints 2, most other progra
 _SEARCHED_PX = 960  # longer side of the image in which a checkerboard is searched
 _REACH_PX = (2, 6)  # least and greatest half width of the window in which a corner is refined
 
-# To recognise a board. A few false tags and a small false checkerboard appear in any image of
-# houses, so it takes more tags than that, or the same checkerboard in two images.
+# An unknown board is recognised by at least this many tags, or by the same checkerboard in two
+# images, because images of houses often give a few false tags and a small false checkerboard.
 _RECOGNISED_TAGS = 6
-_TRIED_TAGS = 50  # the first of a dictionary tell its family, many times faster than all
-_SIZES = (50, 100, 250, 1000)  # of the dictionaries of a family; each begins with the smaller ones
+# The family of a dictionary is found by its first tags, many times faster than by all of them.
+_TRIED_TAGS = 50
+# Numbers of tags of a family's dictionaries; each dictionary begins with the tags of the smaller.
+_SIZES = (50, 100, 250, 1000)
 # The largest dictionary of each family, and the black bits around its tags.
 _FAMILIES = tuple((f"{n}X{n}_1000", 1) for n in (4, 5, 6, 7))
 _FAMILIES += (("ARUCO_ORIGINAL", 1), *((_TAGS, border) for border in _BORDERS))
 _MOST_COLUMNS = 40
 _OFF_PLACE = 0.2  # largest distance of a tag from its place in the layout, in squares
-_SAME_RATIO = 0.12  # relative error of the measured marker / square, which blur decreases
+# Relative error of the measured ratio of marker to square. Blur makes markers look smaller.
+_SAME_RATIO = 0.12
 
 
 @dataclass(frozen=True)
@@ -129,7 +132,7 @@ def read_board(path: Path) -> Board:
         names, marker = ("targetCols", "targetRows"), 0.0
         square = document.number("colSpacingMeters")
         if square != document.number("rowSpacingMeters"):
-            raise InputError(f"{path}: the fields of the board are not square; use another board.")
+            raise InputError(f"{path}: the board's fields are not square; use a board of squares.")
     else:
         raise InputError(
             f"{path}: the target_type {kind} is unknown; use an aprilgrid or a checkerboard."
@@ -163,8 +166,9 @@ def find_corners(board: Board, image: Image, name: str = "") -> View | None:
 def same_order(board: Board, left: View, right: View) -> View:
     """The right view, with its corners numbered like those of the left one.
 
-    A checkerboard that looks the same upside down may be numbered from either end. The numbering
-    under which the two images look most alike is the same one in both.
+    The corners of a checkerboard that looks the same upside down may be numbered from either end.
+    With the correct numbering, the distances between corresponding corners of the two images vary
+    least.
     """
     if board.kind != "checkerboard":
         return right
@@ -175,8 +179,8 @@ def same_order(board: Board, left: View, right: View) -> View:
 
 
 def other_board(board: Board, images: Sequence[Image]) -> str:
-    """A clause that names the board in ``images`` and the options that describe it; empty if it is
-    ``board``, or if no board is recognised."""
+    """A clause for an error message that names the board in ``images`` and the options that
+    describe it; empty if the images show ``board``, or if no board is recognised."""
     small = [_reduced(image)[0] for image in images]
     found = _recognised_tags(small) or _recognised_checkerboard(small)
     if found is None:
@@ -184,7 +188,8 @@ def other_board(board: Board, images: Sequence[Image]) -> str:
     if found.kind == board.kind and found.columns == board.columns:  # some rows may be out of view
         found = replace(found, rows=max(found.rows, board.rows))
     given, tags = (_dictionary(each.dictionary).bytesList for each in (board, found))
-    if found.kind != "charuco" or np.array_equal(given[: len(tags)], tags):  # it contains them
+    # The dictionary of ``board`` is right if it begins with the tags of the recognised one.
+    if found.kind != "charuco" or np.array_equal(given[: len(tags)], tags):
         found = replace(found, dictionary=board.dictionary)
     ratio = found.marker / found.square
     same_layout = replace(found, square=board.square, marker=board.marker) == board
@@ -208,7 +213,8 @@ def _checkerboard(board: Board, image: Image) -> tuple[NDArray[np.int64], Array]
 
 
 def _reduced(image: Image) -> tuple[Image, float]:
-    """An image small enough to find a checkerboard quickly, and by what factor it is smaller."""
+    """The image at a size at which a checkerboard is found quickly, and the factor by which it was
+    reduced."""
     times = max(1.0, max(image.shape) / _SEARCHED_PX)
     small = cv2.resize(image, None, None, 1 / times, 1 / times, cv2.INTER_AREA)
     return cast("Image", small), times
@@ -236,8 +242,8 @@ def _aprilgrid(board: Board, image: Image) -> tuple[NDArray[np.int64], Array] | 
         if np.count_nonzero(known) >= _FEWEST_TAGS:
             ids = (4 * numbers[known, None] + np.arange(4)).ravel()
             at, plane = xy[known].reshape(-1, 2), np.add(board_points(board), [0, 0, 1])
-            # Unlike Kalibr, most programs print the tags upright, so that corners 0 and 2 swap:
-            # their order is the one that an affine map of the grid to the image fits best.
+            # Most programs print the tags upright. Kalibr turns them, which swaps corners 0 and 2.
+            # The correct order is the one with which an affine map fits the image better.
             error = [np.linalg.lstsq(plane[each], at)[1].sum() for each in (ids, ids ^ 2)]
             return ids if error[0] <= error[1] else ids ^ 2, at
     return None
@@ -246,8 +252,9 @@ def _aprilgrid(board: Board, image: Image) -> tuple[NDArray[np.int64], Array] | 
 def _find_tags(
     image: Image, dictionary: str, border: int, most: int | None = None
 ) -> tuple[NDArray[np.int64], Array]:
-    """The numbers, ``(N,)``, and corners, ``(N, 4, 2)`` pixels, of those of the first ``most`` tags
-    of a dictionary that an image shows."""
+    """Find tags of a dictionary in an image; returns their numbers ``(N,)`` and corners
+    ``(N, 4, 2)`` in pixels. With ``most``, only the first ``most`` tags of the dictionary are
+    searched for."""
     tags, parameters = _dictionary(dictionary), cv2.aruco.DetectorParameters()
     tags.bytesList, parameters.markerBorderBits = tags.bytesList[:most], border
     corners, numbers, _ = cv2.aruco.ArucoDetector(tags, parameters).detectMarkers(image)
@@ -320,8 +327,8 @@ def _recognised_tags(images: Sequence[Image]) -> Board | None:
 def _layout(
     kind: Kind, first: int, columns: int, family: str, numbers: NDArray[np.int64], xy: Array
 ) -> tuple[int, Board | None]:
-    """How many tags fit a board with this number of columns whose tag 0 is in column ``first`` of
-    the first row, and the board; None if few fit."""
+    """Fit a board with this number of columns, and with tag 0 in column ``first`` of the first row.
+    Returns the number of tags that fit and the board; 0 and None if too few tags fit."""
     step = 2 if kind == "charuco" else 1  # a ChArUco board has a tag on every other square
     squares = np.indices((step * numbers.max() // columns + 2, columns)).sum(axis=0)
     at = np.argwhere(squares % step == first)[numbers, ::-1].astype(np.float64)

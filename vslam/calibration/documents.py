@@ -18,7 +18,7 @@ from vslam.calibration.models import Array
 from vslam.errors import InputError
 
 _HEADER = re.compile(r"\A\ufeff?%YAML[: ]1\.\d.*\n?")
-_MOST_BYTES = 100_000  # parsed within two seconds; a calibration file has about 5,000
+_MOST_BYTES = 100_000  # takes two seconds to parse; a calibration file has about 5,000 bytes
 _MOST_STEPS = 10_000  # lists and numbers at one key
 _NO_SPACE = re.compile(r"^(\s*[\w.]+):(?=\[)", re.MULTILINE)
 
@@ -57,7 +57,8 @@ class Document:
         return self._numbers(key, "one number", 1)[0]
 
     def numbers(self, key: str, *counts: int) -> tuple[float, ...]:
-        """The numbers at a key, flattened; their number must be one of ``counts``, if given."""
+        """The numbers at a key, flattened. If ``counts`` are given, there must be as many numbers
+        as one of them."""
         wanted = " or ".join(map(str, counts))
         return self._numbers(key, f"{wanted} numbers" if counts else "numbers", *counts)
 

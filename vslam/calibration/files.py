@@ -1,4 +1,4 @@
-"""Reading calibration files, whose format is recognised by their keys, and writing our own."""
+"""Reads calibration files, whose format is recognised by their keys, and writes vslam's own."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from vslam.calibration.formats import (
     read_ros,
 )
 from vslam.calibration.models import Calibration, CameraModel
-from vslam.errors import InputError, ResultsError
+from vslam.errors import InputError, write_file
 
 _Reader = Callable[[Sequence[Document], Size | None], Calibration]
-# The keys of each format, its reader and the largest number of its files. The first format with all
-# its keys in one file is used.
+# For each format: keys by which it is recognised, its reader, and the largest number of files. The
+# first format whose keys are all in one file is used.
 _FORMATS: tuple[tuple[set[str], _Reader, int], ...] = (
     ({"left"}, read_own, 1),
     ({"cam0"}, read_kalibr, 1),
@@ -66,7 +66,7 @@ def read_calibration(files: Sequence[Path | str], size: Size | None = None) -> C
             if len(documents) > most:
                 raise InputError(
                     f"--calib {paths[most]}: is one file too many; this format has "
-                    f"{'one' if most == 1 else 'at most two'}, so leave the others out."
+                    f"{'one file' if most == 1 else 'at most two files'}; leave the others out."
                 )
             return reader(documents, size)
     there = ", ".join(" ".join(key.split())[:20] for key in sorted(documents[0].values)[:6])
@@ -88,12 +88,7 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
         lines += ["right:", *_camera_lines(calibration.right)]
         lines += ["T_left_right:  # maps points of the right camera to the left one; metres"]
         lines += [f"  - {row}" for row in calibration.T_left_right.tolist()]
-    try:
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise ResultsError(
-            f"{path}: cannot be written ({error.strerror}); name another file with --out."
-        ) from error
+    write_file(path, "\n".join(lines) + "\n", "name another file with --out")
 
 
 def _camera_lines(model: CameraModel) -> list[str]:

@@ -1,9 +1,9 @@
-"""Readers of the calibration formats, which docs/howto/cameras.md describes.
+"""Readers of the calibration formats that docs/howto/cameras.md describes.
 
-Each is a few lines that call the same helpers. The formats are documented in Kalibr's wiki (yaml
-formats), OpenCV's samples ``stereo_calib.cpp`` and ``camera_calibration.cpp``,
-the ASL dataset format of EuRoC (Burri et al., IJRR 2016), ROS's ``sensor_msgs/CameraInfo``, the
-settings files of ORB-SLAM2 and ``Calibration_Tutorial.pdf`` of ORB-SLAM3.
+The formats are documented in Kalibr's wiki (yaml formats), OpenCV's samples ``stereo_calib.cpp``
+and ``camera_calibration.cpp``, the ASL dataset format of EuRoC (Burri et al., IJRR 2016), ROS's
+``sensor_msgs/CameraInfo``, the settings files of ORB-SLAM2 and ``Calibration_Tutorial.pdf`` of
+ORB-SLAM3.
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ _PAIR_KEYS = ("T_left_right", "baseline", "right_delay")
 _DEPTH_KEYS = ("depth_scale", "virtual_baseline")
 _OWN_KEYS = {"left", "right", *_PAIR_KEYS, *_DEPTH_KEYS}
 _OWN_CAMERA_KEYS = {"lens", "size", "focal", "centre", "distortion"}
-_OFF_CENTRE = 0.2  # of the image size; images of half the resolution give 0.5, of twice it 0.25
+# Largest plausible distance of the principal point from the middle, as a share of the image size.
+# A calibration for images of twice the size gives 0.5, one for half the size 0.25.
+_OFF_CENTRE = 0.2
 _ROUNDED = 1e-3  # tolerance of rotations, whose numbers are rounded in files
 _LONGEST_DELAY_S = 0.1  # between the two images of a pair
 
@@ -138,8 +140,8 @@ def read_ros(documents: Sequence[Document], size: Size | None) -> Calibration:
     P = right.matrix("P", 3, 4)
     if P[0, 3] == 0 and "P" in left and left.matrix("P", 3, 4)[0, 3] != 0:
         raise InputError(
-            f"{_sources(documents)}: the sides seem swapped, because the projection matrix of the "
-            "first camera contains the baseline, not that of the second; name the left camera "
+            f"{_sources(documents)}: the sides seem swapped, because the baseline is in the "
+            "projection matrix of the first camera instead of the second; name the left camera "
             "first, with --topics or --calib."
         )
     T_left_right = _unrectified(left.matrix("R", 3, 3), right.matrix("R", 3, 3), P, right.source)
@@ -148,7 +150,8 @@ def read_ros(documents: Sequence[Document], size: Size | None) -> Calibration:
 
 def read_opencv(documents: Sequence[Document], size: Size | None) -> Calibration:
     """Read what OpenCV's samples write: ``camera_matrix``, or ``M1 D1 M2 D2 R T`` in one file or
-    two. ``K1``, or ``cameraMatrix1`` and ``distCoeffs1`` as in OpenCV's manual, are read too."""
+    two. The names ``K1``, or ``cameraMatrix1`` and ``distCoeffs1`` as in OpenCV's manual, are also
+    accepted."""
     source = _sources(documents)
     document = Document(source, {k: v for each in documents for k, v in each.values.items()})
     lens: Lens = "fisheye" if _flag(document, "fisheye_model") else "pinhole"
@@ -241,8 +244,8 @@ def _matrix_camera(
     elif max(abs(c / n - 0.5) for c, n in zip(numbers[2:], size, strict=True)) > _OFF_CENTRE:
         raise InputError(
             f"{source}: the principal point ({numbers[2]:.1f}, {numbers[3]:.1f}) is far from the "
-            f"centre of the {size[0]}x{size[1]} images; give a calibration made at this resolution "
-            "and orientation, or add image_width and image_height if it was."
+            f"centre of the {size[0]}x{size[1]} images; give a calibration for this resolution and "
+            "orientation, or, if this one is correct, add image_width and image_height to it."
         )
     return _camera(source, lens, tuple(map(float, numbers)), document.numbers(D), size)
 

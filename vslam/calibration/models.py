@@ -19,7 +19,7 @@ Lens = Literal["pinhole", "fisheye"]
 N_COEFFICIENTS: dict[Lens, tuple[int, ...]] = {"pinhole": (0, 4, 5, 8), "fisheye": (4,)}
 _NEWTON_STEPS = 30
 _OUTWARD = np.linspace(0.0, 1.0, 17)  # fractions of the way from the axis to a ray
-_SOLVED_PX = 1e-3  # an unprojected pixel must come back this close
+_SOLVED_PX = 1e-3  # largest distance between a pixel and the projection of its unprojected ray
 
 
 @dataclass(frozen=True)
@@ -56,11 +56,12 @@ class Calibration:
 
     Attributes:
         left: the left camera, or the only one.
-        right: the right camera, or None.
+        right: the right camera; None for a single camera.
         T_left_right: ``(4, 4)`` float64, maps points of the right camera to the left one; None
             without a right camera.
         depth_scale: value of a depth pixel at one metre; None if the file has none.
-        virtual_baseline: metres, converts depth to disparity; None if the file has none.
+        virtual_baseline: baseline in metres by which depth is converted to disparity; None if the
+            file has none.
         right_delay: seconds by which the right image is taken later than the left one.
         source: file or files that it was read from, for error messages.
     """
@@ -101,8 +102,8 @@ def project(model: CameraModel, rays: Array) -> Array:
 def unproject(model: CameraModel, xy: Array) -> Array:
     """Unit rays ``(N, 3)`` float64 of ``(N, 2)`` pixels.
 
-    NaN where the distortion cannot be inverted: Newton's method does not converge, or the
-    distortion folds the image between the principal point and the pixel.
+    The ray of a pixel is NaN if the distortion cannot be inverted there: Newton's method does not
+    converge, or the distortion folds the image between the principal point and the pixel.
     """
     plane = (xy - (model.cx, model.cy)) / (model.fx, model.fy)
     if model.lens == "fisheye":

@@ -22,8 +22,9 @@ from vslam.errors import InputError
 
 Pixels = TypeVar("Pixels", bound=NDArray[np.generic])
 
-# At 60 degrees off the axis a pinhole image is stretched four times as much as at its centre; a
-# wider view would magnify the border and shrink the centre even more.
+# Largest half field of view of a rectified image. At 60 degrees off the axis, a pinhole image is
+# stretched four times as much as at its centre; a wider view would enlarge the border and shrink
+# the centre even more.
 _MAX_HALF_VIEW = np.tan(np.radians(60.0))
 _FARTHEST_M = 20.0  # longest baseline
 _SAME = 1e-5  # radians; rows then agree to 0.02 px at focal lengths below 2000 px
@@ -41,8 +42,9 @@ class Rectification:
         left, right: map ``(H, W)`` uint8 images of the calibrated size to rectified ones of the
             left camera's size, bilinearly. Images that need no rectification are returned
             unchanged; without a right camera, ``right`` returns every image unchanged.
-        left_depth: the same for depth images of any type, by nearest neighbour. It is valid only
-            for a camera that is not turned, since depth is measured along the camera's own axis.
+        left_depth: the same for depth images of any type, by nearest neighbour. It is valid only if
+            rectification does not turn the camera, because depth is measured along the camera's
+            axis.
         identity: whether images are returned unchanged.
     """
 
@@ -132,8 +134,8 @@ def _between(R_left_right: Array, centre: Array, source: str) -> Array:
     if baseline > _FARTHEST_M:
         raise InputError(
             f"{source}: the cameras are {baseline:.4g} m apart, probably because the translation "
-            "between them is in millimetres or centimetres; write it in metres (a checkerboard "
-            "calibration has the unit of the squares)."
+            "between them is in millimetres or centimetres; write it in metres (a calibration with "
+            "a checkerboard has the unit in which the size of the squares was given)."
         )
     x = centre / baseline
     across = float(half[:, 0] @ x)
@@ -175,11 +177,14 @@ def _common_view(source: str, cameras: list[tuple[CameraModel, Array]], baseline
 
 
 def _inner_rectangle(model: CameraModel, R_own_rectified: Array, source: str) -> Array:
-    """Opposite corners ``[[x0, y0], [x1, y1]]``, on the plane z = 1 of the rectified camera, of a
-    rectangle that the image covers: each side touches a border of the image at the pixel nearest to
-    the centre.
+    """A rectangle on the plane z = 1 of the rectified camera that the image covers: each side
+    touches a border of the image at the pixel nearest to the centre.
 
-    The distortion polynomial of a wide lens may fold the corners of the image, which are ignored.
+    The distortion polynomial of a wide lens may fold the corners of the image, so pixels in the
+    corners that cannot be unprojected are ignored.
+
+    Returns:
+        ``[[x0, y0], [x1, y1]]``, two opposite corners of the rectangle.
     """
     found = []
     for k, border in enumerate(_borders(model.width, model.height)):
@@ -195,7 +200,7 @@ def _inner_rectangle(model: CameraModel, R_own_rectified: Array, source: str) ->
 
 
 def _check_view(model: CameraModel, R_own_rectified: Array, camera: Camera, source: str) -> None:
-    """Refuse a view parts of which the image shows twice or not at all."""
+    """Refuse a rectified view of which the image shows some part twice or not at all."""
     xy = np.concatenate(_borders(camera.width, camera.height))
     rays = camera.backproject(xy, np.ones(len(xy))) @ R_own_rectified.T
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -224,7 +229,7 @@ def _folded(source: str) -> InputError:
 
 
 def _maps(model: CameraModel, R_own_rectified: Array, camera: Camera) -> NDArray[np.float32]:
-    """``(H, W, 2)`` float32, for each rectified pixel its position in the original image."""
+    """``(H, W, 2)`` float32, the position of each rectified pixel in the original image."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     rays = np.stack(
         [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1

@@ -27,7 +27,7 @@ _Fit = TypeVar("_Fit", "CameraFit", "PairFit")
 _MOST_FRAMES = 60
 _FEWEST_VIEWS = 3  # for 8 unknowns of the camera and 6 of each view
 _OUTLIER = 3.0  # times the median error of all views
-_NO_FIT = 0.01  # RMS in image widths, above which the corners are those of another board
+_NO_FIT = 0.01  # in image widths; with a larger RMS error, the corners are those of another board
 _FEWEST_COMMON = 6  # corners that both images of a pair show
 _SAME_VIEW = 0.02  # in image sizes; the board is at rest if its outline moves less
 
@@ -108,7 +108,7 @@ def estimate(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], lens:
     seen = [sum(views[side] is not None for views in frames) for side in range(len(sizes))]
     if not any(seen):
         raise InputError(
-            f"no {board} in any of {len(frames)} images; no other board is recognised either, so "
+            f"no {board} in any of {len(frames)} images, and no other board that vslam recognises; "
             "check that this is the right video or folder and that the board is sharp and complete."
         )
     if not all(seen):
@@ -126,10 +126,11 @@ def estimate(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], lens:
 
 
 def diverse(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], n: int) -> list[Frame]:
-    """Select at most ``n`` frames in which the board is in places that differ most.
+    """Select at most ``n`` frames in which the places of the board differ most.
 
-    Each frame selected is the one farthest from those selected before. A board at rest is selected
-    once, and frames without the board are left out.
+    Farthest-point selection: the next frame is the one whose outlines of the board differ most from
+    those of all frames selected before. A board at rest is selected once, and frames without the
+    board are left out.
     """
     frames = [views for views in frames if any(views)]
     outlines = np.array(
@@ -144,8 +145,8 @@ def diverse(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], n: int
 
 
 def _outline(board: Board, view: View | None, size: Size) -> Array:
-    """The corners of the board's outline, ``(8,)`` in image sizes. A homography finds those that
-    are out of view; they count as at most half an image away."""
+    """The four corners of the board's outline, ``(8,)`` in image sizes, from a homography, because
+    some may be out of view. They are clipped to half an image size beyond the image."""
     points = board_points(board)[:, :2]
     H = None if view is None else cv2.findHomography(points[view.ids], view.xy)[0]
     if H is None:
@@ -230,8 +231,8 @@ def fit_pair(board: Board, left: CameraFit, right: CameraFit) -> PairFit:
                 both = View(view.name, view.ids[common], view.xy[common])
                 pairs.append((both, T_left_board, T_right_board @ inverse(T_left_board)))
 
-    # cv2.fisheye.stereoCalibrate needs the same number of corners in every view, which a board that
-    # is partly out of view does not have.
+    # cv2.fisheye.stereoCalibrate is not used, because it needs the same number of corners in every
+    # view, and the board may be partly out of view.
     def fit(kept: Sequence[int]) -> PairFit:
         def residuals(T_right_left: Array) -> list[Array]:
             return [
@@ -258,7 +259,8 @@ def fit_pair(board: Board, left: CameraFit, right: CameraFit) -> PairFit:
 def _without_outliers(
     names: Sequence[str], fit: Callable[[Sequence[int]], _Fit], found_in: str, fix: str
 ) -> _Fit:
-    """Fit the named views, and repeat it without those whose error is large until none is.
+    """Fit the named views, and repeat the fit without the views with large errors until no error is
+    large.
 
     Raises:
         InputError: too few views are left; ``found_in`` and ``fix`` are parts of the message.

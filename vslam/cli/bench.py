@@ -105,8 +105,8 @@ def bench(
     check_disk(needed, out)
     setup.console.announce(
         f"{counted(len(cells), 'run')}, {len(missing)} to do: about {duration(needed.seconds)} "
-        f"with {jobs} at a time ({needed.basis}), {size(needed.kept)} in {out} and another "
-        f"{size(needed.scratch)} until the end"
+        f"with {jobs} at a time ({needed.basis}), {size(needed.kept)} in {out} and "
+        f"{size(needed.scratch)} of temporary files"
     )
     stopped = False
     try:

@@ -27,8 +27,8 @@ _EXAMPLES = """
   vslam calibrate pair.mkv --side-by-side --board charuco --size 7x5 --square 0.04 --marker 0.03
   vslam calibrate cam_april/mav0 --board april_6x6.yaml --lens fisheye --out stereo.yaml
 """
-_MOST_SEARCHED = 300  # images, spread evenly; the search takes a minute or two
-_EXAMINED = 10  # images in which another board is looked for
+_MOST_SEARCHED = 300  # images, spread evenly over the source; this takes a minute or two
+_EXAMINED = 10  # images in which other boards are searched for, if the given one is not found
 
 app = typer.Typer()
 
@@ -38,40 +38,66 @@ app = typer.Typer()
 def calibrate(
     given: SourceOptions,
     board: Annotated[
-        str, option("Board", "KIND|FILE", "checkerboard, charuco, aprilgrid, or a Kalibr target.")
+        str,
+        option(
+            "Board",
+            "KIND|FILE",
+            "Kind of board: checkerboard, charuco or aprilgrid; or a target file of Kalibr.",
+        ),
     ],
     size: Annotated[
-        str, option("Board", "COLUMNSxROWS", "Inner corners, squares (charuco), tags (aprilgrid).")
+        str,
+        option(
+            "Board",
+            "COLUMNSxROWS",
+            "Number of inner corners of a checkerboard, of squares of a ChArUco board, or of tags "
+            "of an AprilGrid.",
+        ),
     ] = "",
     square: Annotated[
         float | None,
         option(
             "Board",
             "METRES",
-            "Side of a square; for an AprilGrid, the distance from one tag to the next. A single "
-            "camera that films a checkerboard does not need it.",
+            "Side of a square; for an AprilGrid, the distance from the edge of a tag to the same "
+            "edge of the next one. Not needed for a single camera and a checkerboard.",
         ),
     ] = None,
     marker: Annotated[
-        float | None, option("Board", "METRES", "Side of a marker or tag, without white border.")
+        float | None,
+        option("Board", "METRES", "Side of a marker or tag, without its white border."),
     ] = None,
     dictionary: Annotated[
-        str, option("Board", "NAME", "Markers of a ChArUco board: OpenCV's name without DICT_.")
+        str,
+        option(
+            "Board",
+            "NAME",
+            "Dictionary of a ChArUco board's markers: OpenCV's name without DICT_.",
+        ),
     ] = "5X5_1000",
     lens: Annotated[
         Literal["pinhole", "fisheye"],
         option(
             METHOD,
             "pinhole|fisheye",
-            "[b]pinhole[/b] has radial-tangential distortion; [b]fisheye[/b] is equidistant, for "
-            "angles of view above about 120 degrees.",
+            "Camera model: [b]pinhole[/b] with radial-tangential distortion, or [b]fisheye[/b] "
+            "(equidistant) for fields of view above about 120 degrees.",
         ),
     ] = "pinhole",
     out: Annotated[
-        Path, option(OUTPUT, "FILE", "Calibration to write, and its page; renames earlier ones.")
+        Path,
+        option(
+            OUTPUT,
+            "FILE",
+            "Calibration file to write; a page with residuals is written beside it. Existing files "
+            "are renamed.",
+        ),
     ] = Path("calibration.yaml"),
 ) -> None:
-    """Calibrate a camera or stereo pair from images of a board; exit code 1 if it is doubtful."""
+    """Calibrate a camera or stereo pair from images of a board.
+
+    The exit code is 1 if the calibration has faults.
+    """
     from vslam.calibration.boards import other_board
     from vslam.calibration.files import write_calibration
     from vslam.calibration.solve import estimate
@@ -80,11 +106,13 @@ def calibrate(
     from vslam.doctor.findings import lines
 
     if given.sensor == "rgbd":
-        raise InputError("--sensor rgbd: depth is not calibrated; give mono or stereo.")
+        raise InputError("--sensor rgbd: depth cameras cannot be calibrated; give mono or stereo.")
     _check_place(out)
     raw = open_raw(given)
     if raw.live and given.max_frames is None:
-        raise InputError(f"{given.data}: a camera never ends; give --max-frames, such as 300.")
+        raise InputError(
+            f"{given.data}: the images of a live camera never end; give --max-frames, such as 300."
+        )
     stereo = len(raw.sizes) == 2
     made = _board(board, size, square, marker, dictionary.upper(), stereo=stereo)
     frames, examined = _search(raw, made)
@@ -115,7 +143,11 @@ def calibrate(
 
 
 def _check_place(out: Path) -> None:
-    """Refuse, before any work, a file that cannot be written or that another program made."""
+    """Check, before any work, that a calibration can be written to a file.
+
+    Raises:
+        InputError: the file cannot be written, is not YAML, or is another program's.
+    """
     from vslam.calibration.documents import read_document
     from vslam.maps.new_output import require_place
 
@@ -127,7 +159,8 @@ def _check_place(out: Path) -> None:
 
 
 def _keep_earlier(*files: Path) -> None:
-    """Rename the files of an earlier calibration, with the first number that is free for all."""
+    """Rename the files of an earlier calibration: ``a.yaml`` to ``a-1.yaml``, or to ``a-2.yaml``
+    if one of the files already has a renamed file with the number 1, and so on."""
     for n in count(1):
         kept = {path: path.with_stem(f"{path.stem}-{n}") for path in files}
         if not any(path.exists() for path in kept.values()):
@@ -175,7 +208,13 @@ def _board(
 
 
 def _frames(raw: RawSource, most: int) -> Iterator[TimedFrame]:
-    """Frames of a source up to where it breaks off; ``most``, evenly spread, of a longer one."""
+    """Yield the frames of a source, or about ``most`` evenly spread ones if it has more.
+
+    If the source breaks off, print a warning and end after the last frame that could be read.
+
+    Raises:
+        BrokenSourceError: not even the second frame can be read.
+    """
     every = -(-(raw.n_expected or 1) // most)
     n = 0
     try:
@@ -189,7 +228,7 @@ def _frames(raw: RawSource, most: int) -> Iterator[TimedFrame]:
 
 
 def _search(raw: RawSource, board: Board) -> tuple[list[Frame], list[Image]]:
-    """Search images for the board; return what each shows, and some of the left images."""
+    """Search images for the board; return the views of each frame, and some of the left images."""
     from vslam.calibration.boards import find_corners, same_order
 
     total = min(raw.n_expected or _MOST_SEARCHED, _MOST_SEARCHED)

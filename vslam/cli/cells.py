@@ -1,4 +1,7 @@
-"""The systems and the data of the cells of ``vslam bench`` and ``vslam stress``."""
+"""The systems and the data that ``vslam bench`` and ``vslam stress`` test.
+
+A cell is one run: a sequence, a perturbation, a seed and a system.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,7 @@ class Systems:
 
     Attributes:
         detectors: loop detectors of vslam.
-        weights: weight files of some of them.
+        weights: weight files by detector, for detectors that do not use the shipped weights.
         others: command templates of other systems by name (:mod:`vslam.lab.stress.external`).
     """
 
@@ -53,7 +56,7 @@ def choose_systems(
     """The systems that the options name.
 
     Raises:
-        InputError: no system is named, one is unknown, or a file that it needs is missing.
+        InputError: no system is named, or a named system is unknown or lacks a file.
     """
     from vslam.loopclosure.registry import parse_weights, require_detector
 
@@ -111,7 +114,8 @@ class Cells:
 
     Attributes:
         kind: kind of data.
-        given: options of the data, with absolute paths, because each run has its own folder.
+        given: options of the data; paths are absolute, because each run has its own working
+            folder.
         systems: the systems to test.
         sequences: the opened sequences by name.
         options: settings that all cells share.
@@ -252,7 +256,7 @@ def _open_all(
 ) -> dict[str, Source]:
     """Open every sequence by name, so that missing data is reported before the first run.
 
-    Synthetic sequences are rendered here, because two runs must not render the same one.
+    Synthetic sequences are rendered here, so that parallel runs do not render the same one.
     """
     from vslam.datasets.sources import LIVE
     from vslam.lab.bench.grid import parse_sequences

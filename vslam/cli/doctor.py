@@ -52,9 +52,8 @@ def doctor(
     """Check images, calibration and time stamps before a run; the exit code is 1 if there is a
     fault."""
     from vslam.datasets.frames import first_frames
-    from vslam.doctor.examine import Diagnosis, examine
+    from vslam.doctor.examine import Diagnosis, examine, write_page
     from vslam.doctor.findings import Finding, lines
-    from vslam.doctor.page import write_page
 
     require_data(given)
     thresholds = read_thresholds(config)
@@ -75,6 +74,7 @@ def doctor(
 
 
 def _free(path: Path) -> Path:
-    """The path itself, or with the first number that gives a path that does not exist."""
+    """The path if it does not exist, else the first of ``doctor-2.html``, ``doctor-3.html``, ...
+    that does not exist."""
     numbered = (path.with_stem(f"{path.stem}-{n}") for n in count(2))
     return next(one for one in chain((path,), numbered) if not one.exists())

@@ -62,7 +62,7 @@ def drive(
     from vslam.cli.tables import print_summary
     from vslam.doctor.nothing_tracked import why_nothing_was_tracked
     from vslam.report.folder import write_results
-    from vslam.run.autosave import MAP, FolderAutosave, remove_autosave
+    from vslam.run.autosave import MAP, Autosave, remove_autosave
     from vslam.run.moments import LoopPictureRecorder, MomentRecorder
     from vslam.run.pipeline import begin, run_sequence
 
@@ -80,7 +80,7 @@ def drive(
         recorder = _recorder(folder, output, unfinished, viewer, moments, pictures)
         # Localising does not change the map, so there is nothing to save during the run.
         period = 0.0 if options.localize else options.autosave
-        autosave = FolderAutosave(folder, period, f"{source.dataset} {source.name}")
+        autosave = Autosave(folder, period, f"{source.dataset} {source.name}")
         with console.progress_bar(source.n_expected) as on_frame:
             outcome = run_sequence(
                 source, perturbation, settings, recorder,
@@ -110,14 +110,18 @@ def drive(
         raise ResultsError(f"{folder}: ended early: {outcome.interrupted}{fix}.")
     if gps_error and not why:
         raise ResultsError(
-            f"{folder}: no trajectory by GPS, all other results are there: {gps_error}"
+            f"{folder}: no trajectory by GPS, all other results were written: {gps_error}"
         )
     if why or outcome.interrupted:
         raise typer.Exit(1)
 
 
 def _open(options: RunOptions, console: Console) -> tuple[Source, Perturbation]:
-    """Open the images and bind the perturbation to them; refuse laws that need other data."""
+    """The images and their perturbation.
+
+    Raises:
+        InputError: the images cannot be read, or lack data that the perturbation needs.
+    """
     from vslam.datasets.perturbation import parse_perturbation
 
     perturbation = parse_perturbation(options.perturb, options.seed)
@@ -127,7 +131,7 @@ def _open(options: RunOptions, console: Console) -> tuple[Source, Perturbation]:
 
 
 def _fixes(path: Path, antenna: tuple[float, ...] | None, source: Source) -> Fixes:
-    """The GPS fixes of ``--gps``; they must overlap with the images in time."""
+    """The GPS fixes of ``--gps``, which must overlap with the images in time."""
     from vslam.datasets.fixes import read_fixes, require_overlap
 
     fixes = read_fixes(path, antenna)
@@ -136,7 +140,8 @@ def _fixes(path: Path, antenna: tuple[float, ...] | None, source: Source) -> Fix
 
 
 def _georeferenced(outcome: RunOutcome, fixes: Fixes) -> tuple[RunOutcome, str]:
-    """The outcome with the georeferenced trajectory, and an error message, empty on success."""
+    """The outcome with the georeferenced trajectory, and an error message that is empty on
+    success."""
     from vslam.plugins import reason
     from vslam.run.gps import locate
 
@@ -163,11 +168,10 @@ def _refuse_live_source(source: Source, resume: Path | None) -> None:
 def _unfinished(
     options: RunOptions, source: Source, resume: Path | None, lock: ExitStack
 ) -> Unfinished | None:
-    """The saved state of the run to resume, None for a new run.
+    """The saved state of the run to resume; None for a new run.
 
     Raises:
-        InputError: the images are of another camera than the map that is continued, or there is no
-            saved state.
+        InputError: there is no saved state, or the map to continue was made with another camera.
     """
     from vslam.run.autosave import find_unfinished, lock_run
     from vslam.run.pipeline import require_camera

@@ -50,7 +50,8 @@ def evaluate_files(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="times.txt of the sequence, to compare a KITTI file with a TUM file.",
+            help="times.txt of the sequence, which the comparison of a KITTI file with a TUM file "
+            "needs.",
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,

@@ -37,7 +37,12 @@ RunOrFile = Annotated[
 ]
 Data = Annotated[
     str | None,
-    option(INPUT, "DATA", "The run's images, if they have moved.", unset="where the run read them"),
+    option(
+        INPUT,
+        "DATA",
+        "Images of the run, if they were moved since.",
+        unset="where the run read them",
+    ),
 ]
 Link = Annotated[
     bool, flag(OUTPUT, "Link to the images of the data set instead of copying them.", "--link")
@@ -142,7 +147,7 @@ def g2o(
     from vslam.maps.new_output import new_output
 
     graph, map_ = _graph(run)
-    ids = graph.keyframes  # frames of several drives are not unique
+    ids = graph.keyframes  # frame numbers repeat in a map of several drives
     if len(set(map_.sessions)) == 1:
         ids = map_.frames[ids]
     target = out or _beside(run, "pose_graph.g2o")
@@ -222,16 +227,20 @@ def _beside(run: Path, name: str) -> Path:
 
 
 def _graph(run: Path) -> tuple[PoseGraph, Map]:
-    """The pose graph of a run, or of a map file with the default weights."""
-    from vslam.config import Config
-    from vslam.maps.storage import load_map
-    from vslam.report.finished_run import graph_of_map, pose_graph, read_run
+    """The pose graph and the map of a run, or of a map file.
 
-    if run.is_file():
-        stored = load_map(run)
-        return graph_of_map(stored.map, stored.loops, Config()), stored.map
-    finished = read_run(run)
-    return pose_graph(finished), finished.map
+    A map file does not store the thresholds that weight the edges; the default ones are used.
+    """
+    from vslam.backend.pose_graph import essential_graph
+    from vslam.config import Config, load_config
+    from vslam.maps.storage import load_map
+    from vslam.report.finished_run import read_run
+
+    is_file = run.is_file()
+    stored = load_map(run) if is_file else read_run(run)
+    config = Config() if is_file else load_config(run / "config.json")
+    graph = essential_graph(stored.map, stored.loops, config.pose_graph, driven=True)
+    return graph, stored.map
 
 
 def _reconstruction_of_file(path: Path) -> Reconstruction:

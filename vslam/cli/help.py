@@ -56,7 +56,7 @@ def show_help(command: Any, context: Any) -> None:
 
 
 def describe_parameters(command: Any, context: Any) -> str:
-    """Sentences that say what the arguments of a command are, and list its options."""
+    """Sentences that describe the arguments of a command and list its options."""
     arguments, options = [], []
     for parameter in command.get_params(context):
         if parameter.param_type_name == "option":
@@ -68,7 +68,7 @@ def describe_parameters(command: Any, context: Any) -> str:
 
 
 def _name(parameter: Any) -> str:
-    """``--record/--no-record``, ``--map FILE`` or ``RUN``."""
+    """How the help names a parameter: ``--record/--no-record``, ``--map FILE`` or ``RUN``."""
     if parameter.param_type_name == "argument":
         name = parameter.metavar or parameter.name.upper()
         return f"{name}..." if parameter.nargs != 1 else str(name)
@@ -83,7 +83,7 @@ def _described(parameter: Any) -> Text:
     if isinstance(parameter.show_default, str):
         default = parameter.show_default
     elif not parameter.show_default or isinstance(default, bool):
-        default = None  # a flag is off
+        default = None  # the names of a flag show what it changes
     if parameter.required:
         text.append(" [required]", "red")
     elif default not in (None, "", ()):

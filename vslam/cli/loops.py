@@ -47,8 +47,8 @@ def bench(
         option(
             METHOD,
             "retrieval|online",
-            "[b]retrieval[/b] searches a gallery for every query; [b]online[/b] searches, for "
-            "every image of a drive, the images before it, and decides once.",
+            "[b]retrieval[/b] searches a gallery of images for every query image. [b]online[/b] "
+            "compares every image of a drive with the earlier ones and decides at once.",
         ),
     ] = "retrieval",
     data: Annotated[
@@ -83,8 +83,7 @@ def bench(
         option(
             METHOD,
             "AGE",
-            "With online: smallest age of the images to search, in seconds (20s) or images (200) "
-            "before the query.",
+            "With online: do not search the last seconds (20s) or images (200) before the query.",
         ),
     ] = WINDOW,
     seed: Seed = 0,
@@ -109,7 +108,7 @@ def bench(
             "online."
         )
     if protocol == "retrieval" and window != WINDOW:
-        raise InputError("--window: only for --protocol online; add that or leave it out.")
+        raise InputError("--window: only for --protocol online; add it, or leave out --window.")
 
     _require_writable(out)
     from vslam.cli.console import Console

@@ -49,7 +49,7 @@ _UsageError: Any = typer.BadParameter.__base__  # typer does not export it
 
 
 class _Command(TyperCommand):
-    """A command with our own help, which says what to use instead of a wrong choice or option."""
+    """A command with our own help, whose errors say what to use instead of a wrong option."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         from vslam.cli.help import show_help
@@ -145,7 +145,7 @@ def main() -> None:
             require_utf8(Path(word))
         with suppress(FileNotFoundError):  # the folder was removed
             require_utf8(Path.cwd())
-        # For vslam run, the other commands are left out: to prepare their options takes 30 ms.
+        # vslam run does not load the other commands: preparing their options takes 30 ms.
         (application((run,)) if sys.argv[1:2] == ["run"] else app)()
     except InputError as error:
         typer.echo(f"error: {error}", err=True)

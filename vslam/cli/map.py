@@ -113,7 +113,12 @@ def merge(
     config: Thresholds = None,
     weights: Annotated[
         Path | None,
-        option(METHOD, "FILE", "Weights or vocabulary of the maps' detector, if not the shipped."),
+        option(
+            METHOD,
+            "FILE",
+            "Weights or vocabulary of the detector that made the maps.",
+            unset="the shipped ones",
+        ),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -169,7 +174,7 @@ def merge(
 
 
 def _thresholds_of(stored: list[StoredMap], files: list[Path]) -> Config:
-    """The thresholds of the first map; a message lists the maps that were made with other ones."""
+    """The thresholds of the first map; a message lists the maps that were made with others."""
     from vslam.config import as_config
 
     thresholds = stored[0].thresholds
@@ -204,7 +209,7 @@ def crop(
         str,
         typer.Option(
             metavar="FIRST:LAST",
-            help="Keep keyframes --within a distance of the keyframes of these frames.",
+            help="Keep keyframes --within a distance of any keyframe in this range of frames.",
         ),
     ] = "",
     drive: Annotated[

@@ -1,4 +1,4 @@
-"""Options that several commands share, and the source that the options for data describe."""
+"""Options that several commands share, and functions that open the data they describe."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ INPUT, METHOD, MAP, OUTPUT, EXECUTION = "Input", "Method", "Map", "Output", "Exe
 def option(
     panel: str, metavar: str, text: str, *names: str, unset: str | bool = True, **more: Any
 ) -> Any:
-    """An option in a panel of ``--help``; ``unset`` describes the default."""
+    """An option in a panel of ``--help``; a text ``unset`` is shown as the default."""
     return typer.Option(
         *names, metavar=metavar, help=text, show_default=unset, rich_help_panel=panel, **more
     )
@@ -65,8 +65,8 @@ Perturb = Annotated[
     option(
         METHOD,
         "LAWS",
-        "Perturbations with strengths, such as [b]fog:60,blur:0.5[/b]; [b]vslam perturb "
-        "--list[/b] shows all.",
+        "Perturbations of the images, with strengths, such as [b]fog:60,blur:0.5[/b]; "
+        "[b]vslam perturb --list[/b] shows all.",
     ),
 ]
 Seed = Annotated[int, option(METHOD, "N", "Seed of the random numbers.", min=0)]
@@ -83,17 +83,26 @@ Thresholds = Annotated[
 Weights = Annotated[
     list[str] | None,
     option(
-        METHOD, "NAME=FILE", "Weights for a detector; repeat for several.", unset="the shipped ones"
+        METHOD,
+        "NAME=FILE",
+        "Weights of a detector; repeat the option for several detectors.",
+        unset="the shipped ones",
     ),
 ]
 Detectors = Annotated[
     str,
-    option(METHOD, "NAMES", "Loop detectors, separated by commas; the first is the baseline."),
+    option(
+        METHOD,
+        "NAMES",
+        "Loop detectors, separated by commas; the others are compared with the first.",
+    ),
 ]
-Seeds = Annotated[int, option(METHOD, "N", "Number of seeds per random perturbation.", min=1)]
+Seeds = Annotated[
+    int, option(METHOD, "N", "Number of seeds of each perturbation with random numbers.", min=1)
+]
 Jobs = Annotated[
     int,
-    option(EXECUTION, "N", "Number of runs at a time; only with 1, speeds can be compared.", min=1),
+    option(EXECUTION, "N", "Number of runs at a time; with 1, speeds can be compared.", min=1),
 ]
 Threads = Annotated[int | None, threads("all cores, at most 4")]
 AllThreads = Annotated[int | None, threads("all cores")]
@@ -109,7 +118,9 @@ Scheduler = Annotated[
 SystemNames = Annotated[
     str,
     option(
-        METHOD, "NAMES", "Systems to test: [b]vslam[/b], [b]orbslam3[/b] and names of --system."
+        METHOD,
+        "NAMES",
+        "Systems to test: [b]vslam[/b], [b]orbslam3[/b] and names given with --system.",
     ),
 ]
 OtherSystems = Annotated[
@@ -117,8 +128,8 @@ OtherSystems = Annotated[
     option(
         METHOD,
         "NAME=COMMAND",
-        "Another system: a command that reads {folder} in KITTI's format and writes {out} "
-        "(docs/howto/stress.md).",
+        "Another system: a command that reads images from {folder} in KITTI's format and writes "
+        "a trajectory to the folder {out} (docs/howto/stress.md).",
         "--system",
     ),
 ]
@@ -173,6 +184,7 @@ def _source_options(
     source: Annotated[
         str | None,
         typer.Argument(
+            metavar="SOURCE",
             help="The data to read, the same as [b]--data[/b].",
             show_default=False,
             rich_help_panel=INPUT,
@@ -223,18 +235,22 @@ def _source_options(
         option(INPUT, "NUMBER", "Frames per second, for data without time stamps."),
     ] = None,
     side_by_side: Annotated[
-        bool, flag(INPUT, "Each image contains the left and the right one.", "--side-by-side")
+        bool, flag(INPUT, "Each image shows the left and the right view.", "--side-by-side")
     ] = False,
     topics: Annotated[
         str,
-        option(INPUT, "LEFT,RIGHT", "Image topics of a bag; one for mono, COLOUR,DEPTH for RGB-D."),
+        option(
+            INPUT,
+            "LEFT,RIGHT",
+            "Image topics of a bag; a single topic for mono, COLOUR,DEPTH for RGB-D.",
+        ),
     ] = "",
     depth_scale: Annotated[
         float | None,
         option(
             INPUT,
             "NUMBER",
-            "Value of a depth pixel at one metre.",
+            "Pixel value that stands for a depth of one metre.",
             unset="from the calibration, data set or encoding",
         ),
     ] = None,
@@ -328,7 +344,7 @@ def require_data(options: SourceOptions) -> None:
 
 
 def kind_of_source(options: SourceOptions) -> str:
-    """The kind of data that the options name, or else the one that the files show.
+    """The kind of data that the options name, or else the kind detected from the files.
 
     Raises:
         InputError: there is no data to read, or its kind is unknown.

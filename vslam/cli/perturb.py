@@ -42,7 +42,7 @@ def preview(
         ),
     ] = False,
 ) -> None:
-    """Write a picture of a perturbation: left images, and beside them both images perturbed.
+    """Write a picture of a perturbation, with a row for each frame: original and perturbed images.
 
     [b]--perturb all[/b] shows one frame under every perturbation at its default strength.
     """

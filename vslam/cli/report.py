@@ -33,8 +33,9 @@ def report(
         typer.Option(
             metavar="NAME=FILE",
             help="Trajectory of another system, in the format of KITTI or TUM. "
-            "NAME@SEQ@PERTURB=FILE also names its sequence and perturbation. It is aligned like "
-            "the runs of its sequence; if its name ends in ', mono', the scale is fitted, too.",
+            "NAME@SEQ@PERTURB=FILE also names its sequence and perturbation. The trajectory is "
+            "aligned like the runs of the sequence; a NAME that ends in ', mono' also fits the "
+            "scale.",
         ),
     ] = None,
     baseline: Annotated[
@@ -50,7 +51,8 @@ def report(
         bool,
         flag(
             OUTPUT,
-            "Write no report; serve a page of all runs, for this machine only, until Ctrl-C.",
+            "Instead of writing a report, serve a page of all runs, for this machine only, until "
+            "Ctrl-C.",
             "--serve",
         ),
     ] = False,

@@ -112,7 +112,7 @@ def run(
     ] = "",
     map_file: Annotated[
         Path | None,
-        option(MAP, "FILE|FOLDER", "Continue this map, or the map of this run.", "--map"),
+        option(MAP, "FILE|FOLDER", "Continue the map in a file, or the map of a run.", "--map"),
     ] = None,
     localize: Annotated[
         bool, flag(MAP, "Localise in the map without changing it.", "--localize")
@@ -133,7 +133,7 @@ def run(
         bool,
         flag(
             EXECUTION,
-            "Play the frames in real time; drop those that tracking is too slow for.",
+            "Play the frames in real time, and drop frames while tracking is too slow.",
             "--realtime",
         ),
     ] = False,
@@ -189,9 +189,7 @@ def run(
     if localize and map_file is None:
         raise InputError("--localize: name the map to localise in with --map.")
     if localize and gps is not None:
-        raise InputError(
-            "--gps: changes the map, which --localize does not; leave one of them out."
-        )
+        raise InputError("--gps: changes the map, but --localize must not; leave one of them out.")
     if gps_antenna is not None and gps is None:
         raise InputError("--gps-antenna: name the fixes of this antenna with --gps.")
     of_map: dict[str, object] = {}
@@ -238,7 +236,11 @@ _WITH_RESUME = {"resume", "record", "view", "keep_open", "pages", "ply", "save_m
 
 
 def _refuse_with_resume(context: typer.Context) -> None:
-    """Refuse options that cannot be combined with ``--resume``: the run continues with its own."""
+    """Refuse options that cannot be combined with ``--resume``, because they change the method.
+
+    Raises:
+        InputError: such an option was given.
+    """
     for one in context.command.params:
         source = context.get_parameter_source(one.name or "")
         given = source is not None and source.name == "COMMANDLINE"

@@ -1,4 +1,4 @@
-"""The command ``vslam stress``: the strength of each law at which a run fails."""
+"""The command ``vslam stress``: the strength of each perturbation at which a run fails."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def stress(
         option(
             METHOD,
             "kitti-c",
-            "Test the fixed severities of a published benchmark instead of --laws.",
+            "Test the five severities of KITTI-C, a published benchmark, instead of --laws.",
         ),
     ] = None,
     baseline: Annotated[
@@ -81,13 +81,13 @@ def stress(
         option(
             METHOD,
             "NAME",
-            "With --preset: the detector or system to whose errors the others are compared.",
+            "With --preset: the detector or system with which the others are compared.",
             unset="the first",
         ),
     ] = None,
     seeds: Seeds = 3,
     steps: Annotated[
-        int, option(METHOD, "N", "Bisection steps of each search.", min=1, max=10)
+        int, option(METHOD, "N", "Number of bisection steps in each search.", min=1, max=10)
     ] = 5,
     max_lost: Annotated[
         float,
@@ -103,12 +103,12 @@ def stress(
         option(
             _FAILURE,
             "NUMBER",
-            "A run fails if its ATE is more than this times that of the clean run.",
+            "A run fails if its ATE is more than NUMBER times the ATE of the unperturbed run.",
             min=1.0,
         ),
     ] = 3.0,
     ate_least: Annotated[
-        float, option(_FAILURE, "METRES", "An ATE up to this value is no failure.", min=0.0)
+        float, option(_FAILURE, "METRES", "An ATE up to this value is never a failure.", min=0.0)
     ] = 0.25,
     config: Thresholds = None,
     jobs: Jobs = 1,
@@ -203,7 +203,7 @@ def foreign(
 
 
 def _fitting(laws: list[str], opened: Mapping[str, Source]) -> tuple[list[str], list[str]]:
-    """The laws that can be applied to every sequence, and a note on each of the others."""
+    """The perturbations that suit every sequence, and a note on each one that does not."""
     from vslam.datasets.perturbation import laws_for
 
     notes: dict[str, None] = {}

@@ -30,7 +30,10 @@ app = typer.Typer()
 @app.command(epilog=_EXAMPLES)
 def synth(
     route: Annotated[
-        str, typer.Argument(help="Built-in route, or a name for the route of --trajectory.")
+        str,
+        typer.Argument(
+            metavar="ROUTE", help="Built-in route, or a name for the route of --trajectory."
+        ),
     ] = "",
     trajectory: Annotated[
         Path | None,
@@ -47,7 +50,7 @@ def synth(
         option(
             _DRIVE,
             "N",
-            "Stop after N frames; a later command can render the others.",
+            "Stop after N frames; a later command can render the remaining ones.",
             min=1,
             unset="all",
         ),
@@ -105,12 +108,15 @@ def synth(
         option(
             _PAIRS,
             "LOW:HIGH",
-            "Range of the second view's offset to the right in metres; -3.2 is the other lane.",
+            "Range of the offset of the second view to the right, in metres; at -3.2, it is in the "
+            "opposite lane.",
         ),
     ] = "-1.4:1.4",
     heading: Annotated[
         str,
-        option(_PAIRS, "LOW:HIGH", "Range of the second view's turn to either side in degrees."),
+        option(
+            _PAIRS, "LOW:HIGH", "Range of the turn of the second view to either side, in degrees."
+        ),
     ] = "0:14",
     out: Annotated[
         Path | None, option(OUTPUT, "FOLDER", "Folder to write to.", unset="the user's cache")
@@ -120,7 +126,7 @@ def synth(
         flag(OUTPUT, "Only list the routes and what has been rendered.", "--list"),
     ] = False,
     clean: Annotated[
-        bool, flag(OUTPUT, "Delete rendered images, of ROUTE or of all routes.", "--clean")
+        bool, flag(OUTPUT, "Delete the rendered images of ROUTE, or of all routes.", "--clean")
     ] = False,
     verify: Annotated[
         bool, flag(OUTPUT, "Verify all checksums and render damaged frames again.", "--verify")

@@ -98,18 +98,7 @@ def train(
         ),
     ] = None,
     pixels: Annotated[
-        str | None, option(METHOD, "SIDE|HxW", "Size of the images; smaller ones train faster.")
-    ] = None,
-    prune_share: Annotated[
-        float | None,
-        option(
-            METHOD,
-            "SHARE",
-            "Share of the capsules that pruning removes.",
-            min=0.01,
-            max=0.99,
-            unset="from the settings",
-        ),
+        str | None, option(METHOD, "SIDE|HxW", "Size of the images; smaller images train faster.")
     ] = None,
     allow_test_data: Annotated[
         bool,
@@ -155,8 +144,7 @@ def train(
     if not allow_test_data:
         refuse_test_data(sources)
     chosen = load_settings(settings) if settings else PRESETS[preset]
-    given = {"epochs": epochs, "pairs": pairs, "seed": seed, "network": network,
-             "prune_share": prune_share}  # fmt: skip
+    given = {"epochs": epochs, "pairs": pairs, "seed": seed, "network": network}
     chosen = chosen.model_copy(update={k: v for k, v in given.items() if v is not None})
     shape = chosen.shape
     if weights is not None and weights.suffix == ".safetensors" and settings is None:

@@ -87,8 +87,12 @@ def train(
 
 @app.command(epilog="[b]Example[/b]\n  vslam vocabulary convert ORBvoc.txt orbvoc.npz")
 def convert(
-    source: Annotated[Path, typer.Argument(help="Vocabulary, .npz or .txt (DBoW2).")],
-    target: Annotated[Path, typer.Argument(help="File to write, .npz or .txt (DBoW2).")],
+    source: Annotated[
+        Path, typer.Argument(metavar="SOURCE", help="Vocabulary, .npz or .txt (DBoW2).")
+    ],
+    target: Annotated[
+        Path, typer.Argument(metavar="TARGET", help="File to write, .npz or .txt (DBoW2).")
+    ],
 ) -> None:
     """Convert a vocabulary between vslam's npz and the text format of DBoW2 and ORB-SLAM."""
     from vslam.loopclosure.vocabulary_text import is_text, read_vocabulary, write_vocabulary
@@ -103,7 +107,9 @@ def convert(
 def info(
     file: Annotated[
         Path | None,
-        typer.Argument(help="Vocabulary, .npz or .txt.", show_default="the shipped one"),
+        typer.Argument(
+            metavar="FILE", help="Vocabulary, .npz or .txt.", show_default="the shipped one"
+        ),
     ] = None,
 ) -> None:
     """Show the size and the weights of a vocabulary."""

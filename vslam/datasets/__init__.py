@@ -12,7 +12,7 @@ from vslam.datasets.frames import Source
 from vslam.errors import InputError, did_you_mean
 
 _DEFAULT_NAME = "00"  # of KITTI and of the rendered towns
-DATASETS = ("kitti", "euroc", "tum", "synthetic")  # without those of plug-ins
+DATASETS = ("kitti", "euroc", "tum", "synthetic")  # plug-ins may add others
 
 
 def open_sequence(
@@ -31,7 +31,7 @@ def open_sequence(
     """Open a sequence and check the frames that ``start``, ``every``, ``max_frames`` select.
 
     Args:
-        dataset: one of `known_datasets`.
+        dataset: one of `DATASETS`, or a data set of a plug-in.
         root: folder of the data set; ignored for rendered towns, which are rendered into the
             user's cache on first use.
         name: name of the sequence; None opens 00 of KITTI or of the rendered towns, or the only
@@ -81,8 +81,3 @@ def open_sequence(
     from vslam.datasets.plugin_reader import open_plugin
 
     return open_plugin(others[dataset], Path(root), name, **chosen)
-
-
-def known_datasets() -> tuple[str, ...]:
-    """Data sets that `open_sequence` reads, those of plug-ins included."""
-    return (*DATASETS, *plugins.find_plugins(plugins.READERS))

@@ -12,10 +12,11 @@ from vslam.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
 
-# Ground truth comes at 100 Hz (TUM), 200 Hz (EuRoC) or 10 Hz (vehicles). At an acceleration of
-# 2 m/s^2, linear interpolation is off by 6 mm in the middle of this gap.
+# Longest gap in the ground truth across which poses are interpolated. Ground truth comes at 100 Hz
+# (TUM), 200 Hz (EuRoC) or 10 Hz (vehicles). At an acceleration of 2 m/s^2, linear interpolation is
+# off by 6 mm in the middle of this gap.
 _MAX_GAP_S = 0.15
-_MANY = 0.1  # share of images without a partner; TUM's sequences have up to 7 %
+_MANY = 0.1  # share of images without a partner that causes a warning; TUM's have up to 7 %
 
 
 def associate(
@@ -62,7 +63,7 @@ def poses_at(
     """Interpolate poses at given times: positions linearly, rotations by slerp.
 
     Args:
-        source: file to name in the log.
+        source: file of the ground truth, for the log.
         times: ``(N,)`` seconds.
 
     Returns:

@@ -79,10 +79,10 @@ def open_bag(
     Args:
         path: ``.bag``, ``.mcap`` or ``.db3``, or the folder of a ROS 2 bag.
         topics: the topic of the left images, and the topic of the right images or the depth. If
-            empty, the bag must have exactly the needed image topics, and their alphabetical order
-            tells left from right.
-        sensor: ``stereo``, ``rgbd`` or ``mono``, which reads only the first of two topics; None
-            decides by the content of the topics.
+            empty, the bag must have exactly as many image topics as are needed; the first one in
+            alphabetical order is the left.
+        sensor: ``stereo``, ``rgbd`` or ``mono`` (only the first of two topics is read); None
+            chooses by the content of the topics.
         depth_scale: depth image units per metre; None derives it from the encoding.
 
     Raises:
@@ -98,7 +98,7 @@ def open_bag(
         first_two = list(islice(_synchronised(_messages(bag, path, chosen), chosen, tolerance), 2))
         if not first_two:
             raise InputError(
-                f"{path}: {' and '.join(chosen)} have no images of the same time (within "
+                f"{path}: no images of {' and '.join(chosen)} have the same time (within "
                 f"{tolerance / 1e6:g} ms); name topics of one camera with --topics."
             )
         if all(stamp_of(messages[0]) == 0 for messages in first_two):
@@ -164,9 +164,11 @@ def _in_colour(path: Path, topic: str, message: Message) -> NDArray[np.uint8]:
 
 
 def find_calibration(source: BagSource) -> Calibration | None:
-    """Read the calibration from the ``camera_info`` topics beside the image topics.
+    """Read the calibration from the ``camera_info`` topics that belong to the image topics.
 
-    None if such a topic is missing, or has no focal length because the camera is not calibrated.
+    Returns:
+        The calibration; None if such a topic is missing, or has no focal length because the camera
+        is not calibrated.
 
     Raises:
         InputError: a ``camera_info`` cannot be read, or is not a valid calibration.
@@ -250,7 +252,7 @@ def _opened(path: Path) -> Iterator[Bag]:
 
 
 def _check_metadata(file: Path) -> None:
-    """Reject a large file: rosbags needs 30 microseconds and 300 bytes of memory for each byte.
+    """Reject a large file, because rosbags needs 30 us and 300 bytes of memory for each byte of it.
 
     Raises:
         ValueError: the file is too large.
@@ -286,7 +288,7 @@ def _tolerance(depth: bool) -> int:
 def _synchronised(
     messages: Iterator[tuple[str, Message]], topics: tuple[str, ...], tolerance: int
 ) -> Iterator[tuple[Message, ...]]:
-    """Yield one message per topic whose stamps differ by at most ``tolerance`` (ns).
+    """Yield groups of one message of each topic whose stamps differ by at most ``tolerance`` (ns).
 
     A message is paired only when no later message of the other topic can be nearer in time.
     """

@@ -15,8 +15,8 @@ from types import SimpleNamespace
 from typing import Any, Protocol
 
 MOST_BYTES = 2**29
-"""Limit for a chunk or a message, enough for an image of `vslam.untrusted.MOST_PIXELS` with four
-bytes per pixel. Recorders write chunks of 0.8 to 4 MB."""
+"""Largest size in bytes of a decompressed chunk or message. It is enough for an image of
+`vslam.untrusted.MOST_PIXELS` with four bytes per pixel; recorders write chunks of 0.8 to 4 MB."""
 
 _FREE_BYTES = 2**30  # of disk space that must remain when a whole bag is decompressed
 _log = logging.getLogger(__name__)
@@ -56,14 +56,14 @@ def limit_bags() -> None:
         ros2.zstd = SimpleNamespace(decompress=_limited(kinds["zstd"]), open=opened)
     except AttributeError as error:
         _log.warning(
-            "cannot limit the memory that this version of rosbags uses (%s); a damaged bag may use "
-            "all of it",
+            "cannot limit the memory that this version of rosbags uses (%s); a damaged bag may "
+            "exhaust it",
             error,
         )
 
 
 def unpack(make: Callable[[], _Decompressor], data: bytes, most: int) -> bytes:
-    """Decompress data that consists of one or more compressed frames, of ``most`` bytes at most.
+    """Decompress data that consists of one or more compressed frames to at most ``most`` bytes.
 
     Raises:
         ValueError: the result exceeds ``most`` bytes, or the data is truncated.

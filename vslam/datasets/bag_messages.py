@@ -45,7 +45,7 @@ def stamp_of(message: Message) -> int:
 
 def nav_sat_fix(message: Message) -> tuple[float, ...]:
     """Seconds, latitude, longitude, altitude and three standard deviations (east, north, up) of a
-    ``NavSatFix``; the position is NaN without a fix, and an unknown deviation is NaN."""
+    ``NavSatFix``. The position is NaN if the receiver had no fix; unknown deviations are NaN."""
     status, covariance = message.status.status, np.asarray(message.position_covariance)
     position = (message.latitude, message.longitude, message.altitude)
     if status < 0:  # STATUS_NO_FIX
@@ -102,8 +102,8 @@ def _decoded(message: Message, wanted: str) -> NDArray[np.uint8]:
 
 
 def is_depth(message: Message, topic: str) -> bool:
-    """Whether an image message holds depth. 16-bit images are grey values unless the topic's name
-    contains ``depth``."""
+    """Whether an image message contains depth. A 16-bit image counts as depth only if the name of
+    its topic contains ``depth``, otherwise as grey values."""
     if not hasattr(message, "encoding"):
         return _COMPRESSED_DEPTH in message.format
     is_16_bit_depth = message.encoding == "16UC1" and "depth" in topic.lower()
@@ -177,7 +177,7 @@ def _pixels(message: Message, channels: int, bits: int, kind: str = "u") -> NDAr
 def camera_info(message: Message, source: str, rectified: bool) -> Document | None:
     """Convert a ``CameraInfo`` to the input of `vslam.calibration.formats.read_ros`.
 
-    None for an uncalibrated camera, whose K is all zero by the definition of ``CameraInfo``.
+    Returns None for an uncalibrated camera: ``CameraInfo`` defines that its K is all zero.
 
     Args:
         source: bag and topic to name in error messages.

@@ -1,4 +1,4 @@
-"""Live depth cameras; the makers' packages deliver the images and the device's calibration."""
+"""Live depth cameras, whose images and calibration come from the packages of their makers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ class Grabbed:
     Attributes:
         timestamp: seconds.
         left: left or colour image, ``(H, W)`` uint8, or ``(H, W, 3)`` uint8 red, green, blue.
-        second: right image, ``(H, W)`` uint8; or depth, ``(H, W)`` uint16; or None.
+        second: right image, ``(H, W)`` uint8, or depth, ``(H, W)`` uint16; None if only the left
+            camera is used.
     """
 
     timestamp: float
@@ -43,7 +44,7 @@ class DepthCamera:
     Attributes:
         dataset: kind of source.
         name: serial number.
-        calibration: calibration of the delivered images, from the device. If it has a
+        calibration: calibration of the delivered images, read from the device. If it has a
             ``depth_scale``, the second images are the depth of the first images' pixels.
         grab: waits for the next images; None after a timeout, or if the device is gone.
         stop: stops the device.
@@ -57,7 +58,7 @@ class DepthCamera:
 
 
 def frames_of(device: DepthCamera) -> RawSource:
-    """Make a source of the frames of a device, which can be read only once."""
+    """Make a source from the frames of a device. The frames can be read only once."""
     calibration = device.calibration
     models = [model for model in (calibration.left, calibration.right) if model is not None]
     return RawSource(

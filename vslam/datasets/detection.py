@@ -24,7 +24,8 @@ def _within(folder: Path) -> tuple[Path, ...]:
     return (folder, *(path for path in folder.glob("*") if path.is_dir()))
 
 
-# The order matters, because the folders of data sets hold images, too.
+# The first kind that fits is chosen. The order matters, because the folders of data sets also
+# contain images.
 _KINDS: tuple[tuple[str, str, Callable[[Path], bool]], ...] = (
     (
         "kitti",
@@ -46,7 +47,7 @@ _KINDS: tuple[tuple[str, str, Callable[[Path], bool]], ...] = (
         f"a file {', '.join(sorted(_BAG_SUFFIXES))} or metadata.yaml",
         lambda path: path.suffix.lower() in _BAG_SUFFIXES or (path / "metadata.yaml").is_file(),
     ),
-    ("images", "images (png, jpg, ...), in it or in left/ and right/", has_images),
+    ("images", "images (png, jpg, ...) in the folder or in left/ and right/", has_images),
     ("video", "any other file, as a video", Path.is_file),
 )
 

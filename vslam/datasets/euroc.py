@@ -44,12 +44,14 @@ def open_euroc(
 ) -> Source:
     """Open a sequence; its images are rectified as they are read.
 
-    A frame is a left image with the nearest right image within 5 ms; left images without a partner
-    are skipped. The ground truth is interpolated, see `vslam.datasets.association.poses_at`.
+    A frame consists of a left image and the nearest right image, at most 5 ms apart; left images
+    without a partner are skipped. The ground truth is interpolated, see
+    `vslam.datasets.association.poses_at`.
 
     Args:
         root: folder of the sequence, or of several sequences.
-        name: name of the sequence in ``root``; None for ``root`` itself, or its only sequence.
+        name: name of the sequence in ``root``; None opens ``root`` itself, or the only sequence in
+            it.
         start, every, max_frames: read every ``every``-th pair from pair ``start`` on, at most
             ``max_frames``.
         monocular: read only the left camera.
@@ -83,7 +85,7 @@ def open_raw_euroc(
 
 
 def is_euroc(root: Path) -> bool:
-    """Whether a folder holds the left camera of a sequence in this layout."""
+    """Whether a folder contains the left camera of a sequence in this layout."""
     return any((base / "cam0" / "data.csv").is_file() for base in (root / "mav0", root))
 
 

@@ -70,15 +70,15 @@ def read_fixes(path: Path, antenna: Sequence[float] | None = None) -> Fixes:
     """Read all fixes of a file or folder.
 
     Args:
-        path: CSV file with a header of ``time`` (s), ``latitude``, ``longitude`` (degrees),
-            ``altitude`` (m) and optionally ``sigma`` (m); KITTI's folder ``oxts``, whose times
-            begin at 0; or a bag.
+        path: one of: a CSV file with the columns ``time`` (s), ``latitude``, ``longitude``
+            (degrees), ``altitude`` (m) and optionally ``sigma`` (m), named in its first line;
+            KITTI's folder ``oxts``, whose times begin at 0; a bag.
         antenna: position of the antenna as in ``Fixes``. If None, it is read from the calibration
-            of KITTI raw, or taken to be that of the camera where there is none.
+            of KITTI raw, or assumed to be that of the camera if there is none.
 
     Raises:
-        InputError: pymap3d is not installed, the file is missing or malformed, it holds no fix or
-            no times, a latitude or longitude is out of range, or a calibration is damaged.
+        InputError: pymap3d is not installed, the file is missing or malformed, it contains no fix
+            or no times, a latitude or longitude is out of range, or a calibration is damaged.
     """
     try:
         import pymap3d  # noqa: F401
@@ -112,7 +112,7 @@ def read_fixes(path: Path, antenna: Sequence[float] | None = None) -> Fixes:
 
 
 def require_overlap(fixes: Fixes, source: Source, path: Path) -> None:
-    """Check that fixes and images overlap in time, as far as the time of a stream is known.
+    """Check that some fixes were taken during the images; the end of a stream is unknown.
 
     Raises:
         InputError: the source is a live camera, or no fix was taken during its images.
@@ -124,19 +124,19 @@ def require_overlap(fixes: Fixes, source: Source, path: Path) -> None:
     if source.seekable:
         first, last = source.timestamps[[0, -1]].tolist()
     else:
-        frame = next(source.frames(), None)  # the last time of a stream is unknown
+        frame = next(source.frames(), None)  # only the first time of a stream is known
         first, last = -np.inf if frame is None else frame.timestamp, np.inf
     if not len(fixes.between(first, last)):
         until = f" to {last:.3f} s" if np.isfinite(last) else " s on"
         raise InputError(
             f"--gps {path}: the fixes are from {fixes.times[0]:.3f} to {fixes.times[-1]:.3f} s but "
-            f"the images are from {first:.3f}{until}; give the times of both by one clock."
+            f"the images are from {first:.3f}{until}; both must have times of the same clock."
         )
 
 
 def to_enu(geodetic: NDArray[np.float64], datum: NDArray[np.float64]) -> NDArray[np.float64]:
     """Convert ``(N, 3)`` latitude, longitude (degrees) and altitude (m) to ``(N, 3)`` metres east,
-    north and up of the datum, ``(3,)`` in the same units."""
+    north and up of the datum, whose ``(3,)`` latitude, longitude and altitude are given."""
     from pymap3d import geodetic2enu
 
     return np.column_stack(geodetic2enu(*geodetic.T, *datum))
@@ -166,7 +166,7 @@ def _read_csv(path: Path) -> NDArray[np.float64]:
     if missing:
         raise InputError(
             f"--gps {path}: the first line names no {' and no '.join(missing)}; begin the file "
-            "with time,latitude,longitude,altitude (seconds, degrees, degrees, metres)."
+            "with the line time,latitude,longitude,altitude (seconds, degrees, degrees, metres)."
         )
     rows = []
     for number, words in enumerate(lines[1:], start=2):
@@ -190,7 +190,7 @@ def _read_csv(path: Path) -> NDArray[np.float64]:
 
 
 def _read_oxts(folder: Path) -> NDArray[np.float64]:
-    """Rows as `_read_csv`, with seconds since the first packet, as in KITTI odometry."""
+    """Rows as `_read_csv` returns them. As in KITTI odometry, times count from the first packet."""
     files = sorted((folder / "data").glob("*.txt"))
     if not files:
         raise InputError(f"--gps {folder}: no data/*.txt; name the folder oxts of KITTI raw.")

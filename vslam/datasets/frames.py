@@ -39,12 +39,12 @@ class TimedFrame:
         read: decodes the left and the second image; safe to call in any thread. The left image is
             ``(H, W)`` uint8. The second one is the right image, ``(H, W)`` uint8; or the depth of
             the left image's pixels, ``(H, W)`` float32 metres, 0 if unknown; or None (monocular).
-            The argument is a map function over both images, which may decode them in parallel.
-            Raises UnreadableImageError if a file is damaged or its size differs from the
-            calibration.
-        sides: two functions, which decode only the left and only the right image of ``read`` and
-            raise the same errors. None if both images are decoded together, or if there is no right
-            image.
+            The argument is a map function (`vslam.camera.ImageMap`), which may decode both images
+            in parallel. Raises UnreadableImageError if a file is damaged or its size differs from
+            the calibration.
+        sides: two functions, of which one decodes only the left image of ``read`` and the other one
+            only the right image; they raise the errors of ``read``. None if both images are decoded
+            together, or if there is no right image.
         file: file of the left image if its pixels need no rectification, else None.
         colour: decodes the left image in colour, ``(H, W, 3)`` uint8 red, green, blue, or
             ``(H, W)`` if it is grey; None if the source has no colours. Raises the errors of
@@ -141,7 +141,8 @@ class Source(_Frames):
         n_expected: the number of frames, approximate for a stream; None if unknown.
         live: whether frames arrive in real time and are lost if they are not read, as from a
             camera.
-        ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames without a pose, or None.
+        ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames without a pose; None without
+            ground truth.
         rectify_mask: rectifies an ``(H, W)`` uint8 mask of the original left images; None if the
             images are not rectified by vslam.
 
@@ -235,7 +236,7 @@ def _increasing(frames: Iterator[TimedFrame], name: str) -> Iterator[TimedFrame]
     for frame in frames:
         if last is not None and frame.timestamp <= last:
             _log.warning(
-                "%s: the frame at %.6f s is skipped because it comes after the one at %.6f s",
+                "%s: the frame at %.6f s is skipped because it follows a frame at %.6f s",
                 name,
                 frame.timestamp,
                 last,

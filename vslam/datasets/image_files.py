@@ -36,7 +36,7 @@ def checked_files(
 
     Args:
         timestamps: ``(N,)`` float64 seconds.
-        ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of the left camera, or None.
+        ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of the left camera; None without ground truth.
         sides: N left images, optionally followed by N right images or N depth images.
         depth_scale: depth image units per metre; None if there are no depth images.
 
@@ -113,8 +113,9 @@ def read_image_list(
     """Read the times and file names of images from the lines of a file; # begins a comment.
 
     Args:
-        parsed: time and file name in a line; raises ValueError if it is malformed.
-        time: what the time is, for error messages.
+        parsed: returns the time and the file name in a line; raises ValueError if the line is
+            malformed.
+        time: what error messages call the time, such as "a time in seconds".
         instead: what the user can do without the file, for error messages; may be empty.
 
     Raises:
@@ -153,8 +154,8 @@ def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bo
     """Find the folder of a sequence: ``root`` or a folder in it; None if there is no sequence.
 
     Args:
-        name: name of the sequence's folder; None for ``root`` itself, or the only sequence in it.
-        is_sequence: whether a folder holds a sequence.
+        name: name of the sequence's folder; None finds ``root`` itself, or the only sequence in it.
+        is_sequence: returns whether a folder contains a sequence.
 
     Raises:
         InputError: no sequence has this name, or there are several and ``name`` is None.
@@ -275,7 +276,8 @@ def size_text(shape: tuple[int, ...]) -> str:
 
 
 def with_depth(camera: Camera, calibration: Calibration) -> Camera:
-    """The camera for RGB-D images, with the calibration's virtual baseline or that of a Kinect."""
+    """The camera for RGB-D images, with the virtual baseline of the calibration if there is one,
+    otherwise with the baseline of a Kinect."""
     baseline = calibration.virtual_baseline or _VIRTUAL_BASELINE
     return replace(camera, baseline=baseline, depth=True)
 

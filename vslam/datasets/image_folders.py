@@ -1,15 +1,16 @@
 """Folders of images: one folder for a single camera, two for a stereo pair or images with depth.
 
-A pair is two folders in one folder, named as in `PAIRS` or `DEPTH_PAIRS`, or given by ``--right``
-or ``--depth``. Images with the same name form a pair. If the two folders share no name but have the
-same number of images, these are paired in order. Depth images whose names are times are paired with
-images less than 20 ms apart. Times are taken from the first of these that exists:
+The two folders of a stereo pair, or of images and depth, lie in one folder and are named as in
+`PAIRS` or `DEPTH_PAIRS`, or the second one is given by ``--right`` or ``--depth``. Images with the
+same name belong together. If the two folders have no name in common but the same number of images,
+their images are matched in order. Depth images whose names are times are matched with images less
+than 20 ms apart. The times of the images come from the first of these that exists:
 
 1. ``--fps``;
-2. ``times.txt`` or ``timestamps.txt`` in the folder of the images or its parent, which holds the
-   time of one image in seconds per line;
+2. ``times.txt`` or ``timestamps.txt`` in the folder of the images or its parent, with the time of
+   one image in seconds on each line;
 3. file names that are times since 1970: seconds with a decimal point, or integers in s, ms, us or
-   ns, which their magnitude tells apart; smaller integers are counters;
+   ns, which are told apart by their magnitude; smaller integers count as frame numbers;
 4. ``DateTimeOriginal`` with ``SubSecTimeOriginal`` in the images' EXIF.
 """
 
@@ -43,7 +44,7 @@ PAIRS = (
     ("cam0/data", "cam1/data"),
 )
 DEPTH_PAIRS = (("rgb", "depth"), ("color", "depth"), ("colour", "depth"), ("image", "depth"))
-_LONGEST_INTERVAL_S = 10.0  # tracking is impossible at longer intervals
+_LONGEST_INTERVAL_S = 10.0  # between images; longer intervals suggest that times have a wrong unit
 _NEAR_S = 0.02  # as in TUM's associate.py
 _TIME_FILES = ("times.txt", "timestamps.txt")
 _EXIF = 0x8769  # tags of EXIF 2.32
@@ -53,7 +54,7 @@ _UNITS = ((1e17, 10**9), (1e14, 10**6), (1e11, 10**3), (1e9, 1))
 
 
 def has_images(folder: Path) -> bool:
-    """Whether a folder holds images, or a pair of folders with images."""
+    """Whether a folder contains images, or a pair of folders with images."""
     inside = (folder / left for left, _ in PAIRS + DEPTH_PAIRS)
     return any(list_images(place) for place in (folder, *inside))
 
@@ -65,8 +66,8 @@ class ImageFolders:
     Attributes:
         name: name of the folder.
         timestamps: ``(N,)`` float64 seconds, increasing.
-        sides: N image files each of the left and right camera, of images and depth, or of one
-            camera.
+        sides: lists of N image files: those of the left and the right camera, those of the images
+            and the depth, or those of a single camera.
         depth: whether the second side is the depth of the first one.
         size: width and height of the first image.
     """
@@ -110,14 +111,14 @@ def open_images(
     """Find the files of a folder of images, or of a pair of folders.
 
     Args:
-        folder: folder of the images, or the folder that holds both folders of a pair.
-        right: folder of the right images if ``folder`` holds the left ones.
-        depth: folder of the depth images if ``folder`` holds the images.
+        folder: folder of the images, or the folder that contains both folders of a pair.
+        right: folder of the right images; ``folder`` then contains the left images.
+        depth: folder of the depth images; ``folder`` then contains the images.
         fps: frames per second, which replace the images' time stamps.
         start, every, max_frames: read every ``every``-th frame from frame ``start`` on, at most
             ``max_frames``.
-        sensor: ``stereo``, ``rgbd``, or ``mono`` for only the left images; None reads all images
-            that are found.
+        sensor: ``stereo``, ``rgbd`` or ``mono`` (only the left images are read); None reads all
+            images that are found.
 
     Raises:
         InputError: there are no images or no second images, the sides do not match, or there are
@@ -173,7 +174,8 @@ def _find_sides(
 
 
 def _near_miss(folder: Path) -> str:
-    """A hint for a user who names one side of a pair, or has only one side."""
+    """A hint, for an error message, if the user named one side of a pair or has only one side;
+    otherwise empty."""
     above = folder.resolve().parent
     for names in PAIRS + DEPTH_PAIRS:
         if all(list_images(above / name) for name in names) and folder.resolve().name in names:
@@ -186,7 +188,8 @@ def _near_miss(folder: Path) -> str:
 
 
 def _sorted_images(folder: Path) -> dict[str, Path]:
-    """Images by stem, sorted by time if all names are times, else naturally (2 before 10)."""
+    """Images by stem, sorted by time if all names are times, otherwise by the numbers in the names
+    (2 before 10)."""
     images = list_images(folder)
     if not images:
         raise InputError(f"{folder}: no images in this folder; name another.")

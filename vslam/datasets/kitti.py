@@ -36,12 +36,12 @@ def open_kitti(
 ) -> Source:
     """Open a sequence; only the selected frames must be complete.
 
-    Row k of ``times.txt`` and of the poses belongs to the k-th image. If a file has more rows than
-    there are images, k is the number in the image's file name, so that an excerpt of a sequence
-    works with the files of the whole sequence.
+    The k-th row of ``times.txt`` and of the poses belongs to the k-th image. If a file has more
+    rows than there are images, an image belongs to the row with the number in its file name, so
+    that an excerpt of a sequence works with the files of the whole sequence.
 
     Args:
-        root: folder that holds ``sequences`` (or ``dataset/sequences``, as KITTI's archives unpack)
+        root: folder that contains ``sequences`` (or ``dataset/sequences``, as in KITTI's archives)
             and, optionally, ``poses``.
         name: name of the sequence, for example ``00``.
         start, every, max_frames: read every ``every``-th of the existing frames from frame
@@ -179,7 +179,11 @@ def _by_number(stem: str) -> tuple[int, str]:
 def _check_frames(
     folder: Path, sides: list[dict[str, Path]], stems: list[str]
 ) -> list[tuple[Path, ...]]:
-    """The files with these stems of each camera."""
+    """The files of each camera that have these stems.
+
+    Raises:
+        InputError: a camera has no images, or a frame lacks one of its images.
+    """
     for side, images in enumerate(sides):
         if not images:
             instead = ", or run on the left camera alone with --sensor mono" if side else ""

@@ -26,9 +26,9 @@ def with_masks(source: Source, path: Path, *, start: int = 0, every: int = 1) ->
     """Add masks to the frames of a source.
 
     Args:
-        path: one mask for all images, or a folder with a mask for each image. A mask in a folder
-            has the name of its image file, with any suffix or with a second one (``7.jpg.png``), or
-            the number of its frame in a video or bag.
+        path: one mask for all images, or a folder with a mask for each image. The mask of the image
+            ``7.jpg`` has the same stem and any suffix (``7.png``) or a second suffix
+            (``7.jpg.png``). For a video or bag, the name of a mask is the number of its frame.
         start, every: the options with which the frames were selected.
 
     Raises:

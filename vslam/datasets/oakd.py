@@ -26,7 +26,7 @@ def open_oakd(serial: str, sensor: str | None) -> DepthCamera:
 
     Args:
         serial: serial number of the device; empty for the first one found.
-        sensor: ``stereo``, ``rgbd`` or ``mono``; None is ``stereo``.
+        sensor: ``stereo``, ``rgbd`` or ``mono``; None means ``stereo``.
 
     Raises:
         InputError: depthai cannot be imported, or the device is missing, busy or unable to deliver
@@ -120,7 +120,7 @@ def _model(image: Any, source: str) -> CameraModel:
     transformation = image.getTransformation()
     if any(transformation.getDistortionCoefficients()):
         raise InputError(
-            f"{source}: has an old format, with which the device cannot undistort images; "
+            f"{source}: the device cannot undistort images with a calibration of this old format; "
             "calibrate the device again with Luxonis' tool."
         )
     (fx, _, cx), (_, fy, cy), _ = transformation.getIntrinsicMatrix()

@@ -28,7 +28,7 @@ def open_plugin(
 ) -> Source:
     """Let a plug-in open a source, and select frames of it.
 
-    If the plug-in fails later, a source that can seek loses one frame, and a stream ends.
+    If the plug-in fails later, a frame of a source that can seek is skipped, but a stream ends.
 
     Raises:
         InputError: the plug-in rejects its input, fails, or returns no valid `Source`.
@@ -84,8 +84,8 @@ def _play(plugin: PlugIn, raw: Source, checked: partial[TimedFrame]) -> Iterator
 
 
 def _checked(plugin: PlugIn, root: Path, camera: Camera, frame: TimedFrame, at: str) -> TimedFrame:
-    """The frame, with a check of its images against the camera's size and type whenever they are
-    read."""
+    """The same frame; whenever its images are read, their sizes and types are compared with those
+    of the camera's images."""
 
     def read(image_map: ImageMap) -> Images:
         try:

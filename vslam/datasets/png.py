@@ -1,8 +1,8 @@
 """Fast decoding of 8-bit grey PNG files without interlacing, as in rectified stereo sequences.
 
 OpenCV's decoder spends as much time on undoing the line filters as on decompression, because every
-pixel depends on the one on its left. Here 32 lines are decoded at once, each one pixel behind the
-line above, so that one vector register holds a pixel of each line (a wavefront). If no pixel is
+pixel depends on the one on its left. Here 32 lines are decoded at once (a wavefront): each line is
+one pixel behind the line above, and a vector register holds one pixel of each line. If no pixel is
 predicted from two others, as in all files that OpenCV writes, decoding line by line is faster.
 """
 
@@ -20,7 +20,8 @@ from vslam.untrusted import MOST_PIXELS
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 GREY_8_BITS = (8, 0, 0, 0, 0)  # depth, colour type, compression, filter method, no interlacing
-# Chunks that do not change pixels; others may do so (transparency, orientation, animation).
+# Chunks that do not change pixels. Files with other chunks are not decoded here, because these may
+# change pixels (transparency, orientation, animation).
 WITHOUT_EFFECT = {b"gAMA", b"cHRM", b"sRGB", b"pHYs", b"tIME", b"tEXt", b"bKGD"}
 LANES = 32  # lines decoded at once
 _CHECK_SUM, _CHUNK, _NEXT_CHUNK = map(struct.Struct, (">I", ">I4s", ">II4s"))
@@ -30,8 +31,8 @@ _WIDEST = 1 << 15  # pixels per line; the buffers need 65 bytes per pixel of a l
 def decode_png(data: bytes) -> NDArray[np.uint8] | None:
     """Decode a PNG file of 8-bit grey levels to ``(H, W)`` uint8, exactly as libpng does.
 
-    Returns None if the file is of another kind, interlaced, or damaged according to its checksums;
-    another decoder may be able to read it.
+    Returns None if the file is of another kind, interlaced, or damaged according to its checksums.
+    The caller can then try another decoder.
     """
     import deflate
 
@@ -58,7 +59,7 @@ def _contents(data: bytes) -> tuple[tuple[int, int], bytes]:
     kind, header = next(chunks, (b"", b""))
     width, height, *form = struct.unpack(">II5B", header)
     if kind != b"IHDR" or tuple(form) != GREY_8_BITS:
-        raise ValueError("not a PNG of 8-bit grey levels, not interlaced")
+        raise ValueError("not a PNG of 8-bit grey levels without interlacing")
     if not 0 < width * height <= MOST_PIXELS or width > _WIDEST:
         raise ValueError("too large, or empty")
     parts: list[memoryview] = []

@@ -24,7 +24,7 @@ def open_realsense(serial: str, sensor: str | None) -> DepthCamera:
 
     Args:
         serial: serial number of the device; empty for the first one found.
-        sensor: ``stereo``, ``rgbd`` or ``mono``; None is ``rgbd``.
+        sensor: ``stereo``, ``rgbd`` or ``mono``; None means ``rgbd``.
 
     Raises:
         InputError: pyrealsense2 cannot be imported, or the device is missing, busy or unable to

@@ -18,7 +18,7 @@ from vslam.datasets.frames import Images, RawSource, Size, Source, TimedFrame, d
 from vslam.datasets.image_files import with_depth
 from vslam.errors import InputError
 
-# Names by the number of missing columns and rows.
+# What an encoder has cut off, by the number of missing columns and rows.
 _MISSING = {(1, 0): "column", (0, 1): "row", (1, 1): "column and row"}
 
 
@@ -38,7 +38,7 @@ def rectified(raw: RawSource, calibration: Calibration) -> Source:
         rectification = _rectification_for(calibration, raw.sizes)
     frame = partial(_rectified_frame, rectification)
     T_wc = raw.ground_truth
-    if T_wc is not None:  # rectification rotates the left camera about its centre
+    if T_wc is not None:  # the poses follow the left camera, which rectification rotates
         T_wc = T_wc.copy()
         T_wc[:, :3, :3] = T_wc[:, :3, :3] @ rectification.R_left_rectified
     return Source(

@@ -26,20 +26,20 @@ class SourceOptions(BaseModel):
     """The options that select and describe a source of frames.
 
     Attributes:
-        data: folder, file, device number or URL; for a depth camera, its serial number, or empty
-            for the first one found; ignored for rendered towns.
-        dataset: one of `vslam.datasets.known_datasets` or of `SOURCES`; None detects it from
-            ``data``.
-        seq: name of the sequence of a data set; None as for `vslam.datasets.open_sequence`.
+        data: folder, file, device number or URL. For a depth camera, it is the serial number, or
+            empty for the first one found. It is ignored for rendered towns.
+        dataset: one of `vslam.datasets.DATASETS` or of `SOURCES`, or a data set of a plug-in; None
+            detects it from ``data``.
+        seq: name of the sequence of a data set, see `vslam.datasets.open_sequence`.
         calib: calibration files, see `vslam.calibration.files.read_calibration`.
         right: folder of the right images.
         depth: folder of the depth images.
         fps: frames per second, which replace the source's time stamps.
-        side_by_side: whether each frame holds the left and the right image side by side.
-        topics: a bag's topic of left images and its topic of right images or depth, separated by a
-            comma.
+        side_by_side: whether each frame contains the left and the right image side by side.
+        topics: for a bag, the topic of the left images and the topic of the right images or the
+            depth, separated by a comma.
         depth_scale: depth image units per metre.
-        sensor: ``stereo``, ``rgbd`` or ``mono``, which reads only the left images; None reads all
+        sensor: ``stereo``, ``rgbd`` or ``mono`` (only the left images are read); None reads all
             images of the source.
         mask: mask of the left images, or folder with a mask for each image, see
             `vslam.datasets.masks.with_masks`.
@@ -80,7 +80,8 @@ _NOT_MONOCULAR = ("right", "depth", "depth_scale")
 def open_source(
     options: SourceOptions, on_render: Callable[[int, int], None] | None = None
 ) -> Source:
-    """Open a data set, or images of any camera, which are rectified with the user's calibration.
+    """Open a data set, or images of any camera. The latter are rectified with the user's
+    calibration.
 
     Args:
         on_render: see `vslam.datasets.open_sequence`.
@@ -131,11 +132,11 @@ def open_raw(options: SourceOptions) -> RawSource:
     """Open unrectified images to calibrate their cameras; times are not used.
 
     Without ``sensor``, a video or live camera is monocular unless ``side_by_side`` is set, and a
-    folder that itself holds images is monocular unless ``right`` is given.
+    folder that directly contains images is monocular unless ``right`` is given.
 
     Raises:
-        InputError: an option does not apply to this source, it has no unrectified images of one
-            camera or a pair, or the reader rejects the data.
+        InputError: an option does not apply to this source, the source has no unrectified images of
+            one camera or a pair, or the reader rejects the data.
     """
     o = options
     dataset = o.dataset or detect_dataset(o.data)

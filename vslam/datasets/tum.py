@@ -1,9 +1,9 @@
 """TUM's RGB-D sequences, and all data in their layout [Sturm et al., IROS 2012].
 
-FOLDER/rgb.txt, depth.txt    each line holds a time in seconds and an image file
+FOLDER/rgb.txt, depth.txt    a time in seconds and an image file on each line
 FOLDER/groundtruth.txt       optional: t tx ty tz qx qy qz qw
-FOLDER/calibration.yaml      optional: the camera (docs/howto/cameras.md); by default, the name of
-                             the folder tells which of TUM's cameras freiburg1 to 3 it is
+FOLDER/calibration.yaml      optional: the camera (docs/howto/cameras.md). Without it, the name of
+                             the folder must contain that of TUM's camera: freiburg1, 2 or 3.
 """
 
 from __future__ import annotations
@@ -58,13 +58,14 @@ def open_tum(
 ) -> Source:
     """Open a sequence; its images are undistorted as they are read.
 
-    A frame is a colour image and a depth image less than 20 ms apart, paired as by TUM's
-    ``associate.py`` (`vslam.datasets.association.associate`). The ground truth is interpolated
-    (`vslam.datasets.association.poses_at`).
+    A frame consists of a colour image and a depth image less than 20 ms apart. They are paired like
+    in TUM's ``associate.py`` (`vslam.datasets.association.associate`). The ground truth is
+    interpolated (`vslam.datasets.association.poses_at`).
 
     Args:
         root: folder of the sequence, or of several sequences.
-        name: name of the sequence in ``root``; None for ``root`` itself, or its only sequence.
+        name: name of the sequence in ``root``; None opens ``root`` itself, or the only sequence in
+            it.
         start, every, max_frames: read every ``every``-th pair from pair ``start`` on, at most
             ``max_frames``.
         monocular: read only the colour images; depth images need not exist.
@@ -114,7 +115,7 @@ def open_tum(
 
 
 def is_tum(folder: Path) -> bool:
-    """Whether a folder holds a sequence in this layout."""
+    """Whether a folder contains a sequence in this layout."""
     return (folder / "rgb.txt").is_file()
 
 

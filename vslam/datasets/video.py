@@ -30,7 +30,9 @@ _TIMEOUT_MS = 10_000  # of a camera at a URL
 _DEVICES = Path("/dev")
 _CONVERT = "convert the video, for example with ffmpeg -i VIDEO -c:v libx264 -crf 12 NEW.mp4"
 _SAME_RATE = 0.02  # relative; 30 and 29.97 frames per second count as the same rate
-_MISSING_SHARE = 0.05  # tolerated at the end, because containers only estimate their frame count
+# Share of the frames that may be missing at the end without an error, because containers only
+# estimate their number of frames.
+_MISSING_SHARE = 0.05
 
 
 def open_capture(source: str | int, *parameters: int) -> Capture | None:
@@ -109,13 +111,13 @@ def open_video(
     """Open a video and decode its first frames.
 
     Args:
-        fps: frames per second, which replace the file's time stamps; None uses these.
-        side_by_side: whether each frame holds the left and the right image side by side.
+        fps: frames per second, which override the file's time stamps; None uses the time stamps.
+        side_by_side: whether each frame contains the left and the right image side by side.
         monocular: read only the left images.
 
     Raises:
         InputError: the file is missing or cannot be decoded, there are neither time stamps nor
-            ``fps``, or stereo is asked for but a frame holds one image.
+            ``fps``, or neither ``side_by_side`` nor ``monocular`` is set.
     """
     import cv2
 
@@ -162,7 +164,8 @@ def open_video(
 
 
 def _check_sides(source: str, side_by_side: bool, monocular: bool) -> None:
-    """Check that a stereo pair is side by side, because videos have one image per frame."""
+    """Check that stereo is requested only with images side by side, because the frames of a video
+    have one image each."""
     if not side_by_side and not monocular:
         raise InputError(
             f"{source} has one image per frame; use --side-by-side if each frame holds both "
@@ -221,12 +224,12 @@ def open_camera(device: str, *, side_by_side: bool = False, monocular: bool = Fa
 
     Args:
         device: a number, or a URL.
-        side_by_side: whether each frame holds the left and the right image side by side.
+        side_by_side: whether each frame contains the left and the right image side by side.
         monocular: read only the left images.
 
     Raises:
-        InputError: there is no such device, it is busy or returns no image, or stereo is asked for
-            but a frame holds one image.
+        InputError: there is no such device, it is busy or returns no image, or neither
+            ``side_by_side`` nor ``monocular`` is set.
     """
     name = _name(device)
     _check_sides(f"camera {name}: a camera", side_by_side, monocular)

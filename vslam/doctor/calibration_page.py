@@ -18,20 +18,21 @@ from vslam.report.page import Code, Page, Section, Tile, Tiles
 from vslam.report.render import html
 
 _FEW_VIEWS = 10
-# Degrees, and number of views tilted by more. Without tilt, the focal length is not determined.
+# Least tilt in degrees, and least number of views that are tilted more. Views of a board that faces
+# the camera do not determine the focal length.
 _TILT, _FEW_TILTED = 15.0, 3
 _CELLS = (8, 6)  # cells of the image, across and down
-_COVERED = 0.6  # smallest share of cells with corners, which hardly reach the outermost pixels
-_LARGE_PX = 0.5  # largest RMS in images of the common width; grows with the width of wider images
+_COVERED = 0.6  # least share of cells with corners; a whole board hardly reaches the image border
+_LARGE_PX = 0.5  # largest RMS in images up to the common width; larger in proportion to the width
 _COMMON_WIDTH = 640
-_APART_PX = 2.0  # largest RMS between the cameras
-_SHARED = 0.2  # largest share of the squared residuals that neighbouring corners have in common
+_APART_PX = 2.0  # largest RMS of the pair: more shows that the board moved between the two images
+_SHARED = 0.2  # largest share of the squared residuals that is systematic, see _shared
 _MOST_DROPPED = 0.25
 _ARROW = 0.02  # length of an arrow of the RMS error, relative to the image width
 
 
 def findings_of(found: Estimate) -> list[Finding]:
-    """Check each camera, and then the pair."""
+    """Check the calibration of each camera, and then that of the pair."""
     findings = [finding for side, fit in _sides(found) for finding in _camera(side, fit)]
     if found.pair is not None:
         error = _rms(found.pair.errors)
@@ -117,7 +118,7 @@ def _camera(side: str, fit: CameraFit) -> list[Finding]:
         ),
         judge(
             f"{side}lens", shared > _SHARED,
-            f"{m.lens}; {shared:.0%} of the residuals depend on the position in the image",
+            f"{m.lens}; {shared:.0%} of the squared residuals depend on the position in the image",
             f"try --lens {'pinhole' if m.lens == 'fisheye' else 'fisheye'}",
         ),
     ]  # fmt: skip
@@ -133,14 +134,14 @@ def _kept(check: str, n: int, dropped: Sequence[tuple[str, float]]) -> Finding:
 
 
 def _cells(fit: CameraFit) -> NDArray[np.int64]:
-    """For every corner of all views, the number of its cell in the image, column by column."""
+    """The cell of the image in which each corner of all views lies, counted column by column."""
     xy = np.concatenate([view.xy for view in fit.views]) / (fit.model.width, fit.model.height)
     x, y = (xy * _CELLS).astype(np.int64).clip(0, np.subtract(_CELLS, 1)).T
     return np.asarray(x * _CELLS[1] + y, np.int64)
 
 
 def _shared(cells: NDArray[np.int64], residuals: Array) -> float:
-    """The share of the squared residuals that is common to all corners of a cell: about 0 for
+    """The share of the squared residuals that the mean residual of each cell explains: about 0 for
     noise, close to 1 for a model that does not fit the lens."""
     n = np.bincount(cells)
     sums = np.stack([np.bincount(cells, weights=column) for column in residuals.T], axis=1)
@@ -162,8 +163,8 @@ def _drawings(found: Estimate) -> Iterator[Drawing]:
         axes.set(xlim=(0, m.width), ylim=(m.height, 0), aspect="equal")
         yield (
             f"corners-{name}",
-            f"Every corner of all views with its residual, enlarged {times:.0f} times. Arrows "
-            "should point in all directions, and corners should fill the image.",
+            f"Every corner of all views with its residual, enlarged {times:.0f} times. In a good "
+            "calibration, arrows point in all directions, and corners fill the image.",
             figure,
         )
         figure, axes = new_figure(f"Error of each view: {name}", "view", "RMS (px)", LOW)

@@ -1,6 +1,6 @@
 """The checks, as functions of images, matches and timestamps.
 
-They share one file because each is short, and so that their thresholds are in one place.
+The checks are short and share this file, so that their thresholds are in one place.
 """
 
 from __future__ import annotations
@@ -21,47 +21,49 @@ from vslam.errors import counted
 from vslam.frontend.orb import extract
 
 Times = NDArray[np.float64]
-Depth = NDArray[Any]  # numbers, 0 or NaN where missing
+Depth = NDArray[Any]  # of any number type; 0 or NaN where the depth is missing
 
 # A run searches for stereo matches within 2 rows; KITTI's rectification is off by 0.3 to 0.5 px.
 ROWS_PX = 0.8
-IN_FRONT = 0.9  # share of matches with positive disparity; that of distant points scatters about 0
-EXPOSURE = 0.25  # relative difference in brightness; stereo matching compares grey values
-# Another lag must reduce the row error by this much, and to this fraction.
+IN_FRONT = 0.9  # least share of positive disparities; distant points scatter about 0
+EXPOSURE = 0.25  # largest relative difference in brightness; stereo matching compares grey values
+# A frame lag is reported only if it reduces the row error by so many pixels and to this fraction.
 LAG_GAIN_PX, LAG_FACTOR = 0.25, 0.6
-FEATURES = 0.5  # share of the requested features
+FEATURES = 0.5  # least share of the requested features
 # Contrast of pixels with their neighbours, relative to the contrast with a wider neighbourhood:
 # KITTI 0.43, TUM 0.25, EuRoC 0.27; at most 0.17 after a Gaussian blur of 1.5 px.
 SHARP = 0.18
-JITTER = 0.2  # standard deviation, relative to the interval
+JITTER = 0.2  # largest standard deviation, relative to the interval
 GAP = 1.75  # a longer step, in intervals, means that a frame is missing
-# Largest share of steps with a gap; two standard deviations are added, because the share scatters
-# if there are few steps.
+# Largest share of steps with a gap. Two standard deviations are added, because a share of few steps
+# is uncertain.
 GAPS = 0.05
 LONG_GAP = 3.5  # a longer step, in intervals, means that several frames in a row are missing
 DEPTH_PX = 4.0  # depth edges of structured light are off by 2 to 3 px
 DEPTH_SHARE = 0.3  # smallest share of pixels with a depth
-# Depth is misregistered only if the fit has one clear peak away from shift 0. Heights are measured
-# above the median, relative to the highest peak. In nine parts of TUM fr1/desk, the height near
-# shift 0 is at least 0.67, or that of the second peak is 0.85. With depth moved by 20 px, the
-# height near 0 is 0.25 to 0.66, and that of the second peak is mostly 0.65 to 0.77.
+# Misregistered depth is reported only if the fit has one clear peak away from shift 0. Heights are
+# measured above the median of the fit, relative to the highest peak. In nine parts of TUM fr1/desk,
+# the height near shift 0 is at least 0.67, or the height of the second peak is 0.85. If the depth
+# is moved by 20 px, the height near shift 0 is 0.25 to 0.66, and the height of the second peak is
+# mostly 0.65 to 0.77.
 DEPTH_AT_ZERO = 0.6
 DEPTH_SECOND = 0.8
 _ANOTHER_PX = 8.0  # smallest distance of the second peak from the highest one
-DEPTH_VIEWS = 2  # different views that are needed; one scene may fit at another shift by chance
+DEPTH_VIEWS = 2  # least number of different views; a single view may fit a wrong shift by chance
 NEAREST_M, FARTHEST_M = 0.01, 3.0  # plausible baselines of a stereo pair on a vehicle
-# With the right calibration, the fitted factor is 0.975 to 1.026 (KITTI 00 0.98, three parts of
-# fr1/desk, six rendered drives); with a focal length that is 10 % too long, it is 0.89 to 0.93.
+# With the right calibration, the fitted factor of the focal length is 0.975 to 1.026 (KITTI 00,
+# three parts of fr1/desk, six rendered drives). If the calibrated focal length is 10 % too long,
+# the factor is 0.89 to 0.93.
 FOCAL = 0.05
-FOCAL_SIGMA = 0.01  # on straight roads, sigma is 0.05 or more
-TURNED = 2.0  # degrees; on straight roads, up to 1.6 within four frames
+FOCAL_SIGMA = 0.01  # largest sigma of a fit that is used; on straight roads, it is 0.05 or more
+TURNED = 2.0  # least rotation in degrees; on straight roads, up to 1.6 within four frames
 NEAREST_DEPTH_M, FARTHEST_DEPTH_M = 0.05, 100.0  # plausible median depths of a sensor
-_BORDER = 2  # px; a peak this near the end of the search range may lie beyond it
-_REACH = 16, 48  # px, search range down and across; larger across, where the two sensors are apart
+_BORDER = 2  # px; if a peak is this near the end of the search range, the true peak may lie outside
+_REACH = 16, 48  # px, vertical and horizontal search range; the sensors are side by side
 
 
 def check_rectification(matches: Matches) -> Finding:
-    """Check the median row difference of matches."""
+    """Check that matches lie in the same rows, by their median row difference."""
     rows = float(np.median(np.abs(matches.left[:, 1] - matches.right[:, 1])))
     return judge(
         "rectification",
@@ -72,7 +74,7 @@ def check_rectification(matches: Matches) -> Finding:
 
 
 def check_sides(matches: Matches) -> Finding:
-    """Check the sign of the disparity."""
+    """Check the sign of the disparities, which is wrong if left and right are swapped."""
     disparity = matches.left[:, 0] - matches.right[:, 0]
     in_front = float(np.mean(disparity > -ROWS_PX))
     middle = float(np.median(disparity))
@@ -94,8 +96,8 @@ def check_sides(matches: Matches) -> Finding:
 def check_scale(camera: Camera, matches: Matches | None) -> Finding:
     """Report the field of view, the baseline and the median depth.
 
-    The user must compare them with the scene, because images do not reveal a wrong baseline. There
-    is a fault only if the baseline seems to be in a wrong unit.
+    The user must compare these numbers with the scene, because images do not reveal a wrong
+    baseline. Only a baseline that seems to be in a wrong unit is reported as a fault.
 
     Args:
         matches: matches of the stereo pair; None for a monocular or RGB-D camera.
@@ -108,7 +110,7 @@ def check_scale(camera: Camera, matches: Matches | None) -> Finding:
     measured += f"; baseline {camera.baseline:.3f} m"
     if (disparity > 0).any():
         middle = camera.fx * camera.baseline / float(np.median(disparity[disparity > 0]))
-        measured += f", half of the matches nearer than {middle:.3g} m"
+        measured += f", half of the matches are nearer than {middle:.3g} m"
     return judge(
         "scale",
         not NEAREST_M <= camera.baseline <= FARTHEST_M,
@@ -133,7 +135,7 @@ def check_calibration(camera: Camera) -> Finding:
 
 
 def check_focal_length(fit: FocalFit | None, camera: Camera) -> Finding:
-    """Check whether the camera's rotations fit the calibration's focal length.
+    """Check whether the rotations of the camera fit the calibrated focal length.
 
     Args:
         fit: None if too few frames have points in common.
@@ -170,11 +172,11 @@ def check_exposure(pairs: Sequence[tuple[Image, Image]], several: Sequence[Match
 
 
 def check_synchronisation(rows_of_lag: Mapping[int, float]) -> tuple[Finding, int]:
-    """Check whether the cameras are synchronised, or a right image of another frame fits better.
+    """Check whether the cameras are synchronised, or the right image of another frame fits better.
 
     Args:
-        rows_of_lag: median vertical error (px) for each delay of the right image in frames; empty
-            if no frame has matches at all delays.
+        rows_of_lag: median vertical error (px) for each lag, which is the delay of the right image
+            in frames; empty if no frame has matches at all lags.
 
     Returns:
         The finding, and the best lag, which is 0 if the camera hardly moves.
@@ -234,7 +236,7 @@ def sharpness(image: Image) -> float:
 
 
 def check_times(timestamps: Times) -> list[Finding]:
-    """Check order, gaps and jitter of timestamps (s), which need not increase."""
+    """Check order, gaps and jitter of timestamps (s), which may be out of order."""
     steps = np.diff(timestamps)
     if len(steps) < 3:
         return [Finding("times", "unknown", f"{len(timestamps)} frames are too few")]
@@ -278,7 +280,7 @@ def check_times(timestamps: Times) -> list[Finding]:
 def check_depth(images: Sequence[Image], depths: Sequence[Depth]) -> list[Finding]:
     """Check the range of the depth, and whether it is registered to the images.
 
-    Depth edges coincide with image edges, so they fit best without a shift if depth is registered.
+    If the depth is registered, depth edges fit the image edges best without a shift.
     """
     depths = [np.nan_to_num(depth.astype(np.float32)) for depth in depths]
     share = float(np.mean([np.mean(depth > 0) for depth in depths]))
@@ -301,8 +303,8 @@ def check_depth(images: Sequence[Image], depths: Sequence[Depth]) -> list[Findin
 
 
 def _registration(fit: NDArray[np.float32], views: Callable[[], int]) -> Finding:
-    """Report a fault only if there is a single clear peak inside the search range, and more than
-    one view was examined."""
+    """Check whether the best shift is 0. Another shift is a fault only if it is the single clear
+    peak inside the search range, and more than one view was examined."""
     reach = np.array(_REACH)
     best = np.array(np.unravel_index(np.argmax(fit), fit.shape)) - reach
     shifts = np.moveaxis(np.indices(fit.shape), 0, -1) - reach
@@ -327,7 +329,8 @@ def _registration(fit: NDArray[np.float32], views: Callable[[], int]) -> Finding
 
 
 def _edge_fit(image: Image, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """``(33, 97)`` mean edge strength of the image at the depth edges, for each shift of them."""
+    """``(33, 97)`` mean edge strength of the image at the depth edges, for each shift of the depth
+    edges."""
     down, across = _REACH
     grey = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32)
     strength = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))

@@ -1,8 +1,10 @@
-"""Examination of a sequence: all its timestamps, and a few frames spread over it."""
+"""Examination of a sequence: all its timestamps, and a few frames spread over it. The result is a
+table of findings, and pictures."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,15 +14,17 @@ from vslam.camera import Camera, DepthImage, Image
 from vslam.config import OrbConfig
 from vslam.datasets.frames import Source
 from vslam.doctor import checks
-from vslam.doctor.findings import Finding, judge
+from vslam.doctor.findings import Finding, judge, sections
 from vslam.doctor.focal_length import Moved, fit_focal_length
 from vslam.doctor.matching import Matches, joined, match_images
-from vslam.errors import UnreadableImageError
+from vslam.errors import UnreadableImageError, counted, write_file
+from vslam.report.page import Figure, Page, Section
+from vslam.report.render import html
 
 _FRAMES = 8  # examined frames, spread over the sequence
-_LAGS = range(-2, 3)  # delays of the right image in frames that are tried
-# To check the focal length: pairs of frames, frames from the first to the second of a pair, and the
-# smallest number of common points and the largest number that is used.
+_LAGS = range(-2, 3)  # delays of the right image, in frames, that are tried
+# To check the focal length: number of pairs of frames, number of frames from the first to the
+# second of a pair, and least and largest number of common points.
 _TURNS, _LATER = 16, 4
 _FEWEST, _MOST = 30, 200
 _PICTURES = 2
@@ -54,7 +58,7 @@ class Diagnosis:
 def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
     """Run all checks that apply to a stereo, RGB-D or monocular sequence.
 
-    They examine rectified images, as a run uses them.
+    The checks examine rectified images, as a run uses them.
     """
     frames = np.unique(np.linspace(0, len(sequence) - 1, _FRAMES).round().astype(int)).tolist()
     read: dict[int, tuple[Image, Image | DepthImage | None]] = {}
@@ -95,8 +99,8 @@ def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
 
 
 def _examine_mask(sequence: Source, lefts: dict[int, Image]) -> tuple[list[Finding], list[Picture]]:
-    """Measure which share of the first image the mask hides, and draw this part in red; nothing
-    without a mask."""
+    """Measure which share of the first image the mask hides, and draw this part in red; return
+    empty lists without a mask."""
     frame = next(iter(lefts), None)
     read = None if frame is None else sequence.stored[frame].mask
     if frame is None or read is None:
@@ -143,7 +147,7 @@ def _pairs(sequence: Source, lefts: dict[int, Image], lag: int) -> list[_Pair]:
 def _examine_stereo(
     sequence: Source, lefts: dict[int, Image], *, few_features: bool
 ) -> tuple[list[Finding], list[Picture]]:
-    inner = dict(list(lefts.items())[1:-1:2])  # with frames before and after them
+    inner = dict(list(lefts.items())[1:-1:2])  # frames that have frames before and after them
     by_lag = {lag: _pairs(sequence, inner if lag else lefts, lag) for lag in _LAGS}
     pairs = by_lag[0]
     if not any(len(pair.matches) for pair in pairs):
@@ -151,7 +155,7 @@ def _examine_stereo(
         measured = "no pair of images has 12 matches"
         finding = Finding("stereo", "fault", measured, fix)
         if few_features:
-            finding = Finding("stereo", "unknown", f"{measured}, because they have few features")
+            finding = Finding("stereo", "unknown", f"{measured}: the images have few features")
         return [finding], [_stereo_picture(pair) for pair in pairs[:1]]
     synchronised, lag = checks.check_synchronisation(_rows_by_lag(by_lag))
     pairs = by_lag[lag]  # the other checks need synchronised images
@@ -264,3 +268,27 @@ def _depth_picture(image: Image, depth: checks.Depth) -> Picture:
     drawn[checks.depth_edges(np.nan_to_num(depth.astype(np.float32)))] = _RED
     caption = "Depth edges in red; they lie on the edges of objects if the depth is registered."
     return Picture(caption, np.asarray(drawn, np.uint8))
+
+
+def write_page(diagnosis: Diagnosis, title: str, path: Path) -> None:
+    """Write the page as self-contained HTML: faults with their fixes first, then the other checks.
+
+    Raises:
+        ResultsError: the file cannot be written.
+    """
+    faults = len(diagnosis.faults)
+    figures = [
+        Figure(f"picture-{k}", picture.caption, _jpeg(picture))
+        for k, picture in enumerate(diagnosis.pictures)
+    ]
+    page = Page(
+        title,
+        [counted(faults, "fault") if faults else "no faults"],
+        [*sections(diagnosis.findings), Section("", figures)],
+    )
+    write_file(path, html(page), "name another file with --out")
+
+
+def _jpeg(picture: Picture) -> bytes:
+    data = cv2.imencode(".jpg", picture.image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
+    return bytes(data.tobytes())

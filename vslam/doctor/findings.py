@@ -1,4 +1,4 @@
-"""The result of a check."""
+"""The results of checks, and their text for terminal and page."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Finding:
 
     Attributes:
         check: name of the check.
-        verdict: ``unknown`` if the images do not allow a verdict.
+        verdict: ``good``, ``fault``, or ``unknown`` if the images do not allow a verdict.
         measured: the measurement, with units.
         fix: what the user can do; empty unless there is a fault.
     """

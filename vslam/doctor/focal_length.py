@@ -1,9 +1,9 @@
 """Estimation of the focal length from the motion of the camera.
 
 With a wrong focal length, a stereo pair reconstructs a scene that is stretched along the optical
-axis. A pure translation is consistent with such a scene, but a rotation about another axis is not.
-The estimate is the focal length with the least reprojection error, after optimising the motion
-between two frames for each focal length.
+axis. A pure translation of the camera is consistent with such a scene, but a rotation about any
+axis other than the optical axis is not. The estimate is the focal length with the least
+reprojection error, after the motion between two frames was optimised for each focal length.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from vslam.camera import Camera
 Vectors = NDArray[np.float64]
 
 _PIXEL, _DISPARITY = 0.35, 0.3  # px, standard deviations of matches refined by optical flow
-# Squared error, in variances, at which the weight of a point is one half. For 95 % of the inliers,
-# it is less than 6.
+# Squared error, divided by its variance, at which the weight of a point is one half. For 95 % of
+# the inliers, the squared error is less than 6 variances.
 _CAUCHY = 5.0
 _ITERATIONS = 12
 _FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.6, 1.8, 2.0)  # of the coarse search
@@ -48,7 +48,7 @@ class FocalFit:
     """The focal length that fits best.
 
     Attributes:
-        factor: its ratio to the focal length of the calibration.
+        factor: its ratio to the calibrated focal length.
         sigma: standard deviation of the logarithm of ``factor``.
         turned: largest rotation (degrees) about an axis perpendicular to the optical axis, among
             the frames whose points agree with ``factor``.
@@ -129,7 +129,7 @@ def _errors(
     moved: Moved, camera: Camera, factor: float, pose: Vectors
 ) -> tuple[Vectors, Vectors, Vectors]:
     """``(N, 2)`` reprojection errors, their ``(N,)`` variances, and ``(N, 3)`` points in the later
-    frame. The variances include the uncertainty of the points' depth."""
+    frame. The variances include the uncertainty of the depths of the points."""
     projected, points = _project(moved.before, moved.disparity, camera, factor, pose)
     nearer, _ = _project(moved.before, moved.disparity + _DISPARITY, camera, factor, pose)
     return moved.after - projected, _PIXEL**2 + ((nearer - projected) ** 2).sum(axis=1), points

@@ -1,6 +1,6 @@
-"""Matches between two images without assumptions about the cameras' poses.
+"""Match two images without assumptions about the poses of the cameras.
 
-A run searches for stereo matches only in the same rows, but a check of the rectification has to
+A run searches for stereo matches only in the same rows, but a check of the rectification must
 search the whole image.
 """
 
@@ -18,10 +18,10 @@ from vslam.camera import Image
 _FEATURES = 2000
 _MAX_DISTANCE = 64  # bits of 256; ORB-SLAM2's TH_LOW is 50
 _EPIPOLAR_PX = 1.5
-_REFINED_PX = 3.0  # largest error of a keypoint in a coarse octave
+_REFINED_PX = 3.0  # largest move by refinement: keypoints of coarse octaves can be this inaccurate
 _WINDOW = (15, 15)
 _MIN_MATCHES = 12
-_ANOTHER_VIEW = 0.25  # of the image width: smallest median motion between two different views
+_ANOTHER_VIEW = 0.25  # least median motion between two different views, relative to the image width
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ def why_nothing_was_tracked(outcome: RunOutcome) -> str | None:
     if len(outcome.skipped) == n:
         return f"{problem}: no image could be read ({outcome.skipped[0].rstrip('.')})"
     if options.localize:
-        return f"{problem}: none of them was recognised in the map {options.map_file}"
+        return f"{problem}: no frame was recognised in the map {options.map_file}"
     if outcome.sequence.camera.sensor == "stereo" and not outcome.sequence.live:
         disparity = _negative_disparity(outcome.sequence)
         if disparity is not None:
@@ -39,14 +39,14 @@ def why_nothing_was_tracked(outcome: RunOutcome) -> str | None:
         return f"{problem} under --perturb {options.perturb}; a weaker perturbation may work"
     if outcome.sequence.camera.monocular:
         return (
-            f"{problem}: a single camera must move sideways to begin a map; vslam doctor checks "
-            "the rest"
+            f"{problem}: a single camera must move sideways to begin a map; if it did, vslam "
+            "doctor checks images, calibration and times"
         )
     return f"{problem}: vslam doctor checks images, calibration and times"
 
 
 def _negative_disparity(source: Source) -> float | None:
-    """Median disparity of a few frames in pixels if the sides seem to be swapped, else None."""
+    """Median disparity (px) of a few frames if left and right seem to be swapped, else None."""
     found = []
     try:
         for frame in islice(source.frames(), _FRAMES):

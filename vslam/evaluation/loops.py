@@ -21,15 +21,16 @@ from vslam.run.outcome import RunOutcome, ground_truth_of
 # Definition of a revisit.
 MIN_LENGTH_M = 20.0  # of the stretch
 MAX_LATERAL_M = 5.0  # from the earlier path; the next lane is 3 to 4 m away
-MAX_HEADING_DEG = 30.0  # between the optical axes; from behind, a place looks different
+MAX_HEADING_DEG = 30.0  # between the optical axes; seen from behind, a place looks different
 MIN_SECONDS, MIN_PATH_M = 10.0, 50.0  # since the earlier passage
-# Stretches with a shorter gap count as one, because tracking continues in the old map across it.
+# Stretches with a shorter gap between them count as one stretch, because tracking continues in the
+# old map across the gap.
 MAX_INTERRUPTION_M = 10.0
 # Largest error of the relative pose of a correct loop: well above the error of KITTI's ground truth
 # between two passages, and well below the distance between similar houses in a row.
 MAX_TRANSLATION_M, MAX_ROTATION_DEG = 2.0, 5.0
 _SAMPLE_M = 1.0  # the path is sampled once per metre, so that a standing camera adds no samples
-_UNIT_FRAMES = 20  # frames before and after a frame from which a monocular map's unit is estimated
+_UNIT_FRAMES = 20  # frames before and after a frame from which the unit of the map is estimated
 _MAX_STEP_M = 20.0  # between two frames that are farther apart, the path is unknown
 
 Indices = NDArray[np.int64]
@@ -42,7 +43,7 @@ class Revisits:
 
     Attributes:
         first, last: ``(M,)`` first and last frame of each stretch.
-        first_match, last_match: ``(M,)`` earlier frame at the place of ``first`` and of ``last``.
+        first_match, last_match: ``(M,)`` earlier frames at the places of ``first`` and ``last``.
         length_m: ``(M,)`` length of each stretch.
     """
 
@@ -62,10 +63,10 @@ class LoopEvaluation:
 
     Attributes:
         revisits: M stretches.
-        loop_frame: ``(M,)`` query frame of the first right loop that was closed on each stretch, -1
-            if none was.
-        right: for each edge, including rejected ones, whether its relative pose is right; None if
-            it has no pose or its frames have no ground truth.
+        loop_frame: ``(M,)`` query frame of the first correct loop that was closed on each stretch;
+            -1 if no correct loop was closed there.
+        right: for each edge, including rejected edges, whether its relative pose is right; None if
+            the edge has no pose or its frames have no ground truth.
         n_wrong: number of accepted edges whose relative pose is wrong.
     """
 
@@ -76,7 +77,7 @@ class LoopEvaluation:
 
     @property
     def n_found(self) -> int:
-        """Number of stretches with a right loop.
+        """Number of stretches on which a correct loop was closed.
 
         One loop per stretch is enough, because tracking then continues in the old map.
         """
@@ -84,7 +85,7 @@ class LoopEvaluation:
 
     @property
     def n_missed(self) -> int:
-        """Number of stretches without a right loop."""
+        """Number of stretches on which no correct loop was closed."""
         return len(self.revisits) - self.n_found
 
 
@@ -189,10 +190,9 @@ def judge_loops(
     """Determine whether each edge is right, and whether each revisit was found by a loop.
 
     An edge is right if ``T_query_match`` agrees with the ground truth within ``MAX_TRANSLATION_M``
-    and ``MAX_ROTATION_DEG``. It finds a stretch if it is right and accepted, its match belongs to
-    an earlier passage (not to the frames just before), and its query lies on the stretch or within
-    ``MAX_INTERRUPTION_M`` of it, because the camera sees a place shortly before and after it is
-    there.
+    and ``MAX_ROTATION_DEG``. A right and accepted edge finds a stretch if its match belongs to an
+    earlier passage (not to the frames just before) and its query lies on the stretch or within
+    ``MAX_INTERRUPTION_M`` of it: a camera sees a place also shortly before and after it is there.
 
     Args:
         edges: E loops, accepted or not.
@@ -224,7 +224,7 @@ def judge_loops(
 
 def is_right_loop(edge: LoopEdge, frames: Indices, T_wc: Poses) -> bool | None:
     """Whether the relative pose of a loop agrees with the ground truth, as in `judge_loops`; None
-    if it has no pose or its frames have no ground truth."""
+    if the loop has no pose or its frames have no ground truth."""
     if edge.T_query_match is None or edge.query < 0:
         return None
     query, match = frames[edge.query], frames[edge.match]
@@ -243,7 +243,8 @@ def is_right_loop(edge: LoopEdge, frames: Indices, T_wc: Poses) -> bool | None:
 def _earlier_passage(
     T_wc: Poses, timestamps: NDArray[np.float64], path: NDArray[np.float64]
 ) -> Indices:
-    """``(S,)`` index of the nearest sample of an earlier passage for each sample, or -1."""
+    """``(S,)`` index of the nearest sample of an earlier passage for each sample of the path; -1 if
+    the camera was not there before."""
     from scipy.spatial import cKDTree
 
     position, axis = T_wc[:, :3, 3], T_wc[:, :3, 2]
@@ -280,6 +281,6 @@ def _long_ago(
     query: Indices | int,
     match: Indices | int,
 ) -> NDArray[np.bool_]:
-    """Whether the match is early enough to belong to an earlier passage than the query."""
+    """Whether a match is early enough before its query to belong to an earlier passage."""
     apart = path[query] - path[match] >= MIN_PATH_M
     return apart & (timestamps[query] - timestamps[match] >= MIN_SECONDS)

@@ -31,9 +31,9 @@ class MotionErrors:
 
     @property
     def nees(self) -> NDArray[np.float64]:
-        """``(M,)`` normalised estimation errors squared, divided by the six degrees of freedom: 1
-        on average if the covariances are right (Bar-Shalom et al., Estimation with Applications to
-        Tracking and Navigation, 2001, 5.4)."""
+        """``(M,)`` normalised estimation errors squared (NEES), divided by the six degrees of
+        freedom, so that their mean is 1 if the covariances are right (Bar-Shalom et al., Estimation
+        with Applications to Tracking and Navigation, 2001, 5.4)."""
         solved = np.linalg.solve(self.covariance, self.xi[:, :, None])[:, :, 0]
         return np.asarray((self.xi * solved).sum(axis=1) / 6.0, np.float64)
 
@@ -55,7 +55,7 @@ def motion_errors(
 
     Args:
         tracks: one result per frame; frames without an uncertainty or a true pose are not used.
-        truth: true poses at the times of frames.
+        truth: true poses at the times of some or all frames.
         interval_s: duration of a motion; it ends at the first frame that is at least this many
             seconds later.
     """

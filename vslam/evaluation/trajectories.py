@@ -30,8 +30,9 @@ class Evaluation:
     Attributes:
         frames: N, number of compared frames.
         alignment: ``se3``, ``sim3`` or ``none``, the transformation fitted before the comparison.
-        on_one_line: whether all positions lie on one line. They do not determine the rotation about
-            this line, which was then fitted to the orientations; evo rejects such trajectories.
+        on_one_line: whether all positions lie on one line. The rotation about this line was then
+            fitted to the orientations, because the positions do not determine it. evo rejects such
+            trajectories.
         timestamps: ``(N,)`` seconds of the estimate.
         ate_rmse_m, ate_mean_m, ate_max_m: RMSE, mean and maximum of ``errors_m``.
         errors_m: ``(N,)`` distance of each aligned position from the ground truth.
@@ -71,10 +72,10 @@ def evaluate_trajectory(
     alignment (``none``).
 
     Trajectories with the same timestamps are compared frame by frame. Otherwise, each pose is
-    compared with the pose nearest in time, if it is at most 10 ms away; ``Evaluation.frames`` is
-    the number of such pairs. ATE is the RMSE of the positions [Sturm et al., IROS 2012] after
-    alignment by Umeyama's method (TPAMI 1991; without scale for ``se3``). RPE is computed from one
-    frame to the next, and KITTI's drift by `kitti_drift`.
+    compared with the true pose nearest in time if that is at most 10 ms away;
+    ``Evaluation.frames`` is the number of such pairs. ATE is the RMSE of the positions [Sturm et
+    al., IROS 2012] after alignment by Umeyama's method (TPAMI 1991; without scale for ``se3``). RPE
+    is computed from one frame to the next, and KITTI's drift by `kitti_drift`.
 
     Raises:
         InputError: the alignment is unknown, the trajectories have no common frames, or the camera
@@ -130,8 +131,8 @@ def evaluate_trajectory(
 def _align(estimate: Any, reference: Any, with_scale: bool) -> bool:
     """Align a trajectory of evo in place; returns whether the positions lie on one line.
 
-    Positions on a line do not determine the rotation about it. Therefore, points on short axes of
-    the cameras are aligned together with the positions.
+    Positions on a line do not determine the rotation about the line. In this case, a point to the
+    right of each camera and a point below it are aligned together with the positions.
     """
     from evo import EvoException
     from evo.core.geometry import umeyama_alignment
@@ -170,9 +171,9 @@ def kitti_drift(
 ) -> tuple[float, float] | None:
     """Average drift over segments of 100 to 800 m, as the KITTI development kit defines it.
 
-    Segments of 100, 200, ..., 800 m start at every tenth frame and end at the first frame beyond
-    this length along the ground truth. The error of the motion over a segment is divided by its
-    length [Geiger et al., CVPR 2012].
+    Segments of 100, 200, ..., 800 m start at every tenth frame and end at the first frame that is
+    farther along the ground truth than this length. The error of the motion over a segment is
+    divided by the length of the segment [Geiger et al., CVPR 2012].
 
     Args:
         T_wc: ``(N, 4, 4)`` estimate.
@@ -209,7 +210,7 @@ def read_pair(
             in KITTI's format, which have no times.
 
     Raises:
-        InputError: a file is malformed, or the two cannot be matched without times.
+        InputError: a file is malformed, or the files cannot be matched without times.
     """
     timestamps = None if times is None else read_table(times, (1,), "a time in seconds")[:, 0]
     formats = {trajectory_format(estimate), trajectory_format(ground_truth)}

@@ -12,19 +12,19 @@ import numpy as np
 from vslam.evaluation.trajectories import Evaluation
 from vslam.geometry import Matrix
 from vslam.maps.stored_map import World
-from vslam.run.outcome import RunOutcome, matched_ground_truth
+from vslam.run.outcome import RunOutcome
 
 
 def name_of_world(outcome: RunOutcome) -> str:
-    """Name of the world frame of a run's ground truth. Rendered drives along one route share it,
-    whatever their light and traffic."""
+    """Name of the world frame of a run's ground truth. All rendered drives along a route have the
+    same name, whatever their light and traffic."""
     return f"{outcome.sequence.dataset} {outcome.sequence.name.partition('+')[0]}"
 
 
 def world_of(outcome: RunOutcome, evaluation: Evaluation) -> World:
-    """The transformation from a map to its ground truth, by the alignment of the trajectory that
-    built the map."""
-    truth = matched_ground_truth(outcome)
+    """The transformation from a map to its ground truth: the alignment of the trajectory of the
+    run that made the map."""
+    truth = outcome.ground_truth
     assert truth is not None
     kept = np.isin(outcome.trajectory.timestamps, truth.timestamps)
     T_wc, aligned = outcome.trajectory.T_wc[kept], evaluation.T_wc_aligned
@@ -32,9 +32,9 @@ def world_of(outcome: RunOutcome, evaluation: Evaluation) -> World:
 
 
 def error_in_map(outcome: RunOutcome) -> float | None:
-    """RMSE (m) of the frames that were localised in the map from which a run started; None if the
-    transformation from this map to the run's ground truth is unknown."""
-    world, truth = outcome.world, matched_ground_truth(outcome)
+    """Position RMSE (m) of the frames that were localised in the map that a run continued; None if
+    the transformation from this map to the ground truth of the run is unknown."""
+    world, truth = outcome.world, outcome.ground_truth
     if world is None or truth is None or outcome.in_map is None:
         return None
     frames = np.isin(outcome.trajectory.timestamps, truth.timestamps) & outcome.in_map

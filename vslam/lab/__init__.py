@@ -1,4 +1,5 @@
 """Experiments: benchmarks of many runs, stress tests, comparisons of loop detectors on images.
 
-Running SLAM does not need them; only the command line imports them (tests/test_dependencies.py).
+Running SLAM does not need this package; only the command line imports it
+(tests/test_dependencies.py).
 """

@@ -26,8 +26,8 @@ from vslam.maps.checkpoint import ARRAYS as CHECKPOINT_ARRAYS
 from vslam.maps.checkpoint import checked_checkpoint
 from vslam.maps.stored_map import StoredMap, World, observations
 
-# Instead of these columns, the file has a list of observations by landmark, which determines them
-# together with keyframe_first_row.
+# These columns are not in the file. They are computed from its list of observations, which is
+# sorted by landmark, and from keyframe_first_row.
 _NOT_IN_FILE = ("head", "n_observations", "keyframe", "landmark", "next_row")
 # The columns of the map and their names in the file.
 FILE_NAMES = {
@@ -84,9 +84,9 @@ class DamagedMapError(Exception):
 def _scalars(entry: dict[str, Any]) -> Scalars:
     names = asdict(Scalars())
     scalars = Scalars(**{name: type(default)(entry[name]) for name, default in names.items()})
-    _require(abs(scalars.disparity_offset) < _MAX_OFFSET, "the disparity offset")
-    _require(0.0 <= scalars.offset_information < np.inf, "the disparity offset")
-    _require(0 <= scalars.session < _MAX_SESSION, "the number of the drive")
+    _require(abs(scalars.disparity_offset) < _MAX_OFFSET, "disparity_offset is out of range")
+    _require(0.0 <= scalars.offset_information < np.inf, "offset_information is out of range")
+    _require(0 <= scalars.session < _MAX_SESSION, "session is out of range")
     return scalars
 
 
@@ -110,7 +110,7 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
         a = map_.arrays
         living = bool(a.keyframe_alive.all() and a.landmark_alive.all())
         _require(living, "a culled keyframe or landmark without a checkpoint")
-        _require(bool((np.diff(a.first_keyframe) >= 0).all()), "the order of the landmarks")
+        _require(bool((np.diff(a.first_keyframe) >= 0).all()), "the landmarks are not in order")
     detector, n = header["detector"], sizes["K"]
     tables = {str(name): _per_keyframe(data, f"detector_{name}", n) for name in detector["tables"]}
     images = _per_keyframe(data, "image", n) if header["images"] else None
@@ -175,7 +175,7 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
     _check_ids("keyframe_parent", parent, n, least=NONE)
     _require(bool((data["keyframe_unit_scale"] > 1 / _MOST).all()), "keyframe_unit_scale")
     _check_ids("keyframe_restart", data["keyframe_restart"], UNPREDICTED + 1)
-    _require(not data["keyframe_restart"][:1].any(), "keyframe_restart of the first keyframe")
+    _require(not data["keyframe_restart"][:1].any(), "the first keyframe has a restart")
     _check_ids("row_octave", data["row_octave"], len(scales))
     _require(bool((data["row_certainty"] > 0).all()), "row_certainty")
 
@@ -201,7 +201,7 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
 
 
 def _check_merges(merged_into: NDArray[np.int32], alive: NDArray[np.bool_]) -> None:
-    """Check that every chain of ``merged_into`` ends, at a living landmark or at none."""
+    """Check that every chain of ``merged_into`` ends at a living landmark or at -1."""
     n = len(merged_into)
     _check_ids("landmark_merged_into", merged_into, n, least=NONE)
     _require(bool((merged_into[alive] == NONE).all()), "a living landmark that was merged")

@@ -58,7 +58,8 @@ def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
 
 
 def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
-    """Everything else in a checkpoint as a JSON object; JSON preserves float64 exactly."""
+    """The rest of a checkpoint, without its arrays, as a JSON object. JSON preserves float64
+    exactly."""
     tracker, closing = checkpoint.tracker, checkpoint.closing
     consistency = closing.consistency
     return {
@@ -112,7 +113,7 @@ def checked_checkpoint(
     tracker, mapper, policy = (dict(entry[name]) for name in ("tracker", "mapper", "policy"))
     T_cw, twist = tracker.pop("T_cw"), tracker.pop("twist")
     landmark, reference = arrays["landmark"], _count(mapper["reference"])
-    # These are -1 and -inf until a drive in a stored map inserts its first keyframe.
+    # A drive that continues in a stored map has the values -1 and -inf until its first keyframe.
     last_frame, last_timestamp = _count(mapper["last_frame"], -1), mapper["last_timestamp"]
     valid = (
         ((landmark >= -1) & (landmark < map_.n_landmarks)).all()

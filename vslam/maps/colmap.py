@@ -1,8 +1,9 @@
 """COLMAP's sparse model, text or binary (https://colmap.github.io/format.html).
 
-COLMAP's poses are ``T_cw`` with x right, y down, z forward, as here, but its pixel coordinates
-begin at the corner of the image: the centre of the upper left pixel is (0.5, 0.5). COLMAP's files
-of rigs and frames are not written, so COLMAP treats every image as a separate frame.
+As in vslam, COLMAP's poses are ``T_cw`` with x right, y down and z forward. Unlike in vslam, its
+pixel coordinates begin at the corner of the image: the centre of the upper left pixel is
+(0.5, 0.5). The optional files of rigs and frames are not written, so COLMAP treats every image as a
+separate frame.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def save_colmap(
     *,
     text: bool = False,
 ) -> None:
-    """Write ``cameras``, ``images`` and ``points3D`` as ``.bin``, or with ``text`` as ``.txt``.
+    """Write ``cameras.bin``, ``images.bin`` and ``points3D.bin``; with ``text``, ``.txt`` files.
 
     Only keypoints that observe a landmark are written.
 

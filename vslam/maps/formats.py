@@ -80,8 +80,8 @@ def save_g2o(
     information matrix, row by row, translation first.
 
     The information of rotations is per square radian, as GTSAM, Ceres' examples and SE-Sync expect.
-    g2o itself measures rotations by qx qy qz, which are half the angle if it is small, and so gives
-    them a quarter of the weight.
+    g2o itself measures the error of a rotation by qx qy qz, which for small angles is half the
+    angle, and so gives rotations a quarter of the weight.
 
     Args:
         ids: ``(N,)`` ids of the vertices.
@@ -125,8 +125,8 @@ def _words(values: list[float]) -> str:
 def save_ply(
     path: Path | str, xyz: NDArray[np.float64], colours: NDArray[np.uint8] | None = None
 ) -> None:
-    """Write ``(N, 3)`` points (world, metres) as binary PLY, with ``(N, 3)`` uint8 RGB colours if
-    they are given."""
+    """Write ``(N, 3)`` points in the world (metres) as binary PLY, with or without their ``(N, 3)``
+    uint8 RGB colours."""
     fields = [("xyz", "<f4", 3)]
     properties = [f"property float {axis}\n" for axis in "xyz"]
     if colours is not None:
@@ -179,6 +179,6 @@ def landmark_colours(
         colours[seen] = pixels.reshape(len(pixels), -1)
     order = np.lexsort((colours @ _LUMA, r.landmark))
     counts = np.bincount(r.landmark, minlength=len(r.xyz))
-    # The lower median, so that the result is an observed colour.
+    # The lower median is an observed colour, not the mean of two.
     middle = order[np.cumsum(counts) - counts + (counts - 1) // 2]
     return colours[middle]

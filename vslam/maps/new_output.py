@@ -14,12 +14,12 @@ from vslam.errors import InputError, ResultsError
 
 @contextmanager
 def new_output(path: Path, *, folder: bool = False) -> Iterator[Path]:
-    """Yield the path of a temporary file to write, or with ``folder`` an empty temporary folder. It
-    is renamed to ``path`` at the end, or removed after an error.
+    """Yield the path of a temporary file to write, or with ``folder`` an empty temporary folder. At
+    the end it is renamed to ``path``; after an error it is removed.
 
     Raises:
-        InputError: ``path`` exists already; with ``folder`` it may be an empty folder.
-        ResultsError: it cannot be written, for example because the disk is full.
+        InputError: ``path`` exists already. With ``folder``, an empty folder is accepted.
+        ResultsError: the output cannot be written, for example because the disk is full.
     """
     empty = path.is_dir() and not path.is_symlink() and not any(path.iterdir())
     if not (folder and empty):
@@ -47,7 +47,7 @@ def replaced_file(path: Path) -> Iterator[BinaryIO]:
     at the end. After an error ``path`` is unchanged.
 
     Raises:
-        OSError: it cannot be written, for example because the disk is full.
+        OSError: the file cannot be written, for example because the disk is full.
     """
     part = _beside(path)
     try:

@@ -11,8 +11,8 @@ from vslam.camera import Camera
 from vslam.geometry import inverses
 from vslam.map import Map
 
-# Centre of the upper left pixel in formats whose pixel coordinates begin at the image corner; in
-# vslam it is 0.
+# Coordinates of the centre of the upper left pixel in formats whose pixel coordinates begin at the
+# corner of the image. In vslam this centre is (0, 0).
 PIXEL_CENTRE = 0.5
 
 
@@ -20,7 +20,7 @@ PIXEL_CENTRE = 0.5
 class Reconstruction:
     """Living keyframes and landmarks, numbered without gaps, and their observations.
 
-    K keyframes, L landmarks, N observations, all of the left camera.
+    There are K keyframes, L landmarks and N observations, all of the left camera.
 
     Attributes:
         camera: camera of all keyframes; the centre of the upper left pixel is (0, 0), as in OpenCV.

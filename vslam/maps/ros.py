@@ -3,11 +3,11 @@
 The frames are those of REP 105: ``map`` -> ``odom`` -> ``base_link`` -> ``camera_optical``. Their
 axes are those of REP 103: in ``map``, ``odom`` and ``base_link`` x points forward, y left and z up;
 in ``camera_optical``, as everywhere else in vslam, x points right, y down and z forward.
-``base_link`` lies in the left camera, and ``map`` and ``odom`` in its first pose. Lengths are in
-metres, or in the unit of a monocular map.
+``base_link`` is at the left camera; ``map`` and ``odom`` are at the first pose of ``base_link``.
+Lengths are in metres, or in the unit of a monocular map.
 
-The argument ``types`` of these functions returns a message class for the name of a message: a class
-of rosbags for files, or one of ROS for a node (``examples/ros2``).
+The functions take an argument ``types``, which returns the message class for the name of a message:
+a class of rosbags to write files, or a class of ROS for a node (``examples/ros2``).
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ T_BASE_OPTICAL = np.array(
 _LAST_SECOND = 2**31  # builtin_interfaces/Time counts seconds in 32 bits with a sign
 _FLOAT32 = 7  # sensor_msgs/PointField
 _VERSION: Literal[8] = 8  # bag version of ROS 2 Humble, which later releases read, too
-# For each topic, its message type, and whether it has only one message, which subscribers that
-# connect later also receive.
+# For each topic, its message type, and whether it is latched: it then has a single message, which
+# subscribers that connect later also receive.
 TOPICS = {
     "/tf_static": ("tf2_msgs/msg/TFMessage", True),
     "/map_points": ("sensor_msgs/msg/PointCloud2", True),
@@ -65,7 +65,7 @@ class FramePose:
 
     @classmethod
     def of(cls, result: TrackResult, stamp: int) -> FramePose:
-        """The pose of a frame that ``Slam.step`` returned. ``stamp`` is given in nanoseconds,
+        """The pose of a frame, from the result of ``Slam.step``. ``stamp`` is given in nanoseconds,
         because ROS looks up transforms by exact times, and Unix time in float64 seconds has a
         resolution of only 0.2 us."""
         uncertainty, T = result.uncertainty, result.T_odom_camera
@@ -91,8 +91,8 @@ def in_ros_axes(T: Matrix) -> Matrix:
 
 
 def odometry_message(types: Types, pose: FramePose, before: FramePose | None) -> Any:
-    """``nav_msgs/Odometry``: the pose of ``base_link`` in ``odom``, and its mean velocity since the
-    frame ``before``, in ``base_link``; the velocity is zero if ``before`` is None."""
+    """``nav_msgs/Odometry``: the pose of ``base_link`` in ``odom``, and the mean velocity of
+    ``base_link``, in its own axes, since the frame ``before``; zero if ``before`` is None."""
     twist, R = np.zeros(6), T_BASE_OPTICAL[:3, :3]
     if before is not None:
         motion = inverse(before.T_odom_base) @ pose.T_odom_base
@@ -140,7 +140,8 @@ def path_message(types: Types, trajectory: Trajectory) -> Any:
 
 
 def points_message(types: Types, stamp: int, xyz: NDArray[np.float64]) -> Any:
-    """``sensor_msgs/PointCloud2`` in ``map``, of ``(N, 3)`` points in the world of vslam."""
+    """``sensor_msgs/PointCloud2`` in the frame ``map``, made from ``(N, 3)`` points in the world
+    frame of vslam."""
     points = (xyz @ T_BASE_OPTICAL[:3, :3].T).astype("<f4")
     fields = [
         types("sensor_msgs/msg/PointField")(name=name, offset=4 * k, datatype=_FLOAT32, count=1)
@@ -163,7 +164,7 @@ def nanoseconds(timestamp: float) -> int:
     """Convert a time in seconds to nanoseconds.
 
     Raises:
-        InputError: ROS cannot represent it.
+        InputError: ROS cannot represent the time.
     """
     if not 0 <= timestamp < _LAST_SECOND:
         raise InputError(
@@ -179,8 +180,8 @@ def save_bag(
     """Write an MCAP file with the topics of ``TOPICS``.
 
     Args:
-        poses: the poses of the frames, at least one.
-        trajectory: the poses of the path.
+        poses: the poses for the topics ``/tf`` and ``/odom``, at least one.
+        trajectory: the poses for the topic ``/path``.
         xyz: ``(N, 3)`` landmarks in the world of the trajectory.
 
     Raises:
@@ -259,8 +260,8 @@ def frame_poses(
 
 
 def _covariance(matrix: Matrix | None, R: Matrix) -> NDArray[np.float64]:
-    """``(36,)`` the covariance of ``[x, y, z, rx, ry, rz]`` with axes rotated by ``R``, row by row.
-    An unknown covariance (None) is all zeros, as in ``sensor_msgs``."""
+    """``(36,)`` the covariance of ``[x, y, z, rx, ry, rz]`` after rotating the axes by ``R``, row
+    by row. An unknown covariance (None) becomes all zeros, the convention of ``sensor_msgs``."""
     if matrix is None:
         return np.zeros(36)
     both = np.kron(np.eye(2), R)

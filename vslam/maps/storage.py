@@ -35,10 +35,11 @@ _FOREIGN = "not a map of vslam; name a map.npz or the folder of a run"
 def save_map(path: Path | str, stored: StoredMap, *, resumable: bool = False) -> None:
     """Write a map; an existing file is replaced.
 
-    After an error or a power cut, an existing file is unchanged. The file holds the JSON text
+    After an error or a power cut, an existing file is unchanged. The file contains the JSON text
     ``header`` (schema, camera, detector, drives, thresholds, versions), the arrays of ``ARRAYS``,
-    and values for each keyframe: ``detector_NAME_first``, ``detector_NAME_values``, ``image_first``
-    and ``image_values``. Observations are listed by landmark, in the order of the map's chains.
+    and the data of the detector and the images for each keyframe (``PerKeyframe``):
+    ``detector_NAME_first``, ``detector_NAME_values``, ``image_first`` and ``image_values``.
+    Observations are sorted by landmark; those of one landmark are in the order of its chain.
 
     Args:
         path: the file.

@@ -29,12 +29,13 @@ from vslam.states import Checkpoint
 
 @dataclass(frozen=True)
 class World:
-    """The place of a map in the world of a ground truth.
+    """The transformation of a map into the frame of a ground truth.
 
     Attributes:
         name: data set and sequence of the ground truth.
-        S_truth_world: ``(4, 4)`` maps the map's world to that of the ground truth, so that the
-            first drive is aligned with it: a rigid motion, or a similarity for a monocular map.
+        S_truth_world: ``(4, 4)`` transformation from the map's world frame to that of the ground
+            truth, which aligns the first drive with the ground truth. It is a rigid motion, or a
+            similarity for a monocular map.
     """
 
     name: str
@@ -56,7 +57,8 @@ class StoredMap:
         drives: source of the images of each drive, such as "kitti 06".
         thresholds: the thresholds of the last drive that differed from the defaults, by dotted
             name.
-        world: the map's place in the world of a ground truth; None without ground truth.
+        world: the transformation of the map into the frame of a ground truth; None without ground
+            truth.
         checkpoint: state from which the last drive continues with identical results. The map then
             includes dead keyframes and landmarks, with unchanged ids. None if the map is compact or
             there was no checkpoint.
@@ -182,7 +184,7 @@ def observations(
     Args:
         rows: ``(O,)`` rows that observe the landmarks, sorted by landmark; each row occurs once.
         first: ``(L + 1,)`` offsets of each landmark in ``rows``; a dead landmark has no rows.
-        u_right: ``(R,)`` right columns of all rows.
+        u_right: ``(R,)`` columns in the right image, for all rows; NaN without a stereo match.
     """
     count = np.diff(first)
     landmark, next_row = (np.full(len(u_right), NONE, np.int32) for _ in range(2))
@@ -260,8 +262,8 @@ def _spanning_tree(
         if ancestor >= 0:
             parent[k] = new_id[ancestor]
 
-    # A sub-map now begins at its first selected keyframe, where edges of the spanning tree may be
-    # weak.
+    # If the first keyframe of a sub-map is not selected, the sub-map begins at its first selected
+    # keyframe.
     restart = np.zeros(n, np.uint8)
     begins = np.array(map_.restarts, np.int64)
     position = np.searchsorted(keyframes, begins)
@@ -283,7 +285,7 @@ def _renumbered(frames: FrameTable, map_: Map, new_id: NDArray[np.int64]) -> Fra
     for i, keyframe in enumerate(frames.reference.tolist()):
         if not map_.n_keyframes or map_.arrays.keyframe_alive[keyframe]:
             continue
-        # Do not change the pose that FramePoses.pose returns.
+        # This replaces the reference without changing the pose that FramePoses.pose returns.
         T_c_reference[i, :3, 3] *= table.unit_scale[keyframe] / unit[i]
         T_c_reference[i] = orthonormalised(T_c_reference[i] @ table.T_c_parent[keyframe])
         reference[i] = table.parent[keyframe]

@@ -1,1 +1,1 @@
-"""The report of one run, in its folder: JSON for scripts, Markdown, HTML and PNG for people."""
+"""The report of one run, in its folder: JSON for scripts; Markdown, HTML and PNG for people."""

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 BLUE, GREEN, AMBER, RED, GREY = "#3b82f6", "#10b981", "#f59e0b", "#ef4444", "#94a3b8"
 VIOLET = "#8b5cf6"
-COMPARED = ("#ec4899", "#f97316", "#06b6d4")  # colours of the detectors of --compare, in turn
+COMPARED = ("#ec4899", "#f97316", "#06b6d4")  # colours of the detectors of --compare, repeated
 STATE_COLORS = {
     TrackingState.WEAK: AMBER, TrackingState.LOST: RED, TrackingState.DROPPED: VIOLET,
 }  # fmt: skip
@@ -64,7 +64,7 @@ STYLE = {
 WIDTH, LOW, SQUARE = 4.6, 2.5, 5.4
 DOTS_PER_INCH = 200
 _LEGEND_CHARACTERS = 60  # that fit side by side
-_HANDLE_CHARACTERS = 6  # taken by the line or marker of an entry and the gap to the next
+_HANDLE_CHARACTERS = 6  # width of the line or marker of an entry and of the gap to the next entry
 
 Drawing = tuple[str, str, Figure]  # name, caption and figure
 
@@ -87,7 +87,7 @@ def add_legend(figure: Figure, axes: Axes) -> None:
 
 
 def _legend_columns(labels: Sequence[str]) -> int:
-    """The most columns, as matplotlib fills them, that are not wider than the figure."""
+    """The largest number of columns that are not wider than the figure."""
     lengths = np.array([len(label) + _HANDLE_CHARACTERS for label in labels])
     columns = len(lengths)
     while columns > 1 and (
@@ -112,7 +112,8 @@ def plain_ticks(axis: Axis) -> None:
 
 
 def draw(drawings: Iterable[Drawing]) -> list[page.Figure]:
-    """Save drawings. A lazy iterable makes them here, in the style of reports."""
+    """Save drawings. If ``drawings`` is a generator, its figures are made here, in the style of
+    reports."""
     # after_reset ignores the user's matplotlibrc, so that equal runs give equal figures.
     with style.context(STYLE, after_reset=True):
         return [save(*drawing) for drawing in drawings]

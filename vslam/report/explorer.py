@@ -1,7 +1,7 @@
 """The explorer in a report: pose, state and error of every frame, and images of some keyframes.
 
 A frame adds 47 bytes to the page, an image with its keypoints about 10,000. ``explorer.js`` uses no
-plotting library, because that (Plotly: 4.7 MB) would be larger than the rest of the page.
+plotting library, because a library (Plotly: 4.7 MB) would be larger than the rest of the page.
 """
 
 from __future__ import annotations
@@ -18,21 +18,19 @@ from vslam.evaluation.trajectories import Evaluation
 from vslam.report.page import Markup, Section
 from vslam.report.render import fill_template
 from vslam.run.outcome import RunOutcome
-from vslam.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from vslam.run.moments import Moment
 
 
 def explorer(
-    outcome: RunOutcome,
-    evaluation: Evaluation | None,
-    ground_truth: Trajectory | None,
-    moments: Collection[Moment],
+    outcome: RunOutcome, evaluation: Evaluation | None, moments: Collection[Moment]
 ) -> list[Section]:
-    """The section with the explorer, or none if fewer than two frames were tracked. The arguments
-    are those of :func:`explorer_data`."""
-    data = explorer_data(outcome, evaluation, ground_truth, moments)
+    """The section with the explorer; no section if fewer than two frames were tracked.
+
+    The arguments are those of :func:`explorer_data`.
+    """
+    data = explorer_data(outcome, evaluation, moments)
     if data is None:
         return []
     program = files("vslam.report").joinpath("explorer.js").read_text("utf-8")
@@ -42,10 +40,7 @@ def explorer(
 
 
 def explorer_data(
-    outcome: RunOutcome,
-    evaluation: Evaluation | None,
-    ground_truth: Trajectory | None,
-    moments: Collection[Moment],
+    outcome: RunOutcome, evaluation: Evaluation | None, moments: Collection[Moment]
 ) -> dict[str, Any] | None:
     """Numbers and images for ``explorer.js``, ready for JSON; None if fewer than two frames were
     tracked.
@@ -55,8 +50,7 @@ def explorer_data(
 
     Args:
         outcome: the run.
-        evaluation: errors of ``outcome.trajectory``, or None.
-        ground_truth: ground truth of the evaluated frames, or None.
+        evaluation: errors of ``outcome.trajectory``; None if they cannot be computed.
         moments: images from a `vslam.run.moments.MomentRecorder`.
     """
     n = len(outcome.trajectory)
@@ -65,11 +59,11 @@ def explorer_data(
     times = outcome.trajectory.timestamps
     T_wc, errors = outcome.trajectory.T_wc, np.full(n, np.nan)
     truth = np.zeros((0, 3))
-    if evaluation is not None and ground_truth is not None:
+    if evaluation is not None and outcome.ground_truth is not None:
         at = np.searchsorted(times, evaluation.timestamps).clip(0, n - 1)
         errors[at] = evaluation.errors_m
         if evaluation.frames == n:  # otherwise only a part of the path has been aligned
-            T_wc, truth = evaluation.T_wc_aligned, ground_truth.T_wc[:, :3, 3]
+            T_wc, truth = evaluation.T_wc_aligned, outcome.ground_truth.T_wc[:, :3, 3]
     states = sorted({str(track.state) for track in outcome.tracks})
     floats = {
         "t": times - times[0],

@@ -34,38 +34,30 @@ from vslam.report.drawing import (
 from vslam.report.summary import stage_names
 from vslam.report.trajectory_figures import gps_map, loop_closing, top_view
 from vslam.run.outcome import RunOutcome
-from vslam.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _STAGE_COLORS = [BLUE, AMBER, GREEN, VIOLET, "#ec4899", "#06b6d4", "#84cc16", "#f97316", GREY]
 _MOTION_S = 1.0  # duration of the motions whose errors are drawn
-_MAX_BINS = 240  # of the stacked times, so that a bin is one or two pixels wide
+_MAX_BINS = 240  # in the plot of stacked times, so that a bin is one or two pixels wide
 
 
 def draw_figures(
-    outcome: RunOutcome,
-    evaluation: Evaluation | None,
-    ground_truth: Trajectory | None,
-    verdict: LoopEvaluation | None,
+    outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
 ) -> list[page.Figure]:
     """Draw all figures for which this run has data, in the order of the report.
 
     Args:
         outcome: the run.
-        evaluation: errors of ``outcome.trajectory``, or None.
-        ground_truth: ground truth of the evaluated frames, or None.
-        verdict: evaluation of ``outcome.loops``, or None.
+        evaluation: errors of ``outcome.trajectory``; None if they cannot be computed.
+        verdict: evaluation of ``outcome.loops``; None if a frame has no ground truth.
     """
-    return draw(_drawings(outcome, evaluation, ground_truth, verdict))
+    return draw(_drawings(outcome, evaluation, verdict))
 
 
 def _drawings(
-    outcome: RunOutcome,
-    evaluation: Evaluation | None,
-    ground_truth: Trajectory | None,
-    verdict: LoopEvaluation | None,
+    outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
 ) -> Iterator[Drawing]:
     if len(outcome.trajectory) and (outcome.n_tracked or not outcome.tracks):
         caption = "Seen from above, at equal scale; z points ahead of the first camera."
@@ -73,20 +65,20 @@ def _drawings(
             caption += f" Estimate after {evaluation.alignment.upper()} alignment."
         if outcome.compared:
             caption += " Dashed: the detectors of --compare, each after its own alignment."
-        yield "top_view", caption, top_view(outcome, evaluation, ground_truth, verdict)
+        yield "top_view", caption, top_view(outcome, evaluation, verdict)
     if (track := outcome.gps_track) is not None:
         caption = (
-            "Seen from above, in metres from the first fix: the trajectory by vision alone, "
-            "aligned to the fixes as a whole, and the trajectory with GPS."
+            "Seen from above, in metres from the first fix: the trajectory with GPS, and the "
+            "trajectory by vision alone after its alignment with the fixes."
         )
         yield "gps_map", caption, gps_map(track)
     if outcome.corrections:
         caption = (
             "Keyframes just before the first loop was closed, and at the end. A dashed line joins "
-            "the two keyframes of each loop before its correction; its length is the drift that "
-            "the correction removed."
+            "the two keyframes of a loop as they were before its correction; the length of the "
+            "line is the drift that the correction removed."
         )
-        yield "loop_closing", caption, loop_closing(outcome, evaluation, ground_truth)
+        yield "loop_closing", caption, loop_closing(outcome, evaluation)
     if evaluation is not None:
         yield (
             "error_along_path",
@@ -94,22 +86,22 @@ def _drawings(
             _error_along_path(outcome, evaluation),
         )
         yield "error_histogram", "Number of frames by error.", _error_histogram(evaluation)
-    if ground_truth is not None and not outcome.sequence.camera.monocular:
-        errors = motion_errors(outcome.tracks, ground_truth, _MOTION_S)
+    if outcome.ground_truth is not None and not outcome.sequence.camera.monocular:
+        errors = motion_errors(outcome.tracks, outcome.ground_truth, _MOTION_S)
         if len(errors.first) > 1:
             yield (
                 "odometry_error",
                 "Error of the motion over one second by odometry alone (trajectory_odom.tum), and "
-                "twice the standard deviation that its covariance predicts. About one error in "
-                "twenty should be larger, provided that the ground truth is that accurate over one "
-                "second (KITTI's is not).",
+                "twice its standard deviation according to the estimated covariance. About one "
+                "error in twenty should be larger, provided that the ground truth is accurate "
+                "enough over one second (KITTI's is not).",
                 _odometry_error(errors),
             )
     if outcome.tracks:
         yield (
             "tracked_points",
-            f"{_usable_features(outcome)[0].capitalize()}, matches with landmarks, and inliers of "
-            "the pose.",
+            f"Number of {_usable_features(outcome)[0]}, of matches with landmarks, and of inlier "
+            "matches.",
             _tracked_points(outcome),
         )
     if stage_names(outcome.tracks):
@@ -120,7 +112,7 @@ def _drawings(
         )
         yield (
             "stage_distribution",
-            "Of the frames that went through a stage, boxes contain 50 % and whiskers 90 %.",
+            "Boxes contain 50 % and whiskers 90 % of the frames that went through a stage.",
             _stage_distribution(outcome),
         )
 
@@ -203,7 +195,7 @@ def _tracked_points(outcome: RunOutcome) -> Figure:
 
 
 def _usable_features(outcome: RunOutcome) -> tuple[str, list[int]]:
-    """The kind of features that can become landmarks with this sensor, and their number in each
+    """The name of the features that this sensor can turn into landmarks, and their number in each
     frame."""
     sensor = outcome.sequence.camera.sensor
     if sensor == "mono":
@@ -263,6 +255,6 @@ def _stage_colors(names: list[str]) -> list[str]:
 
 
 def _intervals(at: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """``(M, 2)`` first and last index of each run of True in ``(N,)``."""
+    """``(M, 2)`` first and last index of each interval of True values in ``(N,)`` ``at``."""
     steps = np.diff(np.concatenate([[False], at, [False]]).astype(np.int8))
     return np.stack([np.flatnonzero(steps == 1), np.flatnonzero(steps == -1) - 1], axis=1)

@@ -1,15 +1,13 @@
-"""Read the folder of a finished run: its map, images and pose graph."""
+"""Read the folder of a finished run: its map and images."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 
-from vslam.backend.pose_graph import PoseGraph, essential_graph
 from vslam.camera import Camera, same_camera
-from vslam.config import Config, load_config
 from vslam.datasets.frames import Source, TimedFrame, frames_at
 from vslam.datasets.sources import LIVE, open_source
 from vslam.errors import InputError
@@ -25,8 +23,11 @@ _WITHOUT_IMAGES = "export g2o, euroc or ply --no-colours, which need no images"
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """The content of a run's folder. ``map`` has no removed keyframes; ``loops`` are the closed
-    ones, with the relative poses that verification measured."""
+    """The content of a run's folder.
+
+    ``map`` contains no culled keyframes. ``loops`` are the closed loops, with the relative poses
+    that verification measured.
+    """
 
     folder: Path
     report: ReportJson
@@ -48,16 +49,9 @@ def read_run(folder: Path | str) -> FinishedRun:
     stored = load_map(folder / "map.npz")
     if not stored.map.n_keyframes:
         raise InputError(f"{folder / 'map.npz'}: the map is empty; name a run that has one.")
-    return FinishedRun(folder, read_report(folder), stored.map, stored.camera, stored.loops)
-
-
-def read_report(folder: Path | str) -> ReportJson:
-    """Read ``report.json`` of a run.
-
-    Raises:
-        InputError: it is missing, damaged or of another version of vslam.
-    """
-    return ReportJson.read(Path(folder) / "report.json")
+    return FinishedRun(
+        folder, ReportJson.read(folder / "report.json"), stored.map, stored.camera, stored.loops
+    )
 
 
 def open_images(
@@ -68,11 +62,12 @@ def open_images(
     """Open the images of a run again, with the options in its ``run.json``.
 
     Args:
-        data: the present location of the data, if it has moved.
+        data: the location of the data if it has moved; None for the location in ``run.json``.
         on_render: as in :func:`vslam.datasets.open_sequence`.
 
     Raises:
-        InputError: the images are missing, are of another camera, or came from a live camera.
+        InputError: the images are missing, are of another camera, or came from a live camera, or
+            the map was made from several drives.
     """
     if set(run.map.sessions) != {run.map.scalars.session}:  # the report is of the last drive
         raise InputError(
@@ -108,27 +103,4 @@ def _other_images(run: FinishedRun) -> InputError:
     return InputError(
         f"{run.report.dataset} {run.report.sequence}: the times or the camera differ from those of "
         f"{run.folder}; use --data to name the data that the run was made on."
-    )
-
-
-def pose_graph(run: FinishedRun) -> PoseGraph:
-    """The essential graph of a run's final map, with its measured loop edges and the weights that
-    the run used.
-
-    Raises:
-        InputError: the run's thresholds cannot be read.
-    """
-    config = load_config(run.folder / "config.json")
-    return graph_of_map(run.map, run.loops, config)
-
-
-def graph_of_map(map_: Map, loops: Collection[LoopEdge], config: Config) -> PoseGraph:
-    """The essential graph of a finished map."""
-    return essential_graph(
-        map_,
-        loops,
-        config.pose_graph,
-        weak=map_.restarts,
-        unpredicted=map_.unpredicted_restarts,
-        driven=True,
     )

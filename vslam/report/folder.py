@@ -21,12 +21,7 @@ from vslam.maps.storage import save_map
 from vslam.report.frame_table import write_covariances, write_frames
 from vslam.report.schema import ReportJson
 from vslam.report.summary import evaluate_run, gps_figures, summarize
-from vslam.run.outcome import (
-    RunOutcome,
-    causal_trajectory,
-    matched_ground_truth,
-    odometry_trajectory,
-)
+from vslam.run.outcome import RunOutcome, causal_trajectory, odometry_trajectory
 from vslam.trajectory import write_kitti, write_tum
 
 if TYPE_CHECKING:
@@ -47,9 +42,9 @@ def create_run_folder(
 ) -> Path:
     """Create ``out/<YYYYmmdd-HHMMSS>-<dataset>-<sequence>-<perturb>-<detector>``.
 
-    The first changed threshold is appended, with the number of further ones, and a number if the
-    name is in use. ``out/latest`` becomes a symbolic link to the folder if the file system has
-    such links.
+    If thresholds differ from the defaults, the first of them is appended, with the number of
+    further ones. If the name is in use, a number is appended. ``out/latest`` becomes a symbolic
+    link to the folder if the file system supports such links.
 
     Raises:
         InputError: the folder cannot be created.
@@ -94,7 +89,7 @@ def write_results(
 ) -> ReportJson:
     """Evaluate a complete or interrupted run and write all results.
 
-    The most valuable files are written first, and one that fails does not affect the others:
+    The most valuable files are written first. If a file cannot be written, the others still are:
 
     - trajectories: ``trajectory_kitti.txt``, ``trajectory.tum``, ``ground_truth_kitti.txt``,
       ``keyframes.tum``, ``trajectory_causal.tum`` (poses as first estimated), ``covariance.csv``
@@ -107,7 +102,7 @@ def write_results(
 
     Args:
         folder: an existing folder; files of an earlier report are replaced.
-        outcome: the run; all its frames may be lost, or there may be none.
+        outcome: the run, which may have lost all frames or have no frames.
         moments: images of keyframes for the HTML page.
         pictures: pictures of closed loops; some become ``figures/loop-<frame>-<frame>.jpg``.
         pages: whether to write the pages.
@@ -115,7 +110,7 @@ def write_results(
         map_file: a second place to write the map to.
 
     Raises:
-        ResultsError: some results could not be written; all others are complete.
+        ResultsError: some results could not be written; all others were written.
     """
     written = Results(folder)
     evaluation, remark = _write_data(written, outcome, ply=ply, map_file=map_file)
@@ -133,7 +128,7 @@ def write_results(
 
 
 class Results:
-    """Writes the results of a run; the failure of one does not prevent the others."""
+    """Writes the results of a run, and continues with the others if one cannot be written."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -149,7 +144,7 @@ class Results:
 
     @contextlib.contextmanager
     def file(self, name: str) -> Iterator[Path]:
-        """The path at which to write a file or folder, which is removed if that fails."""
+        """Yield the path at which to write a file or folder, which is removed if writing fails."""
         path = self.folder / name
         with self.part(name):
             try:
@@ -160,10 +155,10 @@ class Results:
                 raise
 
     def require_all(self) -> None:
-        """Fail if a part has failed.
+        """Check that all parts have succeeded.
 
         Raises:
-            ResultsError: names the parts and their errors.
+            ResultsError: some parts failed; the message names them and their errors.
         """
         if not self._failed:
             return
@@ -179,7 +174,7 @@ class Results:
         else:
             remedy = "free some space or name another folder with --out"
         raise ResultsError(
-            f"{self.folder}: {failed}, all other results are there; {remedy}."
+            f"{self.folder}: {failed}, all other results were written; {remedy}."
         ) from first
 
 
@@ -192,8 +187,11 @@ def _reason(error: Exception) -> str:
 def _write_data(
     written: Results, outcome: RunOutcome, *, ply: bool, map_file: Path | None
 ) -> tuple[Evaluation | None, str | None]:
-    """Write trajectories, maps and tables; return the result of ``evaluate_run``, which also gives
-    the place of the map in the ground truth."""
+    """Write trajectories, maps and tables; return the result of ``evaluate_run``.
+
+    The evaluation also gives the transform from the map to the ground truth, which the map file
+    contains.
+    """
     write_trajectories(written, outcome)
     with written.file("keyframes.tum") as file:
         write_tum(file, outcome.keyframes)
@@ -256,14 +254,15 @@ def _config_text(outcome: RunOutcome) -> str:
 
 def write_trajectories(written: Results, outcome: RunOutcome) -> None:
     """Write the final trajectory in both formats, and the ground truth of the same frames. If some
-    frames have none, it is written only in the TUM format, which has times."""
+    frames have no ground truth, it is written only in the TUM format, because only this format has
+    times."""
     with written.file("trajectory_kitti.txt") as file:
         write_kitti(file, outcome.trajectory.T_wc)
     with written.file("trajectory.tum") as file:
         write_tum(file, outcome.trajectory)
     ground_truth = None
     with written.part("the ground truth"):
-        ground_truth = matched_ground_truth(outcome)
+        ground_truth = outcome.ground_truth
     if ground_truth is None:
         return
     if len(ground_truth) == len(outcome.trajectory):
@@ -275,7 +274,7 @@ def write_trajectories(written: Results, outcome: RunOutcome) -> None:
 
 
 def _evo_command(folder: Path, outcome: RunOutcome, evaluation: Evaluation | None) -> str | None:
-    """The command that repeats the evaluation with evo; None if evo cannot."""
+    """The command that repeats the evaluation with evo; None if evo cannot evaluate this run."""
     if evaluation is None or evaluation.on_one_line:
         return None
     if evaluation.frames == len(outcome.trajectory):
@@ -294,18 +293,17 @@ def _write_pages(
     moments: Collection[Moment],
     pictures: Collection[LoopPicture],
 ) -> None:
-    """Write the figures, and pages with the figures that could be drawn."""
+    """Write the figures, and the pages, which contain the figures that could be drawn."""
     from vslam.report.explorer import explorer
     from vslam.report.figures import draw_figures
     from vslam.report.loop_tables import seen_loops
     from vslam.report.render import html, markdown
     from vslam.report.run_page import run_page
 
-    truth = matched_ground_truth(outcome)
     figures: list[Figure] = []
     seen: list[Figure] = []
     with written.file("figures") as file:
-        drawn = draw_figures(outcome, evaluation, truth, verdict)
+        drawn = draw_figures(outcome, evaluation, verdict)
         figures = [replace(figure, file=f"figures/{figure.name}.png") for figure in drawn]
         seen = seen_loops(report, pictures)
         file.mkdir(exist_ok=True)
@@ -316,6 +314,6 @@ def _write_pages(
         page = run_page(report, figures, seen, recordings)
         file.write_text(markdown(page), encoding="utf-8")
     with written.file("report.html") as file:
-        sections = explorer(outcome, evaluation, truth, moments)
+        sections = explorer(outcome, evaluation, moments)
         page = run_page(report, figures, seen, recordings, sections, _config_text(outcome))
         file.write_text(html(page), encoding="utf-8")

@@ -21,9 +21,9 @@ def write_frames(path: Path, tracks: list[TrackResult]) -> None:
     """Write a row per frame: time (s), state, counts, whether it became a keyframe, standard
     deviations of position (m) and orientation (degrees), and milliseconds of each stage.
 
-    The first two deviations are relative to the landmarks around the camera, the others relative to
-    the start of the drive. Cells of unknown deviations are empty, and so are those of stages that a
-    frame did not go through.
+    The first two deviations are relative to the landmarks around the camera, the other two relative
+    to the start of the drive. Cells of unknown deviations are empty, and so are the cells of stages
+    that a frame did not go through.
     """
     stages = stage_names(tracks)
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -50,11 +50,12 @@ def _sigmas(track: TrackResult) -> list[str]:
 
 
 def write_covariances(path: Path, tracks: list[TrackResult]) -> None:
-    """Write a row per frame with known covariances: time (s) and two upper triangles, row by row.
+    """Write a row for each frame with known covariances: the time (s), and the upper triangles of
+    two covariances, row by row.
 
-    The covariances are those of ``[x, y, z, rx, ry, rz]`` in metres and radians, in the frame of
-    the camera (``vslam.odometry``). The first is relative to the landmarks around the camera
-    (``local``), the second to the start of the drive (``drive``).
+    Both are covariances of ``[x, y, z, rx, ry, rz]`` in metres and radians, in the frame of the
+    camera (``vslam.odometry``). The first is that of the pose relative to the landmarks around the
+    camera (``local``), the second relative to the start of the drive (``drive``).
     """
     upper = np.triu_indices(6)
     pairs = [f"{_AXES[row]}_{_AXES[column]}" for row, column in zip(*upper, strict=True)]
@@ -73,8 +74,8 @@ def write_covariances(path: Path, tracks: list[TrackResult]) -> None:
 def read_covariances(
     path: Path,
 ) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Read the two ``(6, 6)`` covariances of each frame that ``write_covariances`` wrote, keyed by
-    the time as it is written in the file.
+    """Read the two ``(6, 6)`` covariances of each frame that ``write_covariances`` wrote. The keys
+    are the times, as text of the file.
 
     Raises:
         InputError: the file is missing or damaged.

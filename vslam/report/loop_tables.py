@@ -1,4 +1,4 @@
-"""Tables and pictures of loops, of limited size even if hundreds of candidates were rejected."""
+"""Tables and pictures of loops. Their size is limited, even for hundreds of rejected candidates."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
 def loop_sections(report: ReportJson) -> list[Section]:
-    """Closed loops, revisits, reasons for rejection, and the candidates nearest to acceptance."""
+    """Sections on closed loops, revisits, the reasons for rejections, and the rejected candidates
+    with the most inliers."""
     return [
         Section("Loops closed", [_closed(report)]),
         Section("Revisits", [_revisits(report)], wide=False),
@@ -41,7 +42,10 @@ def _revisits(report: ReportJson) -> Table:
         )
         for r in report.revisits
     ]
-    note = "Frames in which the camera, by the ground truth, drives along an earlier stretch again."
+    note = (
+        "Frames in which, according to the ground truth, the camera drives along an earlier "
+        "stretch again."
+    )
     return Table(("frames", "earlier frames", "length", "loop"), rows, ("loop",), note)
 
 
@@ -60,8 +64,9 @@ def _closed(report: ReportJson) -> Table:
     head = (*_EVIDENCE, "pose", "moved", "time")
     note = (
         "Proposed by: the detectors that found the place. Verified by: the descriptors (ORB or "
-        "learned) whose matches give the relative pose. Pose: whether it agrees with the ground "
-        "truth. Moved: the largest distance by which the correction moved a keyframe."
+        "learned) whose matches give the relative pose. Pose: whether the relative pose agrees "
+        "with the ground truth. Moved: the largest distance by which the correction moved a "
+        "keyframe."
     )
     if report.sensor == "mono":
         note = f"{note.rstrip('.')}, in units of the map."
@@ -113,7 +118,7 @@ def _evidence(loop: LoopEntry) -> Row:
 
 
 def _shared_reason(loops: list[LoopEntry]) -> str:
-    """The reason of loops whose reasons differ only in their numbers, which become ranges."""
+    """One text for reasons that differ only in their numbers, which are replaced by ranges."""
     columns = zip(*(_NUMBER.findall(loop.reason) for loop in loops), strict=True)
     ends = [(min(column, key=float), max(column, key=float)) for column in columns]
     ranges = iter([low if low == high else f"{low}-{high}" for low, high in ends])
@@ -130,7 +135,7 @@ def _right_share(loops: list[LoopEntry]) -> str:
 
 
 def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[Figure]:
-    """Draw a few closed loops: wrong ones first, then those that learned descriptors verified.
+    """Draw a few closed loops: wrong loops first, then loops verified by learned descriptors.
 
     Args:
         report: the numbers of the run.

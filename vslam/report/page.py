@@ -39,7 +39,7 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Tile:
-    """One number of a summary; ``tone`` is ``good``, ``bad`` or empty."""
+    """One number of a summary; ``tone`` is ``good`` (green), ``bad`` (red) or empty."""
 
     label: str
     value: str
@@ -49,7 +49,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class Tiles:
-    """The numbers that a reader should see first."""
+    """The numbers of a summary, which readers should see first."""
 
     tiles: Sequence[Tile]
 

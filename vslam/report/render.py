@@ -38,7 +38,7 @@ def write_files(
     Args:
         folder: where to write.
         files: text or bytes by file name, in the order in which they are written.
-        fix: the remedy that the error message names.
+        fix: what the error message advises the user to do.
 
     Raises:
         ResultsError: a file cannot be written.
@@ -96,12 +96,12 @@ def _markdown_part(part: Part) -> str:
 
 
 def html(page: Page) -> str:
-    """One self-contained HTML page, which loads nothing."""
+    """A self-contained HTML page, which loads no other files."""
     return fill_template("report.html.jinja", page=page)
 
 
 def fill_template(template: str, **values: object) -> str:
-    """Fill in one of the templates of this package; all text is escaped."""
+    """Fill values into a template of this package; text in values is escaped."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -135,8 +135,8 @@ def _is_shown(part: Part) -> bool:
 def show(sections: Iterable[Section], console: Console) -> None:
     """Print sections to a terminal.
 
-    Sentences are wrapped at the width of the console. Tables and values are not, because a broken
-    number cannot be read and a broken command cannot be copied.
+    Sentences are wrapped at the width of the console. Tables and values are not wrapped, because a
+    broken number cannot be read and a broken command cannot be copied.
     """
 
     def say(text: str, *, style: str = "", indent: str = "") -> None:
@@ -180,7 +180,7 @@ def _columns(rows: Sequence[Row]) -> list[str]:
 
 
 def rich_table(table: Table, gap: int) -> RichTable:
-    """A rich table that is as wide as its cells need; headings are broken at commas and brackets.
+    """A table of rich in which no cell is cut off; headings are broken at commas and brackets.
 
     Args:
         table: the cells.

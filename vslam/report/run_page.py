@@ -47,14 +47,14 @@ _COMPARED = (
     ("time", "seconds", "{:.1f} s"),
 )
 _ABOUT_COMPARED = (
-    "All detectors saw the same frames. Time: wall time of tracking and mapping, on cores that the "
-    "detectors share, without reading images and extracting features, which is done once for all. "
-    "To compare costs, time separate runs."
+    "All detectors saw the same frames. Time: wall time of tracking and mapping, while the "
+    "detectors share the cores. It excludes reading images and extracting features, which is done "
+    "once for all detectors. To compare costs, time separate runs."
 )
 
 
 def headlines(report: ReportJson) -> list[Tile]:
-    """The summary. Lost frames come first, because the ATE of a run with many of them means
+    """The summary. Lost frames come first, because the ATE of a run that lost many frames means
     little."""
     lost, mono = report.lost_frames, report.sensor == "mono"
     share = f"{100.0 * lost / report.frames:.1f} % of" if lost else "of"
@@ -106,12 +106,12 @@ def _before_map(report: ReportJson) -> str:
 
 
 def _together(report: ReportJson) -> str:
-    """A remark on speed and memory if several detectors were run; otherwise empty."""
+    """A remark that speed and memory cover several detectors; empty for a single detector."""
     return f", {len(report.detectors)} detectors together" if report.detectors else ""
 
 
 def advice(report: ReportJson) -> str:
-    """What to do if many frames were lost; otherwise empty."""
+    """What to do if many frames were lost; empty if few were."""
     if report.lost_frames <= _MANY_LOST * report.frames:
         return ""
     return "Many frames were lost; vslam doctor checks images, calibration and time stamps."
@@ -140,8 +140,8 @@ def _on_earth(report: ReportJson) -> list[Tile]:
 
 
 def _latency(report: ReportJson) -> list[Tile]:
-    """The latency of a real-time run; dropped frames are marked, because they show that the machine
-    is too slow."""
+    """The latency of a real-time run. It is marked as bad if frames were dropped, because then the
+    machine is too slow."""
     if report.latency_ms is None:
         return []
     ms, dropped = report.latency_ms, report.dropped_frames
@@ -167,8 +167,8 @@ def _loops(report: ReportJson) -> Tile:
 
 
 def _revisits(report: ReportJson) -> str:
-    """How many revisits were found. If there are none, right loops on shorter stretches are
-    mentioned."""
+    """How many revisits were found. If the drive has no revisits, correct loops on shorter
+    stretches are mentioned."""
     if report.revisit_stretches:
         return f"{report.loops_found} of {counted(report.revisit_stretches, 'revisit')} found"
     none = f"the drive revisits no stretch of {MIN_LENGTH_M:.0f} m or more"
@@ -177,10 +177,10 @@ def _revisits(report: ReportJson) -> str:
 
 
 def detector_section(report: ReportJson) -> Section:
-    """A row for each detector, the run's own first; empty if no detectors were compared.
+    """A section with a row for each detector, the run's own first; empty without a comparison.
 
-    Columns without any value are left out. The number of closed loops is shown only if no ground
-    truth tells which revisits were found.
+    Columns without any value are left out. The number of closed loops is shown only if there is no
+    ground truth that shows which revisits were found.
     """
     detectors = report.detectors
     if not detectors:

@@ -22,7 +22,7 @@ class Record(BaseModel):
 
 
 class Document(Record):
-    """A JSON file of results. A subclass sets ``schema_version`` to the one that it can read."""
+    """A JSON file of results. A subclass sets ``schema_version`` to the version that it reads."""
 
     schema_version: int
 
@@ -63,12 +63,14 @@ class StageTime(Record):
 class LoopEntry(Record):
     """One loop candidate, accepted or rejected, with the frames of this run.
 
-    ``query_frame`` is None for a frame that did not become a keyframe, ``match_frame`` for a
-    keyframe of an earlier drive. ``right``: whether the relative pose agrees with the ground truth,
-    None if unknown. ``moved_m``: the largest distance by which the correction moved a keyframe;
-    ``correction_s``: its duration; both are None for rejected candidates. ``matched_by``: the
-    descriptors that gave the relative pose. ``proposed_by``: the detector that found the candidate,
-    or several joined by ``+``.
+    - ``query_frame``: None for a frame that did not become a keyframe.
+    - ``match_frame``: None for a keyframe of an earlier drive.
+    - ``right``: whether the relative pose agrees with the ground truth; None if unknown.
+    - ``moved_m``: the largest distance by which the correction moved a keyframe; None for rejected
+      candidates.
+    - ``correction_s``: the duration of the correction; None for rejected candidates.
+    - ``matched_by``: the descriptors that gave the relative pose.
+    - ``proposed_by``: the detectors that found the candidate, joined by ``+``.
     """
 
     query_frame: int | None
@@ -88,7 +90,8 @@ class LoopEntry(Record):
 class RevisitEntry(Record):
     """Frames in which, according to the ground truth, the camera drives along an earlier stretch.
 
-    ``loop_frame`` is the first of them in which a right loop was closed, None if all missed it.
+    ``loop_frame`` is the first of these frames in which a correct loop was closed; None if the
+    revisit was missed.
     """
 
     first_frame: int
@@ -105,9 +108,10 @@ class Measures(Record):
     Errors are None without ground truth, and KITTI's drift also on paths shorter than 100 m.
     ``causal_ate_rmse_m`` is the ATE of the poses as first estimated (``trajectory_causal.tum``),
     after their own alignment. ``loops_closed`` is the number of accepted candidates, of which
-    ``loops_wrong`` are wrong. ``loops_found`` and ``loops_missed`` are numbers of revisited
-    stretches. The last three are None without ground truth. ``interrupted`` is the reason why the
-    run ended early, or None.
+    ``loops_wrong`` are wrong. ``loops_found`` and ``loops_missed`` are the numbers of revisited
+    stretches with and without a correct loop. Without ground truth, ``loops_wrong``,
+    ``loops_found`` and ``loops_missed`` are None. ``interrupted`` is the reason why the run ended
+    early; None if it did not.
     """
 
     lost_frames: int
@@ -138,12 +142,15 @@ class DetectorFigures(Measures):
 class MapFigures(Record):
     """How a run was localised in the map that it continued.
 
-    ``in_map_percent``: frames whose final pose is in the map; ``weak_percent``: those of them with
-    few inliers (WEAK). ``first_fix_s``: time from the first frame to the first localised one, None
-    if there is none. ``sought``: number of frames at which the whole map was searched; ``found``:
-    number of successful searches. ``error_m``: RMSE of the positions in the map, with the alignment
-    of the drives that made the map, so that it includes an offset of the whole run; None if the
-    map has not been aligned to the ground truth.
+    - ``in_map_percent``: share of the frames whose final pose is in the map.
+    - ``weak_percent``: share of the frames whose pose is in the map but has few inliers (WEAK).
+    - ``first_fix_s``: time from the first frame to the first localised frame; None if no frame was
+      localised.
+    - ``sought``: number of frames at which the whole map was searched.
+    - ``found``: number of these searches that succeeded.
+    - ``error_m``: RMSE of the positions in the map. They are aligned as the drives that made the
+      map, so that the error includes an offset of the whole run; None if the map was not aligned
+      with a ground truth.
     """
 
     in_map_percent: float
@@ -157,13 +164,17 @@ class MapFigures(Record):
 class GpsFigures(Record):
     """The georeferenced trajectory in numbers, also written as ``gps.json``.
 
-    ``datum``: origin of the local east-north-up frame, the first fix, as latitude and longitude in
-    degrees and altitude in metres. ``antenna``: its position in the frame of the left camera (x
-    right, y down, z forward), in metres. ``fixes``: number of fixes at tracked frames, of which
-    ``refused`` failed the chi-square test. ``residual_m``: root mean square distance of the other
-    fixes from the trajectory. ``metres_per_unit``: mean scale of the map. ``ate_rmse_m``: ATE of
-    ``trajectory_enu.tum`` after SE3 alignment, None without ground truth. ``level``: False if the
-    drive is so straight that GPS does not determine the rotation about its direction.
+    - ``datum``: origin of the local east-north-up frame, which is the first fix: latitude and
+      longitude in degrees, altitude in metres.
+    - ``antenna``: its position in the frame of the left camera (x right, y down, z forward), in
+      metres.
+    - ``fixes``: number of fixes at tracked frames.
+    - ``refused``: number of these fixes that failed the chi-square test.
+    - ``residual_m``: root mean square distance of the other fixes from the trajectory.
+    - ``metres_per_unit``: mean scale of the map.
+    - ``ate_rmse_m``: ATE of ``trajectory_enu.tum`` after SE3 alignment; None without ground truth.
+    - ``level``: False if the drive is so straight that GPS does not determine the rotation about
+      its direction.
     """
 
     datum: tuple[float, float, float]
@@ -194,14 +205,14 @@ class ReportJson(Measures, Document):
       new map. ``longest_loss_s``: the longest time from a lost frame to the next tracked one or to
       the end.
     - ``warnings``: sentences about faults of the rig that the run has detected.
-    - ``evaluation_remark``: why there are no errors, or how many frames they cover.
+    - ``evaluation_remark``: why no errors were computed, or how many frames they cover.
     - ``latency_ms``: time from an image to its pose in a real-time run, otherwise None.
     - ``loops_rejected``: number of rejected candidates. ``revisit_stretches``: the sum of
       ``loops_found`` and ``loops_missed`` (:mod:`vslam.evaluation.loops`).
-    - ``detectors``: with ``--compare``, all detectors, the run's own first; speed, CPU time and
-      memory are then those of all together. It is empty in a resumed run, because the maps of the
-      other detectors are not saved.
-    - ``thresholds``: those that differ from the defaults, by dotted name.
+    - ``detectors``: with ``--compare``, all detectors, the run's own first; the speed, CPU time and
+      memory of the run then cover all detectors together. The list is empty in a resumed run,
+      because the maps of the other detectors are not saved.
+    - ``thresholds``: thresholds that differ from the defaults, by dotted name.
     """
 
     schema_version: int = 5

@@ -31,15 +31,15 @@ from vslam.report.schema import (
     RevisitEntry,
     StageTime,
 )
-from vslam.run.outcome import RunOutcome, causal_trajectory, matched_ground_truth
+from vslam.run.outcome import RunOutcome, causal_trajectory
 
 _OPTIONS = (
     "perturb", "detector", "seed", "threads", "start", "every", "max_frames", "weights",
     "local_weights", "realtime", "calib", "mask", "gps", "localize", "compare",
 )  # fmt: skip
 
-_WRONG_SCALE = 1.2  # drift changes the scale by a few per cent
-_LEFT_OVER = 0.3  # share of the error, and of the path's size, that a change of scale may leave
+_WRONG_SCALE = 1.2  # smallest factor that is reported; drift changes the scale by a few per cent
+_LEFT_OVER = 0.3  # largest share of the error, and of the path's size, left after scaling
 
 
 def summarize(
@@ -53,9 +53,9 @@ def summarize(
 
     Args:
         outcome: the run.
-        evaluation: errors of ``outcome.trajectory``, or None.
-        verdict: evaluation of ``outcome.loops``, or None.
-        evo_command: command that repeats the evaluation, or None.
+        evaluation: errors of ``outcome.trajectory``; None if they cannot be computed.
+        verdict: evaluation of ``outcome.loops``; None if a frame has no ground truth.
+        evo_command: command that repeats the evaluation; None if evo cannot evaluate the run.
         remark: why there is no evaluation, or how many frames it covers.
     """
     frames = len(outcome.tracks)
@@ -107,9 +107,9 @@ def summarize(
 
 
 def _scale_warnings(outcome: RunOutcome, evaluation: Evaluation | None) -> list[str]:
-    """A warning if the trajectory of a sensor that knows the scale fits the ground truth only after
-    it is scaled."""
-    camera, ground_truth = outcome.sequence.camera, matched_ground_truth(outcome)
+    """A warning if a trajectory fits the ground truth only after it is scaled, although the sensor
+    measures the scale."""
+    camera, ground_truth = outcome.sequence.camera, outcome.ground_truth
     if evaluation is None or ground_truth is None or camera.monocular:
         return []
     estimate, truth = (
@@ -151,8 +151,11 @@ def _longest_loss_s(tracks: list[TrackResult]) -> float:
 
 
 def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
-    """The errors of a run's final trajectory, or None, and a remark if not all frames count."""
-    ground_truth = matched_ground_truth(outcome)
+    """The errors of the final trajectory of a run, and a remark; either can be None.
+
+    The remark says why there are no errors, or how many frames they cover if not all.
+    """
+    ground_truth = outcome.ground_truth
     if ground_truth is None:
         return None, "no ground truth"
     if not outcome.tracks:
@@ -168,7 +171,7 @@ def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
 
 def causal_ate(outcome: RunOutcome) -> float | None:
     """ATE of the poses as first estimated; None if it cannot be computed."""
-    ground_truth = matched_ground_truth(outcome)
+    ground_truth = outcome.ground_truth
     if ground_truth is None or not outcome.tracks:
         return None
     try:
@@ -213,7 +216,7 @@ def _figures_in_map(outcome: RunOutcome) -> MapFigures | None:
     inside, tracks = outcome.in_map, outcome.tracks
     if inside is None:
         return None
-    # A lost frame is searched for only while no keyframe is being mapped.
+    # Relocalisation of a lost frame is attempted only while no keyframe is being mapped.
     lost = [track for track in tracks if track.state == TrackingState.LOST]
     found = [track for track in tracks if track.relocalised]
     sought = sum("relocalise" in track.stage_ms for track in lost) + len(found)
@@ -233,7 +236,7 @@ def gps_figures(outcome: RunOutcome) -> GpsFigures | None:
     """The georeferenced trajectory in numbers; None without GPS."""
     if (track := outcome.gps_track) is None:
         return None
-    ate, ground_truth = None, matched_ground_truth(outcome)
+    ate, ground_truth = None, outcome.ground_truth
     if ground_truth is not None:
         with suppress(InputError):
             ate = evaluate_trajectory(track.trajectory, ground_truth, "se3").ate_rmse_m

@@ -30,7 +30,6 @@ from vslam.report.drawing import (
 )
 from vslam.report.summary import evaluate_run
 from vslam.run.outcome import RunOutcome
-from vslam.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,25 +40,19 @@ Points = NDArray[np.float64]
 
 
 def top_view(
-    outcome: RunOutcome,
-    evaluation: Evaluation | None,
-    ground_truth: Trajectory | None,
-    verdict: LoopEvaluation | None,
+    outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
 ) -> Figure:
-    """Estimate, ground truth, weak and lost frames, closed loops and missed revisits. The estimates
-    of the detectors of --compare are dashed, each after its own alignment."""
+    """Draw estimate, ground truth, weak and lost frames, closed loops and missed revisits. The
+    trajectories of the detectors of --compare are dashed, each after its own alignment."""
     figure, axes = _new_map("Top view", outcome, evaluation)
     path = _aligned(outcome, evaluation, outcome.trajectory.T_wc[:, :3, 3])
     x, z = path[:, 0], path[:, 2]
-    if evaluation is not None and ground_truth is not None:
-        truth = ground_truth.T_wc[:, :3, 3]
-        axes.plot(truth[:, 0], truth[:, 2], color=GREY, linewidth=3.4, alpha=0.65, label="truth")
     name = outcome.settings.detector if outcome.compared else "estimate"
     axes.plot(x, z, color=BLUE, label=name)
     for k, (other, color) in enumerate(zip(outcome.compared, cycle(COMPARED), strict=False)):
         its_own = None if evaluation is None else evaluate_run(other)[0]
         points = _aligned(other, its_own, other.trajectory.T_wc[:, :3, 3])
-        # Shifted dashes keep all of several coinciding paths visible.
+        # The dashes of each path are shifted, so that coinciding paths all stay visible.
         dashes = (2.0 * k, (2.0, 2.0 * len(outcome.compared)))
         axes.plot(
             points[:, 0],
@@ -105,18 +98,13 @@ def top_view(
     return figure
 
 
-def loop_closing(
-    outcome: RunOutcome, evaluation: Evaluation | None, ground_truth: Trajectory | None
-) -> Figure:
-    """Keyframes before the first correction and at the end, in the frame of the ground truth.
+def loop_closing(outcome: RunOutcome, evaluation: Evaluation | None) -> Figure:
+    """Draw the keyframes before the first correction and at the end.
 
-    Both are transformed by the alignment of the final trajectory, so that every difference between
-    them is the effect of loop closing.
+    Both are transformed to the frame of the ground truth by the alignment of the final trajectory,
+    so that every difference between them is the effect of loop closing.
     """
     figure, axes = _new_map("Map before and after loop closing", outcome, evaluation)
-    if evaluation is not None and ground_truth is not None:
-        truth = ground_truth.T_wc[:, :3, 3]
-        axes.plot(truth[:, 0], truth[:, 2], color=GREY, linewidth=3.4, alpha=0.65, label="truth")
     before = _aligned(outcome, evaluation, _centres(outcome.corrections[0].T_cw_before))
     after = _aligned(outcome, evaluation, outcome.keyframes.T_wc[:, :3, 3])
     for points, color, label in ((before, AMBER, "before"), (after, BLUE, "after")):
@@ -146,7 +134,7 @@ def loop_closing(
 
 
 def gps_map(track: GpsTrack) -> Figure:
-    """The trajectory with and without GPS, and the fixes."""
+    """Draw the trajectory with and without GPS, and the fixes."""
     figure, axes = new_figure("With GPS", "east (m)", "north (m)", SQUARE)
     used = track.anchored.used
     fixes, refused = track.fixes[used], track.fixes[~used]
@@ -162,7 +150,11 @@ def gps_map(track: GpsTrack) -> Figure:
 def _new_map(title: str, outcome: RunOutcome, evaluation: Evaluation | None) -> tuple[Figure, Axes]:
     monocular = outcome.sequence.camera.monocular
     unit = "map units" if monocular and evaluation is None else "m"
-    return new_figure(title, f"x ({unit})", f"z ({unit})", SQUARE)
+    figure, axes = new_figure(title, f"x ({unit})", f"z ({unit})", SQUARE)
+    if evaluation is not None and outcome.ground_truth is not None:
+        truth = outcome.ground_truth.T_wc[:, :3, 3]
+        axes.plot(truth[:, 0], truth[:, 2], color=GREY, linewidth=3.4, alpha=0.65, label="truth")
+    return figure, axes
 
 
 def _centres(T_cw: NDArray[np.float64]) -> Points:
@@ -170,14 +162,14 @@ def _centres(T_cw: NDArray[np.float64]) -> Points:
 
 
 def _lines(ends: Points) -> Collection[Points]:
-    """x and z of ``(M, 2, 3)`` lines, joined to one polyline with gaps (NaN)."""
+    """x and z of ``(M, 2, 3)`` lines, as one polyline in which NaN separates the lines."""
     gaps = np.full((len(ends), 1, 3), np.nan)
     points = np.concatenate([ends, gaps], axis=1).reshape(-1, 3)
     return points[:, 0], points[:, 2]
 
 
 def _at_frames(outcome: RunOutcome, path: Points, frames: NDArray[np.int64]) -> Points:
-    """``(F, 3)`` positions of some frames of the run, from the ``path`` of all of them."""
+    """``(F, 3)`` positions of some frames of the run, taken from the ``path`` of all frames."""
     times = np.array([outcome.tracks[k].timestamp for k in frames])
     index = np.searchsorted(outcome.trajectory.timestamps, times)
     return path[np.minimum(index, len(path) - 1)]

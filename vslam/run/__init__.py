@@ -1,1 +1,1 @@
-"""A run over a sequence: frames are prepared, tracked and recorded, and the results collected."""
+"""A run over a sequence: prepare, track and record its frames, and collect the results."""

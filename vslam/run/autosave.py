@@ -1,10 +1,11 @@
-"""Saving the state of a run at intervals, so that a killed run loses at most a minute of work.
+"""Save the state of a run at intervals, so that a killed run loses at most a minute of work.
 
 A line with the pose of each tracked frame is appended to ``trajectory_online.tum``. At intervals,
 the map is copied between two frames, if possible while no keyframe is being mapped. A thread then
 writes the data that the report needs about the frames so far (``autosave_progress.npz``) and the
 map (``autosave.npz``, an ordinary map file). Each file replaces the previous one atomically. If a
-run is killed between the two, its progress has a few frames more than its map; they are ignored.
+run is killed between these two writes, its progress contains a few frames more than its map; a
+resumed run tracks these frames again.
 """
 
 from __future__ import annotations
@@ -32,14 +33,14 @@ MAP, PROGRESS, ONLINE = "autosave.npz", "autosave_progress.npz", "trajectory_onl
 LOCK = ".lock"
 _DUE = 0.75  # share of the period after which saving is due, which leaves time for writing
 _DUE_WHILE_ADJUSTING = 0.95  # the same while a global bundle adjustment is running
-_MOST_MISSED = 5  # frames that may end during mapping before saving waits for mapping
+_MOST_MISSED = 5  # frames for which saving is postponed because a keyframe is being mapped
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Unfinished:
-    """The files of an interrupted run: its map, and its progress at the same frame."""
+    """The saved state of an interrupted run: its map file, and its progress at the same frame."""
 
     map: Path
     progress: Progress
@@ -64,7 +65,7 @@ def find_unfinished(folder: Path) -> Unfinished:
     again are removed from ``trajectory_online.tum``.
 
     Raises:
-        InputError: nothing was saved, or it is damaged.
+        InputError: nothing was saved, or a file is damaged.
     """
     file = folder / MAP
     if not file.is_file():
@@ -85,26 +86,6 @@ def _keep_poses(path: Path, frames: int) -> None:
 
 
 class Autosave:
-    """Interface to save a run. This base class saves nothing."""
-
-    def frame(self, result: TrackResult) -> None:
-        """Called for every frame in order, after it was tracked."""
-
-    def offer(self, slam: Slam, progress: Callable[[], Progress]) -> None:
-        """Save if saving is due; called after ``frame``."""
-
-    def close(self, slam: Slam, progress: Callable[[], Progress], *, resumable: bool) -> None:
-        """Called at the end of the run.
-
-        Args:
-            resumable: whether the run ended early with a complete map.
-        """
-
-
-NO_AUTOSAVE = Autosave()
-
-
-class FolderAutosave(Autosave):
     """Saves into the folder of a run.
 
     If writing fails, for example on a full disk, one warning is logged, the run continues, and
@@ -114,7 +95,7 @@ class FolderAutosave(Autosave):
     def __init__(self, folder: Path, seconds: float, drive: str) -> None:
         """
         Args:
-            seconds: longest time whose work a killed run can lose; 0 saves no map.
+            seconds: a killed run loses at most the work of this time; 0 saves no map.
             drive: name of the drive in the map file.
         """
         self._folder, self._seconds, self._drive = folder, seconds, drive
@@ -130,6 +111,7 @@ class FolderAutosave(Autosave):
             self._warn(ONLINE, error)
 
     def frame(self, result: TrackResult) -> None:
+        """Append the pose of a tracked frame; called for every frame in order."""
         if self._online is None:
             return
         try:
@@ -140,6 +122,7 @@ class FolderAutosave(Autosave):
             self._online = None
 
     def offer(self, slam: Slam, progress: Callable[[], Progress]) -> None:
+        """Save if saving is due; called after ``frame``."""
         waited = time.monotonic() - self._last
         if not self._seconds or waited < _DUE * self._seconds:
             return
@@ -152,6 +135,7 @@ class FolderAutosave(Autosave):
             self._save(slam, progress)
 
     def close(self, slam: Slam, progress: Callable[[], Progress], *, resumable: bool) -> None:
+        """End saving; ``resumable`` says that the run ended early with a complete map."""
         if self._seconds and resumable:
             self._save(slam, progress)
         self._writer.shutdown()
@@ -189,7 +173,7 @@ class FolderAutosave(Autosave):
 
 
 def remove_autosave(folder: Path) -> None:
-    """Remove the files that are needed only for resuming, and partly written files of killed runs.
+    """Remove the files that are needed only to resume a run, and partly written files.
     Call this after the results are written."""
     for name in (MAP, PROGRESS):
         (folder / name).unlink(missing_ok=True)

@@ -17,7 +17,7 @@ from vslam.geometry import inverses
 from vslam.maps.stored_map import StoredMap
 from vslam.trajectory import Trajectory, bridge_gaps
 
-_LONGEST_S = 0.5  # between two frames; at longer intervals no position is interpolated
+_LONGEST_S = 0.5  # between two frames; over longer intervals, no position is interpolated
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,7 @@ class GpsTrack:
         trajectory: poses of the frames, camera to ENU, in metres.
         geodetic: ``(N, 3)`` their latitude and longitude (degrees) and altitude (m).
         datum: ``(3,)`` latitude, longitude and altitude of the origin, which is the first fix.
-        visual: ``(N, 3)`` the visual trajectory aligned with ENU as a whole, without other use of
-            GPS.
+        visual: ``(N, 3)`` the trajectory by vision alone, aligned with the fixes as a whole.
         fixes: ``(M, 3)`` the fixes at the time of tracked frames, in ENU: positions of the antenna.
         antenna: ``(3,)`` position of the antenna in the frame of the camera, in metres.
         anchored: the keyframes in ENU, and which fixes were used.
@@ -48,7 +47,7 @@ def locate(stored: StoredMap, fixes: Fixes, config: PoseGraphConfig) -> GpsTrack
     """Georeference a finished drive. The map is not changed.
 
     Args:
-        stored: the map with the poses of its last drive's frames.
+        stored: the map, with the poses of the frames of its last drive.
 
     Raises:
         InputError: fewer than three fixes belong to tracked frames, or the drive is too short.
@@ -61,10 +60,7 @@ def locate(stored: StoredMap, fixes: Fixes, config: PoseGraphConfig) -> GpsTrack
     T_c_reference = table.T_c_reference.copy()
     T_c_reference[:, :3, 3] *= growth[:, None]
     table = table._replace(T_c_reference=T_c_reference)
-    graph = essential_graph(
-        map_, stored.loops, config, weak=map_.restarts, unpredicted=map_.unpredicted_restarts,
-        driven=True,
-    )  # fmt: skip
+    graph = essential_graph(map_, stored.loops, config, driven=True)
     positions, datum = _positions(table, map_.arrays.T_cw[: map_.n_keyframes], fixes)
     metric = not stored.camera.monocular
     found = anchor(graph, map_.timestamps[: map_.n_keyframes], positions, config, metric=metric)
@@ -89,7 +85,8 @@ def _in_map(
 
     Args:
         T_kw: ``(K, 4, 4)`` poses of the keyframes.
-        scale: ``(K,)`` factors for the lengths around each keyframe.
+        scale: ``(K,)`` factors by which the translations from each keyframe to its frames are
+            multiplied; None leaves them unchanged.
     """
     T_ck = table.T_c_reference.copy()
     if scale is not None:
@@ -104,8 +101,11 @@ def _in_map(
 def _positions(
     table: FrameTable, T_kw: NDArray[np.float64], fixes: Fixes
 ) -> tuple[Positions, NDArray[np.float64]]:
-    """The fixes between tracked frames, each with the positions of the camera and the antenna at
-    its time relative to the keyframe of the frame before, and the datum."""
+    """The fixes between tracked frames, and the datum.
+
+    Each fix gets the interpolated positions of the camera and the antenna at its time, in the frame
+    of the keyframe to which the previous frame refers.
+    """
     at = np.searchsorted(table.timestamp, fixes.times, "right") - 1
     at[fixes.times == table.timestamp[-1]] -= 1
     inside = (at >= 0) & (at + 1 < len(table.timestamp))

@@ -27,8 +27,8 @@ class LoopPicture:
     Attributes:
         query_frame: the frame of this run that closed the loop.
         match_frame: the earlier frame of this run that shows the same place.
-        query_jpeg, match_jpeg: their left images, small and grey.
-        query_xy, match_xy: ``(N, 2)`` float64 pixels of the same landmarks in these small images.
+        query_jpeg, match_jpeg: left images of these frames, grey and reduced in size.
+        query_xy, match_xy: ``(N, 2)`` float64 pixels of the same landmarks in the reduced images.
     """
 
     query_frame: int
@@ -44,10 +44,10 @@ def loop_matches(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The pixels of the same landmarks in the two keyframes of a closed loop.
 
-    After a loop is closed, the query's inlier features observe the landmarks of the place. If the
-    match itself does not observe such a landmark, the landmark is projected into it. Features that
-    lost their landmark in the bundle adjustment after the loop, and landmarks outside the view of
-    the match, are left out.
+    After a loop is closed, the inlier features of the query observe the landmarks of the matched
+    place. If the matched keyframe itself does not observe such a landmark, the landmark is
+    projected into its image. Features that lost their landmark in the bundle adjustment after the
+    loop are left out, and so are landmarks outside the view of the matched keyframe.
 
     Args:
         map_: the map after the correction of the loop.

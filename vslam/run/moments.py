@@ -1,4 +1,4 @@
-"""Small images of keyframes for the report: some moments of the run, and the closed loops."""
+"""Small images of keyframes for the report: a sample of the whole run, and the closed loops."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vslam.run.loop_pictures import LoopPicture, loop_matches, spread
 from vslam.run.recorder import Recorder
 from vslam.trajectory import Trajectory
 
-_MOST = 96  # moments, which take about 1 MB of the page
+_MOST = 96  # images, which take about 1 MB of the page
 _WIDTH = 360  # pixels
 _QUALITY = 55
 _MOST_POINTS = 400
@@ -48,8 +48,8 @@ class Moment:
 
 
 class MomentRecorder(Recorder):
-    """Keeps every keyframe and, whenever there are too many, drops every second one, so that the
-    kept ones are spread evenly over a run of any length."""
+    """Keeps the images of at most 96 keyframes, spread evenly over a run of any length: when there
+    are more, every second one is dropped."""
 
     def __init__(self) -> None:
         self.moments: list[Moment] = []
@@ -74,7 +74,7 @@ def _moment(
     size = min(width, _WIDTH), max(1, round(height * min(width, _WIDTH) / width))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
-    # Tracked keypoints come first; both kinds are thinned out evenly.
+    # Tracked keypoints come first. Taking every n-th keypoint thins out both kinds evenly.
     order = np.argsort(~tracked, kind="stable")
     order = order[:: max(1, -(-len(order) // _MOST_POINTS))]
     share = xy[order] / np.array([width, height], np.float32)
@@ -85,8 +85,9 @@ def _moment(
 class LoopPictureRecorder(Recorder):
     """Keeps a small image of each keyframe, and the data for a picture of each closed loop.
 
-    A loop has no picture if its earlier image was not kept, because it belongs to another drive or
-    to the part of the run before it was resumed, or because the run is very long.
+    A loop has no picture if its earlier image was not kept: images of earlier drives and of the
+    part before the run was resumed are not available, and a very long run keeps only every second
+    image.
 
     Attributes:
         pictures: pictures of the closed loops, in order.

@@ -17,10 +17,10 @@ OPTIONS = "run.json"
 
 
 class RunOptions(SourceOptions):
-    """The options as given on the command line. In the file, paths are absolute.
+    """The options as given on the command line. In ``run.json``, paths are absolute.
 
     Attributes:
-        plugins: the package of each plug-in that the other options name; set only in the file.
+        plugins: the package of each plug-in that the other options name; set only in ``run.json``.
     """
 
     perturb: str = "none"
@@ -72,8 +72,8 @@ def resumed_options(folder: Path) -> RunOptions:
     """The options of a run that is to be resumed.
 
     Raises:
-        InputError: as `read_options`, a plug-in of the run is not installed, or the folder contains
-            a symbolic link, through which the run would write outside the folder.
+        InputError: ``run.json`` cannot be read, a plug-in of the run is not installed, or the
+            folder contains a symbolic link, through which the run would write outside the folder.
     """
     for path in folder.rglob("*"):
         if path.is_symlink():
@@ -96,7 +96,7 @@ def read_options(folder: Path) -> RunOptions:
     """Read ``run.json`` of the folder of a run.
 
     Raises:
-        InputError: there is none, or it is damaged.
+        InputError: the file is missing or damaged.
     """
     path = folder / OPTIONS
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,30 +32,31 @@ class RunOutcome:
 
     Attributes:
         settings: the options of the run, with the canonical name of its perturbation.
-        trajectory: final pose of every processed frame, including lost ones. If there is no map,
-            the poses as they were tracked.
+        trajectory: final pose of every processed frame, including lost ones. Without a complete
+            map, these are the poses as they were tracked.
         keyframes: final poses of the keyframes.
         tracks: one result per frame.
         warnings: faults of the rig that the run detected, as sentences.
         skipped: a message for each frame whose images could not be read.
         latency_ms: time from the arrival of each tracked frame to its pose, in a real-time run.
         wall_s, cpu_s: seconds from reading the first frame until the last one is tracked and
-            mapped; the sum of all detectors if several are compared.
-        step_s: wall seconds of this detector's own steps: tracking, waiting for its mapping, and
+            mapped; if several detectors are compared, for all of them together.
+        step_s: wall seconds that this detector alone took: tracking, waiting for mapping, and
             completing the map at the end. Reading images and extracting features is excluded.
         startup_s: seconds from the start of the process to the first frame.
         peak_memory_mb: peak memory of the process.
         n_landmarks, n_keyframes: size of the final map.
         map: the final map; None for a trajectory from another system or after mapping failed.
-        world: place of the continued map in the world of a ground truth, if known.
+        world: transform from the continued map to the world of its ground truth; None if unknown.
         in_map: ``(N,)`` bool, frames tracked in the map that the run continued or in sub-maps that
             loops joined to it; None for a run that started a new map.
         stored: the map with all data needed to continue it; None if the run only localised in it.
-        loops: accepted and rejected loop candidates, in the order of their decision.
+        loops: accepted and rejected loop candidates, in the order in which they were decided.
         corrections: corrections of the map by the accepted loops, in order.
         keyframe_frames: ``(K,)`` int64, the frame of this run that became each keyframe, including
             culled ones; -1 for keyframes of earlier drives.
-        n_submaps: how often a map or sub-map was started; 0 before the first keyframe.
+        n_submaps: number of sub-maps that were started, including the first map; 0 without a
+            keyframe.
         gps_track: the georeferenced drive; None without GPS.
         interrupted: why the run ended early ("Ctrl-C", a truncated file), or None.
         compared: the runs of the detectors of ``settings.compare`` on the same frames, without
@@ -99,6 +101,15 @@ class RunOutcome:
         found = (TrackingState.OK, TrackingState.WEAK)
         return sum(track.state in found for track in self.tracks)
 
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:
+        """The ground truth of the frames of the trajectory; None if there is none."""
+        truth = ground_truth_of(self.sequence)
+        if truth is None:
+            return None
+        done = np.isin(truth.timestamps, self.trajectory.timestamps)
+        return truth.select(np.flatnonzero(done))
+
 
 def causal_trajectory(tracks: list[TrackResult]) -> Trajectory:
     """The pose of each frame as it was tracked, without later corrections by bundle adjustment or
@@ -117,17 +128,8 @@ def odometry_trajectory(tracks: list[TrackResult]) -> Trajectory:
 
 
 def ground_truth_of(source: Source) -> Trajectory | None:
-    """The ground truth of all frames that have one; None if there is none."""
+    """The poses of all frames that have ground truth; None if no frame has."""
     if source.ground_truth is None:
         return None
     known = np.flatnonzero(np.isfinite(source.ground_truth).all((1, 2)))
     return Trajectory(source.timestamps, source.ground_truth).select(known)
-
-
-def matched_ground_truth(outcome: RunOutcome) -> Trajectory | None:
-    """The ground truth of the frames of ``outcome.trajectory``; None if there is none."""
-    truth = ground_truth_of(outcome.sequence)
-    if truth is None:
-        return None
-    done = np.isin(truth.timestamps, outcome.trajectory.timestamps)
-    return truth.select(np.flatnonzero(done))

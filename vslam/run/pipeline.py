@@ -1,4 +1,4 @@
-"""Running SLAM on a sequence or stream: frames are prepared, tracked in order and recorded."""
+"""Run SLAM on a sequence or stream: prepare frames, track them in order and record them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -27,7 +28,7 @@ from vslam.machine import give_back_memory, peak_memory_mb, process_age
 from vslam.map import Map
 from vslam.maps.storage import made_with
 from vslam.plugins import reason
-from vslam.run.autosave import NO_AUTOSAVE, Autosave, Unfinished
+from vslam.run.autosave import Autosave, Unfinished
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome, causal_trajectory, ground_truth_of
 from vslam.run.preparation import Played, PreparedFrame, at_their_times
@@ -53,7 +54,7 @@ def run_sequence(
     recorder: Recorder,
     *,
     on_frame: Callable[[TrackResult], None] = lambda result: None,
-    autosave: Autosave = NO_AUTOSAVE,
+    autosave: Autosave | None = None,
     resume: Unfinished | None = None,
     slam: Slam | None = None,
 ) -> RunOutcome:
@@ -64,23 +65,23 @@ def run_sequence(
 
     The run ends early after Ctrl-C (after the current frame), when the source ends unexpectedly, or
     when a part of the run fails, such as a detector of another package. All results so far are
-    kept. If mapping failed, the map is incomplete: the outcome then has no map, and its poses are
-    those of tracking.
+    kept. If mapping failed, the map is incomplete: the outcome then contains no map, and the poses
+    as they were tracked.
 
-    The detectors of ``settings.compare`` run on the same frames as the main one. Images are read
-    and features extracted once. Each detector has its own map, from which only trajectory, frames
-    and loops are kept. If one detector fails, the others continue. A resumed run continues without
-    them, because their maps were not saved.
+    The detectors of ``settings.compare`` run on the same frames as the main detector, so images are
+    read and features extracted only once. Each detector has its own map, from which only the
+    trajectory, the tracking results and the loops are kept. If one detector fails, the others
+    continue. A resumed run continues without these detectors, because their maps were not saved.
 
     Args:
-        autosave: saves the state of the run at intervals.
+        autosave: saves the state of the run at intervals; None saves nothing.
         resume: the saved state of an unfinished run. This run continues at the next frame, and its
             outcome covers both parts.
-        slam: the result of ``begin`` for the same settings, if it was already called.
+        slam: the result of ``begin`` for the same settings; None calls ``begin`` here.
 
     Raises:
-        InputError: before the first frame, the images cannot be read or are not those of the
-            resumed run, or as ``begin``. Later errors end the run early instead.
+        InputError: before the first frame: the images cannot be read or are not those of the
+            resumed run, or ``begin`` fails. Later errors end the run early instead.
     """
     cv2.setNumThreads(1)  # the thread pool already uses all cores
     slam = slam or begin(sequence.camera, settings, None if resume is None else resume.map)
@@ -88,7 +89,7 @@ def run_sequence(
     others = [] if resume is not None else _compared(sequence.camera, settings)
     recorder.begin(sequence.camera, ground_truth_of(sequence))
     main = _Run(slam, settings, Progress() if resume is None else resume.progress)
-    n_recorded = 0  # loops
+    n_recorded = 0  # loops passed to the recorder so far
     end_reasons: list[str] = []  # why the run ended early; the first one counts
     with _stop_on_interrupt() as interrupted:
         frames = perturbed(_until_broken(sequence.frames(), end_reasons), perturbation)
@@ -105,11 +106,13 @@ def run_sequence(
                 result = main.step(played)
                 if (frame := played.prepared) is not None and frame.problem and not frame.dropped:
                     _log.warning("frame %d skipped: %s", result.index, frame.problem)
-                autosave.frame(result)
+                if autosave is not None:
+                    autosave.frame(result)
                 if result.state != TrackingState.DROPPED:
                     n_recorded = _record_frame(recorder, slam, result, played, n_recorded)
                 on_frame(result)
-                autosave.offer(slam, main.so_far)
+                if autosave is not None:
+                    autosave.offer(slam, main.so_far)
                 for other in others:
                     if other.problem is None:
                         with other.recording_failure(f"frame {result.index}"):
@@ -130,9 +133,10 @@ def run_sequence(
         if not end_reasons and main.problem:
             end_reasons.append(main.problem)
         with main.recording_failure("saving the map"):
-            autosave.close(slam, main.so_far, resumable=bool(end_reasons) and main.has_map)
+            if autosave is not None:
+                autosave.close(slam, main.so_far, resumable=bool(end_reasons) and main.has_map)
     seconds = main.seconds()
-    give_back_memory()  # writing the results needs memory: the map is copied first
+    give_back_memory()  # the results are written from a copy of the map, which needs memory
     with main.recording_failure("the final trajectory"):
         if main.has_map:
             _record_loops(recorder, slam, n_recorded)
@@ -146,8 +150,8 @@ def run_sequence(
 
 
 def _compared(camera: Camera, settings: RunOptions) -> list[_Run]:
-    """The runs of the detectors of ``settings.compare``, before their first frame. They use the
-    shipped weights, because ``settings.weights`` are those of the main detector."""
+    """New runs of the detectors of ``settings.compare``. They use the shipped weights, because
+    ``settings.weights`` belongs to the main detector."""
     common: dict[str, object] = {"weights": None, "compare": ()}
     each = [settings.model_copy(update={**common, "detector": name}) for name in settings.compare]
     return [_Run(begin(camera, one), one, Progress()) for one in each]
@@ -157,7 +161,7 @@ class _Run:
     """The SLAM of one detector and its results, including those before the run was resumed.
 
     Attributes:
-        step_s: wall time of its own steps (``RunOutcome.step_s``).
+        step_s: wall seconds that this detector alone took (``RunOutcome.step_s``).
     """
 
     def __init__(self, slam: Slam, settings: RunOptions, before: Progress) -> None:
@@ -185,7 +189,7 @@ class _Run:
 
     @property
     def has_map(self) -> bool:
-        """Whether the map is complete, once the run is finished."""
+        """Whether the finished run has a complete map."""
         try:
             self.slam.map  # noqa: B018
         except RuntimeError:
@@ -225,13 +229,19 @@ class _Run:
             result = self.slam.skip(timestamp)
             self.skipped.append(f"frame {len(self.tracks)}: {frame.problem}")
         else:
-            result = self.slam.step_images(frame.images, timestamp, frame.stage_ms)
-            if self.settings.realtime:
-                self.latency_ms.append(1e3 * (time.perf_counter() - played.arrived))
+            result = self.slam.step_images(
+                frame.images,
+                timestamp,
+                frame.stage_ms,
+                partial(self._add_latency, played.arrived) if self.settings.realtime else None,
+            )
         self.step_s += time.perf_counter() - start
         self.tracks.append(result)
         self._log.append(result)
         return result
+
+    def _add_latency(self, arrived: float, _: TrackResult) -> None:
+        self.latency_ms.append(1e3 * (time.perf_counter() - arrived))
 
     def finish(self) -> None:
         """Complete all mapping."""
@@ -268,7 +278,7 @@ def _record_frame(
     played: Played[PreparedFrame],
     n_recorded: int,
 ) -> int:
-    """Record a frame, and the map if no job is changing it; returns the number of recorded
+    """Record a frame, and the map if mapping does not change it now; returns the number of recorded
     loops."""
     recorder.frame(result)
     images = None if played.prepared is None else played.prepared.images
@@ -281,10 +291,13 @@ def _record_frame(
 
 
 def _following(frames: Iterator[TimedFrame], before: NDArray[np.float64]) -> Iterator[TimedFrame]:
-    """The frames after those of the resumed run, whose times were ``before`` ``(N,)``.
+    """The frames after the first N ones, which the resumed run has already tracked.
+
+    Args:
+        before: ``(N,)`` times of the tracked frames.
 
     Raises:
-        InputError: the source's first frames have other times.
+        InputError: the first N frames of the source have other times.
     """
     for index, timestamp in enumerate(before.tolist()):
         frame = next(frames, None)
@@ -292,7 +305,7 @@ def _following(frames: Iterator[TimedFrame], before: NDArray[np.float64]) -> Ite
             now = "there is none" if frame is None else f"it has {frame.timestamp:.6f} s"
             raise InputError(
                 f"--resume: frame {index} had the time {timestamp:.6f} s, now {now}: these are not "
-                "the images of that run; restore them, or start a new run."
+                "the images of the interrupted run; restore its images, or start a new run."
             )
     yield from frames
 
@@ -312,7 +325,7 @@ def _outcome(
         keyframes=causal_trajectory(keyframes),
         tracks=run.tracks,
         skipped=run.skipped,
-        warnings=["the run has no complete map, and its poses are those of tracking"],
+        warnings=["the run has no complete map; its poses are those of tracking"],
         wall_s=seconds[0],
         cpu_s=seconds[1],
         step_s=run.step_s,
@@ -373,7 +386,8 @@ def _with_earlier(
     """Loops and corrections of a whole run, including the part before it was resumed, and the frame
     of each keyframe that they refer to.
 
-    Earlier loops refer to frames; these get numbers after those of the map's keyframes.
+    Loops before the resumption refer to frames. Each of these frames gets a keyframe number after
+    those of the map.
     """
     frames = _frames_of_this_run(slam.map)
     if not before.loops:
@@ -395,11 +409,11 @@ def begin(camera: Camera, settings: RunOptions, saved: Path | None = None) -> Sl
     """Create the ``Slam`` of a run: with a new map, or with ``settings.map_file``.
 
     Args:
-        saved: the map that an unfinished run left; the ``Slam`` continues after its last frame.
+        saved: the map file of an interrupted run; the ``Slam`` continues after its last frame.
 
     Raises:
-        InputError: the map does not exist or is of another camera, detector or pyramid, or the
-            weights cannot be read.
+        InputError: the map does not exist or was made with another camera, detector or image
+            pyramid, or the weights cannot be read.
     """
     config, threads = settings.thresholds, settings.threads
     late = not settings.realtime  # in real time, no network may be loaded during the drive
@@ -443,12 +457,12 @@ def _until_broken(frames: Iterator[TimedFrame], end_reasons: list[str]) -> Itera
         end_reasons.append(str(error).rstrip("."))
     except InputError:
         raise
-    except Exception as error:  # the frames before are still to be tracked
+    except Exception as error:  # the frames that were read before must still be tracked
         end_reasons.append(f"reading the images failed, {reason(error)}")
 
 
 def _record_loops(recorder: Recorder, slam: Slam, n_recorded: int) -> int:
-    """Record the loops after the first ``n_recorded``; returns the number of recorded loops."""
+    """Record all loops but the first ``n_recorded``; returns the new number of recorded loops."""
     if len(slam.loops) > n_recorded:
         recorder.loops(slam.loops[n_recorded:], slam.map)
     return len(slam.loops)

@@ -3,8 +3,8 @@ tracking.
 
 A small thread pool prepares each frame independently of the others and keeps their order, so that
 the result does not depend on the number of threads. In real time, a frame is prepared when it
-arrives, its two images in parallel, and frames that arrive too fast are dropped; which ones depends
-on the machine.
+arrives, its two images in parallel. Frames that arrive too fast are dropped, and it depends on the
+machine which frames these are.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ class _Mailbox:
         self.error: Exception | None = None
 
     def put(self, arrival: _Arrival) -> None:
-        """Replace the newest frame; the first frame of a run is never replaced: wait until it has
+        """Replace the newest frame. The first frame of a run is never replaced: wait until it has
         been taken."""
         with self._changed:
             if self._newest is not None:
@@ -190,8 +190,14 @@ class _Mailbox:
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """A frame that is ready to be tracked, or the reason why it cannot be read (``problem``);
-    ``dropped`` tells whether a perturbation dropped it."""
+    """A frame that is ready to be tracked, or the reason why it cannot be read.
+
+    Attributes:
+        images: the images and their features; None if the frame cannot be read.
+        stage_ms: milliseconds of reading and extraction.
+        problem: why the frame cannot be read; None if it can.
+        dropped: whether the frame is missing because a perturbation dropped it.
+    """
 
     images: FrameImages | None
     stage_ms: dict[str, float]
@@ -208,22 +214,23 @@ def at_their_times(
     begin: int = 0,
     next_extraction: Callable[[], int] = lambda: -1,
 ) -> Iterator[Played[PreparedFrame]]:
-    """Prepared frames with their times of arrival: all frames arrive at once, or in real time each
-    at its own time.
+    """Yield prepared frames in order, each with its time of arrival. In real time, a frame arrives
+    at its timestamp; otherwise, all frames arrive at the start.
 
     Args:
         begin: index of the first frame.
-        next_extraction: returns ``Slam.next_extraction``, the frame whose features are extracted in
-            advance.
+        next_extraction: returns ``Slam.next_extraction``, the index of the frame whose features
+            will be needed next and are therefore extracted in advance.
     """
     if settings.realtime:
-        with ThreadPoolExecutor(2, "side") as pool:
+        with ThreadPoolExecutor(2, "side") as pool, ThreadPoolExecutor(1, "corners") as corners:
             image_map = map if settings.threads == 1 else pool.map
 
             def prepare(number: int, frame: TimedFrame) -> PreparedFrame:
                 prepared = prepare_frame(frame, context, image_map)
-                if prepared.images is not None and 0 <= next_extraction() <= begin + number:
-                    prepared.images.find_corners()
+                is_due = 0 <= next_extraction() <= begin + number
+                if prepared.images is not None and is_due and settings.threads > 1:
+                    corners.submit(prepared.images.find_corners)
                 return prepared
 
             yield from play(frames, prepare, settings.threads, live=live)
@@ -241,7 +248,7 @@ def prepared_frames(
     begin: int = 0,
     next_extraction: Callable[[], int] = lambda: -1,
 ) -> Iterator[tuple[float, PreparedFrame]]:
-    """Frames in order with their times; with more than one thread, prepared a few frames ahead."""
+    """Yield timestamps and prepared frames in order; several threads prepare a few frames ahead."""
     if threads == 1:
         for frame in frames:
             yield frame.timestamp, prepare_frame(frame, context)
@@ -275,8 +282,8 @@ def _find_corners(prepared: Future[PreparedFrame]) -> None:
 def prepare_frame(
     frame: TimedFrame, context: TrackingContext, image_map: ImageMap = map
 ) -> PreparedFrame:
-    """Read one frame and extract its features. If frames are tracked by patches, the right image is
-    read, and features are extracted, only when tracking needs them."""
+    """Read one frame and extract its features. If tracking uses patches, reading the right image
+    and extracting features are left to tracking, which needs them only for some frames."""
     start = time.perf_counter()
     try:
         read_second: Callable[[], Image | DepthImage | None]
@@ -298,7 +305,7 @@ def prepare_frame(
     return PreparedFrame(images, stage_ms)
 
 
-@lru_cache(maxsize=1)  # all frames with the same static mask pass the same function
+@lru_cache(maxsize=1)  # frames that share a static mask pass the same function
 def _mask(read: Callable[[], Image], config: OrbConfig) -> Mask:
     return Mask.of(read(), config)
 

@@ -1,7 +1,7 @@
-"""The progress of a run: the data of its frames that the report needs, as arrays in a file.
+"""The progress of a run: the data about its frames that the report needs, as arrays in a file.
 
-An interrupted run leaves this file beside its map, and a resumed run starts from it. Each tracked
-frame is appended to arrays, so that saving only copies these arrays.
+An interrupted run leaves this file beside its map, and a resumed run continues from it. Each
+tracked frame is appended to arrays, so that saving the progress only copies these arrays.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vslam.untrusted import ARCHIVE_ERRORS, read_json, read_npz
 
 SCHEMA = 3
 _STATES = tuple(TrackingState)
-_POSE, _NUMBERS = 16, 7 + 16 + N_NUMBERS  # columns of a row: the pose, then the other numbers
+_POSE, _NUMBERS = 16, 7 + 16 + N_NUMBERS  # columns of the pose, and of the numbers after it
 _UNKNOWN = np.full(N_NUMBERS, np.nan)
 
 
@@ -109,9 +109,9 @@ class Progress:
     Attributes:
         tracks: results of the frames.
         skipped, latency_ms, wall_s, cpu_s: see ``RunOutcome``.
-        loops: loops between frames of the run: frame numbers replace keyframe numbers, with -1 for
-            keyframes of earlier drives.
-        corrections: corrections by the accepted loops, also with frame numbers.
+        loops: loops between frames of the run, with frame numbers in place of keyframe numbers; -1
+            stands for a keyframe of an earlier drive.
+        corrections: corrections by the accepted loops, with the same frame numbers.
     """
 
     tracks: TrackTable = field(default_factory=TrackTable)
@@ -138,8 +138,11 @@ def _frame_of(message: str) -> int:
 
 
 def frames_of(loops: list[LoopEdge], frames: NDArray[np.int64]) -> list[LoopEdge]:
-    """Replace keyframe numbers in loops by the frame numbers ``frames`` ``(K,)`` of the keyframes;
-    features and landmarks are dropped."""
+    """Loops with frame numbers in place of keyframe numbers, and without features and landmarks.
+
+    Args:
+        frames: ``(K,)`` frame number of each keyframe.
+    """
     return [
         replace(
             loop,

@@ -64,8 +64,13 @@ _STATE_COLORS = {TrackingState.OK: _GREEN, TrackingState.WEAK: _AMBER, TrackingS
 
 @dataclass(frozen=True)
 class _Pace:
-    """How often data is sent: the number of frames in a batch, and the number of keyframes between
-    two maps, usually and after a correction of the map."""
+    """How often data is sent.
+
+    Attributes:
+        frames: number of frames in a batch.
+        keyframes: number of keyframes between two maps.
+        corrected_keyframes: the same after a correction of the map.
+    """
 
     frames: int
     keyframes: int
@@ -73,7 +78,7 @@ class _Pace:
 
 
 _FILE_PACE = _Pace(50, 25, 10)
-_VIEWER_PACE = _Pace(5, 5, 2)  # a viewer keeps no file, whose size would matter
+_VIEWER_PACE = _Pace(5, 5, 2)  # more often than in a file, because there is no file size to limit
 
 
 class Recorder:
@@ -87,7 +92,7 @@ class Recorder:
 
         Args:
             camera: the camera of the images that :meth:`keyframe` gets.
-            ground_truth: poses of the frames of this run, in any world frame, or None.
+            ground_truth: poses of the frames of this run, in any world frame; None if unknown.
         """
 
     def frame(self, result: TrackResult) -> None:
@@ -100,16 +105,16 @@ class Recorder:
             result: the result of tracking this frame.
             image: ``(H, W)`` uint8 left image.
             xy: ``(N, 2)`` float32 pixels of its features.
-            tracked: ``(N,)`` bool, whether each feature is an inlier of the map.
+            tracked: ``(N,)`` bool, whether each feature is an inlier match of a landmark.
         """
 
     def map(self, map_: Map) -> None:
-        """Called after a frame if no job is changing the map; the recorder decides when to log
-        it."""
+        """Log the map if enough keyframes were added since the last time. Called after a frame
+        while mapping does not change the map."""
 
     def loops(self, edges: Collection[LoopEdge], map_: Map) -> None:
-        """Log new loops, accepted or rejected. Called after :meth:`frame`, between two changes of
-        the map.
+        """Log new loops, accepted or rejected. Called after :meth:`frame`, while mapping does not
+        change the map.
 
         Args:
             edges: the loops since the last call.
@@ -122,8 +127,8 @@ class Recorder:
 
 
 class SeveralRecorders(Recorder):
-    """Forwards every call to several recorders. If one raises an error, a warning is logged, and it
-    gets no more calls."""
+    """Forwards every call to several recorders. A recorder that raises an error gets no more
+    calls, and a warning is logged."""
 
     def __init__(self, recorders: Sequence[Recorder]) -> None:
         self.recorders = list(recorders)
@@ -162,7 +167,7 @@ class Viewer:
 
     Attributes:
         address: URL of the viewer's page; empty for a window.
-        sink: rerun's object that a recording is sent to.
+        sink: rerun's object to which a recording is sent.
     """
 
     address: str
@@ -176,7 +181,7 @@ def open_viewer(kind: str) -> Viewer:
         kind: ``native`` for a window, ``web`` for a page that can only be opened on this machine.
 
     Raises:
-        InputError: it cannot be started here.
+        InputError: the viewer cannot be started on this machine.
     """
     import rerun as rr
 
@@ -206,9 +211,8 @@ def open_viewer(kind: str) -> Viewer:
 
 
 def _start_viewer(port: int, options: list[str]) -> subprocess.Popen[bytes]:
-    """Start a viewer that only this machine can reach; those that rerun's own functions start
-    listen on every interface. It has its own session, so that Ctrl-C ends the run and not the
-    viewer."""
+    """Start a viewer that listens only on this machine, unlike the viewers that rerun's functions
+    start. It is started in its own session, so that Ctrl-C ends the run but not the viewer."""
     command = [_executable(), "--bind=127.0.0.1", f"--port={port}", "--hide-welcome-screen"]
     command += options
     nothing = subprocess.DEVNULL
@@ -269,21 +273,29 @@ class RerunRecorder(Recorder):
 
     Timelines: ``frame`` (number) and ``time`` (seconds).
 
-    Entities: ``world/camera`` (every frame), ``world/camera/image`` with ``tracked`` and
-    ``untracked`` keypoints (keyframes, half size), ``world/landmarks`` and ``world/keyframes``
-    (every 25 keyframes, after a loop and at the end), ``world/loops/accepted`` (green, from the
-    loop on) and ``rejected`` (faint red, for 20 frames), ``loops/images`` (the two images of each
-    closed loop with their matches, until the next loop), ``world/ground_truth`` (static),
-    ``world/trajectory`` (the final one, up to the frame shown), ``points/*`` and ``stage_ms/*``
-    (every frame), ``state`` (on change) and ``state/loops`` (each with its reason). The origin of
-    the world is the estimated pose of the run's first frame: x right, y down, z forward.
+    Entities:
 
-    A recording that cannot be written never ends a run. Rerun writes in its own thread. Errors of
-    that thread are reported only by a later flush, which may then never return. Therefore the
-    recording ends, with a warning in the log, when the disk has less than 64 MB left; everything up
-    to that frame is in the file. If a flush fails or takes longer than 5 s, or the viewer was
-    closed, the recording also ends with a warning, and the last message in the file may be
-    incomplete.
+    - ``world/camera``: the pose of every frame;
+    - ``world/camera/image`` with ``tracked`` and ``untracked``: images of keyframes at half size,
+      with their keypoints;
+    - ``world/landmarks``, ``world/keyframes``: the map, every 25 keyframes, after a loop and at the
+      end;
+    - ``world/loops/accepted``, ``rejected``: lines in green from the loop on, or in faint red for
+      20 frames;
+    - ``loops/images``: the two images of a closed loop with their matches, until the next loop;
+    - ``world/ground_truth``: static;
+    - ``world/trajectory``: the final trajectory up to the frame shown;
+    - ``points/*``, ``stage_ms/*``: numbers of keypoints and milliseconds of every frame;
+    - ``state``, ``state/loops``: changes of the tracking state, and each loop with its reason.
+
+    The origin of the world is the estimated pose of the run's first frame: x right, y down, z
+    forward.
+
+    A recording that cannot be written never ends a run. Rerun writes in its own thread and reports
+    errors only at a later flush, which may then never return. Therefore the recording ends, with a
+    warning in the log, when the disk has less than 64 MB left; everything up to that frame is in
+    the file. If a flush fails or takes longer than 5 s, or the viewer was closed, the recording
+    also ends with a warning, and the last message in the file may be incomplete.
     """
 
     def __init__(self, target: Path | Viewer, pictures: Sequence[LoopPicture] = ()) -> None:
@@ -291,8 +303,8 @@ class RerunRecorder(Recorder):
         warning and record nothing.
 
         Args:
-            pictures: a list to which another recorder, called before this one, appends pictures of
-                the closed loops; they are recorded, too.
+            pictures: pictures of the closed loops to record; another recorder, which is called
+                before this one, appends them to this list.
         """
         import rerun as rr
 
@@ -302,10 +314,10 @@ class RerunRecorder(Recorder):
         self._recording = rr.RecordingStream("vslam")
         self._open = True
         self._state: TrackingState | None = None
-        self._points: dict[str, tuple[int, int, int]] = {}  # colour of each count of a frame
+        self._points: dict[str, tuple[int, int, int]] = {}  # colour of each curve of points/*
         self._index = 0  # of the last frame
         self._frames: list[TrackResult] = []
-        self._stages: list[str] = []  # each has a colour of its own
+        self._stages: list[str] = []  # those with a colour
         self._keyframes = 0
         self._mapped_keyframes = -self._pace.keyframes
         self._accepted: list[LoopEdge] = []
@@ -313,7 +325,8 @@ class RerunRecorder(Recorder):
         self._n_pictures = 0  # recorded so far
         self._hide_rejected_at: int | None = None  # frame
         try:
-            self._recording.set_log_time_enabled(False)  # would be the viewer's default timeline
+            # Otherwise, the time of logging would be the viewer's default timeline.
+            self._recording.set_log_time_enabled(False)
             # This must precede the first log call, which would otherwise be lost.
             if isinstance(target, Path):
                 self._recording.save(target)
@@ -521,7 +534,7 @@ class RerunRecorder(Recorder):
 
         _log.warning("%s: recording ends here (%s).", self._name, reason(error))
         # When a stream is deleted, and when the process ends, rerun 0.41 waits forever for its dead
-        # writer. So the stream is never deleted, and rerun's hook at the end is removed.
+        # writer. So the stream is never deleted, and rerun's hook at exit is removed.
         rr.unregister_shutdown()
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._recording))
         self._open = False

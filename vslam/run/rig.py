@@ -1,4 +1,4 @@
-"""Detects faults of a stereo rig during a run and describes them in sentences for the report."""
+"""Detect faults of a stereo rig during a run and describe them in sentences for the report."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vslam.frontend.sides import ComparedSides
 from vslam.geometry import compose, inverse, orthonormalised, se3_log
 from vslam.map import Map
 
-_FEWEST = 3  # frames; fewer may show a reflection, or a hand in front of the lens
+_FEWEST = 3  # frames; in fewer, a reflection or a hand in front of the lens may be the cause
 _FEWEST_OBSERVATIONS, _MOST_OBSERVATIONS = 3_000, 100_000
 _LARGEST_RESIDUAL_PX = 3.0
 _HUBER_PX = 0.3
@@ -25,9 +25,9 @@ _ROUNDS = 10
 # be observed.
 _LEAST_IMAGE_SPEED = 50.0
 _LONGEST_GAP_S = 2.0  # between keyframes; the motion over a longer time is unknown
-# Sound rigs show at most 0.15 ms and 0.11 pixels, a delay of 10 ms shows as 1.1 ms, and a rotation
-# by 2 arc minutes as 0.29 pixels (docs/research/stress.md): bundle adjustment absorbs a part of
-# both.
+# Rigs without faults show a delay of at most 0.15 ms and an offset of at most 0.11 pixels. Bundle
+# adjustment absorbs a part of both faults: a delay of 10 ms shows as 1.1 ms, and a rotation by 2
+# arc minutes as 0.29 pixels (docs/research/stress.md).
 _SUSPECT_DELAY_S, _SUSPECT_OFFSET_PX = 0.4e-3, 0.2
 
 
@@ -46,8 +46,8 @@ class RigResiduals:
 
 
 def measure_rig(map_: Map, camera: Camera) -> RigResiduals | None:
-    """Fit a delay, and an offset and a scale error of disparities, to the stereo residuals of a
-    map; None if there are too few observations or the camera is not stereo."""
+    """Estimate the delay of the right image and the offset of the disparities from the stereo
+    residuals of a map; None if there are too few observations or the camera is not stereo."""
     if camera.sensor != "stereo" or map_.n_keyframes < 3:
         return None
     arrays = map_.arrays
@@ -65,7 +65,7 @@ def measure_rig(map_: Map, camera: Camera) -> RigResiduals | None:
     speed = camera.fx * (moved[:, 0] - p[:, 0] * moved[:, 2] / z) / z
     disparity = camera.bf / z
     measured = arrays.xy[rows, 0].astype(np.float64) - arrays.u_right[rows]
-    residual = disparity - measured  # of the column in the right image
+    residual = disparity - measured  # measured minus predicted column in the right image
     good = (np.abs(residual) < _LARGEST_RESIDUAL_PX) & (z > 0) & np.isfinite(speed)
     if good.sum() < _FEWEST_OBSERVATIONS:
         return None
@@ -78,7 +78,7 @@ def fit(
     residual: NDArray[np.float64], speed: NDArray[np.float64], disparity: NDArray[np.float64]
 ) -> tuple[float, float, float]:
     """Delay (s), offset (px) and relative error of the disparity that minimise the Huber loss of
-    ``(N,)`` residuals in pixels; ``speed`` in pixels per second."""
+    ``(N,)`` residuals in pixels; ``speed`` is the image speed in pixels per second."""
     A = np.stack([speed, np.ones_like(speed), disparity], axis=1)
     x = np.zeros(3)
     for _ in range(_ROUNDS):
@@ -88,8 +88,8 @@ def fit(
 
 
 def _twists(map_: Map) -> NDArray[np.float64]:
-    """``(K, 6)`` twist of each keyframe per second; NaN if the neighbouring keyframes are too far
-    apart in time. Drives are treated separately, because each has its own clock."""
+    """``(K, 6)`` velocity (twist) of the camera at each keyframe; NaN if the neighbouring keyframes
+    are too far apart in time. Drives are treated separately, because each has its own clock."""
     T_cw, times = map_.arrays.T_cw, map_.timestamps
     twists = np.full((map_.n_keyframes, 6), np.nan)
     living = map_.living_keyframes()
@@ -118,8 +118,11 @@ def calibration_warnings(camera: Camera, calib: Sequence[Path], name: str) -> li
 
 
 def delay_warnings(delay: SideDelay, camera: Camera) -> list[str]:
-    """A warning if the delay of the right camera, measured by the rows of stereo matches, differs
-    from that of the calibration."""
+    """A warning if the measured delay of the right camera differs from that in the calibration.
+
+    Args:
+        delay: the delay, measured by the rows of stereo matches.
+    """
     if not delay.is_wrong:
         return []
     known = camera.right_delay
@@ -165,7 +168,7 @@ def rig_warnings(sides: ComparedSides) -> list[str]:
         if black >= _FEWEST:
             warnings.append(
                 f"The {side} image was black in {black} of {sides.n} frames while the {other} "
-                f"one was not: these frames were tracked with the {other} image alone. Check the "
+                f"image was not: these frames were tracked with the {other} image alone. Check the "
                 f"cable, shutter and lens cap of the {side} camera."
             )
     darker = sides.darker_stops
@@ -174,7 +177,7 @@ def rig_warnings(sides: ComparedSides) -> list[str]:
         side, other = ("right", "left") if stops > 0 else ("left", "right")
         warnings.append(
             f"The {side} image was {abs(stops):.1f} stops darker than the {other} one in "
-            f"{len(darker)} of {sides.n} frames: it was brightened to match. Check exposure, "
-            "gain and aperture of both cameras."
+            f"{len(darker)} of {sides.n} frames: the {side} image was brightened to match. Check "
+            "exposure, gain and aperture of both cameras."
         )
     return warnings

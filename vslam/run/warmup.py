@@ -1,15 +1,15 @@
-"""Compilation of all kernels before the first frame, so that the time of a run does not include it.
+"""Compile all kernels before the first frame, so that the time of a run excludes compilation.
 
 Compilation takes most of the time of a first run, and a process compiles one kernel at a time
 because Numba holds a lock. Two processes, ``python -m vslam.run.warmup first`` and
 ``python -m vslam.run.warmup second``, therefore share the work through Numba's cache. The process
-of the run then calls ``EVERYTHING``, which loads the compiled kernels and compiles only missing
-ones, so that this process does not hold the compiler's memory. Later runs load a kernel when they
-first call it.
+of the run then calls ``EVERYTHING``, which loads the compiled kernels. Because it compiles only
+missing ones, it does not need the memory of the compiler. Later runs load a kernel when they first
+call it.
 
-For new kernels, add a function that calls them to the shorter of ``COMPILE_SHARES``, and to
-``EVERYTHING`` if the small SLAM run does not call them; add the last kernel of a new module to
-``COLD_PROBES``. These commands show which share is shorter:
+For new kernels, add a function that calls them to the entry of ``COMPILE_SHARES`` that takes less
+time. Add this function also to ``EVERYTHING`` if ``run_everything`` does not call the kernels, and
+the last kernel of a new module to ``COLD_PROBES``. These commands show how long each share takes:
 
     for share in first second; do
         time NUMBA_CACHE_DIR=$(mktemp -d) python -m vslam.run.warmup $share
@@ -17,8 +17,9 @@ For new kernels, add a function that calls them to the shorter of ``COMPILE_SHAR
 
 Monocular runs call no other kernels: their initialisation and similarities use NumPy.
 
-A kernel that both processes need is compiled by the first one to call it. Both must call it with
-the same types, because Numba's cache is safe for two writers only if they write one signature.
+A kernel that both processes need is compiled by the process that calls it first. Both must call it
+with the same types, because two processes can write to Numba's cache safely only if they write the
+same signature.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ from vslam.slam import Slam
 
 WIDTH, HEIGHT, DISPARITY, STEP, FRAMES = 480, 240, 12, 6, 6
 CAMERA = Camera(240.0, 240.0, WIDTH / 2, HEIGHT / 2, 0.5, WIDTH, HEIGHT)
-# A process that takes longer hangs: each has less than a minute of work on a slow machine.
+# A process that takes longer hangs: even on a slow machine, each share takes less than a minute.
 PATIENCE_S = 300.0
 
 
@@ -82,8 +83,8 @@ def compile_kernels(*, processes: int = 2, load: bool = False) -> None:
 
     Args:
         processes: with 1, or on a single core, no other process is started.
-        load: load compiled kernels and GTSAM now, which takes 0.3 s, for runs in which no frame may
-            wait; otherwise each kernel is loaded at its first call, which takes 2 ms.
+        load: load compiled kernels and GTSAM now, which takes 0.3 s, for real-time runs, in which
+            no frame may wait. Otherwise, each kernel is loaded at its first call, in 2 ms.
     """
     if load:
         load_optimiser()
@@ -108,8 +109,8 @@ def is_cold() -> bool:
 
 
 def mark_warm() -> None:
-    """Update the dates of the cached kernels. Numba compares the content of sources and keeps a
-    kernel if only the date of its source has changed, for example by switching branches."""
+    """Update the dates of the cached kernels, so that ``is_cold`` takes them for compiled. Numba
+    keeps a kernel if only the date of its source has changed, for example by switching branches."""
     for _, indexes in map(cached, COLD_PROBES):
         for index in indexes:
             with suppress(OSError):
@@ -125,9 +126,9 @@ def cached(kernel: tuple[ModuleType, str]) -> tuple[Path, list[Path]]:
 
 
 def compile_shares() -> None:
-    """Run each of ``COMPILE_SHARES`` in a process of its own and wait for both.
+    """Run each of ``COMPILE_SHARES`` in its own process and wait for both processes.
 
-    If one fails, the calling process compiles its share. An exception such as Ctrl-C ends both.
+    If a process fails, the caller must compile its kernels. An exception such as Ctrl-C ends both.
     """
     # The executable of a frozen application is not Python.
     if not sys.executable or getattr(sys, "frozen", False):
@@ -155,8 +156,8 @@ _FEATURES = TrackingConfig(method="orb")
 
 def run_everything() -> None:
     """Run SLAM on a few small images of a camera that moves sideways along a textured wall. Each
-    becomes a keyframe, so that all kernels of tracking, triangulation, fusion and bundle adjustment
-    are called."""
+    image becomes a keyframe, so that the run calls all kernels of tracking, triangulation, fusion
+    and bundle adjustment."""
     every_frame = KeyframeConfig(max_interval_s=0.05, merge_after_frames=1)
     run_slam(Config(keyframes=every_frame, tracking=_FEATURES), FRAMES)
     compile_patches()
@@ -164,19 +165,19 @@ def run_everything() -> None:
 
 
 def compile_tracking() -> None:
-    """Compile extraction, stereo, matching, pose and tracking by a SLAM run with one keyframe."""
+    """Compile extraction, stereo matching and tracking by a SLAM run with one keyframe."""
     decode_image()
     only_first = KeyframeConfig(max_interval_s=1e9, max_tracked_ratio=1e-6, min_tracked_close=0)
     run_slam(Config(keyframes=only_first, tracking=_FEATURES), 3)
 
 
 def compile_patches() -> None:
-    """Compile tracking by patches with a few images of a wall."""
+    """Compile tracking by patches, by a SLAM run on a few images of a wall."""
     run_slam(Config(tracking=TrackingConfig(method="patches")), FRAMES)
 
 
 def decode_image() -> None:
-    """Decode two lines of a PNG file."""
+    """Compile the decoder of PNG files, by decoding two lines."""
     unfilter(np.zeros((2, 5), np.uint8), np.empty((2, 4), np.uint8))
 
 
@@ -195,7 +196,7 @@ def run_slam(config: Config, frames: int) -> None:
 
 
 def compile_depth() -> None:
-    """Compile the depth of keypoints."""
+    """Compile the kernels that give keypoints the depths of a depth image."""
     depth, scale = np.ones((8, 8), np.float32), np.ones(1)
     columns_of_depth(np.zeros((1, 2), np.float32), scale, depth, CAMERA, DepthConfig())
 
@@ -213,9 +214,10 @@ def compile_local_mapping() -> None:
 def map_synthetic(keyframes: int) -> tuple[Map, Features]:
     """Map a camera that moves sideways past a cloud of points, without images.
 
-    Every keyframe observes all points. The first half of the points have a stereo match, the others
-    are left for triangulation. Because a single landmark suffices to make a keyframe redundant, the
-    fourth insertion culls one. Returns the map and the features of the last keyframe.
+    Every keyframe observes all points. The first half of the points have a stereo match; the others
+    must be triangulated. ``redundant_ratio`` is so small that a single landmark makes a keyframe
+    redundant, and the fourth insertion culls a keyframe. Returns the map and the features of the
+    last keyframe.
     """
     config = Config(mapping=MappingConfig(redundant_ratio=1e-6))
     verifier = verifier_for(config, CAMERA)
@@ -275,9 +277,9 @@ def compile_learned_matching() -> None:
 
 
 def compile_correction() -> None:
-    """Compile pose graph, loop fusion and global bundle adjustment: the steps of ``LoopClosing``.
+    """Compile the kernels of ``LoopClosing``: pose graph, loop fusion, global bundle adjustment.
 
-    GTSAM is left out, because it takes a second to import and has nothing to compile.
+    GTSAM is not called, because it takes a second to import and has nothing to compile.
     """
     config = Config()
     map_, _ = map_synthetic(3)
@@ -316,8 +318,8 @@ def compile_bundle_adjustment() -> None:
     adjust(problem, iterations=1)
 
 
-# The second process starts with kernels that the first one does not need. Before it inserts
-# keyframes, the first process, which starts with this, has already cached the kernels for it.
+# The second process starts with kernels that the first one does not need. The first process starts
+# with the insertion of keyframes, so that its kernels are cached before the second one calls them.
 COMPILE_SHARES: dict[str, tuple[Callable[[], None], ...]] = {
     "first": (compile_insertion, compile_tracking, compile_depth, compile_recognition),
     "second": (

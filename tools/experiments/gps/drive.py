@@ -4,11 +4,15 @@
 
 The script simulates a receiver along the ground truth of finished runs: one fix per second, with
 white noise, a bias that follows a random walk, gaps, and jumps by 20 m that last ten seconds. It
-prints the RMSE of the positions of the run without GPS (after the alignment for its sensor), of the
-fixes, of the fixes interpolated at the times of the frames, and of the run with GPS; the last two
-with and without SE3 alignment. With ``--antenna``, the last row is repeated for an antenna that is
-taken to be at the camera. All are means over the seeds. Then it prints the median CPU time that
-adding the fixes took after the drive.
+prints the RMSE of the positions, as a mean over the seeds:
+
+- of the run without GPS, after the alignment for its sensor;
+- of the fixes;
+- of the fixes interpolated at the times of the frames, with and without SE3 alignment;
+- of the run with GPS, with and without SE3 alignment;
+- with ``--antenna``, of the run with GPS if the antenna is taken to be at the camera.
+
+Then it prints the median CPU time that adding the fixes took after the drive.
 """
 
 from __future__ import annotations
@@ -31,8 +35,8 @@ from vslam.run.outcome import alignment_of
 from vslam.trajectory import Trajectory, read_trajectory
 
 DATUM = np.array([49.0, 8.4, 115.0])
-# The ground truth's x, y and z point right, down and ahead of the first camera, which looks
-# north-east.
+# The axes x, y and z of the ground truth point right, down and ahead of the first camera, which is
+# assumed to look north-east.
 R_ENU_TRUTH = np.array([[1, 0, 1], [0, 2**0.5, 0], [-1, 0, 1]])[[0, 2, 1]] / 2**0.5
 R_ENU_TRUTH[2] *= -1.0
 
@@ -130,7 +134,7 @@ def antenna_at(
 def simulated(
     truth: Trajectory, options: argparse.Namespace, seed: int
 ) -> tuple[Fixes, NDArray[np.bool_]]:
-    """Fixes along the ground truth, and whether each of them lies in a jump."""
+    """Fixes along the ground truth, and whether each fix lies in a jump."""
     rng = np.random.default_rng(seed)
     first, last = truth.timestamps[[0, -1]]
     times = np.arange(first, last, 1.0 / options.hertz)

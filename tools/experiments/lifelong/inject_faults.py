@@ -30,7 +30,7 @@ def inject_all(
 
     Args:
         work: an empty folder.
-        once: inject one random fault per point instead of all.
+        once: inject one random fault per point instead of all faults.
     """
     load_everything()
     rows = []

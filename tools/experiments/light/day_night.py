@@ -2,11 +2,12 @@
 
     python tools/experiments/light/day_night.py DATASET SEQ[=MAP_FRAMES] ... --out TABLE.csv
 
-The map is made from the first MAP_FRAMES frames and saved; then each later left image is localised
-in it on its own. Without MAP_FRAMES, the map is made from the whole drive and images of the same
-drive are localised, except keyframes. A pose is right within 2 m and 15 degrees of the ground
-truth, as in AirSLAM's experiment on the reuse of maps (Xu et al., T-RO 2025, section VII-D). Poses
-are compared relative to the nearest frame of the map, so that the drift of the map does not count.
+The map is made from the first MAP_FRAMES frames and saved. Then each later left image is localised
+in the map, without use of the other images. Without MAP_FRAMES, the map is made from the whole
+drive, and the images of this drive except its keyframes are localised. A pose is right if it is
+within 2 m and 15 degrees of the ground truth, as in AirSLAM's experiment on the reuse of maps (Xu
+et al., T-RO 2025, section VII-D). Poses are compared relative to the nearest frame of the map, so
+that the drift of the map does not count.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class Day:
 
     Attributes:
         path: its file.
-        T_wc: ``(N, 4, 4)`` poses of the N frames that it was made from.
+        T_wc: ``(N, 4, 4)`` poses of the N frames from which the map was made.
         keyframes: numbers of the frames that are keyframes.
     """
 
@@ -83,7 +84,7 @@ class Localiser:
     """Searches a saved map for single images."""
 
     def __init__(self, day: Day, detector: str, candidates: int) -> None:
-        """``candidates``: number of keyframes with which an image is compared, by ORB and by
+        """``candidates``: number of keyframes with which an image is compared, both by ORB and by
         learned descriptors."""
         config = as_config(
             {
@@ -99,7 +100,7 @@ class Localiser:
         self._relocaliser = Relocaliser(slam.context, places.locate, recognise)
 
     def pose(self, image: Image) -> Matrix | None:
-        """``(4, 4)`` pose T_wc in the world of the map, None if localisation fails."""
+        """``(4, 4)`` pose T_wc in the world of the map; None if localisation fails."""
         extracted = FrameImages(image, lambda: None, self._context).extracted
         frame = Frame.of(extracted, self._context.camera, image=image)
         lost = Found(TrackingState.LOST)
@@ -123,7 +124,7 @@ def is_right(T_wc: Matrix, k: int, day: Day, truth: Matrix) -> bool:
 
 
 def rows_of(source: Source, n_map: int | None, options: argparse.Namespace) -> Iterator[list]:
-    """A row for each detector, number of candidates and law."""
+    """A row for each detector, number of candidates and perturbation."""
     n = len(source.timestamps)
     for detector in options.detectors:
         with tempfile.TemporaryDirectory() as folder:

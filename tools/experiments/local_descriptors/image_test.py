@@ -1,12 +1,15 @@
-"""Compare two tests of whether images show one place, on photographs of places.
+"""Compare two tests of whether two images show the same place, on photographs of places.
 
     python tools/experiments/local_descriptors/image_test.py PHOTOS multiview webcams
 
-PHOTOS is a folder of sets, SET/PLACE/*; every image is a query. Its right image is the most similar
-one of its place, by the capsule network; with webcams, whose view never changes, the query is
-warped and its right image is one of another hour. Its wrong images are the two most similar ones of
-other places. Prints the share of right and of wrong pairs that pass: matches of coarse cells that
-one homography explains must cover 18 % of the image, or there must be 90 of them.
+PHOTOS is a folder of sets, SET/PLACE/*. Every image is a query, which is paired with a right image
+and with two wrong images. The right image is the most similar image of the same place, by the
+capsule network. The view of a webcam never changes; its right image is of another hour, and the
+query is warped. The wrong images are the two most similar images of other places.
+
+The script prints the share of right and of wrong pairs that pass each test. Both tests count the
+matches of coarse cells that one homography explains: by share, they must cover 18 % of the image;
+by number, there must be 90 of them.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Measure how a visible hood degrades tracking, and how far a mask repairs it.
+"""Measure how much a visible car hood degrades tracking, and how much a mask helps.
 
     python tools/experiments/masks/hood.py --data TOWNS --seq kitti07 --rows 0.2 0.35
 
-A hood that reflects a random texture is painted over the lower part of the images of a stereo
-drive: an arc that stays in place while the street moves. The script prints lost frames, inliers and
-ATE of the drive without the hood, with it, and with the hood and its mask.
+A hood with a random texture is painted over the lower part of the images of a stereo drive: an arc
+that stays in place while the street moves. The script prints lost frames, inliers and ATE of the
+drive without the hood, with the hood, and with the hood and a mask.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from vslam.frontend.masks import Mask
 from vslam.slam import Slam
 from vslam.trajectory import Trajectory
 
-DISPARITY = 90  # pixels, of the hood, which is near
+DISPARITY = 90  # of the hood, in pixels; large, because the hood is near
 
 
 def main() -> None:

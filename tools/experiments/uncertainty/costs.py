@@ -3,8 +3,8 @@
     python tools/experiments/uncertainty/costs.py --data "$KITTI_ROOT" --seq 06 --frames 51
 
 The script runs a stereo drive alternately without a mask and with a mask that hides nothing, so
-that both do the same work, and prints the medians of CPU times. It fails if the trajectories of any
-two runs differ.
+that both runs otherwise do the same work, and prints the medians of CPU times. It fails if the
+trajectories of any two runs differ.
 """
 
 from __future__ import annotations

@@ -2,11 +2,11 @@
 
     python tools/experiments/uncertainty/nees.py DATA SEQ[:START[:FRAMES]] ... [--perturb LAW ...]
 
-DATA is a folder in KITTI's format with exact ground truth, for example rendered. Every drive runs
-under every law. The normalised estimation error squared (NEES; Bar-Shalom et al., Estimation with
-Applications to Tracking and Navigation, 2001, 5.4) of the motion over 1 s and 10 s, divided by its
-six degrees of freedom, has a mean of 1 if the covariances are consistent, and a larger one if they
-are too small.
+DATA is a folder in KITTI's format with exact ground truth, for example of rendered drives. Every
+drive is run under every perturbation. The script prints the normalised estimation error squared
+(NEES; Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, 2001, 5.4) of the
+motion over 1 s and 10 s, divided by its six degrees of freedom. Its mean is 1 if the covariances
+are consistent, and larger if they are too small.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from vslam.trajectory import Trajectory
 
 INTERVALS_S = (1.0, 10.0)
 SKIPPED = 20  # frames at the start, when the map is new
-EVERY = 7  # frames between the starts of intervals; overlapping ones have nearly the same error
+EVERY = 7  # frames between the starts of intervals; fewer would give nearly the same errors again
 
 
 def results_of(source: Source, law: str, seed: int) -> list[TrackResult]:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera, DepthImage, Image
 
-_SHRINK = 2  # half size takes a fifth of the time, and fog needs no edges finer than two pixels
+_SHRINK = 2  # matching at half size takes a fifth of the time, and fog needs no finer edges
 _BLOCK = 5
 _NEAREST_M = 3.0  # nearest depth in the search range
 
@@ -15,14 +15,15 @@ _NEAREST_M = 3.0  # nearest depth in the search range
 def dense_depths(
     camera: Camera, left: Image, second: Image | DepthImage | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """``(H, W)`` depth along z (m) of the left image's pixels, and of the right image's pixels or
-    None; infinite where it is very large or unknown, for example in the sky.
+    """``(H, W)`` depth along z (m) of the left image's pixels, and of the right image's pixels
+    (None without a right image). It is infinite where it is very large or unknown, for example in
+    the sky.
 
     Args:
         camera: calibration of the images.
         left: ``(H, W)`` uint8.
         second: the right image, which is matched with the left one (SGBM; Hirschmueller, PAMI
-            2008), or the depth of the left image's pixels, where 0 becomes infinite.
+            2008), or the depth of the left image's pixels, 0 where unknown.
     """
     if second is not None and second.dtype != np.uint8:
         depth = np.asarray(second, np.float32)
@@ -37,8 +38,8 @@ def dense_depths(
 def disparity(
     camera: Camera, image: Image, other: Image, *, mirrored: bool = False
 ) -> NDArray[np.float32]:
-    """``(H, W)`` float32 disparities in pixels of a left image, relative to the other image; with
-    ``mirrored``, of a right image. They are 0 in rows without any match."""
+    """``(H, W)`` float32 disparities, in pixels, of the pixels of ``image``, which is the left
+    image of a pair or, with ``mirrored``, the right one. They are 0 in rows without any match."""
     import cv2
 
     height, width = image.shape

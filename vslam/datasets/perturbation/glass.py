@@ -80,7 +80,8 @@ def _blobs(share: float, seed: list[int], scene: Scene) -> NDArray[np.float32]:
 
 
 def _flare(greys: float, stream: RandomStream, scene: Scene) -> PairLaw:
-    """A sun that stays at one place in the image, in both cameras because it is far away."""
+    """A sun that stays at one place in the image. The place is the same in both cameras, because
+    the sun is far away."""
     camera = scene.camera
     rng = np.random.default_rng(stream)
     sun = np.array([rng.uniform(0.15, 0.85) * camera.width, rng.uniform(0.05, 0.3) * camera.height])

@@ -15,7 +15,8 @@ from vslam.datasets.frames import Source
 from vslam.errors import InputError
 
 RandomStream = tuple[int, int]
-"""The user's seed and a number for the law, which begin the seed of each generator of the law."""
+"""The user's seed and a number for the law; the seeds of all random generators of the law begin
+with these two numbers."""
 
 Law = Callable[[int, float, int, Image], Image]
 """``(frame, t, side, image) -> image`` of the same shape; t is in seconds since the first frame;
@@ -30,7 +31,8 @@ class Pair:
         index: index of the frame.
         t: seconds since the first frame.
         left: ``(H, W)`` uint8.
-        second: the right image, ``(H, W)`` uint8, a depth image, ``(H, W)`` float32, or None.
+        second: the right image, ``(H, W)`` uint8, or the depth image, ``(H, W)`` float32; None for
+            a monocular source.
         clean: both images before any law changed them.
     """
 
@@ -42,7 +44,7 @@ class Pair:
 
     @property
     def right(self) -> Image | None:
-        """The right image, or None."""
+        """The right image; None if the source has none."""
         if self.second is None or self.second.dtype != np.uint8:
             return None
         return np.asarray(self.second, np.uint8)
@@ -89,7 +91,7 @@ def check_need(law: str, need: Need, scene: Scene) -> None:
     """Check that the source has the data that a law needs.
 
     Raises:
-        InputError: the source does not have them.
+        InputError: the source does not have these data.
     """
     has = {
         "right": scene.camera.sensor == "stereo",
@@ -102,7 +104,7 @@ def check_need(law: str, need: Need, scene: Scene) -> None:
 
 @dataclass(frozen=True)
 class SceneLaw:
-    """A law that can be applied only after it was bound to a scene."""
+    """A law that must be bound to a scene before it can be applied."""
 
     name: str
     needs: tuple[Need, ...]
@@ -135,8 +137,9 @@ class LawKind:
             number if a small strength has a large effect, for example a short visibility in fog.
         about: a description in a few words.
         least, most: allowed range of strengths.
-        logarithmic: whether strengths are compared by their ratio rather than their difference.
-        drawn: whether the images depend on the seed.
+        logarithmic: whether ``vslam stress`` compares strengths by their ratio instead of their
+            difference.
+        drawn: whether the effect is random, so that the images depend on the seed.
         needs: data that the source must have.
         of_scene: whether the law needs the scene.
         sides: ``both``, or ``one`` for a fault of the stereo rig.

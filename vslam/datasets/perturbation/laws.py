@@ -46,8 +46,8 @@ class Perturbation:
     ) -> tuple[Image, Image | DepthImage | None]:
         """Perturb the images of frame ``index``, ``t`` seconds after the first frame; thread-safe.
 
-        Depth images stay unchanged, because depth sensors bring their own light. The left image
-        does not depend on the second one, except in fog, which computes depth from both.
+        Depth images stay unchanged, because depth sensors have their own light source. The left
+        image depends on the second one only in fog, whose depth is computed from both images.
 
         Args:
             left, second: images as in `vslam.datasets.frames.TimedFrame`.
@@ -101,7 +101,8 @@ def parse_perturbation(spec: str, seed: int) -> Perturbation:
 
 
 def perturbed(frames: Iterator[TimedFrame], perturbation: Perturbation) -> Iterator[TimedFrame]:
-    """Yield the same frames, perturbed as they are read; time counts from the first frame."""
+    """Yield the same frames; their images are perturbed as they are read. The time of the laws
+    begins at the first frame."""
     first = None
     laws = [law for law in perturbation.laws if isinstance(law, EachSide)]
     pair_needed = len(laws) < len(perturbation.laws)
@@ -152,8 +153,8 @@ def contact_sheet(
 
     Args:
         indices: frames of the sequence.
-        start, every: options with which the frames were selected, so that labels show the frame
-            numbers of the whole sequence.
+        start, every: options with which the frames were selected. The labels show the number of
+            each frame in the whole sequence.
 
     Raises:
         InputError: the sequence does not have the data that a law needs.

@@ -27,7 +27,7 @@ FULL_WELL = 10_000.0  # electrons at grey value 255, as in a Sony ICX267
 READ_NOISE = 10.0  # electrons, typical for such sensors
 _TUNNEL_STOPS = 3.0
 _TUNNELS_PER_S = 1.0 / 5.0
-# Gain and gamma at the levels of ``dark``, which lower them in turn.
+# Gain and gamma at each level of ``dark``; each level lowers one of them.
 DARK_GAIN = tuple(1.0 - 0.15 * ((level + 1) // 2) for level in range(13))
 DARK_GAMMA = tuple(1.0 - 0.1 * (level // 2) for level in range(13))
 _BLACKOUTS = ((0.16, 0.64), (0.32, 0.40))  # seconds without light, and seconds of rising light
@@ -60,7 +60,8 @@ def ou_walk(
 
 
 class Cached:
-    """The numbers of an endless iterator by their index, generated on demand; thread-safe."""
+    """Gives access by index to the numbers of an endless iterator, which are generated on demand;
+    thread-safe."""
 
     def __init__(self, numbers: Iterator[float]) -> None:
         self._numbers = numbers
@@ -74,7 +75,7 @@ class Cached:
 
 
 def on_grid(t: float) -> int:
-    """The step of a process at time t."""
+    """The index of the grid step of a process at time t (seconds)."""
     # The small offset keeps rounding errors from moving a time on the grid to the previous step.
     return floor(t / STEP_S + 1e-6)
 
@@ -128,7 +129,7 @@ def _flicker(strength: float, stream: RandomStream) -> Law:
 
 
 def _exposure(seconds: float, stream: RandomStream) -> Law:
-    """The light falls and rises by 3 stops in turn; the camera follows with a time constant."""
+    """The light falls and rises by 3 stops in turn; the exposure follows with a time constant."""
 
     def errors() -> Iterator[float]:
         rng = np.random.default_rng(stream)
@@ -156,7 +157,7 @@ def _night(stops: float, stream: RandomStream) -> Law:
             return image
         rng = np.random.Generator(np.random.SFC64([*stream, frame, side]))
         mean = image * np.float32(electrons * 2.0**-stops)
-        # Since read noise is added, a normal distribution approximates Poisson's well.
+        # With the read noise, a normal distribution approximates the Poisson distribution well.
         noise = rng.standard_normal(image.shape, dtype=np.float32)
         counted = mean + noise * np.sqrt(mean + np.float32(READ_NOISE**2))
         return to_8_bits(counted / np.float32(electrons))

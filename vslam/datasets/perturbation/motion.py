@@ -1,4 +1,5 @@
-"""Motion blur from the camera's rotation during the exposure, and the rates that it needs."""
+"""Motion blur from the camera's rotation during the exposure, and the velocities of camera and
+image that this and other laws need."""
 
 from __future__ import annotations
 
@@ -28,7 +29,7 @@ def optical_flow(first: Image, second: Image) -> NDArray[np.float32]:
 
 
 def neighbours(scene: Scene, frame: int) -> tuple[int, int]:
-    """Indices of the previous and the next frame; at an end, of the frame itself."""
+    """Indices of the previous and the next frame; where there is none, the frame's own index."""
     assert scene.times is not None
     return max(0, frame - 1), min(len(scene.times) - 1, frame + 1)
 
@@ -101,7 +102,7 @@ def _motion(shutter_ms: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 KINDS = {
     "motion": LawKind(
-        _motion, "ms", 50.0, 1.0, 1000.0, "exposure time, which blurs turns", most=1000.0,
+        _motion, "ms", 50.0, 1.0, 1000.0, "exposure time; turning the camera blurs", most=1000.0,
         logarithmic=True, drawn=False, needs=("neighbours",), of_scene=True,
     ),
 }  # fmt: skip

@@ -19,8 +19,8 @@ _PROBE = (48, 64)  # rows and columns of the image on which a new law is tried
 
 
 def plugin_laws() -> dict[str, Callable[[float, tuple[int, int]], PlugInLaw]]:
-    """Functions that make the laws of other packages, each from a strength and the seed of its
-    random stream, by name."""
+    """The laws of other packages by name, each as a function that makes the law from a strength and
+    a random stream (`RandomStream`)."""
     return {name: partial(_make, plugin) for name, plugin in find_plugins(PERTURBATIONS).items()}
 
 

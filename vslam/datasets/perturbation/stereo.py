@@ -67,7 +67,8 @@ def _baseline(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 
 def _moved(image: Image, shift: NDArray[np.float32]) -> Image:
-    """Shift the pixels of an image by ``(H, W, 2)`` pixels, with a backward lookup."""
+    """Shift the pixels of an image by ``(H, W, 2)`` pixels; each pixel is looked up at its position
+    minus its shift."""
     import cv2
 
     y, x = np.mgrid[0 : image.shape[0], 0 : image.shape[1]].astype(np.float32)

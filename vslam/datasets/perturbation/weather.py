@@ -58,8 +58,8 @@ def _fog(visibility_m: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 
 def drops_per_m3(mm_per_h: float) -> tuple[float, float]:
-    """Number of raindrops larger than 1 mm per cubic metre, and the rate (1/mm) of its exponential
-    decay with the diameter [Marshall and Palmer, J. Meteorology 1948]."""
+    """Number of raindrops larger than 1 mm per cubic metre, and the rate (1/mm) at which the number
+    decays exponentially with the diameter [Marshall and Palmer, J. Meteorology 1948]."""
     rate = 4.1 * mm_per_h**-0.21
     return 8000.0 / rate * exp(-rate * _LEAST_MM), rate
 
@@ -124,8 +124,8 @@ def _streaks(
 
 
 def glass_drops(mm_per_h: float, camera: Camera) -> float:
-    """Mean number of drops on a glass that is 30 mm wide and wiped every 3 s, if all the water that
-    falls on it forms drops of 2 mm."""
+    """Mean number of drops on a glass that is 30 mm wide and wiped every 3 s. All the water that
+    falls on the glass is assumed to form drops of 2 mm."""
     area = _GLASS_WIDTH_M**2 * camera.height / camera.width
     fallen = mm_per_h / 3.6e6 * area * _WIPED_EVERY_S
     return fallen / (np.pi / 6.0 * _GLASS_DROP_M**3)

@@ -34,7 +34,7 @@ __all__ = [
 def parse_drive(name: str) -> tuple[str, Variation]:
     """Split ``05+change:0.5+moving:6+aliased+seed:1`` into the route's name and the variation.
 
-    A name in `DRIVES` stands for its route and variation, to which further parts may be added.
+    A name in `DRIVES` stands for a route with a variation; further parts may be added to it.
 
     Raises:
         InputError: a part of the name is not understood.
@@ -58,7 +58,7 @@ def parse_drive(name: str) -> tuple[str, Variation]:
     except ValueError:
         raise InputError(
             f"--seq {name}: '{part}' is not understood; the route may only be followed by "
-            "+change:0 to 1, +moving:CARS, +seed:N and +aliased."
+            "+change:X (0 to 1), +moving:CARS, +seed:N and +aliased."
         ) from None
     return route, variation
 

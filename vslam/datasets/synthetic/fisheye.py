@@ -33,7 +33,7 @@ _NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class FisheyeRig:
-    """A fisheye pair with the positions of a rectified pair.
+    """Two fisheye cameras at the positions of the cameras of a rectified pair.
 
     Attributes:
         models: left and right camera.
@@ -63,7 +63,8 @@ def fisheye_rig(camera: Camera) -> FisheyeRig:
 
 
 def wide_camera(camera: Camera) -> Camera:
-    """The smallest rectified pair of the same focal length that covers the fisheye pair's view."""
+    """The rectified pair with the same focal length and the smallest images that cover the fisheye
+    pair's view."""
     rig = fisheye_rig(camera)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for model, R_own_rectified in zip(rig.models, rig.R_own_rectified, strict=True):
@@ -129,8 +130,8 @@ def render_fisheye(
 
 
 def _seen_at(model: CameraModel, R_own_rectified: Array, camera: Camera) -> NDArray[np.float32]:
-    """``(H, W, 2)`` float32 pixel of the rectified pinhole camera that looks in the same direction,
-    for each pixel of a camera."""
+    """``(H, W, 2)`` float32: for each pixel of a fisheye camera, the pixel of the rectified pinhole
+    camera with the same viewing direction."""
     u, v = np.meshgrid(np.arange(model.width), np.arange(model.height))
     own = unproject(model, np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
     at = camera.project(own @ R_own_rectified)[:, :2]

@@ -163,7 +163,7 @@ def _tile(x: float, z: float, terrain: Terrain, texture: int, fine: int) -> Surf
 def _road_marks(rng: Rng, roads: Roads, style: RoadStyle) -> NDArray[np.float64]:
     """``(M, 10)`` marks on the road at each sample of its middle line: lateral positions of two
     cracks, whether a crack runs across, a patch (from, to, tone), a manhole (along, across), and
-    the tones of asphalt and pavement."""
+    the tones of asphalt and pavement. NaN where there is no crack, patch or manhole."""
     n = len(roads.xz)
     marks = np.full((n, 10), np.nan)
     for k in range(2):

@@ -24,10 +24,12 @@ from vslam.datasets.synthetic.town import Town, build_town
 
 _HEIGHT = 0.25  # m, largest change of the camera's height
 _EXPOSURE = 0.25  # standard deviation of the logarithm of the ratio of the two exposures
-# Places are different if they are more than _APART m apart and not in one street: places in one
-# street have parallel headings, are within _SIGHT m, and at most _STREET m apart across the street.
+# Two places are different if they are more than _APART m apart and not in the same street. They are
+# in the same street if the headings are parallel, the distance is below _SIGHT m, and the distance
+# across the street is below _STREET m.
 _APART, _SIGHT, _STREET = 40.0, 160.0, 25.0
-# Two passes through a place differ by at most 4 m and 30 degrees, and by more than 60 frames.
+# Two frames are two passes through one place if they differ by at most 4 m and 30 degrees but by
+# more than 60 frames.
 _TOGETHER, _ALIGNED, _LATER = 4.0, 30.0, 60
 _ALIKE = 5  # number of the most similar places that count as look-alikes of a place
 _PLACES, _SMALL = 160, 8  # number of places that are compared; factor by which views are reduced
@@ -65,12 +67,12 @@ def render_pairs(
 ) -> None:
     """Render ``count`` labelled pairs; with all kinds, half of them show the same place twice.
 
-    The second view is moved at random. Its kind tells from where it is taken:
+    The second view is moved at random. The kind of a pair tells where the second view is taken:
 
-    - ``shift``: the same frame;
-    - ``pass``: another pass through the place, if the drive has one;
-    - ``alike``: another place that is among the most similar ones in a small blurred view;
-    - ``random``: any other place.
+    - ``shift``: at the same frame;
+    - ``pass``: at another pass through the place, if the drive has one;
+    - ``alike``: at one of the places that look most similar in small, blurred views;
+    - ``random``: at any other place.
 
     ``folder/pairs.csv`` has one row per pair: the two images; ``same`` (1 or 0); the kind; the
     frame at which each view is taken; for each view, the frame whose light and objects it shows;
@@ -167,8 +169,8 @@ def _other_passes(T_wc: Float) -> list[NDArray[np.int64]]:
 
 
 def _different(T_wc: Float, others: Float) -> NDArray[np.bool_]:
-    """``(N,)`` bool: which of the ``(N, 4, 4)`` poses ``others`` show a different place than
-    ``T_wc``, and not another view along the same street."""
+    """``(N,)`` bool: which of the ``(N, 4, 4)`` poses ``others`` are at a different place than the
+    pose ``T_wc`` and not in the same street."""
     away = (others[:, :3, 3] - T_wc[:3, 3])[:, [0, 2]]
     ahead = T_wc[[0, 2], 2] / np.linalg.norm(T_wc[[0, 2], 2])
     aside = np.abs(away @ np.array([ahead[1], -ahead[0]]))

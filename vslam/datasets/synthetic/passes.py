@@ -24,12 +24,12 @@ from vslam.datasets.synthetic.town import Town
 _NEAR, _LEFT = 60.0, 75.0  # m: distances at which a place is reached, and at which it is left
 _AGAIN, _STRETCH = 60, 15  # frames: shortest time until a revisit, and its shortest duration
 _SHADOW_MAPS = 8  # number of shadow maps that are kept
-_CLOUD = 12.0  # frames; a cloud hides the sun while it moves between two passes
+_CLOUD = 12.0  # frames around the start of a pass in which a cloud hides the sun, which then moves
 _CAR_REACH = np.array([1.1, 2.7])  # half the width and length of the largest car, m
 
 
 class Passes:
-    """Computes the moments of a drive; may be called from several threads."""
+    """Computes the scene at each frame of a drive; may be called from several threads."""
 
     def __init__(self, route: Route, town: Town, variation: Variation) -> None:
         self._route, self._town, self._variation = route, town, variation
@@ -119,7 +119,8 @@ class Passes:
 
 
 def _switch_frames(place: NDArray[np.float64], cameras: NDArray[np.float64]) -> NDArray[np.int64]:
-    """``(T,)`` frame at which each place is left for the first time."""
+    """``(T,)`` frame at which each place is left for the first time; the largest int64 if it is
+    never reached or never left."""
     switch = np.full(len(place), np.iinfo(np.int64).max)
     for k, xz in enumerate(place):
         distance = np.hypot(*(cameras - xz).T)
@@ -132,7 +133,8 @@ def _switch_frames(place: NDArray[np.float64], cameras: NDArray[np.float64]) -> 
 
 
 def pass_starts(T_wc: NDArray[np.float64]) -> list[int]:
-    """Frame 0, and the frames at which a drive ``(N, 4, 4)`` returns to earlier streets."""
+    """The first frame of each pass: frame 0, and each frame at which a drive, ``(N, 4, 4)`` poses,
+    returns to an earlier street."""
     xz = T_wc[:, [0, 2], 3]
     tree = cKDTree(xz)
     known = np.array([

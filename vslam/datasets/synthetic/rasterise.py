@@ -15,8 +15,9 @@ FAR = 400.0  # m
 LAYER_STEP = 1e-3  # relative depth by which a layer is drawn in front of the next lower one
 _SEAM = 1e-6  # overlap of neighbours as a fraction of an edge, so that there are no gaps
 
-# Columns of the result of ``find_visible``: the coefficients of affine functions of the pixel
-# (u, v) for s/z, t/z, 1/z and for both texture coordinates over z, and then single numbers.
+# Columns of the result of ``find_visible``. PLANE: 3 x 3 coefficients of s/z, t/z and 1/z, which
+# are affine functions of the pixel (u, v). TEXTURE: 2 x 3 coefficients of both texture coordinates
+# divided by z. Each of the other columns is a single number.
 PLANE, TEXTURE, FIRST_ROW, LAST_ROW, TRIANGLE, LAYER = 0, 9, 15, 16, 17, 18
 NUMBER, DETAIL_U, DETAIL_V, DETAIL, AMBIENT, SUN, GLOW, KEY, COLUMNS = range(19, 28)
 
@@ -38,8 +39,11 @@ class _Span(NamedTuple):
 
 
 class _AlphaMap(NamedTuple):
-    """Alpha of one texture: ``alpha`` (N,) u1 of all textures; ``offset`` (L,) i8 start of each of
-    its levels; ``log_size`` (2,) i8 binary logarithms of width and height of level 0."""
+    """Alpha of one texture.
+
+    ``alpha`` (N,) u1 values of all textures; ``offset`` (L,) i8 start of each level of this texture
+    in ``alpha``; ``log_size`` (2,) i8 binary logarithms of width and height of level 0.
+    """
 
     alpha: NDArray[np.uint8]
     offset: NDArray[np.int64]
@@ -275,8 +279,8 @@ def rasterise(visible, atlas, band):
 
 @kernel
 def _fill(value, slope, number, begin, inverse_depth, seen):
-    """Draw surface ``number`` on the part of a row that begins at sample ``begin``. Sample ``i`` of
-    the row has 1/z = ``value + slope i``."""
+    """Draw surface ``number`` on the part of a row that begins at sample ``begin``. The surface has
+    1/z = ``value + slope i`` at sample ``i`` of the row."""
     value += slope * begin
     for i in range(np.uintp(len(seen))):
         near = np.float32(value + slope * np.float64(np.int32(i)))

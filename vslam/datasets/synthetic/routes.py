@@ -36,8 +36,8 @@ class Route:
         about: description in a few words.
         land: ``town``, ``suburb`` or ``motorway``.
         camera: the stereo rig.
-        T_wc: ``(N, 4, 4)`` float64 poses of the left camera in the world frame of the town, whose
-            heights count from y = 0.
+        T_wc: ``(N, 4, 4)`` float64 poses of the left camera in the world frame of the town, where
+            y = 0 is the height 0 of the terrain.
         roads, terrain: the roads and the ground of the drive.
     """
 
@@ -67,8 +67,8 @@ class Route:
 
 @dataclass(frozen=True)
 class _Leg:
-    """A drive along corner points ``(x, z)`` in metres; ``lanes`` holds the lane from each corner
-    on, 1 for the right and -1 for the left one."""
+    """A drive along corner points ``(x, z)`` in metres. ``lanes`` gives the lane after each corner:
+    1 is the right one, -1 the left one."""
 
     corners: tuple[tuple[float, float], ...]
     lanes: tuple[float, ...] = ()

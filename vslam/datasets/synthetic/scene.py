@@ -187,7 +187,7 @@ def _flatten(
 
 
 class LightValues(NamedTuple):
-    """Sun, sky and air as f8 for kernels; `render.Light` documents the other fields.
+    """The values of `render.Light`, which documents them, as f8 for kernels.
 
     ``sun_x``, ``sun_y``, ``sun_z``: unit vector towards the sun, world.
     """

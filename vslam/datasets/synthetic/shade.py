@@ -94,9 +94,9 @@ def _log2(bits):
 
 @inline
 def _trilinear(texels, offset, number, log_w, log_h, bits, u, v):
-    """Texture ``number`` at ``(u, v)``, averaged over a pixel. ``bits`` are those of a float32, the
-    number of texels of level 0 per pixel in one direction. Two levels are blended over the middle
-    half of an octave."""
+    """Texture ``number`` at ``(u, v)``, averaged over a pixel. ``bits`` are the bits of a float32:
+    the number of texels of level 0 per pixel in one direction. Two levels are blended over the
+    middle half of an octave."""
     low, part = _log2(bits)
     top = max(log_w, log_h)
     part = (part - np.float32(0.25)) * np.float32(2.0)
@@ -249,9 +249,9 @@ def shade(visible, band, atlas, sky, light, shadows, pools, camera, view):
 
 @inline
 def _kinds(seen, row, column, samples, number, weight, shift_u, shift_v):
-    """Collect the different surfaces that the samples of a pixel see, and for each the number of
-    its samples and the sum of their offsets from the pixel's centre; returns the number of
-    surfaces."""
+    """Collect the different surfaces that the samples of a pixel see; returns their number. For
+    each surface, ``weight`` is the number of its samples, and ``shift_u`` and ``shift_v`` are the
+    sums of the samples' offsets from the pixel's centre."""
     kinds = 0
     step = 1.0 / samples
     for a in range(samples):

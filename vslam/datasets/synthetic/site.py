@@ -90,7 +90,8 @@ def _roof_tiles(rng: Rng) -> textures.Grey:
 
 Float = NDArray[np.float64]
 
-# When an object exists: always, until its place is left for the first time, or from then on.
+# When an object exists: always, until the camera leaves its place for the first time, or only
+# after that.
 ALWAYS, BEFORE, AFTER = 0, 1, 2
 ALIASES = 4  # number of different houses, trees and cars with --aliased
 
@@ -126,7 +127,7 @@ class Site:
         cameras: ``(N, 2)`` x and z of all possible camera positions.
         lamps: x and z of each street lamp.
         parts: surfaces of the things, in the route's world.
-        place, when: of each thing, as in `town.Town`.
+        place, when: position of each thing and when it exists, as in `town.Town`.
     """
 
     route: Route

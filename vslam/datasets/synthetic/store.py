@@ -46,7 +46,15 @@ OnFrame = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Stored:
-    """A rendered sequence: the folder of its KITTI tree, and its name and size (bytes) there."""
+    """A rendered sequence in a cache folder.
+
+    Attributes:
+        root: folder of its KITTI tree.
+        name: name of the sequence in that tree.
+        frames: number of frames of the sequence.
+        complete: whether all frames are rendered.
+        size: bytes on the disk.
+    """
 
     root: Path
     name: str
@@ -92,7 +100,8 @@ def place_folder(cache: Path) -> Path:
 
 
 def clean(cache: Path, name: str | None = None) -> int:
-    """Remove everything, or all variations of one route; returns the number of freed bytes."""
+    """Remove the whole cache, or all variations of the route ``name``; returns the number of freed
+    bytes."""
     freed = 0
     for places in cache.glob("v*-places") if name is None else []:
         freed += _folder_size(places)

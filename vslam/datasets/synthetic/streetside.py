@@ -38,7 +38,8 @@ def plant(site: Site, xz: Float, height: float) -> None:
 
 
 def _pruned(site: Site, model: Surfaces, xz: Float) -> Surfaces | None:
-    """The model without the twigs too near to a camera; None if 30 % or more of them are."""
+    """The model without the twigs that are too near to a camera; None if 30 % or more of the twigs
+    are too near."""
     near = float(np.min(np.linalg.norm(site.cameras - xz, axis=1)))
     middle = model.origin + 0.5 * (model.edge_s + model.edge_t)
     size = np.linalg.norm(model.edge_s, axis=1) + np.linalg.norm(model.edge_t, axis=1)

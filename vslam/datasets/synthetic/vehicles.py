@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from vslam.datasets.synthetic.scene import AtlasBuilder, Surfaces, join, patches
 from vslam.datasets.synthetic.textures import Grey, Rng, letters, noise, write
 
-# Outlines from the front bumper over the roof to the rear, as fractions of length and height. The
-# third number tells whether the strip that begins at the point is paint (0) or glass (1).
+# Outlines from the front bumper over the roof to the rear: points as fractions of length and
+# height. The third number tells whether the strip from this point to the next is paint (0) or glass
+# (1).
 _OUTLINES = {
     "hatchback": ((0.0, 0.16, 0), (0.0, 0.42, 0), (0.05, 0.52, 0), (0.27, 0.62, 1),
                   (0.45, 0.97, 0), (0.62, 1.0, 0), (0.86, 0.93, 1), (0.97, 0.62, 0),

@@ -1,1 +1,4 @@
-"""Benchmarks: a grid of sequences, perturbations, detectors and seeds, with a process per run."""
+"""Benchmarks: a grid of sequences, perturbations, detectors and seeds.
+
+A *cell* of the grid is one run, which has its own process.
+"""

@@ -25,7 +25,7 @@ def run_on_cluster(
 ) -> Generator[CellOutcome, None, None]:
     """Run cells on the workers of a scheduler; publish and yield each outcome when it arrives.
 
-    A worker runs as many cells at a time as it has threads. Closing the generator stops them.
+    A worker runs as many cells at a time as it has threads. Closing the generator stops the cells.
 
     Raises:
         InputError: Dask is not installed, or no scheduler answers.
@@ -64,7 +64,7 @@ def run_on_cluster(
 
 
 def _require_certificates(scheduler: str) -> None:
-    """Refuse a TLS address without certificates, with which Dask's client would never close."""
+    """Refuse a TLS address if Dask has no certificates, because its client would never close."""
     from distributed.security import Security
 
     if not scheduler.startswith("tls://"):

@@ -11,22 +11,23 @@ from vslam.errors import InputError, counted
 from vslam.lab.bench.grid import Cell
 from vslam.report.schema import ReportJson
 
-# Seconds per frame and to start a run, used until a cell is finished. Measured with two threads of
-# a Xeon on KITTI's images, with loop closing.
+# Seconds per frame and seconds to start a run, used until a cell is finished. Measured on KITTI,
+# with two threads of a Xeon and with loop closing.
 _FRAME_S, _START_S = 0.06, 5.0
-# Measured and rounded up: the files of a cell that are kept, and the map, which is deleted.
+# Measured and rounded up: bytes of the kept files per cell and per frame, and bytes per frame of
+# the map, which is deleted after the run.
 _CELL_BYTES, _FRAME_BYTES, _SCRATCH_FRAME_BYTES = 100_000, 1_000, 45_000
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a grid needs.
+    """Time and disk space that a grid needs.
 
     Attributes:
         seconds: wall time if all jobs are always busy.
         kept: bytes of the files that stay.
         scratch: bytes of the files that are deleted after each run.
-        basis: what the estimate of the time is based on, in words.
+        basis: what the estimated time is based on, in words.
     """
 
     seconds: float
@@ -41,7 +42,8 @@ def estimate(
     frames: Mapping[str, int],
     jobs: int,
 ) -> Estimate:
-    """Estimate the missing cells from the finished ones, per detector where possible.
+    """Estimate time and space of the missing cells from the finished ones; the time per frame is
+    that of the same detector if one of its cells is finished.
 
     Args:
         finished: finished cells and their reports.
@@ -75,7 +77,7 @@ def estimate(
 
 
 def check_disk(needed: Estimate, out: Path) -> None:
-    """Refuse a grid that does not fit on the disk.
+    """Check that the disk has enough free space for a grid.
 
     Raises:
         InputError: the free space is too small.

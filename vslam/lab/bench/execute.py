@@ -37,7 +37,7 @@ class RunOptions:
         config: thresholds, as the text of a ``config.json``.
         threads: threads of each run; they do not change its result.
         command: program that accepts the arguments of ``vslam``; None for vslam itself.
-        others: programs of other systems, which accept the same arguments, by ``Cell.detector``.
+        others: programs of other systems by ``Cell.detector``; they accept the same arguments.
         scratch: folder in which runs write; None for the machine's temporary folder.
         source: arguments of ``vslam run`` that describe how to read the data.
     """
@@ -108,8 +108,9 @@ def run_here(
 ) -> Generator[CellOutcome, None, None]:
     """Run cells on this machine, ``jobs`` at a time; publish and yield each outcome when it ends.
 
-    Threads suffice, because each one only waits for a process. They also publish, so that a cell
-    that ends while the caller is interrupted is not lost. Closing the generator kills the runs.
+    Threads suffice, because each thread only waits for a process. The threads also publish, so that
+    a cell that ends while the caller is interrupted is not lost. Closing the generator kills the
+    runs.
 
     Raises:
         ResultsError: the results of a cell cannot be written.
@@ -141,7 +142,8 @@ def finished_cells(cells: Collection[Cell], out: Path, config: str) -> list[Cell
 
 
 def publish(outcome: CellOutcome, out: Path) -> None:
-    """Write a finished cell into ``out``, completely or not at all, or the log of a failed one.
+    """Write the results of a finished cell into ``out``, completely or not at all. A failed cell
+    has no results; its log is written instead.
 
     Raises:
         ResultsError: the folder cannot be written.
@@ -161,7 +163,8 @@ def publish(outcome: CellOutcome, out: Path) -> None:
             if not path.resolve().is_relative_to(part.resolve()):
                 raise ResultsError(f"{name}: a worker sent a file outside its folder.")
             path.parent.mkdir(parents=True, exist_ok=True)
-            if path.suffix in (".json", ".md", ".html"):  # they print the command that repeats ATE
+            # These files contain the command that reproduces the ATE, which names the folder.
+            if path.suffix in (".json", ".md", ".html"):
                 data = data.replace(outcome.folder.encode(), shlex.quote(str(target)).encode())
             path.write_bytes(data)
         shutil.rmtree(target, ignore_errors=True)  # a damaged result or one of another version
@@ -178,11 +181,11 @@ def prepare(out: Path, data: str) -> None:
     """Create the folder of a benchmark and remove what killed benchmarks left there.
 
     Args:
-        data: text that identifies the data. Results in a folder must be of the same data, because
-            sequences of other data may have the same names.
+        data: text that identifies the data. All results in a folder must be of the same data,
+            because sequences of other data may have the same names.
 
     Raises:
-        InputError: the folder cannot be written, or it holds runs on other data.
+        InputError: the folder cannot be written, or it contains runs on other data.
     """
     import psutil
 

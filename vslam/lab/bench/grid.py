@@ -19,7 +19,7 @@ from vslam.report.schema import ReportJson
 
 @dataclass(frozen=True, order=True)
 class Cell:
-    """One run of the grid: everything that determines its result, except the images.
+    """One run of the grid, described by everything that determines its result except the images.
 
     Attributes:
         perturb: perturbation in canonical spelling, e.g. ``none`` or ``brightness:1.5,blur:0.5``.
@@ -29,7 +29,7 @@ class Cell:
         digest: digest of the weight file.
         sensor: value of ``--sensor``; None for all images that the data has.
         calib: calibration files.
-        thresholds: digest of the thresholds that differ from the defaults; empty if none does.
+        thresholds: digest of the thresholds that differ from the defaults; empty without any.
     """
 
     dataset: str
@@ -46,7 +46,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Name of the folder of its results, unique to the cell."""
+        """Name of the folder of the results, which is unique to the cell."""
         light = self.perturb.replace(":", "").replace(",", "+")
         parts = [self.dataset, self.sequence, light, self.detector, f"seed{self.seed}"]
         parts += [f"{self.max_frames}frames"] if self.max_frames else []
@@ -90,10 +90,10 @@ def parse_sequences(text: str) -> list[str]:
 def parse_perturbations(text: str) -> list[str]:
     """Parse ``none,brightness:2+blur`` into ``none`` and ``brightness:2,blur:1``.
 
-    A comma separates entries of the grid; ``+`` joins laws that act together.
+    A comma separates entries of the grid; ``+`` joins perturbations that act together.
 
     Raises:
-        InputError: ``vslam run --perturb`` would refuse one of the entries.
+        InputError: one of the entries is not a valid perturbation.
     """
     specs = [part.strip().replace("+", ",") for part in text.split(",")]
     return list(dict.fromkeys(parse_perturbation(spec, 0).name for spec in specs))
@@ -112,10 +112,10 @@ def make_grid(
     thresholds: str = "",
     repeated: Collection[str] = (),
 ) -> list[Cell]:
-    """All cells: first every sequence with the first seed, then every sequence with the next one.
+    """All cells: first every sequence with the first seed, then every sequence with the next seed.
 
-    An interrupted benchmark is most useful in this order. A perturbation without randomness gets
-    one run: its repetitions would be identical, and a statistical test would count them as
+    In this order, an interrupted benchmark is most useful. A perturbation without randomness gets
+    only one run: repetitions would be identical, and a statistical test would count them as
     independent samples.
 
     Args:
@@ -147,7 +147,7 @@ def make_grid(
 
 
 def thresholds_digest(config: str) -> str:
-    """Digest of the thresholds that differ from the defaults (``Cell``); empty if none does.
+    """Digest of the thresholds that differ from the defaults (``Cell``); empty without any.
 
     Args:
         config: the text of a ``config.json``.
@@ -168,13 +168,13 @@ def _digest(path: Path) -> str:
 
 
 def draws(perturb: str) -> bool:
-    """Whether the images depend on the seed."""
+    """Whether a perturbation draws random numbers, so that the images depend on the seed."""
     laws = {law.partition(":")[0] for law in perturb.split(",")} - {"none"}
     return any(law_kind(law).drawn for law in laws)
 
 
 def read_report(folder: Path) -> ReportJson | None:
-    """The report of a run folder; None if there is none or it has another schema."""
+    """The report in a run folder; None if it is missing or has another schema."""
     try:
         return ReportJson.read(folder / "report.json")
     except InputError:
@@ -182,13 +182,13 @@ def read_report(folder: Path) -> ReportJson | None:
 
 
 def tracked_nothing(folder: Path) -> bool:
-    """Whether a run folder holds the report of a run that was lost in every frame."""
+    """Whether a run folder contains the report of a run that was lost in every frame."""
     report = read_report(folder)
     return report is not None and report.lost_frames + report.dropped_frames == report.frames
 
 
 def is_finished(cell: Cell, folder: Path, config: str) -> bool:
-    """Whether ``folder`` holds a complete run of exactly this cell.
+    """Whether ``folder`` contains a complete run of exactly this cell.
 
     Args:
         config: the thresholds, as in ``config.json`` of a run.

@@ -60,8 +60,8 @@ class GridProgress:
         return f"{len(self.reports) + len(self.failed)}/{len(self.cells)} {cell.name}: {result}"
 
     def table(self) -> Table:
-        """The number of finished cells and their median ATE, with a row for each sequence and
-        perturbation and a column for each detector."""
+        """A table with a row for each sequence and perturbation and a column for each detector.
+        Each entry gives the number of finished cells and their median ATE."""
         detectors = list(dict.fromkeys(cell.detector for cell in self.cells))
         caption = "Each entry gives the number of finished runs and their median ATE.\n"
         caption += f"{len(self.reports)} of {counted(len(self.cells), 'run')} finished"
@@ -92,9 +92,9 @@ class GridProgress:
 
 @contextmanager
 def shown_live(progress: GridProgress, *, shown: bool) -> Iterator[Callable[[str], None]]:
-    """Show the table on stderr and update it; yield a function that prints a line where stderr is
-    not a terminal. The table is left standing only if cells are missing or failed, because the
-    results of a complete grid follow it."""
+    """Show the table on stderr and update it; yield a function that prints a line if stderr is not
+    a terminal. The table is erased at the end of a complete grid, because its results follow. It
+    stays if cells are missing or failed."""
     console = Console(stderr=True, quiet=not shown, highlight=False, soft_wrap=True)
     live = (
         Live(get_renderable=progress.table, console=console, refresh_per_second=1, transient=True)

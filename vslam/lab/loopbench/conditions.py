@@ -15,7 +15,8 @@ from vslam.loopclosure.siamese.images import turn_homography
 Image = NDArray[np.uint8]
 
 KINDS = ("none", "light", "clipping", "viewpoint", "occlusion", "noise", "blur", "change", "all")
-# Perturbations of `vslam run --perturb` at strength 1.
+# The perturbations of `vslam run --perturb` that make up a condition, with their strengths at the
+# condition's strength 1.
 _LAWS = {
     "light": {"brightness": 2.0, "gamma": 2.0},
     "occlusion": {"occlusion": 2.0},
@@ -25,7 +26,7 @@ _LAWS = {
 _LAWS["all"] = {law: s / 2 for kind in _LAWS.values() for law, s in kind.items()}
 _OTHER_LANE, _TURN = 3.2, 30.0  # metres and degrees of a change of viewpoint at strength 1
 _CLIPPED = 0.6  # share of the pixels that become white, or black, at strength 1
-_APART_S = 10.0  # between images, so that their changes are independent: light decorrelates in 2 s
+_APART_S = 10.0  # between images, so that their changes are independent (light changes within 2 s)
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,8 @@ class Condition:
 
     @property
     def lateral(self) -> tuple[float, float]:
-        """Range of the lateral offset in metres, positive to the right. Even an unchanged view has
-        some offset, because no two drives follow exactly the same line."""
+        """Range of the lateral offset in metres, positive to the right. Even without a change of
+        viewpoint, there is some offset, because no two drives follow exactly the same line."""
         side = -_OTHER_LANE * self.view
         return (side, side) if self.view else (-0.3, 0.3)
 
@@ -97,7 +98,8 @@ def apply(
     """The images under a condition, each with its own random change.
 
     Args:
-        condition: ``change`` does nothing here, because the renderer changes the town.
+        condition: the condition. ``change`` leaves the images as they are, because the renderer has
+            already changed the town.
         images: ``(H, W)`` uint8 each.
         seed: seed of all random changes.
         rendered: whether the renderer has already changed the viewpoint.
@@ -119,8 +121,8 @@ def apply(
 
 
 def turned(image: Image, degrees: float) -> Image:
-    """The image after the camera turns to the right about its centre; pixels outside the original
-    view are black."""
+    """The image that the camera would see after a turn to the right about its centre; pixels
+    outside the original view are black."""
     import cv2
 
     height, width = image.shape

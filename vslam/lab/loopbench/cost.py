@@ -1,6 +1,6 @@
 """Measure CPU time and memory of one detector in a separate process.
 
-CPU time hardly depends on other load of the machine.
+Unlike wall time, CPU time hardly depends on what else the machine does.
 """
 
 from __future__ import annotations

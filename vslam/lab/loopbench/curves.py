@@ -24,7 +24,7 @@ from vslam.report.drawing import (
 )
 
 _COLORS = [GREY, BLUE, VIOLET, AMBER, GREEN, RED]
-_DASHES = ["-", "--", ":"]  # for the first six detectors, the next six, and the rest
+_DASHES = ["-", "--", ":"]  # for the first six detectors, the next six, and all further ones
 _VERIFIED = {"nothing": "-", "both": ":"}
 
 # Panel, curve, label in the legend (may be empty), colour and dashes.
@@ -55,7 +55,8 @@ def _drawings(report: LoopsJson) -> Iterator[Drawing]:
         scores = [score for score in report.cells if score.data == data]
         conditions = _in_order(score.condition for score in scores)
         caption = (
-            f"Precision against recall on {data}, unverified, with a panel for each condition."
+            f"Precision against recall on {data} without verification, with a panel for each "
+            "condition."
         )
         lines = []
         for score in scores:

@@ -1,4 +1,4 @@
-"""Loop detectors as functions of images: the similarity of queries and gallery images."""
+"""Loop detectors as functions of images: they give the similarity of query and gallery images."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 _MATCHING_LEVEL = 2  # vocabulary level with about 100 nodes; features are matched within a node
-_KEPT_GALLERIES = 3  # the unchanged gallery and those of two strengths
+_KEPT_GALLERIES = 3  # the gallery of the unchanged town, and the galleries of two strengths
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class DescribedImage:
         xy: ``(N, 2)`` float32 pixels.
         descriptors: ``(N, 32)`` uint8.
         words: ``(N,)`` int32 word of each feature.
-        nodes: direct index of the features.
+        nodes: direct index of the features: which features lie under which node.
     """
 
     image: Image
@@ -71,10 +71,10 @@ class Scorer(Protocol):
 
     name: str
     probability: bool
-    """Whether the scores are probabilities, which can be compared with 0.5 and 0.9."""
+    """Whether the scores are probabilities p, so that accuracy at p = 0.5 and 0.9 is defined."""
 
     def store(self, gallery: list[DescribedImage]) -> Any:
-        """What the detector stores for the gallery."""
+        """The data that the detector keeps of the gallery, to compare queries with it."""
 
     def scores(self, queries: list[DescribedImage], stored: Any) -> NDArray[np.float64]:
         """``(Q, G)`` similarities; higher is more similar."""
@@ -102,7 +102,7 @@ class BowScorer:
 
 
 def require_comparable(name: str, weights: Path | None) -> None:
-    """Refuse a detector that cannot be compared, before large packages are imported.
+    """Check that a detector can be compared, before large packages are imported.
 
     Raises:
         InputError: the detector is unknown, or there are no weights for it.
@@ -130,7 +130,7 @@ def open_scorer(name: str, weights: Path | None, vocabulary: Vocabulary) -> Scor
 
 
 class NetworkScorer:
-    """One of ``NETWORKS``, run on one thread.
+    """A scorer that runs one of ``NETWORKS`` on one thread.
 
     Attributes:
         parameters: number of learned parameters.
@@ -185,7 +185,8 @@ class LocalDescriptorCache:
 class DetectorSet:
     """The detectors of a benchmark; the first one is the baseline of the comparison.
 
-    Most conditions share a gallery, so what was computed for the last few galleries is cached.
+    Most conditions share a gallery, so the features and stored data of the last few galleries are
+    cached.
     """
 
     def __init__(self, scorers: list[Scorer], vocabulary: Vocabulary, threads: int) -> None:
@@ -195,7 +196,7 @@ class DetectorSet:
         self._kept: OrderedDict[bytes, tuple[list[DescribedImage], dict[str, Any]]] = OrderedDict()
 
     def gallery(self, images: list[Image]) -> tuple[list[DescribedImage], dict[str, Any]]:
-        """Features of the images, and what each detector stores for them, by its name."""
+        """Features of the images, and the data that each detector keeps of them, by its name."""
         hashed = hashlib.blake2b()
         for image in images:
             hashed.update(f"{image.shape}".encode())

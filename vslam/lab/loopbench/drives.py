@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,9 +12,11 @@ from vslam.lab.loopbench.sets import ProgressBar, rendered_route
 from vslam.loopclosure.siamese.image_source import ImageSource
 from vslam.loopclosure.siamese.kitti_source import read_kitti
 from vslam.loopclosure.siamese.source_registry import open_source, split_spec
+from vslam.trajectory import write_kitti
 
 if TYPE_CHECKING:
-    from vslam.datasets.synthetic import Variation
+    from vslam.datasets.synthetic import Route, Variation
+    from vslam.datasets.synthetic.store import OnFrame
 
 _ORDERED = ("kitti", "fabmap")  # kinds of sources whose images are in driving order
 
@@ -23,7 +26,8 @@ def open_drives(
 ) -> list[ImageSource]:
     """Open ``drive:ROUTE[seed=101,aliased=1,change=0.5,every=10]``, ``kitti:`` or ``fabmap:``.
 
-    Every ``every``-th frame of a built-in route is rendered on first use, for the left camera.
+    The left images of a built-in route are rendered on first use, with ``every=10`` only those of
+    every tenth frame.
 
     Args:
         cache: folder of rendered towns.
@@ -63,7 +67,6 @@ def _rendered(
     progress_bar: ProgressBar,
 ) -> ImageSource:
     from vslam.datasets.synthetic import built_in_route, store
-    from vslam.lab.loopbench.views import render_views
 
     route = built_in_route(name)
     frames = range(0, len(route.T_wc), every)
@@ -77,3 +80,44 @@ def _rendered(
     kind = "aliased town" if town.aliased else "town"
     changed = f", change {town.change:g}" if town.change else ""
     return replace(source, name=f"{name} in {kind} {town.seed}{changed}")
+
+
+def render_views(
+    route: Route,
+    variation: Variation,
+    root: Path,
+    frames: Sequence[int],
+    *,
+    threads: int,
+    on_frame: OnFrame,
+) -> None:
+    """Render the left images of some frames into a tree in KITTI's layout, unless they exist.
+
+    The images are identical to those of `render_sequence`. Poses and times of the whole drive are
+    written, too. The file of poses is written last, so that it exists only if all images do.
+
+    Args:
+        root: root of the tree, which must not be used for other routes or variations.
+        frames: frame numbers, ascending.
+        threads: number of threads of the renderer.
+        on_frame: called with the number of finished frames and the number of all frames.
+
+    Raises:
+        InputError: the folder cannot be written, or the disk is too small.
+    """
+    from vslam.datasets.synthetic.files import check_disk, frame_files, write, writing
+    from vslam.datasets.synthetic.store import render_frames
+
+    folder = root / "sequences" / route.name
+    missing = [k for k in frames if not frame_files(folder, k, depth=False)[0].exists()]
+    check_disk(root, len(missing), depth=False)
+    with writing(root):
+        (folder / "image_0").mkdir(parents=True, exist_ok=True)
+        (root / "poses").mkdir(exist_ok=True)
+        if missing:
+            render_frames(
+                route, variation, folder, missing, False, threads, on_frame,
+                total=len(frames), monocular=True,
+            )  # fmt: skip
+        write(folder / "times.txt", "".join(f"{t:.6e}\n" for t in route.timestamps).encode())
+        write_kitti(root / "poses" / f"{route.name}.txt", route.ground_truth)

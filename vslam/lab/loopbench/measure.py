@@ -28,8 +28,12 @@ from vslam.loopclosure.precision_recall import (
 )
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
 
-MIN_CELLS, LEAST_COSINE = 90, 0.5  # of coarse matches that fit one homography
-MIN_MATCHES = 20  # that fit one epipolar geometry (ORB-SLAM, VII-B, requires 20 in 3D)
+# Verification by learned descriptors: least number of coarse matches that fit one homography, and
+# least cosine similarity of a match.
+MIN_CELLS, LEAST_COSINE = 90, 0.5
+# Verification by ORB: least number of matches that fit one epipolar geometry. ORB-SLAM (VII-B)
+# requires 20 matches that fit a motion in 3D.
+MIN_MATCHES = 20
 _EPIPOLAR_PIXELS = 2.0
 _CURVE_POINTS = 200
 _RESAMPLES = 200  # bootstrap resamples of the queries
@@ -45,7 +49,7 @@ def measure(
     detectors: DetectorSet,
     seed: int,
 ) -> tuple[list[Score], list[Gain]]:
-    """Measure all detectors on a set; empty if the condition cannot be applied to the set."""
+    """Measure all detectors on a set; returns empty lists if the condition cannot be applied."""
     query_set = test_set.query_set(condition, seed)
     if query_set is None:
         return [], []
@@ -121,10 +125,12 @@ def _best_images(
 
 
 def thinned(curve: PrecisionRecall) -> Curve:
-    """The best precision at equal steps of recall, and the end where every pair is accepted.
+    """Reduce a curve to equal steps of recall, each with its best precision, and to the end of the
+    curve, where every pair is accepted.
 
-    Equal steps in the number of pairs would not show the curve of a good detector, which ranks the
-    few true pairs before thousands of others: nearly all of it would lie within the first step.
+    Equal steps in the number of pairs would not show the curve of a good detector: it ranks the few
+    true pairs before thousands of false ones, so that nearly the whole curve would lie within the
+    first step.
     """
     points = drawn_points(curve)
     return Curve(
@@ -134,7 +140,7 @@ def thinned(curve: PrecisionRecall) -> Curve:
 
 
 def drawn_points(curve: PrecisionRecall) -> NDArray[np.int64]:
-    """The first point of a curve, and the points nearest to equal steps of recall."""
+    """Indices of the first point of a curve, and of the points nearest to equal steps of recall."""
     wanted = np.linspace(0.0, curve.recall[0], _CURVE_POINTS)
     reached = len(curve.recall) - 1 - np.searchsorted(curve.recall[::-1], wanted)
     return np.unique(np.append(reached, 0))
@@ -170,7 +176,7 @@ def _gain(
 
 
 class Verification:
-    """Tests by local features whether two images show the same place; caches the results."""
+    """Decides by local features whether two images show the same place; caches the results."""
 
     def __init__(
         self,
@@ -191,8 +197,9 @@ class Verification:
         return self._by_orb[key]
 
     def by_learned(self, query: int, image: int) -> bool:
-        """Whether enough similar cells of the coarse grids roughly fit one homography. Their number
-        does not depend on how much of the images is sky or road, as their share would."""
+        """Whether enough similar cells of the two coarse grids roughly fit one homography. The
+        number of cells decides, because their share would depend on how much of the images is sky
+        or road."""
         key = query, image
         if key not in self._by_learned:
             a = self._local.of(self._queries[query].image)
@@ -221,18 +228,18 @@ def epipolar_inliers(a: DescribedImage, b: DescribedImage) -> int:
 
 
 def sequence_scores(scores: Matrix) -> Matrix:
-    """The mean score along the best line that ends at each query and gallery image.
+    """Scores of sequences instead of single images, as in SeqSLAM (Milford and Wyeth, ICRA 2012).
 
-    A sequence recognises a stretch of road instead of a single image. As in SeqSLAM (Milford and
-    Wyeth, ICRA 2012), the scores of a query and its predecessors are added along lines through the
-    gallery, one for each speed.
+    A sequence recognises a stretch of road. For each query and gallery image, the scores of the
+    query and its predecessors are added along lines through the gallery that end at this image, one
+    line for each speed. The result is the mean score along the best line.
 
     Args:
         scores: ``(Q, G)`` of queries and images in driving order; higher is more similar.
 
     Returns:
-        ``(Q, G)``. Where a line leaves the gallery, the mean score of the query is added; the lines
-        of the first queries are shorter.
+        ``(Q, G)`` mean scores. Where a line leaves the gallery, the mean score of the query takes
+        the place of the missing score; the lines of the first queries are shorter.
     """
     n_queries, n_images = scores.shape
     usual = scores.mean(1)
@@ -248,6 +255,6 @@ def sequence_scores(scores: Matrix) -> Matrix:
 
 
 def log_odds(p: Matrix) -> Matrix:
-    """Log odds of probabilities; those of independent observations can be added."""
+    """Log odds of probabilities. The log odds of independent observations can be added."""
     p = np.clip(p, _LEAST_P, 1.0 - _LEAST_P)
     return np.asarray(np.log(p / (1.0 - p)))

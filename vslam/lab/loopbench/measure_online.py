@@ -29,7 +29,7 @@ def measure_drive(
     Args:
         drive: images in order.
         scorers: the detectors.
-        window: the newest images, which are not searched.
+        window: the images just before a query, which are not searched.
         vocabulary: vocabulary of ``bow`` and of the features that verification matches.
 
     Raises:

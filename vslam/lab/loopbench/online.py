@@ -1,10 +1,10 @@
 """The usual protocol of the literature: one decision per image of a drive, in driving order.
 
-An image is compared with all images before a time window. The most similar one is its match, and
-the score of the match is compared with a threshold. The ground truth marks which images show the
-same place:
+An image is compared with all earlier images except those in a window just before it. The most
+similar image is its match, and the score of the match is compared with a threshold. The ground
+truth marks which images show the same place:
 
-- a match is *right* if it is marked, otherwise *wrong*;
+- a match is *right* if the ground truth marks it as the same place, otherwise *wrong*;
 - precision is right / (right + wrong) over the images whose score reaches the threshold;
 - recall is right / (images that have a marked image before the window).
 
@@ -27,8 +27,8 @@ from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME
 
 @dataclass(frozen=True)
 class Window:
-    """The most recent images, which are not compared with a query: a number of images, or of
-    seconds if ``timed``."""
+    """The window of images just before a query, which are not compared with it: ``amount`` is a
+    number of images, or of seconds if ``timed``."""
 
     amount: float
     timed: bool
@@ -41,8 +41,8 @@ class Window:
 
         Args:
             n: number of images in the drive.
-            times: ``(n,)`` seconds, ascending; None assumes one image per second, DLoopDetector's
-                default.
+            times: ``(n,)`` seconds, ascending; None assumes one image per second, as DLoopDetector
+                does by default.
 
         Returns:
             ``(n,)`` int64.
@@ -56,7 +56,7 @@ def parse_window(text: str) -> Window:
     """Parse ``20s`` (seconds) or ``200`` (images).
 
     Raises:
-        InputError: the text is neither.
+        InputError: the text has another form, or the number is not positive.
     """
     timed = text.endswith("s")
     try:
@@ -75,8 +75,8 @@ class Decisions:
     """The decisions for N images.
 
     Attributes:
-        match: ``(N,)`` int64 index of the image found, -1 for none.
-        score: ``(N,)`` float64 score of the match, -inf for none.
+        match: ``(N,)`` int64 index of the image found; -1 if there is no match.
+        score: ``(N,)`` float64 score of the match; -inf if there is no match.
     """
 
     match: NDArray[np.int64]
@@ -87,7 +87,7 @@ class Decisions:
             raise InputError("loops bench: a score is NaN; check the weights of the detector.")
 
     def only(self, accepted: NDArray[np.bool_]) -> Decisions:
-        """Only the accepted decisions, given as a mask ``(N,)``; other images get no match."""
+        """The decisions without those that the mask ``(N,)`` rejects: these images get no match."""
         return Decisions(
             np.where(accepted, self.match, -1), np.where(accepted, self.score, -np.inf)
         )
@@ -112,11 +112,12 @@ class Judged:
     """Decisions compared with the ground truth.
 
     Attributes:
-        score: ``(N,)`` float64, -inf for no decision.
+        score: ``(N,)`` float64 score of the match; -inf if there is no match.
         right: ``(N,)`` bool, whether the match is marked as the same place.
         far: ``(N,)`` bool, whether the match shows another place. A match that is neither right
-            nor far lies near the place, but not near enough to be marked.
-        answerable: ``(N,)`` bool, whether there is a marked image before the window.
+            nor far was taken near the place, but not near enough to be marked.
+        answerable: ``(N,)`` bool, whether there is a marked image before the window, so that a
+            right match is possible.
     """
 
     score: NDArray[np.float64]
@@ -126,14 +127,15 @@ class Judged:
 
     @property
     def near(self) -> NDArray[np.bool_]:
-        """``(N,)`` bool, whether there is a match that is neither right nor far."""
+        """``(N,)`` bool, whether the match was taken near the place but is not marked."""
         return np.isfinite(self.score) & ~self.right & ~self.far
 
 
 def judge(
     decisions: Decisions, relation: NDArray[np.int8], searchable: NDArray[np.int64]
 ) -> Judged:
-    """Compare decisions with the ground truth, the relation ``(N, N)`` int8 of the images.
+    """Compare decisions with the ground truth: ``relation`` ``(N, N)`` int8 tells which images show
+    the same place (:class:`vslam.lab.loopbench.sets.QuerySet`).
 
     Raises:
         InputError: no image has a marked image before the window.
@@ -157,8 +159,8 @@ def decision_curve(judged: Judged, *, near_is_wrong: bool = True) -> PrecisionRe
     """Precision and recall over images, with each distinct score as the threshold.
 
     Args:
-        near_is_wrong: count matches near the place as wrong, as the literature does; False leaves
-            them out.
+        near_is_wrong: count unmarked matches near the place as wrong, as the literature does; False
+            leaves them out.
     """
     wrong = judged.far | (judged.near & near_is_wrong)
     counted = judged.right | wrong

@@ -25,22 +25,20 @@ _ABOUT_AP = (
 )
 _ABOUT_RECALL = "The highest recall without a wrong pair, and the precision at a recall of 70 %."
 _ABOUT_VERIFIED = (
-    "Of the queries with a place in the gallery, the share whose best image shows this place, and "
-    "the shares that are then also verified by ORB, by learned descriptors, or by at least one of "
-    f"the two. ORB verifies a pair of images if at least {MIN_MATCHES} matches fit one epipolar "
-    "geometry, learned descriptors if at least "
-    f"{MIN_CELLS} coarse matches fit one homography."
+    "Share of the queries with a place in the gallery whose best image shows this place, and the "
+    "shares whose best image is also verified by ORB, by learned descriptors, or by at least one "
+    f"of the two. ORB verifies a pair of images if at least {MIN_MATCHES} matches fit one epipolar "
+    f"geometry. Learned descriptors verify it if at least {MIN_CELLS} coarse matches fit one "
+    "homography."
 )
 _ABOUT_SEQUENCES = (
-    "Share of the queries whose best image shows their place, by scores of single images and of "
-    f"sequences of {LENGTH} queries (SeqSLAM). Sequences need images in driving order."
+    "Share of the queries whose best image shows their place, by the scores of single images and "
+    f"of sequences of {LENGTH} queries (SeqSLAM). Sequences need images in driving order."
 )
-_ABOUT_WRONG = (
-    "Number of queries whose best image shows another place and is verified nevertheless."
-)
+_ABOUT_WRONG = "Number of queries whose best image shows another place but is verified."
 _ABOUT_ACCURACY = (
-    "Balanced accuracy: the mean of the shares of true and false pairs that are classified "
-    "correctly at a threshold on p."
+    "Balanced accuracy at a threshold on p, the probability that the detector gives: the mean of "
+    "the shares of true and of false pairs that are classified correctly."
 )
 _ABOUT_ACCEPTED = "Over the pairs with p of at least 0.9; if there are none, precision is 1."
 _ABOUT_COST = (
@@ -55,8 +53,8 @@ _ABOUT_ONLINE = (
     "unmarked matches near the place do not count as wrong."
 )
 _ABOUT_DECISIONS = (
-    "Numbers of decisions at the lowest threshold whose match is marked as the same place (right), "
-    "is unmarked but near it, or is far from it."
+    "Number of decisions at the lowest threshold whose match is marked as the same place (right), "
+    "is near the place but not marked (near), or shows another place (far)."
 )
 
 
@@ -91,8 +89,8 @@ def title(report: LoopsJson) -> str:
 
 
 def words(report: LoopsJson) -> list[str]:
-    """Sentences that compare each detector with the first one under each condition, and that name
-    the best detector on each drive."""
+    """Sentences that compare each detector with the first one under each condition, and sentences
+    that name the best detector on each drive."""
     sentences = _online_words(report.online)
     for first, second in dict.fromkeys((g.first, g.second) for g in report.gains):
         for condition in _conditions(report):
@@ -233,7 +231,7 @@ def _by_detector(
     shown: Callable[[_Scored], str],
 ) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Head and rows of a table with a column for each detector. ``about`` gives the first cells of
-    a row, ``shown`` the cell of a score."""
+    a row, and ``shown`` the cell of a detector's score."""
     rows: dict[tuple[str, ...], dict[str, str]] = {}
     for score in scores:
         rows.setdefault(about(score), {})[score.detector] = shown(score)

@@ -16,11 +16,11 @@ class Curve(Record):
 
 
 class Verified(Record):
-    """Best images that pass verification.
+    """Queries whose best image passes verification.
 
-    ``right``: the share of queries whose best image shows their place and is verified, among the
-    queries that have a place in the gallery. ``wrong``: the number of queries whose best image
-    shows another place and is verified.
+    ``right``: share of the queries with a place in the gallery whose best image shows this place
+    and is verified. ``wrong``: number of queries whose best image shows another place and is
+    verified.
     """
 
     right: float
@@ -30,13 +30,16 @@ class Verified(Record):
 class Score(Record):
     """One detector on one set of images under one condition.
 
-    ``figures`` are those of :func:`vslam.loopclosure.precision_recall.summary`, without
-    verification. ``accuracy``: balanced accuracy by threshold on p; None for detectors without p.
-    ``accepted``: precision and recall of the pairs with p of at least 0.9; None without p and in
-    older files. ``first_right``: among the ``queries`` with a place in the gallery, the share whose
-    best image shows it; ``sequence_right``: the same for scores added along sequences, None for
-    images without order. ``verified``: the images verified by ``orb``, by ``learned`` local
-    descriptors, or by at least one of them (``both``); empty if nothing was verified.
+    - ``figures``: see :func:`vslam.loopclosure.precision_recall.summary`; without verification.
+    - ``accuracy``: balanced accuracy by threshold on the probability p; None for detectors that
+      give no probability.
+    - ``accepted``: precision and recall of the pairs with p of at least 0.9; None without p and in
+      older files.
+    - ``queries``: number of queries with a place in the gallery.
+    - ``first_right``: share of these queries whose best image shows their place.
+    - ``sequence_right``: the same for scores added along sequences; None for images without order.
+    - ``verified``: the images verified by ``orb``, by ``learned`` local descriptors, or by at least
+      one of the two (``both``); empty without verification.
     """
 
     data: str
@@ -63,12 +66,15 @@ class DecisionCurve(Record):
 class OnlineScore(Record):
     """One detector on one drive, with one decision per image (:mod:`vslam.lab.loopbench.online`).
 
-    ``window``: the newest images, which are not searched. ``verified_by``: ``nothing``, ``orb``,
-    ``learned`` local descriptors, or ``both`` (at least one of the two). ``answerable``: the number
-    of images that have a true match before the window. ``right``, ``near``, ``far``: the numbers
-    of matches, at the lowest threshold, that are marked as the same place, that are not marked but
-    near it, and that show another place. Figures whose names end in ``_far`` leave out near
-    matches; the others count them as wrong. ``max_f1_threshold`` is None if nothing is found.
+    - ``window``: the images just before a query, which are not searched.
+    - ``verified_by``: ``nothing``, ``orb``, ``learned`` local descriptors, or ``both`` (at least
+      one of the two).
+    - ``answerable``: number of images that have a true match before the window.
+    - ``right``, ``near``, ``far``: numbers of matches, at the lowest threshold, that are marked as
+      the same place, that are near the place but not marked, and that show another place.
+    - Figures whose names end in ``_far`` leave out near matches; the other figures count near
+      matches as wrong.
+    - ``max_f1_threshold``: None if no image has a match.
     """
 
     data: str
@@ -116,8 +122,9 @@ class Cost(Record):
 
 
 class LoopsJson(Document):
-    """The results of ``vslam loops bench``. ``kind`` distinguishes this file from those of runs.
-    The protocol ``retrieval`` fills ``cells``, ``gains`` and ``costs``, the other one ``online``.
+    """The results of ``vslam loops bench``. ``kind`` distinguishes this file from reports of runs.
+    The protocol ``retrieval`` fills ``cells``, ``gains`` and ``costs``; the protocol ``online``
+    fills ``online``.
     """
 
     kind: Literal["loops"] = "loops"

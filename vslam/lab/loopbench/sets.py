@@ -19,7 +19,7 @@ from vslam.loopclosure.siamese.source_registry import open_source, split_spec
 ProgressBar = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
 """``(text, number of steps)`` opens a bar and yields a function to be called after each step."""
 
-_GAP = 50  # images of a drive before a query that are not searched
+_GAP = 50  # number of images just before a query of a drive that are not searched
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class TestSet:
 
     Attributes:
         title: title in the report.
-        query_set: function of ``(condition, seed)`` that returns the images under the condition, or
+        query_set: function of ``(condition, seed)`` that returns the images under the condition;
             None if the condition cannot be applied to the set.
     """
 

@@ -19,7 +19,7 @@ from vslam.trajectory import Trajectory, read_trajectory
 from vslam.untrusted import require_utf8
 
 MONOCULAR = ", mono"  # suffix of the name of a monocular system
-# Options of a run that change its results and are not part of its `Drive`.
+# Options of a run that change its results but are not part of its `Drive`.
 _OPTIONS = ("weights", "local_weights", "realtime", "map", "localize", "mask")
 
 
@@ -28,8 +28,8 @@ class Found:
     """The runs found, in order, and notes on what was left out.
 
     Attributes:
-        estimate: the trajectory file of each run, by its ``source``.
-        truth: for each (dataset, place), the folder of a run that holds its ground truth.
+        estimate: the trajectory file of each run, by the ``source`` of the run.
+        truth: for each (dataset, place), the folder of a run that contains the ground truth.
     """
 
     runs: list[RunEntry]
@@ -44,8 +44,8 @@ def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
     Interrupted runs and reports that this version cannot read are left out with a note.
 
     Raises:
-        InputError: a folder is missing, none contains a finished run, a trajectory cannot be read,
-            or its sequence is not clear.
+        InputError: a folder is missing, no folder contains a finished run, a trajectory cannot be
+            read, or the sequence of a trajectory is not clear.
     """
     found = Found([], [])
     for folder in run_folders(folders):
@@ -81,7 +81,7 @@ def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
 
 
 def read_aligned(found: Found, run: RunEntry) -> tuple[Trajectory, Trajectory | None]:
-    """The trajectory of a run, aligned to the ground truth if there is one, and the ground truth.
+    """The trajectory of a run, aligned to its ground truth, and the ground truth (None if missing).
 
     Raises:
         InputError: a file is missing or malformed.
@@ -95,7 +95,7 @@ def read_aligned(found: Found, run: RunEntry) -> tuple[Trajectory, Trajectory | 
         evaluation = evaluate_trajectory(estimate, truth, run.alignment)
     except InputError:  # too short to align
         return estimate, None
-    # The estimate may lack some frames, so these timestamps may be wrong; only places are drawn.
+    # If the estimate lacks some frames, these timestamps are wrong. Only positions are drawn.
     return Trajectory(estimate.timestamps[: evaluation.frames], evaluation.T_wc_aligned), truth
 
 
@@ -130,7 +130,7 @@ def _read(folder: Path, notes: list[str]) -> ReportJson | None:
 
 
 def _is_overview(path: Path) -> bool:
-    """Whether a file is a report of many runs instead of one run."""
+    """Whether a ``report.json`` is a report of many runs instead of one run."""
     try:
         OverviewJson.read(path)
     except InputError:
@@ -141,7 +141,7 @@ def _is_overview(path: Path) -> bool:
 def _compared_entry(
     entry: RunEntry, report: ReportJson, other: DetectorFigures, folder: Path
 ) -> RunEntry:
-    """The entry of another detector of the same run (``--compare``)."""
+    """The entry of a detector that a run compared with its own (``--compare``)."""
     return entry.model_copy(
         update={
             "system": other.detector + entry.system.removeprefix(report.detector),
@@ -204,7 +204,7 @@ def _settings(report: ReportJson, folder: Path) -> dict[str, Any]:
 
 
 def _name_by_settings(found: Found) -> None:
-    """Make each combination of settings a system; its name lists those that not all runs share."""
+    """Make each combination of settings a system, whose name lists the settings that differ."""
     first = found.runs[0].settings
     shared = {
         name: value
@@ -262,7 +262,7 @@ def _add_external(text: str, found: Found) -> None:
     if evaluation.frames < len(truth):
         found.notes.append(
             f"{system} has poses for {evaluation.frames} of {len(truth)} frames of {drive.place}, "
-            f"{perturb}: its errors cover only these frames, those of vslam cover all"
+            f"{perturb}: its errors cover only these frames; the errors of vslam cover all frames"
         )
     measures: dict[str, float | None] = {
         measure: getattr(evaluation, measure, None) for measure, *_ in MEASURES
@@ -284,8 +284,8 @@ def _add_external(text: str, found: Found) -> None:
 
 
 def _alignment_of_external(system: str, drive: Drive, found: Found) -> str:
-    """The alignment of vslam's runs on the same sequence. If only some of them are monocular, the
-    suffix of the system's name decides."""
+    """The alignment of vslam's runs on the same sequence. If only some of these runs are monocular,
+    it is sim3 for a system whose name ends in ``, mono``, else se3."""
     there = {run.alignment for run in found.runs if run.drive.place == drive.place}
     if len(there) == 1:
         return there.pop()

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _COLORS = [AMBER, BLUE, GREEN, VIOLET, RED, "#06b6d4", "#ec4899", "#84cc16"]
-_MIN_STRENGTHS = 2  # in a strength curve, not counting the images as they are
+_MIN_STRENGTHS = 2  # least number of strengths in a curve, not counting unperturbed images
 _DASHES = ["-", (0, (5, 1.5)), (0, (2, 1)), (0, (5, 1, 1, 1))]  # keep lines that overlap visible
 
 Looks = Mapping[str, tuple[str, Any]]  # colour and dashes of each system
@@ -59,7 +59,7 @@ def draw_overview(report: OverviewJson, found: Found) -> list[page.Figure]:
 
 
 def _errors(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
-    """ATE by sequence, with a figure for each perturbation."""
+    """Draw the ATE by sequence, with a figure for each perturbation."""
     for perturb in dict.fromkeys(row.drive.perturb for row in rows):
         known = [r for r in rows if r.drive.perturb == perturb and r.measures["ate_rmse_m"]]
         places = list(dict.fromkeys((row.drive.dataset, row.drive.place) for row in known))
@@ -87,7 +87,8 @@ def _errors(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
 
 
 def _curves(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
-    """ATE and loops against the strength of a law, with a figure for each law and sequence."""
+    """Draw ATE and loops against the strength of a perturbation, with a figure for each kind of
+    perturbation and sequence."""
     laws = {
         law.partition(":")[0]: None
         for row in rows
@@ -108,8 +109,8 @@ def _curves(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
                 continue
             yield (
                 f"strength-{law}-{place.dataset}-{place.place}",
-                "Medians over runs, shaded from the smallest to the largest value. Strength 0 are "
-                "the images as they are.",
+                "Medians over runs, shaded from the smallest to the largest value. Strength 0 "
+                "stands for the unperturbed images.",
                 _curve(f"{place.place}: {law}", mine, strength, looks),
             )
 
@@ -146,7 +147,8 @@ def _curve(
 
 
 def _paths(report: OverviewJson, found: Found, looks: Looks) -> Iterator[Drawing]:
-    """The run with the median ATE of each system, with a figure for each drive."""
+    """Draw the trajectory of the run with the median ATE of each system, with a figure for each
+    drive."""
     for drive in dict.fromkeys(row.drive for row in report.rows):
         figure, axes = new_figure(
             f"{drive.place}, {_light(drive.perturb)}", "x (m)", "z (m)", SQUARE
@@ -206,7 +208,7 @@ def _logarithmic(axes: Axes) -> None:
 
 
 def _light(perturb: str) -> str:
-    return "images as they are" if perturb == "none" else perturb
+    return "unperturbed images" if perturb == "none" else perturb
 
 
 def _identifier(name: str) -> str:

@@ -27,16 +27,16 @@ _ABOUT_MOTION = (
     "to 800 m."
 )
 _ABOUT_OTHERS = (
-    "Loops are judged by the ground truth. fps: frames per second of the frame loop, lower for "
-    "runs that shared a machine."
+    "Loops are judged by the ground truth. fps: frames per second without start-up; runs that "
+    "shared a machine are slower."
 )
 ALIGNMENTS = {"se3": "SE3", "sim3": "Sim3"}
 _TESTED = (
     "Better, worse, same: numbers of sequences on which the errors of the system named first are "
     "smaller, larger or equal. p: two-sided Wilcoxon signed-rank test over sequences, at the level "
-    f"{ALPHA:g}, not corrected for the number of tests. A sequence counts once, with the median of "
-    "its runs, because these are not independent; over all conditions, with the mean of its "
-    "medians. Comparisons in which all sequences tie are left out."
+    f"{ALPHA:g}, not corrected for the number of tests. A sequence counts once, because its runs "
+    "are not independent: with the median of its runs, or, over all conditions, with the mean of "
+    "these medians. Comparisons in which all sequences tie are left out."
 )
 
 
@@ -52,17 +52,17 @@ def write_overview(
         runs: folders that contain runs at any depth.
         trajectories: trajectories of other systems, ``NAME[@SEQUENCE[@PERTURB]]=FILE``.
         out: folder, created if it does not exist.
-        baseline: the system that the others are compared with; None for the simplest.
+        baseline: the system with which the others are compared; None for the simplest system.
 
     Raises:
-        InputError: there is no finished run, or none of the baseline, or a trajectory cannot be
+        InputError: there is no finished run, or no run of the baseline, or a trajectory cannot be
             read or its sequence is not clear.
         ResultsError: a file cannot be written.
     """
     found = collect(runs, trajectories)
     report = summarize(found, baseline)
     figures = draw_overview(report, found)
-    notes = list(dict.fromkeys((*report.notes, *found.notes)))  # drawing has added some
+    notes = list(dict.fromkeys((*report.notes, *found.notes)))  # drawing can add notes
     report = report.model_copy(update={"notes": notes})
     page = overview_page(report, figures)
     files = {"report.json": report.to_json(), "table.csv": render_csv(report)}
@@ -115,7 +115,7 @@ def render_csv(report: OverviewJson) -> str:
 
 
 def _results(report: OverviewJson) -> list[Section]:
-    """Several tables with the same rows, because a single one would be too wide."""
+    """The results in several tables with the same rows, because one table would be too wide."""
     texts = ("sequence", "perturbation", "system")
 
     def table(name: str, measures: Collection[Measure], note: str, *, aligned: bool) -> Section:

@@ -25,11 +25,12 @@ MEASURES: tuple[Measure, ...] = (
     ("fps", "fps", "", 1),
 )
 DECIMALS = {name: decimals for name, _, _, decimals in MEASURES}
-ALL = "all"  # stands for a comparison over all perturbations
+ALL = "all"  # ``Comparison.perturb`` of a comparison over all perturbations
 
 
 class Drive(Record):
-    """Images on which systems are compared, whatever the seed; ``excerpt`` is empty for a whole
+    """The images on which systems are compared: a sequence or an excerpt of it, with a
+    perturbation. Runs with different seeds have the same drive. ``excerpt`` is empty for a whole
     sequence."""
 
     dataset: str
@@ -46,13 +47,17 @@ class Drive(Record):
 class RunEntry(Record):
     """One run.
 
-    ``system``: the loop detector, followed in brackets by the settings that not all runs share, or
-    the name of another system. ``settings``: thresholds and options that differ from the defaults.
-    ``seed``: None for other systems. ``town``: seed of a rendered town; the same route in another
-    town counts as the same drive with another seed. ``alignment``: the transformation fitted before
-    errors are computed, ``se3``, or ``sim3`` for a monocular run, whose scale is arbitrary.
-    ``measures``: by the names of ``MEASURES``; None if unknown. ``source``: the folder of the run,
-    or the trajectory file of another system or of a detector of ``--compare``.
+    - ``system``: the loop detector, followed in brackets by the settings that not all runs share,
+      or the name of another system.
+    - ``settings``: thresholds and options that differ from the defaults.
+    - ``seed``: seed of the perturbation; None for other systems.
+    - ``town``: seed of a rendered town. The same route in another town counts as the same drive
+      with another seed.
+    - ``alignment``: the transformation fitted before errors are computed: ``se3``, or ``sim3`` for
+      a monocular run, whose scale is arbitrary.
+    - ``measures``: values by the names in ``MEASURES``; None if unknown.
+    - ``source``: the folder of the run, or the trajectory file of another system or of a detector
+      of ``--compare``.
     """
 
     drive: Drive
@@ -77,7 +82,7 @@ class Spread(Record):
 
 
 class Row(Record):
-    """All runs of one system on one drive; a measure that no run has is None."""
+    """All runs of one system on one drive. A measure is None if no run has a value."""
 
     drive: Drive
     system: str
@@ -99,11 +104,12 @@ class Pair(Record):
 class Comparison(Record):
     """Two systems under one perturbation, paired by sequence.
 
-    ``perturb`` is ``all`` for a comparison over all perturbations: a sequence then counts once,
-    with its mean over the perturbations that both systems have run. ``p_value`` is that of the
-    two-sided Wilcoxon signed-rank test on the differences that are not ties, None if there are too
-    few of them. ``winner`` is the system with significantly smaller errors, None if neither has.
-    ``words`` describes the result in sentences.
+    - ``perturb``: ``all`` for a comparison over all perturbations. A sequence then counts once,
+      with its mean over the perturbations under which both systems have run.
+    - ``p_value``: p of the two-sided Wilcoxon signed-rank test on the differences that are not
+      ties; None if there are too few differences.
+    - ``winner``: the system with significantly smaller errors; None if there is no such system.
+    - ``words``: the result in sentences.
     """
 
     measure: str
@@ -122,7 +128,7 @@ class Comparison(Record):
 
 class OverviewJson(Document):
     """A report of many runs. ``kind`` distinguishes this file from the ``report.json`` of one run.
-    ``systems`` are in the order of comparison, the baseline first."""
+    ``systems`` lists the baseline first, then the systems that are compared with it."""
 
     kind: Literal["overview"] = "overview"
     schema_version: int = 4

@@ -4,8 +4,8 @@ Requests name a report by its number; a path from a request is never opened. Req
 host name are refused, so that a web site cannot read reports through the user's browser (DNS
 rebinding).
 
-A report may come from a stranger and contain any script, so it is sandboxed: its scripts run in an
-origin of their own and can reach neither other reports nor the network. A ``report.html`` or
+A report may come from a stranger and contain any script. It is therefore sandboxed: its scripts run
+in their own origin and can reach neither other reports nor the network. A ``report.html`` or
 ``report.json`` that is a symbolic link is not read.
 """
 
@@ -43,7 +43,7 @@ def list_runs(folders: Collection[Path]) -> list[tuple[Path, ReportJson]]:
     """Folders of all runs and their reports, newest first; unreadable reports are left out.
 
     Raises:
-        InputError: a folder does not exist, or none contains a run.
+        InputError: a folder does not exist, or no folder contains a run.
     """
     found: list[tuple[Path, ReportJson]] = []
     for folder in map(Path.resolve, run_folders(folders)):

@@ -1,8 +1,8 @@
 """Summarize runs in rows and compare systems.
 
-The median over its runs represents a system on a drive. Two systems are compared under each
-perturbation and over all of them, paired by *sequence*: runs on the same sequence are not
-independent, so counting each of them would overstate the evidence.
+On each drive, a system is represented by the median of its runs. Two systems are compared under
+each perturbation, and over all perturbations. A comparison pairs the systems by *sequence*: runs on
+the same sequence are not independent, so counting each run would overstate the evidence.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _KNOWN = ("none", "bow", *NETWORKS, "both")
 
 
 class Shown(NamedTuple):
-    """How an error is printed: the value of the measure times ``scale``."""
+    """How an error is printed: its title, its unit, and the factor ``scale`` to this unit."""
 
     title: str
     unit: str
@@ -43,7 +43,7 @@ class Shown(NamedTuple):
     decimals: int
 
     def text(self, value: float, sign: str = "") -> str:
-        """The value without its unit; ``sign`` is ``+`` for differences."""
+        """The value as text without unit; ``sign`` is ``+`` for differences."""
         return f"{self.scale * value:{sign}.{self.decimals}f}"
 
 
@@ -56,7 +56,7 @@ def summarize(found: Found, baseline: str | None = None) -> OverviewJson:
 
     Args:
         found: the runs.
-        baseline: the system that the others are compared with; None for the simplest.
+        baseline: the system with which the others are compared; None for the simplest system.
 
     Raises:
         InputError: there is no run of the baseline.
@@ -89,7 +89,7 @@ def summarize(found: Found, baseline: str | None = None) -> OverviewJson:
 
 
 def _unlike_towns(runs: Iterable[RunEntry]) -> Iterator[str]:
-    """A note on each drive that some systems have run in other rendered towns than others."""
+    """A note on each drive on which the systems ran in different rendered towns."""
     towns: dict[Drive, dict[str, set[int]]] = {}
     for run in runs:
         if run.town is not None:
@@ -104,8 +104,8 @@ def _unlike_towns(runs: Iterable[RunEntry]) -> Iterator[str]:
 
 def systems(runs: Iterable[RunEntry | Row], baseline: str | None = None) -> list[str]:
     """Names of the systems: first the baseline if one is named, then loop detectors from the
-    simplest to the most elaborate, then other systems in the order found. A detector without
-    changed settings precedes the same one with changed settings."""
+    simplest to the most elaborate, then other systems in the order found. A detector with default
+    settings precedes the same detector with other settings."""
     names = dict.fromkeys(run.system for run in runs)
 
     def key(name: str) -> tuple[bool, int, bool]:
@@ -117,7 +117,7 @@ def systems(runs: Iterable[RunEntry | Row], baseline: str | None = None) -> list
 
 
 def _is_called(system: str, name: str | None) -> bool:
-    """Whether a name means this system: its settings and the monocular suffix may be omitted."""
+    """Whether a name means a system. The name may omit the settings and the suffix ``, mono``."""
     return name in {one.removesuffix(MONOCULAR) for one in (system, without_settings(system))}
 
 
@@ -154,10 +154,10 @@ def compare(
     """Compare the errors of two systems.
 
     Args:
-        rows: medians of both systems, and maybe of others.
+        rows: medians of both systems; rows of other systems are ignored.
         first, second: names of the systems. Errors after different alignments are not compared.
-        perturb: a perturbation, or `ALL`: a sequence then counts with its mean over the
-            perturbations that both systems have run.
+        perturb: a perturbation, or `ALL`, which compares the mean of each sequence over the
+            perturbations under which both systems have run.
         measure: ``ate_rmse_m`` or ``rpe_m``; less is better.
 
     Returns:
@@ -210,7 +210,12 @@ def is_tie(difference: float, measure: str) -> bool:
 
 
 def strengths(drives: Iterable[Drive], law: str) -> dict[Drive, float]:
-    """The strength of a law in each drive with this law alone, and 0 for unperturbed drives."""
+    """The strength of a perturbation in each drive that has only this perturbation, and 0 for
+    unperturbed drives.
+
+    Args:
+        law: name of the perturbation, without strength.
+    """
     found = {}
     for drive in drives:
         if drive.perturb == "none":
@@ -221,13 +226,13 @@ def strengths(drives: Iterable[Drive], law: str) -> dict[Drive, float]:
 
 
 def least_pairs() -> int:
-    """Number of pairs that Wilcoxon's two-sided test needs at least in order to reach ``ALPHA``."""
+    """Least number of pairs with which Wilcoxon's two-sided test can reach ``ALPHA``."""
     return math.ceil(1.0 - math.log2(ALPHA))
 
 
 def _wilcoxon(differences: list[float]) -> tuple[float | None, bool]:
-    """The two-sided p, None if there are too few differences, and whether they tend to be
-    negative."""
+    """The two-sided p (None if there are too few differences), and whether the differences tend to
+    be negative."""
     if len(differences) < least_pairs():
         return None, False
     from scipy.stats import wilcoxon
@@ -244,7 +249,7 @@ def _words(found: Comparison, better: list[Pair], worse: list[Pair]) -> str:
 
     first, second, shown = found.first, found.second, COMPARED[found.measure]
     what = shown.title
-    light = {"none": ", images as they are", ALL: " over all conditions"}.get(
+    light = {"none": ", unperturbed images", ALL: " over all conditions"}.get(
         found.perturb, f", {found.perturb}"
     )
     n, untied = len(found.pairs), len(better) + len(worse)

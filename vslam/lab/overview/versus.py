@@ -1,4 +1,4 @@
-"""Systems side by side: tables by sequence and perturbation, then sentences on who wins."""
+"""Systems side by side: tables by sequence and perturbation, and sentences that name the winner."""
 
 from __future__ import annotations
 
@@ -52,15 +52,14 @@ def versus(report: OverviewJson) -> list[Section]:
 
 
 def median_text(spread: Spread | None, decimals: int) -> str:
-    """The median with a number of decimals, or with one if the median of counts is no integer."""
+    """The median as text. The median of counts gets one decimal if it is no integer."""
     if spread is None:
         return "n/a"
     return f"{spread.median:.{1 if decimals == 0 and spread.median % 1 else decimals}f}"
 
 
 def _without_revisits(report: OverviewJson) -> str:
-    """Why loop detectors hardly differ; empty if a drive has a revisit or no run has a ground
-    truth."""
+    """Why loop detectors hardly differ; empty if a drive has a revisit, or without ground truth."""
     judged = [row for row in report.rows if row.measures["loops_found"] is not None]
     names = {row.system for row in judged if row.system == without_settings(row.system)}
     counts = [row.measures[name] for row in judged for name in ("loops_found", "loops_missed")]
@@ -82,7 +81,7 @@ def _is_tie(one: Comparison) -> bool:
 
 def _section(report: OverviewJson, rows: Rows, names: list[str]) -> Section:
     order = {(row.drive, row.alignment): None for row in report.rows if row.system in names}
-    words = [re.split(", | ", name) for name in names]  # a heading breaks between them
+    words = [re.split(", | ", name) for name in names]  # headings break between these words
     width = sum(max(_COLUMN, *(1 + len(word) for word in parts)) for parts in words)
     per_table = max(1, _WIDTH // width)
     tables = []
@@ -125,8 +124,9 @@ def _cell(row: Row | None, measure: str) -> str:
 
 
 def _points(report: OverviewJson, rows: Rows, names: list[str]) -> Iterator[str]:
-    """Sentences: lost frames and loops in total, over the drives that all systems share, then a
-    comparison of each system with its baseline, the first system that shares a drive with it."""
+    """Sentences that give the totals of lost frames and loops over the drives that all systems
+    share, and sentences that compare each system with its baseline, which is the first system that
+    shares a drive with it."""
     shared = set.intersection(*(set(rows[name]) for name in names))
     runs = {
         name: [
@@ -166,7 +166,7 @@ def _points(report: OverviewJson, rows: Rows, names: list[str]) -> Iterator[str]
                 for one in report.comparisons
                 if (one.first, one.second, one.measure) == (baseline, name, measure)
             ]
-            # The last one is over all conditions if there are several.
+            # If there are several conditions, the last comparison is over all of them.
             shown += comparisons[-1:]
     yield from (one.words for one in shown)
     if any(one.p_value is None and one.first_better + one.second_better for one in shown):

@@ -9,15 +9,15 @@ from vslam.report.schema import ReportJson
 _LOSS_S = 10.0
 _ERRORS_M = (10.0, 1.0)
 ABSOLUTE = (
-    "Absolute: the reason if the run also fails by the rules of AirSLAM (Xu et al., T-RO 2025), "
-    f"which allow no loss of more than {_LOSS_S:g} s and no ATE above {_ERRORS_M[0]:g} m (on OIVIO "
+    "Absolute: why the run also fails by the rules of AirSLAM (Xu et al., T-RO 2025), which allow "
+    f"losing track for at most {_LOSS_S:g} s, and an ATE of at most {_ERRORS_M[0]:g} m (on OIVIO "
     f"and UMA-VI) or {_ERRORS_M[1]:g} m (on Dark EuRoC)."
 )
 
 
 def absolute_verdict(report: ReportJson) -> str:
-    """Why a run exceeded the limits that do not depend on its clean run (``ABSOLUTE``); empty if it
-    did not."""
+    """Why a run exceeded the limits that do not depend on a clean run (``ABSOLUTE``); empty if the
+    run kept them."""
     if report.longest_loss_s is not None and report.longest_loss_s > _LOSS_S:
         return f"lost for {report.longest_loss_s:.0f} s"
     above = [limit for limit in _ERRORS_M if (report.ate_rmse_m or 0.0) > limit]
@@ -25,7 +25,7 @@ def absolute_verdict(report: ReportJson) -> str:
 
 
 def lost_percent(report: ReportJson) -> float:
-    """Lost frames in percent of those that were not dropped."""
+    """Lost frames in percent of the frames that were not dropped."""
     return 100.0 * report.lost_frames / max(1, report.frames - report.dropped_frames)
 
 
@@ -48,9 +48,9 @@ class Criterion:
         """The criterion in one sentence."""
         return (
             f"A run fails if more than {self.lost_percent:g} % of its frames are lost, if its ATE "
-            f"is above {self.ate_factor:g} times that of the same system on clean images and above "
-            f"{self.ate_least_m:g} m, if it closes more wrong loops or finds fewer revisits than "
-            "on clean images, or if it ends with an error."
+            f"is above {self.ate_least_m:g} m and above {self.ate_factor:g} times the ATE of the "
+            "same system on clean images, if it closes more wrong loops or finds fewer revisits "
+            "than on clean images, or if it ends with an error."
         )
 
     def verdict(self, report: ReportJson, clean: ReportJson) -> str:

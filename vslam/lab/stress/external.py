@@ -37,7 +37,7 @@ _SAME_TIME_S = 1e-3
 
 @dataclass(frozen=True)
 class Poses:
-    """``(N, 4, 4)`` poses ``T_wc`` of the frames of a run, and a mask of the known ones."""
+    """``(N, 4, 4)`` poses ``T_wc`` of the frames of a run, and a mask ``(N,)`` of known poses."""
 
     T_wc: NDArray[np.float64]
     known: NDArray[np.bool_]
@@ -48,7 +48,7 @@ class Poses:
 
 
 def check_template(name: str, template: str) -> None:
-    """Refuse an invalid command template.
+    """Check a command template.
 
     Raises:
         InputError: a placeholder is missing or unknown.
@@ -108,7 +108,8 @@ def run_external(
 
 
 def export_kitti(sequence: Source, perturbation: Perturbation, folder: Path) -> NDArray[np.int64]:
-    """Write the perturbed frames and return the indices of those that were not dropped."""
+    """Write the perturbed frames in KITTI's format; returns the indices of the written frames,
+    which exclude dropped ones."""
     import cv2
 
     times: list[float] = []
@@ -138,7 +139,7 @@ def _call(template: str, sequence: Path, out: Path) -> None:
         template.format(folder=shlex.quote(str(sequence)), out=shlex.quote(str(out)))
     )
     try:
-        # The standard input of a system closes when this process ends, so that it can end, too.
+        # When this process ends, the standard input of the system closes, so that it can end, too.
         with subprocess.Popen(
             words,
             stdin=subprocess.PIPE,
@@ -206,8 +207,8 @@ def _outcome(
 
 
 def read_poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) -> Poses:
-    """Read the poses that a system wrote. An unknown pose repeats the last known one before it, or
-    the first known one.
+    """Read the poses that a system wrote. An unknown pose repeats the last known pose before it, or
+    else the first known pose.
 
     Args:
         path: file in KITTI's or TUM's format.
@@ -234,7 +235,7 @@ def read_poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) 
 
 
 def _last_known(poses: Poses) -> NDArray[np.float64]:
-    """Replace unknown poses by the last known one before them, or by the first known one."""
+    """Replace each unknown pose by the last known pose before it, or else by the first one."""
     if not poses.known.any():
         return poses.T_wc
     at = np.where(poses.known, np.arange(len(poses.known)), -1)

@@ -1,8 +1,8 @@
-"""The preset ``kitti-c``: the corruptions of RoboDepth's KITTI-C for which vslam has a law.
+"""The preset ``kitti-c``: the corruptions of RoboDepth's KITTI-C that vslam can apply.
 
 KITTI-C (Kong et al., NeurIPS 2023) has 18 corruptions in 5 severities, most of them with the
-parameters of ImageNet-C (Hendrycks and Dietterich, ICLR 2019). The strengths here equal these
-parameters where a law has the same parameter; otherwise a note describes the difference.
+parameters of ImageNet-C (Hendrycks and Dietterich, ICLR 2019). If vslam's perturbation has the same
+parameter, the strengths here are the values of KITTI-C; otherwise, a note describes the difference.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from vslam.datasets.perturbation import parse_perturbation
 
 @dataclass(frozen=True)
 class Corruption:
-    """``specs``: values of ``--perturb``, weakest first, or empty if vslam has no such law.
+    """``specs``: values of ``--perturb``, weakest first; empty if vslam has no such perturbation.
     ``note``: the difference from KITTI-C."""
 
     specs: tuple[str, ...]

@@ -2,9 +2,9 @@
 
 usage: PYTHON orbslam3.py VOCABULARY FOLDER OUT [--frames N]
 
-It prints the costs of its frame loop as a JSON object. The file imports nothing from vslam, because
-the interpreter that has pyorbslam3 may not have vslam. The process ends when its standard input is
-closed.
+The script prints the costs of its frame loop as a JSON object. It imports nothing from vslam,
+because the interpreter that has pyorbslam3 may not have vslam. The process ends when its standard
+input is closed.
 """
 
 from __future__ import annotations

@@ -26,7 +26,8 @@ class Search:
         law: name of the law.
         seed: seed of the perturbation.
         steps: number of bisections.
-        verdicts: verdicts of finished tests, by position.
+        verdicts: verdicts of finished tests, by position, which is 0 for the weakest and 1 for the
+            greatest strength.
         tested: cells of finished tests, by position.
     """
 
@@ -38,7 +39,7 @@ class Search:
     tested: dict[float, Cell] = field(default_factory=dict)
 
     def cell(self, position: float) -> Cell:
-        """The run at a position from 0 (weakest) to 1 (strongest)."""
+        """The cell that tests a position from 0 (weakest) to 1 (strongest)."""
         strength = strength_at(law_kind(self.law), position)
         name = parse_perturbation(f"{self.law}:{strength:g}", self.seed).name
         return replace(self.clean, perturb=name, seed=self.seed)
@@ -52,7 +53,7 @@ class Search:
         return None if (position := self.position()) is None else self.cell(position)
 
     def advance(self, reports: Reports, criterion: Criterion) -> None:
-        """Judge the runs that have ended."""
+        """Judge the tests that have ended, and thus find the next position."""
         clean = reports(self.clean)
         if not isinstance(clean, ReportJson):
             return
@@ -81,7 +82,8 @@ class Plan:
         steps: number of bisections in each search.
         baseline: the system with which the errors of a preset are compared.
         repeated: systems that are not deterministic and therefore run with every seed.
-        preset: ``kitti-c`` for its fixed severities, or None.
+        preset: ``kitti-c``, whose fixed severities are tested instead of ``laws``; None without a
+            preset.
     """
 
     clean: list[Cell]
@@ -94,8 +96,8 @@ class Plan:
     preset: str | None = None
 
     def searches(self) -> list[Search]:
-        """All searches. A law without random numbers is searched with one seed only, unless the
-        system is not deterministic."""
+        """All searches. A law that draws no random numbers is searched with one seed only, unless
+        the system is not deterministic."""
         return [
             Search(clean, law, seed, self.steps)
             for seed in range(self.seeds)
@@ -105,7 +107,7 @@ class Plan:
         ]
 
     def preset_cells(self) -> list[Cell]:
-        """The runs of the preset; empty without one."""
+        """The runs of the preset; empty without a preset."""
         if self.preset is None:
             return []
         specs = [spec for corruption in CORRUPTIONS.values() for spec in corruption.perturbations]
@@ -122,7 +124,7 @@ def parse_laws(text: str) -> list[str]:
     """Parse ``fog,rain`` or ``all``.
 
     Raises:
-        InputError: a law is unknown, or there is none.
+        InputError: a law is unknown, or the text names no law.
     """
     names = list(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
     if names == ["all"]:

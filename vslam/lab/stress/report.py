@@ -21,8 +21,8 @@ from vslam.report.render import csv_text, html, markdown, write_files
 
 _ABOUT = (
     "The weakest strength at which a run fails, found by bisection: the median over seeds, the "
-    "smallest and the largest in brackets, and the reason for one of the seeds. > means that runs "
-    "do not fail even at the greatest strength."
+    "smallest and the largest value in brackets, and the reason of failure for one of the seeds. "
+    "> means that runs do not fail even at the greatest strength."
 )
 _NOT_MONOTONE = (
     "Bisection assumes that a system that withstands a strength also withstands all weaker ones. "
@@ -36,7 +36,8 @@ def write_report(out: Path, report: StressJson, sequences: Mapping[str, Source])
     Args:
         out: an existing folder.
         report: the numbers.
-        sequences: sequences by name, for example images; without the first one, none are drawn.
+        sequences: sequences by name, from which example images are drawn; only the first sequence
+            of the report is needed, and without it no images are drawn.
 
     Raises:
         ResultsError: a file cannot be written.
@@ -101,7 +102,7 @@ def boundary_sections(report: StressJson) -> list[Section]:
 
 
 def groups(report: StressJson) -> dict[tuple[str, str, str], list[BoundaryEntry]]:
-    """Searches grouped by sequence, law and system; those of a group differ only in their seed."""
+    """Searches grouped by sequence, law and system; the searches of a group differ in the seed."""
     found: dict[tuple[str, str, str], list[BoundaryEntry]] = {}
     for entry in report.boundaries:
         found.setdefault((entry.sequence, entry.law, entry.system), []).append(entry)
@@ -156,9 +157,9 @@ def _preset(report: StressJson) -> list[Section]:
         ("sequence", "corruption", *systems, "law"),
         rows,
         ("sequence", "corruption", "law"),
-        "ATE summed over the five severities, in percent of the baseline's sum; the mean share of "
-        "lost frames in brackets. The mean is over the corruptions for which every system has an "
-        "ATE.",
+        "ATE summed over the five severities, in percent of the sum of the baseline; the mean "
+        "share of lost frames in brackets. The mean is over the corruptions for which every system "
+        "has an ATE.",
     )
     title = f"Corruption error against {report.baseline}, preset {report.preset}"
     return [Section(title, [table])]
@@ -232,7 +233,7 @@ def _sheet(report: StressJson, sequences: Mapping[str, Source]) -> list[Figure]:
         return []
     try:
         image = sheet_of_laws(sequences[first], list(specs.values()), len(sequences[first]) // 2, 0)
-    except InputError:  # the images have been removed; the numbers are written without them
+    except InputError:  # the images were removed; the report is written without this picture
         return []
     import cv2
 

@@ -1,4 +1,4 @@
-"""Run all searches together: each round runs the next cell of every open search."""
+"""Run all searches together: each round runs the next cell of every search that has not ended."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RunCells = Callable[[Collection[Cell]], Generator[CellOutcome, None, None]]
 
 
 class Results:
-    """The results of cells: reports in the folder, and failures of this session."""
+    """The results of cells: reports in the folder, and failures since the command was started."""
 
     def __init__(self, out: Path, config: str) -> None:
         self._out, self._config = out, config
@@ -66,7 +66,7 @@ def run_all(
 
 
 def _wanted(search: Search, results: Results) -> Cell | None:
-    """The next cell of a search; None if there is no clean run to compare with."""
+    """The next cell of a search; None if the search has ended or its clean run has failed."""
     return search.wants() if isinstance(results(search.clean), ReportJson) else None
 
 

@@ -1,4 +1,4 @@
-"""The schema of ``stress.json``. It has no times and no machine, so equal runs give equal bytes."""
+"""The schema of ``stress.json``, without times and machine: equal runs give equal bytes."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from vslam.report.schema import Document, Record
 
 
 class Tested(Record):
-    """One run at one strength. ``verdict``: why it failed, or empty. ``absolute``: why it failed by
-    limits that do not depend on the clean run, or empty."""
+    """One run at one strength. ``verdict``: why the run failed; empty if it did not. ``absolute``:
+    why it failed by limits that do not depend on the clean run; empty if it did not."""
 
     strength: float
     verdict: str
@@ -49,10 +49,11 @@ class CleanEntry(Record):
 
 
 class CorruptionEntry(Record):
-    """One corruption of a preset, with values by system; None without a law or an ATE.
+    """One corruption of a preset, with values by system. Values are None if vslam cannot apply the
+    corruption or a run has no ATE.
 
     ``ate_sum_m``: the median ATE over seeds, summed over severities. ``error_percent``: this sum in
-    percent of the baseline's. ``lost_percent``: the mean share of lost frames.
+    percent of the sum of the baseline. ``lost_percent``: the mean share of lost frames.
     """
 
     sequence: str
@@ -65,7 +66,7 @@ class CorruptionEntry(Record):
 
 
 class StressJson(Document):
-    """A stress test."""
+    """The results of a stress test."""
 
     kind: str = "stress"
     schema_version: int = 1

@@ -16,9 +16,10 @@ class Boundary:
     """The strength at which a system fails under a law.
 
     Attributes:
-        holds_to: greatest strength that the bisection found to hold; None if runs failed at every
-            tested strength.
-        fails_at: least strength that the bisection found to fail; None if none failed.
+        holds_to: greatest strength at which a run did not fail, according to the bisection; None if
+            runs failed at every tested strength.
+        fails_at: least strength at which a run failed, according to the bisection; None if no run
+            failed.
         reason: reason of the failure at ``fails_at``.
         also_failed: strengths below ``holds_to`` at which a run failed nevertheless.
     """
@@ -40,8 +41,8 @@ def strength_at(kind: LawKind, position: float) -> float:
 
 
 def bracket(failed: Mapping[float, bool], steps: int) -> tuple[float, float, float | None]:
-    """The greatest position that holds and the least that fails, by the bisection so far, and the
-    next position to test, None if the bisection has ended.
+    """The bisection so far: the greatest position at which the system holds, the least position at
+    which it fails, and the next position to test (None if the bisection has ended).
 
     Args:
         failed: whether the run failed, by tested position.
@@ -61,9 +62,10 @@ def bracket(failed: Mapping[float, bool], steps: int) -> tuple[float, float, flo
 def next_position(failed: Mapping[float, bool], steps: int) -> float | None:
     """The next position to test; None at the end of the search.
 
-    The greatest strength is tested first. If it fails, the interval is bisected ``steps`` times.
-    The last test, at half of the position that holds, checks the assumption of bisection that a
-    system also withstands all weaker strengths. The arguments are those of :func:`bracket`.
+    The greatest strength is tested first. If the run fails, the interval is bisected ``steps``
+    times. Bisection assumes that a system that withstands a strength withstands all weaker ones.
+    The last test checks this assumption, at half of the greatest position that holds. The arguments
+    are those of :func:`bracket`.
     """
     if 1.0 not in failed:
         return 1.0

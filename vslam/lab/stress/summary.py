@@ -18,8 +18,7 @@ from vslam.report.schema import ReportJson
 def summarise(
     plan: Plan, searches: Collection[Search], reports: Reports, notes: list[str]
 ) -> StressJson:
-    """Make the report from the searches that have ended. A note is added for each clean run that
-    failed."""
+    """Make the report from the searches that have ended. Each clean run that failed gets a note."""
     failed = [(cell, found) for cell in plan.clean if isinstance(found := reports(cell), str)]
     notes = [*notes, *(f"{cell.name} is left out because it fails on clean images: {why}"
                        for cell, why in failed)]  # fmt: skip
@@ -98,7 +97,8 @@ def _tested(strength: float, verdict: str, report: ReportJson | str | None) -> T
 def corruption_entries(
     cells: Collection[Cell], reports: Reports, baseline: str
 ) -> list[CorruptionEntry]:
-    """Errors by corruption against a baseline (mCE, Hendrycks and Dietterich, ICLR 2019)."""
+    """Errors of each corruption relative to a baseline, from which the mean corruption error is
+    computed (mCE, Hendrycks and Dietterich, ICLR 2019)."""
     systems = list(dict.fromkeys(cell.detector for cell in cells))
     return [
         _corruption(sequence, name, corruption, cells, reports, systems, baseline)

@@ -1,0 +1,152 @@
+"""Switch off the pieces of the method one at a time, and compare the errors on the same drives.
+
+python tools/experiments/ablation/switch_off.py --source "--dataset synthetic --seqs demo" \\
+    --perturb none,noise --out FOLDER
+
+Each ``--source`` holds the options of ``vslam bench`` that choose drives. The runs are kept in the
+folder, so that the same command continues. The table ``ablation.csv`` in it has a row for each
+piece, data set and perturbation.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import shlex
+import subprocess
+from pathlib import Path
+from statistics import median
+from typing import NamedTuple
+
+from vslam.lab.overview.schema import OverviewJson
+
+
+class Variant(NamedTuple):
+    """One piece of the method, and how to run without it.
+
+    ``thresholds``: values of ``--config`` that switch the piece off. ``detector``: the loop
+    detector of the run. ``reference``: the variant that the run is compared with.
+    """
+
+    piece: str
+    thresholds: str
+    detector: str = "both"
+    reference: str = "nothing"
+
+
+VARIANTS = (
+    Variant("nothing", ""),
+    Variant("tracking by patches", "tracking.method=orb"),
+    Variant(
+        "alignment of matches",
+        "tracking.method=orb,alignment.min_correlation=1",
+        reference="tracking by patches",
+    ),
+    Variant("weight of aligned matches", "alignment.certainty=1"),
+    Variant("triangulation", "mapping.epipolar_distance=0"),
+    Variant("five of ten neighbours", "mapping.neighbours=5"),
+    Variant("fusion of landmarks", "mapping.fuse_distance=0"),
+    Variant("local bundle adjustment", "mapping.ba_iterations=1"),
+    Variant("culling of keyframes", "mapping.redundant_ratio=1"),
+    Variant("known places", "keyframes.known_ratio=1000"),
+    Variant("offset of disparities", "stereo.offset_sigma=0"),
+    Variant(
+        "preparation of weak images",
+        "weak_images.noise_from=1000,weak_images.spikes_from=1,weak_images.few_features=0",
+    ),
+    Variant("search for doubtful frames", "relocalization.doubtful_share=0"),
+    Variant("loop closing", "", "none"),
+    Variant("capsule network", "", "bow"),
+    Variant("bag of words", "", "capsule"),
+    Variant("learned verification", "verification.descriptors=orb"),
+    Variant("inliers in two thirds of the image", "verification.min_elsewhere=0"),
+    Variant("agreement of keyframes", "consistency.min_keyframes=1,consistency.min_verified=1"),
+    Variant("global bundle adjustment", "loops.global_iterations=1"),
+)
+
+Drive = tuple[str, str, str, int | None]  # data set, perturbation, sequence, seed of the town
+Measures = dict[str, float | None]
+
+
+def run(variant: Variant, source: str, arguments: list[str], out: Path) -> dict[Drive, Measures]:
+    """Measure the variant on the drives of a source; finished runs in the folder are kept."""
+    command = ["vslam", "bench", *shlex.split(source), *arguments]
+    if variant.thresholds:
+        command += ["--config", variant.thresholds]
+    command += ["--detectors", variant.detector, "--seeds", "1", "--out", str(out), "--quiet"]
+    if subprocess.run(command).returncode:
+        raise SystemExit(f"{shlex.join(command)} failed")
+    report = OverviewJson.model_validate_json((out / "report.json").read_bytes())
+    return {
+        (one.drive.dataset, one.drive.perturb, one.drive.sequence, one.town): one.measures
+        for one in report.runs
+    }
+
+
+def row_of(
+    variant: Variant,
+    condition: tuple[str, str],
+    runs: dict[Drive, Measures],
+    reference: dict[Drive, Measures],
+) -> dict[str, object]:
+    """A row of the table: errors without the piece divided by those with it, and loops.
+
+    ``condition``: data set and perturbation of the drives that the row is about.
+    """
+    drives = [drive for drive in runs if drive[:2] == condition]
+
+    def ratios(name: str) -> list[float]:
+        pairs = [(runs[drive][name], reference[drive][name]) for drive in drives]
+        return [off / on for off, on in pairs if off is not None and on]
+
+    def total(name: str) -> int:
+        return round(sum(runs[drive][name] or 0 for drive in drives))
+
+    ate, rpe = ratios("ate_rmse_m"), ratios("rpe_m")
+    return {
+        "without": variant.piece,
+        "thresholds": variant.thresholds or f"--detector {variant.detector}",
+        "compared_with": variant.reference,
+        "dataset": condition[0],
+        "perturb": condition[1],
+        "drives": len(drives),
+        "ate_ratio": f"{median(ate):.3f}",
+        "ate_larger": sum(ratio > 1.02 for ratio in ate),
+        "ate_smaller": sum(ratio < 1 / 1.02 for ratio in ate),
+        "rpe_ratio": f"{median(rpe):.3f}",
+        "lost_frames": total("lost_frames"),
+        "loops_found": total("loops_found"),
+        "loops_missed": total("loops_missed"),
+        "loops_wrong": total("loops_wrong"),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--source", action="append", required=True)
+    parser.add_argument("--perturb", default="none")
+    parser.add_argument("--only", default="", help="only pieces whose name contains this")
+    parser.add_argument("--jobs", default="2")
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+    arguments = ["--perturb", options.perturb, "--jobs", options.jobs]
+    runs: dict[str, dict[Drive, Measures]] = {}
+    rows = []
+    chosen = [one for one in VARIANTS if one.piece == "nothing" or options.only in one.piece]
+    for variant in chosen:
+        runs[variant.piece] = {}
+        for k, source in enumerate(options.source):
+            folder = options.out / variant.piece.replace(" ", "-") / str(k)
+            runs[variant.piece] |= run(variant, source, arguments, folder)
+        rows += [
+            row_of(variant, condition, runs[variant.piece], runs[variant.reference])
+            for condition in dict.fromkeys(drive[:2] for drive in runs[variant.piece])
+        ]
+    with (options.out / "ablation.csv").open("w", newline="") as file:
+        table = csv.DictWriter(file, rows[0], lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()

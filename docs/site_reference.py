@@ -100,7 +100,7 @@ def _row(parameter) -> str:
     choices = [
         one for one in get_args(getattr(descriptor, "annotation", None)) if isinstance(one, str)
     ]
-    if choices:
+    if not all(choice in text for choice in choices):
         text += " One of " + ", ".join(f"`{choice}`" for choice in choices) + "."
     cells = (", ".join(f"`{name}`" for name in names), _marked_up(text), f"{default}")
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
@@ -109,7 +109,9 @@ def _row(parameter) -> str:
 def _marked_up(text: str) -> str:
     """Options that a sentence names as code, pages as links."""
     text = re.sub(r"docs/(\w+/(\w+)\.md)", r"[\2](../\1)", text)
-    return re.sub(r"(?<![`\w-])(--[a-z][a-z-]*)", r"`\1`", text)
+    parts = text.split("`")  # every second part is code already
+    parts[::2] = [re.sub(r"(?<![\w-])(--[a-z][a-z-]*)", r"`\1`", part) for part in parts[::2]]
+    return "`".join(parts)
 
 
 def _plain(text: str) -> str:

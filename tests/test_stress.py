@@ -307,6 +307,21 @@ def test_preset_compares_with_a_baseline(tmp_path):
     assert not (tmp_path / "boundaries.csv").exists()
 
 
+def test_a_seed_that_ends_with_an_error_counts_against_its_system():
+    clean = make_grid("kitti", ["00"], ["none"], ["bow"], 1)
+    cells = Plan(clean, (), 2, 4, "bow", Criterion(), preset="kitti-c").preset_cells()
+    seeds = {cell.seed for cell in cells}
+    assert len(seeds) == 2
+
+    def reports(cell):
+        return report_of(cell, ate_rmse_m=0.2) if cell.seed == min(seeds) else "killed"
+
+    with_law = [entry for entry in corruption_entries(cells, reports, "bow") if entry.specs]
+    drawn = [one for one in with_law if one.ate_sum_m["bow"] is None]
+    assert drawn  # laws that draw random numbers run with both seeds
+    assert all(one.ate_sum_m["bow"] == pytest.approx(1.0) for one in with_law if one not in drawn)
+
+
 def test_laws_are_named_without_strengths():
     assert parse_laws("fog, rain,fog") == ["fog", "rain"]
     assert parse_laws("all") == list(LAWS)

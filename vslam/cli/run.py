@@ -236,7 +236,7 @@ _WITH_RESUME = {"resume", "record", "view", "keep_open", "pages", "ply", "save_m
 
 
 def _refuse_with_resume(context: typer.Context) -> None:
-    """Refuse options that cannot be combined with ``--resume``, because they change the method.
+    """Refuse options that cannot be combined with ``--resume``: a resumed run keeps its options.
 
     Raises:
         InputError: such an option was given.

@@ -305,7 +305,7 @@ def _following(frames: Iterator[TimedFrame], before: NDArray[np.float64]) -> Ite
             now = "there is none" if frame is None else f"it has {frame.timestamp:.6f} s"
             raise InputError(
                 f"--resume: frame {index} had the time {timestamp:.6f} s, now {now}: these are not "
-                "the images of the interrupted run; restore its images, or start a new run."
+                "the images of the interrupted run; restore them, or start a new run."
             )
     yield from frames
 

@@ -121,15 +121,15 @@ def _corruption(
     for system in systems:
         ates, losses = [], []
         for spec in corruption.perturbations:
-            found = [
-                report
+            outcomes = [
+                reports(cell)
                 for cell in cells
                 if (cell.sequence, cell.detector, cell.perturb) == (sequence, system, spec)
-                and isinstance(report := reports(cell), ReportJson)
             ]
+            found = [report for report in outcomes if isinstance(report, ReportJson)]
             known = [report.ate_rmse_m for report in found if report.ate_rmse_m is not None]
             # Leaving out failed seeds would make a system that fails look better.
-            all_known = bool(known) and len(known) == len(found)
+            all_known = bool(known) and len(known) == sum(one is not None for one in outcomes)
             ates.append(statistics.median(known) if all_known else None)
             losses += [lost_percent(report) for report in found]
         complete = bool(ates) and None not in ates

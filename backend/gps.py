@@ -46,12 +46,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Positions:
-    """M positions that GPS measured, and the SLAM estimates of the same positions.
+    """M positions of an antenna that GPS measured, and the SLAM estimates of the same positions.
 
     Attributes:
         seconds: ``(M,)`` times of the measurements, seconds.
-        keyframe: ``(M,)`` int64, index of the keyframe in whose frame ``arm`` is given.
-        arm: ``(M, 3)`` estimated position in the frame of this keyframe, in units of the map.
+        keyframe: ``(M,)`` int64, index of the keyframe in whose frame ``arm`` and ``lever``
+            are given.
+        arm: ``(M, 3)`` estimated position of the camera, in units of the map.
+        lever: ``(M, 3)`` from the camera to the antenna, in metres.
         enu: ``(M, 3)`` measured position in metres east, north and up of a reference point.
         sigma: ``(M, 3)`` standard deviations of ``enu`` in metres.
     """
@@ -59,6 +61,7 @@ class Positions:
     seconds: Array
     keyframe: NDArray[np.int64]
     arm: Array
+    lever: Array
     enu: Array
     sigma: Array
 
@@ -181,11 +184,14 @@ def align(T_wk: Array, positions: Positions, *, metric: bool, seed: int = 0) -> 
         metric: see ``anchor``.
         seed: seed of the random samples.
     """
-    path, enu = _predicted(positions, T_wk, np.ones(len(T_wk))), positions.enu
-    up = -T_wk[positions.keyframe, :3, 1]
+    k, enu = positions.keyframe, positions.enu
+    path = _points(T_wk[k], positions.arm)
+    lever = np.einsum("mij,mj->mi", T_wk[k, :3, :3], positions.lever)
+    up = -T_wk[k, :3, 1]
     sigma = float(np.sqrt(np.mean(positions.sigma**2)))
     radius = float(np.sqrt(np.sum(np.median((enu - np.median(enu, axis=0)) ** 2, axis=0))))
     tolerance = max(np.sqrt(GATE) * sigma, _DRIFT * radius)
+    reach = tolerance + float(np.linalg.norm(lever, axis=1).max())
 
     rng = np.random.default_rng(seed)
     drawn = np.unique(np.linspace(0, len(enu) - 1, min(len(enu), _MOST_DRAWN)).astype(int))
@@ -193,8 +199,9 @@ def align(T_wk: Array, positions: Positions, *, metric: bool, seed: int = 0) -> 
     fixed = 1.0 if metric else None
     S = _umeyama(path[triples], enu[triples], up[triples], fixed)
     distance = np.linalg.norm(_mapped(S, path[drawn]) - enu[drawn], axis=-1)
-    best = S[np.argmin(np.minimum(distance / tolerance, 1.0).sum(axis=1))]
+    best = S[np.argmin(np.minimum(distance / reach, 1.0).sum(axis=1))]
     for _ in range(3):
+        enu = positions.enu - lever @ (best[:3, :3] / scale_of(best)).T
         inliers = np.linalg.norm(_mapped(best, path) - enu, axis=-1) <= tolerance
         if inliers.sum() < 3:
             inliers[:] = True
@@ -256,15 +263,18 @@ def _aligned(T_wk: Array, S_enu_w: Array) -> tuple[Array, Array]:
     return T_enu_k, np.full(len(T_wk), scale)
 
 
-def _predicted(positions: Positions, T_k: Array, scale: Array) -> Array:
-    """``(M, 3)`` positions of the camera according to the ``(N, 4, 4)`` poses of the keyframes."""
-    k = positions.keyframe
-    arm = positions.arm * scale[k, None]
-    return np.einsum("mij,mj->mi", T_k[k, :3, :3], arm) + T_k[k, :3, 3]
+def _points(T: Array, points: Array) -> Array:
+    """``(M, 3)`` points moved by ``(M, 4, 4)`` poses."""
+    return np.einsum("mij,mj->mi", T[:, :3, :3], points) + T[:, :3, 3]
+
+
+def _antenna(positions: Positions, scale: Array) -> Array:
+    """``(M, 3)`` positions of the antenna in the frames of the keyframes, in metres."""
+    return positions.arm * scale[positions.keyframe, None] + positions.lever
 
 
 def _residuals(positions: Positions, T_enu_k: Array, scale: Array) -> Array:
-    return _predicted(positions, T_enu_k, scale) - positions.enu
+    return _points(T_enu_k[positions.keyframe], _antenna(positions, scale)) - positions.enu
 
 
 def _chi2(positions: Positions, T_enu_k: Array, scale: Array) -> Array:
@@ -328,11 +338,11 @@ def _optimised(
         drift = noise.Diagonal.Sigmas(sigma)
         factors.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(T), drift))
     crowding = np.sqrt(positions.crowding)
-    arms = positions.arm * scale[positions.keyframe, None]
+    antenna = _antenna(positions, scale)
     for k, (i, n) in enumerate(zip(positions.keyframe.tolist(), crowding.tolist(), strict=True)):
         plain = noise.Diagonal.Sigmas(n * positions.sigma[k])
         loss = None if cauchy is None else noise.mEstimator.Cauchy.Create(cauchy / n)
         model = plain if loss is None else noise.Robust.Create(loss, plain)
-        factors.add(gtsam.GPSFactorArm(i, positions.enu[k], arms[k], model))
+        factors.add(gtsam.GPSFactorArm(i, positions.enu[k], antenna[k], model))
     result = minimised(factors, start, config)
     return np.array([result.atPose3(i).matrix() for i in range(len(T_enu_k))])

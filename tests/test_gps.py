@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from vslam.backend.gps import Positions, align, anchor
 from vslam.backend.pose_graph import TREE, WEAK, PoseGraph, edge_sigmas
 from vslam.config import Config
-from vslam.datasets.fixes import DEFAULT_SIGMA_M, Fixes, read_fixes, to_enu, to_geodetic
+from vslam.datasets.fixes import DEFAULT_SIGMA_M, read_fixes, to_enu, to_geodetic
 from vslam.errors import InputError
 from vslam.geometry import inverses, se3_exp
 from vslam.trajectory import read_trajectory
@@ -106,6 +106,27 @@ def test_fixes_of_a_bag_are_read(tmp_path, kind, name):
     assert fixes.sigma.tolist() == [[1.0, 2.0, 3.0], [DEFAULT_SIGMA_M] * 3]
 
 
+CALIBRATIONS = {
+    # The IMU looks ahead, left and up, as the laser does; the camera right, down and ahead.
+    "calib_imu_to_velo.txt": "R: 1 0 0 0 1 0 0 0 1\nT: -0.81 0.32 -0.8\n",
+    "calib_velo_to_cam.txt": "calib_time: 15-Mar-2012 11:37:16\nR: 0 -1 0 0 0 -1 1 0 0\n"
+    "T: 0 -0.08 -0.27\ndelta_f: 0 0\n",
+}
+
+
+def test_the_calibration_of_kitti_raw_gives_the_antenna(tmp_path):
+    folder = oxts(tmp_path / "2011_09_26" / "drive" / "oxts")
+    assert not read_fixes(folder).antenna.any()
+    for name, text in CALIBRATIONS.items():
+        (tmp_path / "2011_09_26" / name).write_text(text)
+    for path in (folder, folder.parent):
+        assert read_fixes(path).antenna == pytest.approx([-0.32, 0.72, -1.08])
+        assert read_fixes(path, (1.0, 2.0, 3.0)).antenna.tolist() == [1.0, 2.0, 3.0]
+    (tmp_path / "2011_09_26" / "calib_imu_to_velo.txt").write_text("R: 1 0\nT: 0 0 0\n")
+    with pytest.raises(InputError, match=r"imu_to_velo\.txt: not a calibration of KITTI raw"):
+        read_fixes(folder)
+
+
 def test_metres_to_latitude_and_back():
     enu = np.array([[0.0, 0.0, 0.0], [100.0, -2000.0, 30.0]])
     geodetic = to_geodetic(enu, DATUM)
@@ -194,12 +215,14 @@ def graph_of(T_wc, seconds):
     )
 
 
-def measured(true, sigma=1.0, seed=0):
-    """Fixes of all keyframes with a second between them, and their true positions."""
+def measured(true, sigma=1.0, seed=0, antenna=(0.0, 0.0, 0.0)):
+    """Fixes of all keyframes with a second between them, and the true positions of the camera."""
     enu = true[:, :3, 3] @ R_ENU_CAMERA.T + np.array([50.0, -20.0, 3.0])
-    noise = np.random.default_rng(seed).normal(0.0, sigma, enu.shape)
+    fixes = enu + true[:, :3, :3] @ np.array(antenna) @ R_ENU_CAMERA.T
+    fixes += np.random.default_rng(seed).normal(0.0, sigma, enu.shape)
     n, three = len(true), np.full(enu.shape, sigma)
-    return Positions(np.arange(n) * 1.0, np.arange(n), np.zeros((n, 3)), enu + noise, three), enu
+    zeros, lever = np.zeros((n, 3)), np.tile(antenna, (n, 1))
+    return Positions(np.arange(n) * 1.0, np.arange(n), zeros, lever, fixes, three), enu
 
 
 def jumped(positions, at):
@@ -302,6 +325,21 @@ def test_the_scale_of_a_monocular_map_is_found_where_it_drifts():
     assert anchored.scale[30:-30] == pytest.approx(wanted[30:-30], rel=0.05)
 
 
+@pytest.mark.parametrize("metric", [True, False])
+def test_the_antenna_need_not_be_at_the_camera(metric):
+    """It is behind and above the camera, on a drive that turns through more than 90 degrees."""
+    true, found = drive(300, turn=0.1, drift=0.5)
+    if not metric:
+        found[:, :3, 3] *= 0.2
+    positions, enu = measured(true, 0.05, antenna=(0.0, -1.5, -1.5))
+    graph = graph_of(found, positions.seconds)
+    known = anchor(graph, positions.seconds, positions, CONFIG, metric=metric)
+    ignored = replace(positions, lever=np.zeros_like(positions.lever))
+    without = anchor(graph, positions.seconds, ignored, CONFIG, metric=metric)
+    assert error_of(known, enu) < 0.1
+    assert error_of(without, enu) > 1.5
+
+
 def test_each_part_of_a_map_is_aligned_by_itself():
     """After a loss of the camera, nothing is known about where the next part lies."""
     true, found = drive(300)
@@ -322,12 +360,14 @@ def test_each_part_of_a_map_is_aligned_by_itself():
 @pytest.fixture
 def fixes(corridor, tmp_path):
     times = corridor.timestamps - corridor.timestamps[0]
-    enu = corridor.T_wc[:, :3, 3] @ R_ENU_CAMERA.T
+    enu = (corridor.T_wc[:, :3, 3] + corridor.T_wc[:, :3, :3] @ ANTENNA) @ R_ENU_CAMERA.T
     enu = enu + np.random.default_rng(0).normal(0.0, 0.01, enu.shape)
     enu[10] += 3.0
     return csv_of(tmp_path / "fixes.csv", times, enu, 0.01)
 
 
+# Above and behind the camera.
+ANTENNA = np.array([0.2, -0.5, -1.5])
 WORDS = ("--detector", "none", "--no-record", "--quiet", "--threads", 1)
 
 
@@ -335,7 +375,8 @@ WORDS = ("--detector", "none", "--no-record", "--quiet", "--threads", 1)
 def test_a_run_with_gps_lies_on_the_earth(call, corridor, kitti_tree, fixes, tmp_path):
     code, _, err = call("run", "--data", kitti_tree, *WORDS, "--out", "without")
     assert code == 0, err
-    code, _, err = call("run", "--data", kitti_tree, *WORDS, "--gps", fixes)
+    at = ",".join(map(str, ANTENNA))
+    code, _, err = call("run", "--data", kitti_tree, *WORDS, "--gps", fixes, "--gps-antenna", at)
     assert code == 0, err
     run, without = tmp_path / "runs" / "latest", tmp_path / "without" / "latest"
     for name in ("trajectory.tum", "trajectory_odom.tum", "keyframes.tum", "map.npz"):
@@ -344,12 +385,13 @@ def test_a_run_with_gps_lies_on_the_earth(call, corridor, kitti_tree, fixes, tmp
     assert "GPS" not in (without / "report.html").read_text()
 
     figures = json.loads((run / "gps.json").read_text())
+    assert figures["antenna"] == ANTENNA.tolist()
     assert figures["fixes"] == 28
     assert figures["refused"] == 1
-    assert figures["datum"] == pytest.approx([48.0, 11.0, 500.0], abs=0.1)
+    datum = to_enu(np.array([figures["datum"]]), DATUM)
+    assert datum[0] == pytest.approx(R_ENU_CAMERA @ ANTENNA, abs=0.1)
     track = read_trajectory(run / "trajectory_enu.tum")
     true = corridor.T_wc[:, :3, 3] @ R_ENU_CAMERA.T
-    datum = to_enu(np.array([figures["datum"]]), DATUM)
     assert np.linalg.norm(track.T_wc[:, :3, 3] + datum - true, axis=1).max() < 0.1
     forward = track.T_wc[:, :3, 2]
     assert (forward[:, 1] > 0.9).all()
@@ -363,6 +405,7 @@ def test_a_run_with_gps_lies_on_the_earth(call, corridor, kitti_tree, fixes, tmp
     assert figures["ate_rmse_m"] < 0.1
     page = (run / "report.md").read_text()
     assert "28, 1 of them refused" in page
+    assert "0.20 m right of, -0.50 m below, -1.50 m ahead of the camera" in page
     assert "27 fixes" in page
     assert (run / "figures" / "gps_map.png").is_file()
     assert "too straight" in page or figures["level"]
@@ -379,6 +422,22 @@ def test_what_was_computed_is_kept_where_gps_says_too_little(call, kitti_tree, f
     run = tmp_path / "runs" / "latest"
     assert (run / "trajectory.tum").is_file()
     assert not (run / "gps.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--gps-antenna", "1,2,3"), "name the fixes of this antenna with --gps"),
+        (("--gps", "fixes.csv", "--gps-antenna", "1,2"), "--gps-antenna 1,2: give three numbers"),
+        (("--gps", "fixes.csv", "--gps-antenna", "-1,x,2"), "give three numbers"),
+        (("--gps", "fixes.csv", "--gps-antenna", "-1,inf,2"), "give three numbers"),
+    ],
+)
+def test_a_place_that_no_antenna_has_is_refused(call, kitti_tree, words, said):
+    code, _, err = call("run", "--data", kitti_tree, *words)
+    assert code == 2
+    assert len(err.splitlines()) == 1
+    assert said in err
 
 
 def test_localising_takes_no_gps(call, kitti_tree, fixes):
@@ -398,7 +457,7 @@ def test_fixes_before_a_stream_are_refused(corridor, tmp_path, fixes):
     source = open_from("video", tmp_path / "drive.mkv", calib=calib, sensor="mono", start=2)
     good = read_fixes(fixes)
     require_overlap(good, source, fixes)
-    early = Fixes(good.times - 100.0, good.geodetic, good.sigma)
+    early = replace(good, times=good.times - 100.0)
     with pytest.raises(
         InputError, match=r"to -97\.300 s but the images are from 0\.200 s on; both"
     ):

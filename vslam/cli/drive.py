@@ -56,7 +56,7 @@ def drive(
     console = Console(shown=not output.quiet)
     source, perturbation = _open(options, console)
     _refuse_live_source(source, resume)
-    fixes = None if options.gps is None else _fixes(options.gps, source)
+    fixes = None if options.gps is None else _fixes(options.gps, options.gps_antenna, source)
 
     # These imports take a second, so bad input is refused before them.
     from vslam.cli.tables import print_summary
@@ -130,11 +130,11 @@ def _open(options: RunOptions, console: Console) -> tuple[Source, Perturbation]:
     return source, perturbation
 
 
-def _fixes(path: Path, source: Source) -> Fixes:
+def _fixes(path: Path, antenna: tuple[float, ...] | None, source: Source) -> Fixes:
     """The GPS fixes of ``--gps``, which must overlap with the images in time."""
     from vslam.datasets.fixes import read_fixes, require_overlap
 
-    fixes = read_fixes(path)
+    fixes = read_fixes(path, antenna)
     require_overlap(fixes, source, path)
     return fixes
 

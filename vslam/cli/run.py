@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
@@ -62,6 +63,16 @@ def run(
             "FILE",
             "GPS fixes to georeference the trajectory: CSV, a bag, or the folder oxts of KITTI raw "
             "(docs/howto/gps.md).",
+        ),
+    ] = None,
+    gps_antenna: Annotated[
+        str | None,
+        option(
+            INPUT,
+            "X,Y,Z",
+            "Position of the GPS antenna in metres to the right of, below and ahead of the left "
+            "camera, such as [b]0.1,-0.5,-1.5[/b].",
+            unset="that of KITTI's calibration, or 0,0,0",
         ),
     ] = None,
     perturb: Perturb = "none",
@@ -179,6 +190,8 @@ def run(
         raise InputError("--localize: name the map to localise in with --map.")
     if localize and gps is not None:
         raise InputError("--gps: changes the map, but --localize must not; leave one of them out.")
+    if gps_antenna is not None and gps is None:
+        raise InputError("--gps-antenna: name the fixes of this antenna with --gps.")
     of_map: dict[str, object] = {}
     if map_file is not None:
         if compare:
@@ -204,6 +217,7 @@ def run(
         perturb=perturb,
         seed=seed,
         gps=gps,
+        gps_antenna=None if gps_antenna is None else _antenna(gps_antenna),
         threads=threads or min(available_cores(), 4),
         detector=detector,
         weights=weights,
@@ -234,6 +248,20 @@ def _refuse_with_resume(context: typer.Context) -> None:
             raise InputError(
                 f"{one.opts[0]}: a resumed run continues with its own options; leave it out."
             )
+
+
+def _antenna(text: str) -> tuple[float, float, float]:
+    """The position that ``--gps-antenna`` names."""
+    try:
+        right, down, ahead = map(float, text.split(","))
+    except ValueError:
+        right = down = ahead = math.nan
+    if not math.isfinite(right + down + ahead):
+        raise InputError(
+            f"--gps-antenna {text}: give three numbers separated by commas, the metres to the "
+            "right of, below and ahead of the left camera."
+        )
+    return right, down, ahead
 
 
 def _compared(names: str, detector: str) -> tuple[str, ...]:

@@ -8,7 +8,8 @@ between WGS84 coordinates and metres.
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,32 +40,45 @@ class Fixes:
         times: ``(M,)`` seconds, by the clock of the images.
         geodetic: ``(M, 3)`` latitude and longitude in degrees and altitude in metres.
         sigma: ``(M, 3)`` standard deviations east, north and up, in metres.
+        antenna: ``(3,)`` position of the antenna in the frame of the left camera (x right, y down,
+            z forward), in metres.
     """
 
     times: NDArray[np.float64]
     geodetic: NDArray[np.float64]
     sigma: NDArray[np.float64]
+    antenna: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.times)
 
     def between(self, first: float, last: float) -> Fixes:
         """The fixes from one time to another, both included."""
-        inside = (self.times >= first) & (self.times <= last)
-        return Fixes(self.times[inside], self.geodetic[inside], self.sigma[inside])
+        return self.select((self.times >= first) & (self.times <= last))
+
+    def select(self, chosen: NDArray[np.bool_]) -> Fixes:
+        """The fixes where the ``(M,)`` bool ``chosen`` is True."""
+        return replace(
+            self,
+            times=self.times[chosen],
+            geodetic=self.geodetic[chosen],
+            sigma=self.sigma[chosen],
+        )
 
 
-def read_fixes(path: Path) -> Fixes:
+def read_fixes(path: Path, antenna: Sequence[float] | None = None) -> Fixes:
     """Read all fixes of a file or folder.
 
     Args:
         path: one of: a CSV file with the columns ``time`` (s), ``latitude``, ``longitude``
             (degrees), ``altitude`` (m) and optionally ``sigma`` (m), named in its first line;
             KITTI's folder ``oxts``, whose times begin at 0; a bag.
+        antenna: position of the antenna as in ``Fixes``. If None, it is read from the calibration
+            of KITTI raw, or assumed to be that of the camera if there is none.
 
     Raises:
         InputError: pymap3d is not installed, the file is missing or malformed, it contains no fix
-            or no times, or a latitude or longitude is out of range.
+            or no times, a latitude or longitude is out of range, or a calibration is damaged.
     """
     try:
         import pymap3d  # noqa: F401
@@ -77,7 +91,10 @@ def read_fixes(path: Path) -> Fixes:
     if path.suffix in _BAGS or (path / "metadata.yaml").is_file():
         rows = read_fixes_of_bag(path)
     elif path.is_dir():
-        rows = _read_oxts(path)
+        folder = path / "oxts" if (path / "oxts").is_dir() else path
+        rows = _read_oxts(folder)
+        if antenna is None:
+            antenna = _antenna_of_kitti(folder.resolve().parent.parent)
     else:
         rows = _read_csv(path)
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
@@ -90,7 +107,8 @@ def read_fixes(path: Path) -> Fixes:
             f"{position[1]:g}; give degrees, from -90 to 90 and from -180 to 180."
         )
     sigma = np.where(rows[:, 4:] > 0.0, rows[:, 4:], DEFAULT_SIGMA_M)
-    return Fixes(rows[:, 0], rows[:, 1:4], sigma)
+    antenna = (0.0, 0.0, 0.0) if antenna is None else antenna
+    return Fixes(rows[:, 0], rows[:, 1:4], sigma, np.array(antenna, np.float64))
 
 
 def require_overlap(fixes: Fixes, source: Source, path: Path) -> None:
@@ -173,8 +191,6 @@ def _read_csv(path: Path) -> NDArray[np.float64]:
 
 def _read_oxts(folder: Path) -> NDArray[np.float64]:
     """Rows as `_read_csv` returns them. As in KITTI odometry, times count from the first packet."""
-    if (folder / "oxts").is_dir():
-        folder = folder / "oxts"
     files = sorted((folder / "data").glob("*.txt"))
     if not files:
         raise InputError(f"--gps {folder}: no data/*.txt; name the folder oxts of KITTI raw.")
@@ -194,3 +210,27 @@ def _read_oxts(folder: Path) -> NDArray[np.float64]:
     rows = np.array([read_table(file, (_OXTS_COLUMNS,), "an OXTS packet", 1)[0] for file in files])
     sigma = np.repeat(rows[:, [_POS_ACCURACY]], 3, axis=1)
     return np.column_stack([seconds, rows[:, :3], sigma])
+
+
+def _antenna_of_kitti(folder: Path) -> Sequence[float] | None:
+    """The position that OXTS packets refer to (the inertial unit's) in the left grey camera, by the
+    calibration in the folder of a day of KITTI raw; None if there is none.
+
+    The rotation of the rectification is left out: it is less than a degree.
+    """
+    paths = [folder / name for name in ("calib_imu_to_velo.txt", "calib_velo_to_cam.txt")]
+    if not all(path.is_file() for path in paths):
+        return None
+    point = np.zeros(3)
+    for path in paths:
+        try:
+            lines = dict(line.split(":", 1) for line in path.read_text().splitlines() if line)
+            R, t = (np.array(lines[name].split(), np.float64) for name in "RT")
+            point = R.reshape(3, 3) @ point + t.reshape(3)
+        except (OSError, ValueError, KeyError) as error:
+            raise InputError(
+                f"{path}: not a calibration of KITTI raw; unpack it again, or give the position "
+                "of the antenna with --gps-antenna."
+            ) from error
+    x, y, z = point.tolist()
+    return x, y, z

@@ -293,8 +293,13 @@ def _gps(report: ReportJson) -> Section:
     if (found := report.gps_track) is None:
         return Section("GPS", ())
     latitude, longitude, altitude = found.datum
+    right, down, ahead = found.antenna
     rows = [
         ("origin", f"{latitude:.7f}°, {longitude:.7f}°, {altitude:.1f} m"),
+        (
+            "antenna",
+            f"{right:.2f} m right of, {down:.2f} m below, {ahead:.2f} m ahead of the camera",
+        ),
         ("fixes of tracked frames", f"{found.fixes}, {found.refused} of them refused"),
         ("distance of the fixes used (RMS)", _number(found.residual_m, "m")),
         ("scale of the map", f"{found.metres_per_unit:.4g} m per unit"),

@@ -166,6 +166,8 @@ class GpsFigures(Record):
 
     - ``datum``: origin of the local east-north-up frame, which is the first fix: latitude and
       longitude in degrees, altitude in metres.
+    - ``antenna``: its position in the frame of the left camera (x right, y down, z forward), in
+      metres.
     - ``fixes``: number of fixes at tracked frames.
     - ``refused``: number of these fixes that failed the chi-square test.
     - ``residual_m``: root mean square distance of the other fixes from the trajectory.
@@ -176,6 +178,7 @@ class GpsFigures(Record):
     """
 
     datum: tuple[float, float, float]
+    antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)
     fixes: int
     refused: int
     residual_m: float

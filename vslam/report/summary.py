@@ -241,8 +241,10 @@ def gps_figures(outcome: RunOutcome) -> GpsFigures | None:
         with suppress(InputError):
             ate = evaluate_trajectory(track.trajectory, ground_truth, "se3").ate_rmse_m
     latitude, longitude, altitude = track.datum.tolist()
+    right, down, ahead = track.antenna.tolist()
     return GpsFigures(
         datum=(latitude, longitude, altitude),
+        antenna=(right, down, ahead),
         fixes=len(track.fixes),
         refused=int(np.count_nonzero(~track.anchored.used)),
         residual_m=track.anchored.residual_m,

@@ -29,7 +29,8 @@ class GpsTrack:
         geodetic: ``(N, 3)`` their latitude and longitude (degrees) and altitude (m).
         datum: ``(3,)`` latitude, longitude and altitude of the origin, which is the first fix.
         visual: ``(N, 3)`` the trajectory by vision alone, aligned with the fixes as a whole.
-        fixes: ``(M, 3)`` the fixes at the time of tracked frames, in ENU.
+        fixes: ``(M, 3)`` the fixes at the time of tracked frames, in ENU: positions of the antenna.
+        antenna: ``(3,)`` position of the antenna in the frame of the camera, in metres.
         anchored: the keyframes in ENU, and which fixes were used.
     """
 
@@ -38,6 +39,7 @@ class GpsTrack:
     datum: NDArray[np.float64]
     visual: NDArray[np.float64]
     fixes: NDArray[np.float64]
+    antenna: NDArray[np.float64]
     anchored: Anchored
 
 
@@ -70,6 +72,7 @@ def locate(stored: StoredMap, fixes: Fixes, config: PoseGraphConfig) -> GpsTrack
         datum=datum,
         visual=visual @ S[:3, :3].T + S[:3, 3],
         fixes=positions.enu,
+        antenna=fixes.antenna,
         anchored=found,
     )
 
@@ -100,8 +103,8 @@ def _positions(
 ) -> tuple[Positions, NDArray[np.float64]]:
     """The fixes between tracked frames, and the datum.
 
-    Each fix gets the interpolated position of the camera at its time, in the frame of the keyframe
-    to which the previous frame refers.
+    Each fix gets the interpolated positions of the camera and the antenna at its time, in the frame
+    of the keyframe to which the previous frame refers.
     """
     at = np.searchsorted(table.timestamp, fixes.times, "right") - 1
     at[fixes.times == table.timestamp[-1]] -= 1
@@ -117,11 +120,15 @@ def _positions(
         )
     before, after, elapsed = before[inside], after[inside], elapsed[inside]
     share = ((fixes.times[inside] - table.timestamp[before]) / elapsed)[:, None]
-    centres = _in_map(table, T_kw).T_wc[:, :3, 3]
-    world = (1.0 - share) * centres[before] + share * centres[after]
+    T_wc = _in_map(table, T_kw).T_wc
+    centres, levers = (
+        (1.0 - share) * at_frames[before] + share * at_frames[after]
+        for at_frames in (T_wc[:, :3, 3], T_wc[:, :3, :3] @ fixes.antenna)
+    )
     keyframe = table.reference[before]
-    T = T_kw[keyframe]
-    arm = np.einsum("mij,mj->mi", T[:, :3, :3], world) + T[:, :3, 3]
+    R, t = T_kw[keyframe, :3, :3], T_kw[keyframe, :3, 3]
+    arm = np.einsum("mij,mj->mi", R, centres) + t
+    lever = np.einsum("mij,mj->mi", R, levers)
     geodetic = fixes.geodetic[inside]
-    enu = to_enu(geodetic, geodetic[0])
-    return Positions(fixes.times[inside], keyframe, arm, enu, fixes.sigma[inside]), geodetic[0]
+    enu, sigma = to_enu(geodetic, geodetic[0]), fixes.sigma[inside]
+    return Positions(fixes.times[inside], keyframe, arm, lever, enu, sigma), geodetic[0]

@@ -26,6 +26,7 @@ class RunOptions(SourceOptions):
     perturb: str = "none"
     seed: int = 0
     gps: Path | None = None
+    gps_antenna: tuple[float, float, float] | None = None
     threads: int = 1
     detector: str = DEFAULT_DETECTOR
     weights: Path | None = None

@@ -9,7 +9,8 @@ prints the RMSE of the positions, as a mean over the seeds:
 - of the run without GPS, after the alignment for its sensor;
 - of the fixes;
 - of the fixes interpolated at the times of the frames, with and without SE3 alignment;
-- of the run with GPS, with and without SE3 alignment.
+- of the run with GPS, with and without SE3 alignment;
+- with ``--antenna``, of the run with GPS if the antenna is taken to be at the camera.
 
 Then it prints the median CPU time that adding the fixes took after the drive.
 """
@@ -18,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +56,10 @@ def main() -> None:
     parser.add_argument(
         "--correlation", type=float, default=gps.CORRELATION_S, help="correlation time assumed, s"
     )
+    parser.add_argument(
+        "--antenna", type=float, nargs=3, default=(0.0, 0.0, 0.0), metavar=("X", "Y", "Z"),
+        help="position of the antenna in the frame of the left camera, m",
+    )  # fmt: skip
     options = parser.parse_args()
     gps.CORRELATION_S = options.correlation
     print("| run | positions of | error after alignment, m | error, m | refused, wrongly refused |")
@@ -69,36 +75,38 @@ def measure(run: Path, options: argparse.Namespace) -> None:
     truth = Trajectory(truth.timestamps, truth.T_wc.copy())
     truth.T_wc[:, :3] = R_ENU_TRUTH @ truth.T_wc[:, :3]
     stored, config = load_map(run / "map.npz"), load_config(run / "config.json")
-    names = "fixes", "GPS alone", "with GPS"
+    arms = {"with GPS": np.array(options.antenna)}
+    if arms["with GPS"].any():
+        arms["with GPS, antenna taken to be at the camera"] = np.zeros(3)
+    names = "fixes", "GPS alone", *arms
     rows: dict[str, list[tuple[float, ...]]] = {name: [] for name in names}
     spent: list[float] = []
     for seed in range(options.seeds):
         fixes, is_jump = simulated(truth, options, seed)
-        start = time.process_time()
-        track = locate(stored, fixes, config.pose_graph)
-        spent.append(time.process_time() - start)
-        assert len(track.anchored.used) == len(fixes)
-        wrongly = float(np.mean(~track.anchored.used[~is_jump]))
-        missed = int(np.sum(track.anchored.used & is_jump))
-        # The datum of a run is its first fix.
-        placed = to_enu(to_geodetic(track.trajectory.T_wc[:, :3, 3], track.datum), DATUM)
         alone = np.column_stack(
             [np.interp(truth.timestamps, fixes.times, x) for x in to_enu(fixes.geodetic, DATUM).T]
         )
-        at_fixes = np.column_stack(
-            [np.interp(fixes.times, truth.timestamps, x) for x in truth.T_wc[:, :3, 3].T]
-        )
-        apart = np.linalg.norm(to_enu(fixes.geodetic, DATUM) - at_fixes, axis=1)
-        rows["fixes"].append((np.nan, float(np.sqrt(np.mean(apart**2))), wrongly, missed))
-        for name, positions in (("GPS alone", alone), ("with GPS", placed)):
-            rows[name].append((*errors(positions, truth), wrongly, missed))
+        rows["GPS alone"].append((*errors(alone, truth), np.nan, np.nan))
+        true = antenna_at(fixes.times, truth, fixes.antenna)
+        apart = np.linalg.norm(to_enu(fixes.geodetic, DATUM) - true, axis=1)
+        rows["fixes"].append((np.nan, float(np.sqrt(np.mean(apart**2))), np.nan, np.nan))
+        for name, antenna in arms.items():
+            start = time.process_time()
+            track = locate(stored, replace(fixes, antenna=antenna), config.pose_graph)
+            spent.append(time.process_time() - start)
+            assert len(track.anchored.used) == len(fixes)
+            wrongly = float(np.mean(~track.anchored.used[~is_jump]))
+            missed = int(np.sum(track.anchored.used & is_jump))
+            # The datum of a run is its first fix.
+            placed = to_enu(to_geodetic(track.trajectory.T_wc[:, :3, 3], track.datum), DATUM)
+            rows[name].append((*errors(placed, truth), wrongly, missed))
     alignment = alignment_of(stored.camera.sensor)
     without = evaluate_trajectory(visual, truth, alignment).ate_rmse_m
     print(f"| {run.resolve().name} | vision alone | {without:.2f} ({alignment}) | | |")
     for label, values in rows.items():
         aligned, absolute, wrongly, missed = np.mean(values, axis=0)
         jumps = f"{100 * wrongly:.1f} % of the good, {missed:.1f} jumped fixes kept"
-        jumps = jumps if label == "with GPS" else ""
+        jumps = "" if np.isnan(wrongly) else jumps
         shown = "" if np.isnan(aligned) else f"{aligned:.2f}"
         print(f"| | {label} | {shown} | {absolute:.2f} | {jumps} |", flush=True)
     print(
@@ -115,6 +123,14 @@ def errors(positions: NDArray[np.float64], truth: Trajectory) -> tuple[float, fl
     return aligned, float(np.sqrt(np.mean(apart**2)))
 
 
+def antenna_at(
+    times: NDArray[np.float64], truth: Trajectory, antenna: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """``(M, 3)`` true positions of the antenna at ``(M,)`` times, by its place at the camera."""
+    points = truth.T_wc[:, :3, :3] @ antenna + truth.T_wc[:, :3, 3]
+    return np.column_stack([np.interp(times, truth.timestamps, x) for x in points.T])
+
+
 def simulated(
     truth: Trajectory, options: argparse.Namespace, seed: int
 ) -> tuple[Fixes, NDArray[np.bool_]]:
@@ -122,7 +138,8 @@ def simulated(
     rng = np.random.default_rng(seed)
     first, last = truth.timestamps[[0, -1]]
     times = np.arange(first, last, 1.0 / options.hertz)
-    enu = np.column_stack([np.interp(times, truth.timestamps, x) for x in truth.T_wc[:, :3, 3].T])
+    antenna = np.array(options.antenna)
+    enu = antenna_at(times, truth, antenna)
     steps = rng.normal(0.0, options.walk / options.hertz**0.5, enu.shape)
     enu += rng.normal(0.0, options.noise, enu.shape) + np.cumsum(steps, axis=0)
     is_jump, is_gap = np.zeros((2, len(times)), np.bool_)
@@ -133,8 +150,8 @@ def simulated(
         is_jump |= at
     for begin in rng.uniform(first, max(first, last - 30.0), options.gaps):
         is_gap |= (times >= begin) & (times < begin + 30.0)
-    fixes = Fixes(times, to_geodetic(enu, DATUM), np.full(enu.shape, options.sigma))
-    return Fixes(*(values[~is_gap] for values in vars(fixes).values())), is_jump[~is_gap]
+    fixes = Fixes(times, to_geodetic(enu, DATUM), np.full(enu.shape, options.sigma), antenna)
+    return fixes.select(~is_gap), is_jump[~is_gap]
 
 
 if __name__ == "__main__":

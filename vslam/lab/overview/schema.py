@@ -47,12 +47,13 @@ class RunEntry(Record):
     """One run.
 
     ``system``: the loop detector, followed in brackets by the settings that not all runs share, or
-    the name of another system. ``settings``: thresholds and options that differ from the defaults.
-    ``seed``: None for other systems. ``town``: seed of a rendered town; the same route in another
-    town counts as the same drive with another seed. ``alignment``: the transformation fitted before
-    errors are computed, ``se3``, or ``sim3`` for a monocular run, whose scale is arbitrary.
-    ``measures``: by the names of ``MEASURES``; None if unknown. ``source``: the folder of the run,
-    or the trajectory file of another system or of a detector of ``--compare``.
+    the name of another system. ``settings``: thresholds and options that differ from the defaults,
+    and the version of the method. ``seed``: None for other systems. ``town``: seed of a rendered
+    town; the same route in another town counts as the same drive with another seed. ``alignment``:
+    the transformation fitted before errors are computed, ``se3``, or ``sim3`` for a monocular run,
+    whose scale is arbitrary. ``measures``: by the names of ``MEASURES``; None if unknown.
+    ``source``: the folder of the run, or the trajectory file of another system or of a detector of
+    ``--compare``.
     """
 
     drive: Drive

@@ -30,10 +30,8 @@ _PACKAGES = (
 
 
 def versions() -> dict[str, str]:
-    """Version of Python, of the method and of each listed package that is installed."""
-    from vslam import METHOD_VERSION  # the package imports this module
-
-    found = {"python": platform.python_version(), "method": str(METHOD_VERSION)}
+    """Version of Python and of each listed package that is installed."""
+    found = {"python": platform.python_version()}
     for name in _PACKAGES:
         try:
             found[name] = version(name)

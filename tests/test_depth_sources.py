@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections import namedtuple
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,12 +15,15 @@ from conftest import StereoSequence, corridor_depth
 from source_files import open_from, run_source, write_bag, write_calibration, write_images
 
 from vslam.camera import Camera
+from vslam.datasets.association import Pairing
+from vslam.datasets.bag import _synchronised
 from vslam.datasets.detection import detect_dataset
 from vslam.datasets.sources import SourceOptions
 from vslam.errors import InputError
 
 FRAMES = 8
 COLOUR, DEPTH = "/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"
+Stamp = namedtuple("Stamp", ["sec", "nanosec"])
 NAMES = [f"{k}.png" for k in range(FRAMES)]
 STAMPS = [k * 10**8 for k in range(FRAMES)]
 
@@ -124,6 +130,38 @@ def test_each_image_gets_the_nearest_depth(corridor, depths, calib, tmp_path):
         assert np.array_equal(frame.read(map)[1], depths[k + 1] * np.float32(0.001))
 
 
+def test_images_of_a_bag_without_depth_are_counted(corridor, depths, calib, tmp_path, caplog):
+    """Depth comes 95 ms late: near the next image as long as this follows after 100 ms."""
+    stamps = [k * 1_000_000 for k in (0, 100, 200, 300, 430, 560, 690, 820)]
+    sides = {COLOUR: corridor.left[:FRAMES], DEPTH: depths}
+    bag = write_bag(tmp_path / "a.bag", "ros1", sides, stamps, lag=95_000_000)
+    source = opened(bag, calib)
+    assert not caplog.messages
+    outcome = run_source(source)
+    assert len(outcome.tracks) == 3
+    (said,) = caplog.messages
+    assert said == (
+        f"{bag}: 5 of 8 images are left out because no image of {DEPTH} is within 20 ms of them "
+        f"(the nearest is 35 ms away); correct the time stamps if those of {DEPTH} are late, name "
+        "other topics with --topics, or run with --sensor mono."
+    )
+    assert outcome.warnings[0] == said
+    assert len(list(source.frames())) == 3
+    assert source.pairing.warnings() == [said]  # of one reading, not of both
+    assert opened(bag, calib, sensor="mono").pairing is None
+
+
+def test_images_that_wait_too_long_for_depth_are_counted(tmp_path):
+    def messages(topic, numbers):
+        for k in numbers:
+            yield topic, SimpleNamespace(header=SimpleNamespace(stamp=Stamp(k, 0)))
+
+    pairing = Pairing(tmp_path, "depth", 0.02, "wait")
+    read = chain(messages("rgb", range(40)), messages("depth", range(50)))
+    assert len(list(_synchronised(read, ("rgb", "depth"), pairing))) == pairing.n_pairs == 32
+    assert pairing.left_out == list(range(8))  # at most 32 images wait
+
+
 def test_topics_of_bags_with_depth(corridor, depths, calib, tmp_path):
     two, small = {COLOUR: corridor.left[:2], DEPTH: depths[:2]}, [d[:80] for d in depths[:2]]
     more = {"/infra/image_raw": corridor.right[:2]}
@@ -148,7 +186,9 @@ def test_folders_by_option_and_by_times(corridor, depths, calib, folders, tmp_pa
     write_images(tmp_path, {"b": [depths[0], depths[2]]}, late)
     source = opened(tmp_path / "a", calib, depth=tmp_path / "b", depth_scale=1000.0)
     np.testing.assert_allclose(source.timestamps, [times[0], times[2]])
-    assert "only 2 of 3 images have a depth image within 20 ms" in caplog.text
+    assert "1 of 3 images are left out because no depth image is within 20 ms" in caplog.text
+    assert "(the nearest is 92 ms away); correct the names" in caplog.text
+    assert source.pairing.warnings() == caplog.messages
     assert np.array_equal(source.read(1)[1], depths[2] * np.float32(0.001))
     assert np.array_equal(source.read(1)[0], corridor.left[2])
     alone = opened(folders, calib, fps=10.0, sensor="mono")

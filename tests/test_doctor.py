@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 from vslam.camera import Camera
 from vslam.cli.main import app
 from vslam.config import OrbConfig
+from vslam.datasets.association import Pairing
 from vslam.datasets.euroc import open_euroc
 from vslam.datasets.frames import stored_frames
 from vslam.datasets.kitti import open_kitti
@@ -39,6 +40,7 @@ class Seen:
     ground_truth: np.ndarray | None = None
     dataset: str = "drawn"
     name: str = "corridor"
+    pairing: Pairing | None = None
 
     def __len__(self):
         return len(self.left)
@@ -309,6 +311,19 @@ def test_few_frames_have_no_rhythm():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("n_pairs", "verdict"), [(9, "good"), (8, "fault")])
+def test_many_images_without_a_partner_are_a_fault(clean, n_pairs, verdict):
+    pairing = Pairing(Path("bag"), "right image", 0.005, "correct the times")
+    pairing.count(np.arange(10.0), np.arange(n_pairs), np.arange(n_pairs))
+    (found,) = (
+        f
+        for f in examine(replace(clean, pairing=pairing), FEW).findings
+        if "left out" in f.measured
+    )
+    assert (found.check, found.verdict) == ("partners", verdict)
+    assert found.measured.startswith(f"{10 - n_pairs} of 10 images are left out because no right ")
+
+
 def test_the_command(kitti_tree, tmp_path):
     page, config = tmp_path / "page.html", tmp_path / "config.json"
     config.write_text('{"orb": {"n_features": 500}}')

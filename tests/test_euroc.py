@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from vslam.datasets import open_sequence
 from vslam.datasets.association import poses_at
-from vslam.datasets.euroc import open_euroc
+from vslam.datasets.euroc import open_euroc, open_raw_euroc
 from vslam.datasets.perturbation import Perturbation
 from vslam.errors import InputError, UnreadableImageError
 from vslam.geometry import se3_exp
@@ -125,10 +125,14 @@ def test_selection_and_the_left_camera_alone(root, corridor):
     np.testing.assert_allclose(sequence.ground_truth, corridor.T_wc[[1, 3]], atol=1e-9)
 
 
-def test_frames_without_a_partner_are_left_out(root, corridor):
+def test_frames_without_a_partner_are_left_out(root, corridor, caplog):
     drop_lines(root / "V9_01/mav0/cam1/data.csv", lambda k: k not in (1, 4, 6))
     sequence = open_euroc(root, "V9_01")
     assert len(sequence) == 3
+    (said,) = caplog.messages
+    assert said.startswith(f"{root / 'V9_01/mav0'}: 3 of 6 images are left out because no right ")
+    assert "correct the times in cam1/data.csv" in said
+    assert sequence.pairing.warnings() == open_raw_euroc(root).pairing.warnings() == [said]
     np.testing.assert_array_equal(sequence.read(2)[0], corridor.left[4])
     np.testing.assert_array_equal(sequence.read(2)[1], corridor.right[4])
     np.testing.assert_allclose(sequence.ground_truth, corridor.T_wc[[1, 2, 4]], atol=1e-9)

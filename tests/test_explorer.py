@@ -181,6 +181,7 @@ page.onload = async () => {
     moved: first.map !== second.map, zoomed: near !== second.map, back: whole === second.map,
     blue: blue(), ink: ["map", "strip", "picture"].map(ink), map: [box.left, box.right, box.height],
     shown: inner.documentElement.clientWidth, needed: inner.documentElement.scrollWidth,
+    scrolled: [...inner.querySelectorAll(".scroll")].map(x => x.scrollWidth - x.clientWidth),
     requests: window_.performance.getEntriesByType("resource").map(x => x.name)
       .filter(x => !x.startsWith("data:")),
   }) + "END";
@@ -224,6 +225,7 @@ def test_the_explorer_in_a_browser(run: Path, tmp_path: Path, width: int):
     assert 0 <= left < right <= width
     assert height > 200
     assert found["needed"] <= found["shown"] <= width
+    assert max(found["scrolled"]) <= 1
     assert found["requests"] == []
 
 

@@ -1,7 +1,7 @@
 """The method's version changes with the trajectories of three reference clips: a corridor by stereo
 and by RGB-D, and a drive round a block whose loop is closed by night.
 
-After a change of the method, raise ``METHOD_VERSION`` in ``vslam/__init__.py`` and write the
+After a change of the method, raise ``METHOD_VERSION`` in ``vslam/method.py`` and write the
 references again with ``make method``.
 """
 
@@ -72,7 +72,7 @@ def test_the_version_of_the_method_is_that_of_its_trajectories(name, clips):
     limit = LIMIT_M if references["made_on"] == here else LIMIT_ELSEWHERE_M
     assert references["version"] == METHOD_VERSION, "run make method"
     assert far < limit, (
-        f"the clip {name} moved by {far:.2g} m: raise METHOD_VERSION in vslam/__init__.py, "
+        f"the clip {name} moved by {far:.2g} m: raise METHOD_VERSION in vslam/method.py, "
         "then run make method"
     )
 

@@ -14,6 +14,7 @@ import pytest
 from browser import chromium, dumped
 from rich.console import Console
 
+from vslam import METHOD_VERSION
 from vslam.cli import main as cli
 from vslam.config import Config
 from vslam.errors import InputError
@@ -452,11 +453,19 @@ def test_runs_of_different_thresholds_are_different_systems(thresholds: Path, tm
     }  # fmt: skip
     assert [c.first for c in report.comparisons[:2]] == ["bow", "bow"]
     assert "all runs have orb.n_levels=7, orb.retired=3" in report.notes
-    assert report.runs[0].settings == {"orb.n_levels": 7, "orb.retired": 3}
+    method = {"method": str(METHOD_VERSION)}
+    assert report.runs[0].settings == {"orb.n_levels": 7, "orb.retired": 3} | method
+    assert not any("method" in text for text in (*report.systems, *report.notes))
     for name in ("report.md", "report.html", "table.csv"):
         assert "bow (orb.n_features=1500)" in (tmp_path / "out" / name).read_text(), name
     other = summarize(collect([thresholds], []), "bow (orb.n_features=1500)")
     assert other.systems[0] == "bow (orb.n_features=1500)"
+
+
+def test_versions_of_the_method_are_different_systems(run_folder: Path, tmp_path: Path):
+    for version in ("1", "2"):
+        copy_run(run_folder, tmp_path / version, detector="bow", versions={"method": version})
+    assert summarize(collect([tmp_path], [])).systems == ["bow (method=1)", "bow (method=2)"]
 
 
 def test_options_that_change_results_make_systems_too(run_folder: Path, tmp_path: Path):
@@ -637,7 +646,7 @@ FIGURES = {
 def test_html_has_every_figure_and_loads_nothing(written):
     html = (written[1] / "report.html").read_text()
     assert set(re.findall('<figure class="card ([^"]*)"', html)) == FIGURES
-    assert html.count("<table>") == 8
+    assert html.count("<table") == 8
     assert not re.search("<(script|iframe|object|embed|img)", html)
 
 
@@ -657,6 +666,7 @@ page.onload = () => {
       * x.ownerSVGElement.clientWidth / x.ownerSVGElement.viewBox.baseVal.width)),
     paths: [...inner.querySelectorAll("figure svg path")].length,
     requests: page.contentWindow.performance.getEntriesByType("resource").map(x => x.name),
+    scrolled: [...inner.querySelectorAll(".scroll")].map(x => x.scrollWidth - x.clientWidth),
     font: getComputedStyle(inner.querySelector("td")).fontSize,
   }) + "END";
 };
@@ -685,6 +695,7 @@ def test_report_in_a_browser_as_wide_as_a_phone(written, tmp_path: Path):
     answer = re.search("FOUND(.*)END</pre>", text)
     assert answer, text[-4000:]
     found = json.loads(answer[1].replace("&amp;", "&"))
+    assert max(found["scrolled"]) <= 1
     assert len(found["figures"]) == len(FIGURES)
     assert all(
         0 <= left < right <= 400 and height > 100 for left, right, height in found["figures"]

@@ -105,6 +105,20 @@ def test_html():
     assert not re.search(r"(src|href)\s*=\s*[\"']?\s*(https?:)?//", text)
 
 
+def test_rows_of_a_table_wider_than_a_phone_become_blocks():
+    def shown(head: tuple[str, ...], row: tuple[str, ...], texts: tuple[str, ...] = ()) -> str:
+        return html(Page("", [], [Section("", [Table(head, [row], texts)])]))
+
+    head, row = ("what", "ATE (m), bow", *"abcdefghi"), ("<b>", *10 * ["1.234"])
+    assert '<td class="text" data-label="what">&lt;b&gt;</td>' in shown(head, row, ("what",))
+    assert '<table class="stacked">' in shown(head, row)
+    assert '<td data-label="ATE (m), bow">1.234</td>' in shown(head, row)
+    assert "data-label=" not in shown(head[:6], row[:6])
+    sentence = ("Words of a sentence. " * 5,)
+    assert "data-label=" not in shown(head[:1], sentence, ("what",))  # it is wrapped
+    assert "data-label=" in shown(head[:1], sentence)
+
+
 def printed(page: Page, width: int) -> list[str]:
     out = StringIO()
     show(page.sections, Console(file=out, width=width))

@@ -431,4 +431,4 @@ def test_the_table_of_laws_is_that_of_the_code(monkeypatch):
     monkeypatch.syspath_prepend(str(tools))
     import law_table
 
-    assert law_table.TABLE.read_text() == law_table.table()
+    assert law_table.TABLE.read_text() == law_table.table(), "run: python tools/law_table.py"

@@ -9,16 +9,18 @@ import cv2
 import numpy as np
 import pytest
 from conftest import StereoSequence, corridor_depth
+from source_files import run_source
 
 from vslam.camera import Camera
 from vslam.cli.main import app
 from vslam.config import Config, DepthConfig, KeyframeConfig
 from vslam.datasets import open_sequence
+from vslam.datasets.association import Pairing, associate
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.datasets.synthetic.layouts import render_rgbd
 from vslam.datasets.synthetic.routes import built_in_route
 from vslam.datasets.synthetic.site import Variation
-from vslam.datasets.tum import associate, open_tum
+from vslam.datasets.tum import open_tum
 from vslam.errors import InputError, UnreadableImageError
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.frontend.depth import columns_of_depth
@@ -252,11 +254,30 @@ def test_images_without_depth_are_counted(copy, caplog):
     lines = (copy / "depth.txt").read_text().splitlines()
     (copy / "depth.txt").write_text("\n".join(lines[:-1]))
     assert len(open_tum(copy, "")) == FRAMES - 1
-    assert not caplog.messages
     (copy / "depth.txt").write_text("\n".join(lines[:-4]))
-    open_tum(copy, "")
-    (said,) = caplog.messages
-    assert f"only {FRAMES - 4} of {FRAMES} images have a depth image within 20 ms" in said
+    source = open_tum(copy, "", max_frames=3)
+    one, four = caplog.messages
+    assert f"1 of {FRAMES} images are left out because no depth image is within 20 ms" in one
+    assert f"{copy}: 4 of {FRAMES} images are left out because" in four
+    assert "; correct the times in rgb.txt or depth.txt" in four
+    assert run_source(source).warnings == [four]
+    open_tum(copy, "", monocular=True)
+    assert len(caplog.messages) == 2
+
+
+def test_few_images_without_a_partner_are_not_worth_a_warning(tmp_path):
+    pairing = Pairing(tmp_path, "right image", 0.005, "correct the times")
+    times = np.arange(100.0)
+    pairing.count(times, np.arange(99), times[:99])
+    assert pairing.warnings() == []
+    assert not pairing.is_poor
+    pairing.count(times, np.arange(89), times[:89] + 0.004)
+    assert pairing.is_poor
+    (said,) = pairing.warnings()
+    assert said == (
+        f"{tmp_path}: 11 of 100 images are left out because no right image is within 5 ms of them "
+        "(the nearest is 5996 ms away); correct the times."
+    )
 
 
 @pytest.mark.parametrize(

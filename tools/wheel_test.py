@@ -105,6 +105,8 @@ def main() -> None:
     parser.add_argument("--python", nargs="+", default=[sys.executable], help="interpreters to try")
     parser.add_argument("--runners", action="store_true", help="also try pipx and uvx")
     options = parser.parse_args()
+    if missing := [python for python in options.python if shutil.which(python) is None]:
+        sys.exit(f"wheel test: {', '.join(missing)}: not installed; install it or leave it out")
     os.environ.pop("PYTHONPATH", None)
     shutil.rmtree(ROOT / "build" / "lib", ignore_errors=True)  # would be packed into the wheel
     with tempfile.TemporaryDirectory(prefix="vslam-wheel-") as name:

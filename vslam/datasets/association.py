@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,9 @@ _log = logging.getLogger(__name__)
 # (TUM), 200 Hz (EuRoC) or 10 Hz (vehicles). At an acceleration of 2 m/s^2, linear interpolation is
 # off by 6 mm in the middle of this gap.
 _MAX_GAP_S = 0.15
-_MANY = 0.1  # share of images without a partner that causes a warning; TUM's have up to 7 %
+# Shares of images without a partner. A recording that begins or ends between the two images of a
+# pair loses one; TUM's sequences lose up to 7 %.
+_FEW, _MANY = 0.01, 0.1
 
 
 def associate(
@@ -46,15 +49,84 @@ def associate(
     return pairs[:, 0], pairs[:, 1]
 
 
-def warn_of_unpaired(source: Path, n_pairs: int, n_images: int) -> None:
-    """Warn if many colour images are skipped because no depth image is near them in time."""
-    if n_pairs < (1.0 - _MANY) * n_images:
-        _log.warning(
-            "%s: only %d of %d images have a depth image within 20 ms; the others are skipped.",
-            source,
-            n_pairs,
-            n_images,
-        )
+@dataclass
+class Pairing:
+    """The images that a reader pairs by time, and those that it leaves out.
+
+    The reader of a stream counts while it reads.
+
+    Attributes:
+        source: file or folder that messages name.
+        partner: what each image is paired with, such as ``depth image``.
+        within_s: largest difference between the times of a pair (s).
+        fix: what the user can do if images are left out.
+        n_pairs: number of pairs.
+        left_out: times (s) of the images without a partner.
+        seconds: times (s) of all images that could be partners.
+    """
+
+    source: Path
+    partner: str
+    within_s: float
+    fix: str
+    n_pairs: int = 0
+    left_out: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+
+    @property
+    def measured(self) -> str:
+        """How many images are left out, and why."""
+        n = len(self.left_out)
+        why = f" because no {self.partner} is within {1e3 * self.within_s:g} ms of them"
+        return f"{n} of {n + self.n_pairs} images are left out" + (why + self._gap() if n else "")
+
+    @property
+    def is_poor(self) -> bool:
+        """Whether so many images are left out that tracking suffers."""
+        return len(self.left_out) > _MANY * (len(self.left_out) + self.n_pairs)
+
+    def warnings(self) -> list[str]:
+        """A sentence with the number of images left out, the reason and the fix, if it is more
+        than a hundredth of the images."""
+        if len(self.left_out) <= _FEW * (len(self.left_out) + self.n_pairs):
+            return []
+        return [f"{self.source}: {self.measured}; {self.fix}."]
+
+    def count(
+        self, times: NDArray[np.float64], paired: NDArray[np.int64], seconds: NDArray[np.float64]
+    ) -> None:
+        """Count all images of a stored sequence, and log the warnings.
+
+        Args:
+            times: ``(N,)`` seconds, of the images.
+            paired: ``(P,)`` indices of the images that have a partner.
+            seconds: ``(M,)`` seconds, of the possible partners.
+        """
+        self.n_pairs = len(paired)
+        self.left_out = np.delete(times, paired).tolist()
+        self.seconds = seconds.tolist()
+        self.log()
+
+    def restart(self) -> None:
+        """Begin to count anew, because a stream is read from its beginning."""
+        self.n_pairs = 0
+        self.left_out.clear()
+        self.seconds.clear()
+
+    def log(self) -> None:
+        """Log the warnings."""
+        for warning in self.warnings():
+            _log.warning(warning)
+
+    def _gap(self) -> str:
+        """The median time between an image that is left out and the nearest possible partner."""
+        if not self.seconds:
+            return ""
+        times, known = np.array(self.left_out), np.sort(self.seconds)
+        after = np.searchsorted(known, times).clip(0, len(known) - 1)
+        before = (after - 1).clip(0)
+        apart = np.minimum(abs(known[after] - times), abs(times - known[before]))
+        return f" (the nearest is {1e3 * float(np.median(apart)):.0f} ms away)"
 
 
 def poses_at(

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from vslam.calibration.formats import read_ros
 from vslam.calibration.models import Calibration
 from vslam.camera import DepthImage, Image, ImageMap
+from vslam.datasets.association import Pairing
 from vslam.datasets.bag_messages import (
     CAMERA_INFO_TYPE,
     IMAGE_TYPES,
@@ -95,7 +96,14 @@ def open_bag(
     with _opened(path) as bag:
         chosen, depth = _choose_topics(path, bag, topics, sensor)
         tolerance = _tolerance(depth)
-        first_two = list(islice(_synchronised(_messages(bag, path, chosen), chosen, tolerance), 2))
+        pairing = Pairing(
+            path,
+            f"image of {chosen[-1]}",
+            1e-9 * tolerance,
+            f"correct the time stamps if those of {chosen[-1]} are late, name other topics with "
+            "--topics, or run with --sensor mono",
+        )
+        first_two = list(islice(_synchronised(_messages(bag, path, chosen), chosen, pairing), 2))
         if not first_two:
             raise InputError(
                 f"{path}: no images of {' and '.join(chosen)} have the same time (within "
@@ -123,14 +131,20 @@ def open_bag(
             path=path,
             topics=chosen,
             sizes=sizes[:1] if depth else sizes,
-            play=partial(_play, path, chosen, sizes, depth, depth_scale),
+            play=partial(_play, path, chosen, sizes, depth, depth_scale, pairing),
             n_expected=_count(bag, chosen),
             depth=depth,
+            pairing=pairing if len(chosen) == 2 else None,
         )
 
 
 def _play(
-    path: Path, topics: tuple[str, ...], sizes: tuple[Size, ...], depth: bool, scale: float | None
+    path: Path,
+    topics: tuple[str, ...],
+    sizes: tuple[Size, ...],
+    depth: bool,
+    scale: float | None,
+    pairing: Pairing,
 ) -> Iterator[TimedFrame]:
     def read(messages: tuple[Message, ...], image_map: ImageMap) -> Images:
         sides = zip(messages, topics, sizes, (False, depth), strict=False)
@@ -147,13 +161,15 @@ def _play(
         return image
 
     with _opened(path) as bag:
-        messages = _messages(bag, path, topics)
-        for pair in _synchronised(messages, topics, _tolerance(depth)):
-            yield TimedFrame(
-                stamp_of(pair[0]) / 10**9,
-                partial(read, pair),
-                colour=partial(_in_colour, path, topics[0], pair[0]),
-            )
+        try:
+            for pair in _synchronised(_messages(bag, path, topics), topics, pairing):
+                yield TimedFrame(
+                    stamp_of(pair[0]) / 10**9,
+                    partial(read, pair),
+                    colour=partial(_in_colour, path, topics[0], pair[0]),
+                )
+        finally:
+            pairing.log()
 
 
 def _in_colour(path: Path, topic: str, message: Message) -> NDArray[np.uint8]:
@@ -286,17 +302,23 @@ def _tolerance(depth: bool) -> int:
 
 
 def _synchronised(
-    messages: Iterator[tuple[str, Message]], topics: tuple[str, ...], tolerance: int
+    messages: Iterator[tuple[str, Message]], topics: tuple[str, ...], pairing: Pairing
 ) -> Iterator[tuple[Message, ...]]:
-    """Yield groups of one message of each topic whose stamps differ by at most ``tolerance`` (ns).
+    """Yield groups of one message of each topic whose stamps are near in time, and count the messages
+    in ``pairing``.
 
     A message is paired only when no later message of the other topic can be nearer in time.
     """
+    pairing.restart()
     if len(topics) == 1:
         yield from ((message,) for _, message in messages)
         return
     waiting = {topic: deque[Message](maxlen=_MOST_WAITING) for topic in topics}
     first, second = waiting.values()
+    tolerance = round(1e9 * pairing.within_s)
+
+    def leave_out(message: Message) -> None:
+        pairing.left_out.append(stamp_of(message) / 10**9)
 
     def pairs(enough: int) -> Iterator[tuple[Message, ...]]:
         while min(len(first), len(second)) >= enough:
@@ -304,14 +326,23 @@ def _synchronised(
             early, late = (first, second) if apart < 0 else (second, first)
             behind = abs(stamp_of(early[1]) - stamp_of(late[0])) if len(early) > 1 else tolerance
             if abs(apart) <= min(behind, tolerance):
+                pairing.n_pairs += 1
                 yield first.popleft(), second.popleft()
+            elif early is first:
+                leave_out(first.popleft())
             else:
-                early.popleft()
+                second.popleft()
 
     for topic, message in messages:
+        if topic == topics[1]:
+            pairing.seconds.append(stamp_of(message) / 10**9)
+        elif len(first) == _MOST_WAITING:
+            leave_out(first[0])
         waiting[topic].append(message)
         yield from pairs(2)
     yield from pairs(1)
+    for message in first:
+        leave_out(message)
 
 
 def _choose_topics(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vslam.calibration.documents import read_document
 from vslam.calibration.files import read_calibration
-from vslam.datasets.association import poses_at
+from vslam.datasets.association import Pairing, poses_at
 from vslam.datasets.frames import RawSource, Source
 from vslam.datasets.image_files import (
     checked_files,
@@ -62,9 +62,11 @@ def open_euroc(
             unusable.
         UnreadableImageError: the first pair cannot be decoded.
     """
-    base, found, stamps, files = _select(root, name, start, every, max_frames, monocular)
+    base, found, stamps, files, pairing = _select(root, name, start, every, max_frames, monocular)
     truth = _read_ground_truth(base, stamps)
-    raw = checked_files("euroc", found, stamps.astype(np.float64) * 1e-9, truth, files)
+    raw = checked_files(
+        "euroc", found, stamps.astype(np.float64) * 1e-9, truth, files, None, pairing
+    )
     sensors = calib or [base / f"cam{side}" / "sensor.yaml" for side in range(len(files))]
     return rectified(raw, read_calibration(sensors, raw.sizes[0]))
 
@@ -80,8 +82,9 @@ def open_raw_euroc(
 ) -> RawSource:
     """Open the unrectified images of a sequence, without calibration and ground truth; see
     `open_euroc`."""
-    _, found, stamps, files = _select(root, name, start, every, max_frames, monocular)
-    return checked_files("euroc", found, stamps.astype(np.float64) * 1e-9, None, files)
+    _, found, stamps, files, pairing = _select(root, name, start, every, max_frames, monocular)
+    times = stamps.astype(np.float64) * 1e-9
+    return checked_files("euroc", found, times, None, files, None, pairing)
 
 
 def is_euroc(root: Path) -> bool:
@@ -96,19 +99,21 @@ def _select(
     every: int,
     max_frames: int | None,
     monocular: bool,
-) -> tuple[Path, str, NDArray[np.int64], list[tuple[Path, ...]]]:
-    """Folder with ``cam0``, the sequence's name, and times (ns) and files of the chosen frames."""
+) -> tuple[Path, str, NDArray[np.int64], list[tuple[Path, ...]], Pairing | None]:
+    """Folder with ``cam0``, the sequence's name, times (ns) and files of the chosen frames, and the
+    pairing of all frames."""
     base, found = _find(Path(root), name)
     cameras = [base / f"cam{side}" for side in range(1 if monocular else 2)]
     listed = [_read_list(camera) for camera in cameras]
     times = [np.array(stamps, np.int64) for stamps, _ in listed]
     frames = _pair(cameras, times)
+    pairing = None if monocular else _pairing(base, times, frames[:, 0])
     chosen = frames[select_frames(base, len(frames), start, every, max_frames)]
     files = [
         tuple(camera / "data" / names[k] for k in rows)
         for camera, (_, names), rows in zip(cameras, listed, chosen.T, strict=True)
     ]
-    return base, found, times[0][chosen[:, 0]], files
+    return base, found, times[0][chosen[:, 0]], files, pairing
 
 
 def _find(root: Path, name: str | None) -> tuple[Path, str]:
@@ -154,6 +159,17 @@ def _pair(cameras: list[Path], times: list[NDArray[np.int64]]) -> NDArray[np.int
             f"{cameras[0]}; take both cameras from one sequence."
         )
     return np.column_stack([rows, nearest])[near]
+
+
+def _pairing(base: Path, times: list[NDArray[np.int64]], paired: NDArray[np.int64]) -> Pairing:
+    fix = (
+        "correct the times in cam1/data.csv if they are all late, or run on the left camera alone "
+        "with --sensor mono"
+    )
+    pairing = Pairing(base, "right image", _MOST_APART_NS * 1e-9, fix)
+    left, right = (1e-9 * (side - times[0][0]) for side in times)
+    pairing.count(left, paired, right)
+    return pairing
 
 
 def _read_ground_truth(base: Path, stamps: NDArray[np.int64]) -> NDArray[np.float64] | None:

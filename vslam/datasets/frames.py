@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera, DepthImage, Image, ImageMap
+from vslam.datasets.association import Pairing
 from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
 
 Images = tuple[Image, Image | DepthImage | None]
@@ -74,6 +75,7 @@ class _Frames:
     n_expected: int | None = None
     live: bool = False
     ground_truth: NDArray[np.float64] | None = None
+    pairing: Pairing | None = None
 
     def __post_init__(self) -> None:
         if not self.seekable:
@@ -143,6 +145,9 @@ class Source(_Frames):
             camera.
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames without a pose; None without
             ground truth.
+        pairing: how many images have no second image of the same time and are left out, in the
+            whole sequence or as far as a stream has been read; None if images are not paired by
+            time.
         rectify_mask: rectifies an ``(H, W)`` uint8 mask of the original left images; None if the
             images are not rectified by vslam.
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from vslam.calibration.models import Calibration
 from vslam.camera import Camera, DepthImage, Image
+from vslam.datasets.association import Pairing
 from vslam.datasets.frames import RawSource, Size, TimedFrame, decoded
 from vslam.errors import InputError, UnreadableImageError
 from vslam.untrusted import MOST_PIXELS, require_utf8
@@ -31,6 +32,7 @@ def checked_files(
     ground_truth: NDArray[np.float64] | None,
     sides: Several[Several[Path]],
     depth_scale: float | None = None,
+    pairing: Pairing | None = None,
 ) -> RawSource:
     """Make a source of image files: check that no file is empty, and decode the first images.
 
@@ -39,6 +41,7 @@ def checked_files(
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of the left camera; None without ground truth.
         sides: N left images, optionally followed by N right images or N depth images.
         depth_scale: depth image units per metre; None if there are no depth images.
+        pairing: see `vslam.datasets.frames.Source`.
 
     Raises:
         UnreadableImageError: a file is empty, the first frame cannot be decoded, or its depth does
@@ -72,6 +75,7 @@ def checked_files(
         depth=depth,
         stored=tuple(map(frame, timestamps.tolist(), *sides)),
         ground_truth=ground_truth,
+        pairing=pairing,
     )
     if depth:
         source.read(0)

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.datasets.association import associate, warn_of_unpaired
+from vslam.datasets.association import Pairing, associate
 from vslam.datasets.frames import RawSource
 from vslam.datasets.image_files import (
     checked_files,
@@ -70,6 +70,7 @@ class ImageFolders:
             and the depth, or those of a single camera.
         depth: whether the second side is the depth of the first one.
         size: width and height of the first image.
+        pairing: see `vslam.datasets.frames.Source`.
     """
 
     name: str
@@ -77,6 +78,7 @@ class ImageFolders:
     sides: tuple[tuple[Path, ...], ...]
     depth: bool
     size: tuple[int, int]
+    pairing: Pairing | None = None
 
     def source(self, depth_scale: float | None) -> RawSource:
         """Make a source of the images.
@@ -94,7 +96,9 @@ class ImageFolders:
                 "--depth-scale, 1000 for millimetres, or depth_scale in the calibration."
             )
         scale = depth_scale if self.depth else None
-        return checked_files("images", self.name, self.timestamps, None, self.sides, scale)
+        return checked_files(
+            "images", self.name, self.timestamps, None, self.sides, scale, self.pairing
+        )
 
 
 def open_images(
@@ -129,7 +133,8 @@ def open_images(
     right = None if right is None else Path(right)
     depth = None if depth is None else Path(depth)
     places, is_depth = _find_sides(folder, right, depth, sensor)
-    files = _matched([_sorted_images(place) for place in places], places, by_time=is_depth)
+    listed = [_sorted_images(place) for place in places]
+    files, pairing = _matched(listed, places, by_time=is_depth)
     n = len(files[0])
     times = np.arange(n) / fps if fps is not None else _find_times(places[0], files[0])
     if (bad := np.flatnonzero(np.diff(times) <= 0)).size:
@@ -140,7 +145,7 @@ def open_images(
     chosen = select_frames(folder, n, start, every, max_frames)
     sides = tuple(tuple(side[k] for k in chosen) for side in files)
     size = image_size(sides[0][0])
-    return ImageFolders(folder.resolve().name, times[chosen], sides, is_depth, size)
+    return ImageFolders(folder.resolve().name, times[chosen], sides, is_depth, size, pairing)
 
 
 def _find_sides(
@@ -205,12 +210,12 @@ def _sorted_images(folder: Path) -> dict[str, Path]:
 
 def _matched(
     sides: list[dict[str, Path]], folders: list[Path], *, by_time: bool
-) -> list[list[Path]]:
+) -> tuple[list[list[Path]], Pairing | None]:
     """The files of each folder, in the order of the pairs that they form."""
     first, *rest = sides
     for other in rest:
         if first.keys() == other.keys():
-            return [[side[stem] for stem in first] for side in sides]
+            return [[side[stem] for stem in first] for side in sides], None
         if by_time and (pairs := _near_in_time(first, other)) is not None:
             return pairs
         if len(other) != len(first) or first.keys() & other.keys():
@@ -219,10 +224,12 @@ def _matched(
                 f"{min(first.keys() ^ other.keys())} is in only one of them; remove the images "
                 "without a partner."
             )
-    return [list(side.values()) for side in sides]
+    return [list(side.values()) for side in sides], None
 
 
-def _near_in_time(first: dict[str, Path], second: dict[str, Path]) -> list[list[Path]] | None:
+def _near_in_time(
+    first: dict[str, Path], second: dict[str, Path]
+) -> tuple[list[list[Path]], Pairing] | None:
     """Files of both folders, paired by the times in their names; None if these are not times."""
     files = [list(side.values()) for side in (first, second)]
     times = [[_time_of_name(path) for path in side] for side in files]
@@ -235,8 +242,10 @@ def _near_in_time(first: dict[str, Path], second: dict[str, Path]) -> list[list[
             f"{files[1][0].parent}: by the times in their names, no depth image is within 20 ms of "
             "an image; name folders of one recording."
         )
-    warn_of_unpaired(files[0][0].parent, len(pairs[0]), len(colour))
-    return [[side[k] for k in chosen] for side, chosen in zip(files, pairs, strict=True)]
+    fix = "correct the names if the times of one folder are late, or run with --sensor mono"
+    pairing = Pairing(files[0][0].parent, "depth image", _NEAR_S, fix)
+    pairing.count(colour, pairs[0], depth)
+    return [[side[k] for k in chosen] for side, chosen in zip(files, pairs, strict=True)], pairing
 
 
 def _find_times(folder: Path, files: list[Path]) -> NDArray[np.float64]:

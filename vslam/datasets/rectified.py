@@ -50,6 +50,7 @@ def rectified(raw: RawSource, calibration: Calibration) -> Source:
         n_expected=raw.n_expected,
         live=raw.live,
         ground_truth=T_wc,
+        pairing=raw.pairing,
         rectify_mask=rectification.left_depth,
     )
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from vslam.calibration.files import read_calibration
 from vslam.calibration.models import Calibration, CameraModel
-from vslam.datasets.association import associate, poses_at, warn_of_unpaired
+from vslam.datasets.association import Pairing, associate, poses_at
 from vslam.datasets.frames import Source
 from vslam.datasets.image_files import (
     checked_files,
@@ -88,6 +88,7 @@ def open_tum(
     times, colour_files = _read_list(folder / "rgb.txt")
     frames = partners = np.arange(len(times))
     depth_files: list[Path] = []
+    pairing = None
     if not monocular:
         depth_times, depth_files = _read_list(folder / "depth.txt")
         frames, partners = associate(times, depth_times, _NEAR_S)
@@ -96,7 +97,12 @@ def open_tum(
                 f"{folder}: no colour image has a depth image within 20 ms; take rgb.txt and "
                 "depth.txt from one recording, or run on the colour images with --sensor mono."
             )
-        warn_of_unpaired(folder, len(frames), len(times))
+        fix = (
+            "correct the times in rgb.txt or depth.txt if those of one list are late, or run on "
+            "the colour images with --sensor mono"
+        )
+        pairing = Pairing(folder, "depth image", _NEAR_S, fix)
+        pairing.count(times, frames, depth_times)
     chosen = select_frames(folder, len(frames), start, every, max_frames)
     times = times[frames[chosen]]
     colour = tuple(colour_files[k] for k in frames[chosen])
@@ -110,7 +116,7 @@ def open_tum(
     else:
         depth = tuple(depth_files[k] for k in partners[chosen])
         scale = depth_scale or calibration.depth_scale or _DEPTH_SCALE
-        raw = checked_files("tum", found, times, truth, [colour, depth], scale)
+        raw = checked_files("tum", found, times, truth, [colour, depth], scale, pairing)
     return rectified(raw, calibration)
 
 

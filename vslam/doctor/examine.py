@@ -83,6 +83,8 @@ def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
         images = list(lefts.values())
         findings += [checks.check_features(images, config), checks.check_sharpness(images)]
     findings += checks.check_times(sequence.timestamps)
+    if (pairing := sequence.pairing) is not None:
+        findings.append(judge("partners", pairing.is_poor, pairing.measured, pairing.fix))
     masked, hidden = _examine_mask(sequence, lefts)
     findings += masked
     seconds = [second for _, second in read.values() if second is not None]

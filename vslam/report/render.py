@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table as RichTable
 
+_PHONE, _PAD = 48, 2  # width of a phone and the space between two columns, in characters
+
 
 def write_files(
     folder: Path, files: Mapping[str, str | bytes], fix: str = "name another folder"
@@ -114,6 +116,7 @@ def fill_template(template: str, **values: object) -> str:
     environment.filters["kind"] = lambda part: type(part).__name__
     environment.filters["heading_lines"] = _heading_lines
     environment.tests["shown"] = _is_shown
+    environment.tests["wide"] = _is_wide
     return environment.get_template(template).render(**values)
 
 
@@ -130,6 +133,16 @@ def _is_shown(part: Part) -> bool:
         case Bullets():
             return bool(part.sentences)
     return part != ""
+
+
+def _is_wide(table: Table) -> bool:
+    """Whether a table does not fit on a phone, although headings and text are broken at spaces."""
+    columns = zip(table.head, zip(*table.rows, strict=True), strict=True)
+    width = 0
+    for name, cells in columns:
+        unbroken = " ".join(cells).split() if name in table.texts else cells
+        width += max(map(len, (*name.split(), *unbroken)), default=0) + _PAD
+    return width > _PHONE
 
 
 def show(sections: Iterable[Section], console: Console) -> None:

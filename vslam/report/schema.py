@@ -204,7 +204,7 @@ class ReportJson(Measures, Document):
     - ``lost_before_map``: number of lost frames before the first tracked one, in a run that began a
       new map. ``longest_loss_s``: the longest time from a lost frame to the next tracked one or to
       the end.
-    - ``warnings``: sentences about faults of the rig that the run has detected.
+    - ``warnings``: sentences about faults of the images or the rig that the run has detected.
     - ``evaluation_remark``: why no errors were computed, or how many frames they cover.
     - ``latency_ms``: time from an image to its pose in a real-time run, otherwise None.
     - ``loops_rejected``: number of rejected candidates. ``revisit_stretches``: the sum of

@@ -21,6 +21,7 @@ from vslam.features import TrackingState, TrackResult
 from vslam.geometry import inverses
 from vslam.loops import LoopCorrection
 from vslam.machine import available_cores, cpu_name, versions
+from vslam.method import METHOD_VERSION
 from vslam.report.schema import (
     DetectorFigures,
     GpsFigures,
@@ -94,7 +95,7 @@ def summarize(
         in_map=_figures_in_map(outcome),
         gps_track=gps_figures(outcome),
         machine=this_machine(),
-        versions=versions(),
+        versions=versions() | {"method": str(METHOD_VERSION)},
         created=datetime.now(UTC).replace(microsecond=0),
         **_measures(outcome, evaluation, verdict),
         dataset=source.dataset,

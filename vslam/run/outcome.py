@@ -36,7 +36,7 @@ class RunOutcome:
             map, these are the poses as they were tracked.
         keyframes: final poses of the keyframes.
         tracks: one result per frame.
-        warnings: faults of the rig that the run detected, as sentences.
+        warnings: faults of the images and the rig that the run detected, as sentences.
         skipped: a message for each frame whose images could not be read.
         latency_ms: time from the arrival of each tracked frame to its pose, in a real-time run.
         wall_s, cpu_s: seconds from reading the first frame until the last one is tracked and

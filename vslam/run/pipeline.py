@@ -325,7 +325,10 @@ def _outcome(
         keyframes=causal_trajectory(keyframes),
         tracks=run.tracks,
         skipped=run.skipped,
-        warnings=["the run has no complete map; its poses are those of tracking"],
+        warnings=[
+            *_source_warnings(sequence, run.settings),
+            "the run has no complete map; its poses are those of tracking",
+        ],
         wall_s=seconds[0],
         cpu_s=seconds[1],
         step_s=run.step_s,
@@ -352,7 +355,7 @@ def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
         trajectory=run.trajectory(),
         keyframes=slam.keyframe_trajectory(),
         warnings=[
-            *calibration_warnings(source.camera, settings.calib, source.name),
+            *_source_warnings(source, settings),
             *slam.problems,
             *rig_warnings(slam.rig.sides),
             *_map_warnings(slam, source.camera),
@@ -367,6 +370,12 @@ def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
         keyframe_frames=keyframe_frames,
         n_submaps=len({0, *slam.map.restarts}) if slam.map.n_keyframes else 0,
     )
+
+
+def _source_warnings(source: Source, settings: RunOptions) -> list[str]:
+    """Warnings about images that were left out and about the calibration."""
+    left_out = source.pairing.warnings() if source.pairing is not None else []
+    return [*left_out, *calibration_warnings(source.camera, settings.calib, source.name)]
 
 
 def _map_warnings(slam: Slam, camera: Camera) -> list[str]:

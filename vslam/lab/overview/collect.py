@@ -193,13 +193,15 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
 
 
 def _settings(report: ReportJson, folder: Path) -> dict[str, Any]:
-    """The thresholds and options of a run that differ from the defaults."""
+    """The thresholds and options of a run that differ from the defaults, and the version of the
+    method."""
     path = folder / "config.json"
     try:
         changed = changed_thresholds(json.loads(path.read_bytes())) if path.exists() else {}
     except (OSError, ValueError, AttributeError, RecursionError) as error:
         raise InputError(f"{path.name} is damaged") from error
     options = {name: getattr(report, name) for name in _OPTIONS}
+    options["method"] = report.versions.get("method")
     return changed | {name: str(value) for name, value in options.items() if value}
 
 
@@ -211,8 +213,8 @@ def _name_by_settings(found: Found) -> None:
         for name, value in first.items()
         if all(run.settings.get(name) == value for run in found.runs)
     }
-    if shared:
-        found.notes.append(f"all runs have {', '.join(f'{k}={v}' for k, v in shared.items())}")
+    if told := [f"{name}={value}" for name, value in shared.items() if name != "method"]:
+        found.notes.append(f"all runs have {', '.join(told)}")
     for k, run in enumerate(found.runs):
         own = ", ".join(f"{n}={v}" for n, v in run.settings.items() if n not in shared)
         if own:

@@ -49,7 +49,8 @@ class RunEntry(Record):
 
     - ``system``: the loop detector, followed in brackets by the settings that not all runs share,
       or the name of another system.
-    - ``settings``: thresholds and options that differ from the defaults.
+    - ``settings``: thresholds and options that differ from the defaults, and the
+      version of the method.
     - ``seed``: seed of the perturbation; None for other systems.
     - ``town``: seed of a rendered town. The same route in another town counts as the same drive
       with another seed.

@@ -304,8 +304,8 @@ def _tolerance(depth: bool) -> int:
 def _synchronised(
     messages: Iterator[tuple[str, Message]], topics: tuple[str, ...], pairing: Pairing
 ) -> Iterator[tuple[Message, ...]]:
-    """Yield groups of one message of each topic whose stamps are near in time, and count the messages
-    in ``pairing``.
+    """Yield groups of one message of each topic whose stamps are near in time, and count in
+    ``pairing`` the messages that have a partner.
 
     A message is paired only when no later message of the other topic can be nearer in time.
     """

@@ -30,6 +30,7 @@ def row_of(run: RunEntry) -> dict[str, object]:
     measures = {
         name: "" if run.measures[name] is None else f"{run.measures[name]:.{decimals}f}"
         for name, decimals in DECIMALS.items()
+        if name != "fps"  # depends on what else runs; docs/research/performance.csv has the speed
     }
     named = {"system": run.system, "seed": run.seed, "town": run.town, "alignment": run.alignment}
     return run.drive.model_dump() | named | {"frames": run.frames} | measures

@@ -42,6 +42,11 @@ class PatchTrack(NamedTuple):
     n_matches: int
     visible: NDArray[np.int32]
 
+    @property
+    def share(self) -> float:
+        """Share of inliers among the landmarks that were found."""
+        return len(self.ids) / max(1, self.n_matches)
+
 
 def track_patches(
     pyramid: Pyramid,

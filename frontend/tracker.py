@@ -138,7 +138,7 @@ class Tracker:
             return Found(TrackingState.LOST)
         if last is None or last.twist is None or self.status is not TrackerStatus.TRACKING:
             return Found(TrackingState.LOST)
-        camera = self._context.camera
+        camera, T_predicted = self._context.camera, T_cw
         if frame.coarse is not None and last.coarse is not None:
             size = camera.height, camera.width
             xyz = last.xyz[last.landmark >= 0]
@@ -150,6 +150,10 @@ class Tracker:
                 frame.coarse, last.coarse, xyz, last.T_cw, T_cw, camera.intrinsics, size
             )
         track = track_patches(frame.pyramid, T_cw, view, self._context, frame.mask)
+        if track.share < config.patch_retry_ratio:
+            # The alignment of the image may have followed moving objects.
+            again = track_patches(frame.pyramid, T_predicted, view, self._context, frame.mask)
+            track = max(track, again, key=lambda one: len(one.ids))
         n_inliers = len(track.ids)
         if n_inliers < max(
             config.patch_min_inliers, config.patch_min_inlier_ratio * track.n_matches

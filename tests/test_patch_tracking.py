@@ -15,6 +15,7 @@ from vslam.errors import UnreadableImageError
 from vslam.features import TrackingState
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.orb import build_pyramid, level_shapes
+from vslam.frontend.patch_tracking import track_patches
 from vslam.frontend.pose_alignment import align_pose, coarse_levels, coarse_pyramid, coarse_shapes
 from vslam.frontend.tracking import TrackingContext, feature_depth
 from vslam.geometry import inverse, se3_exp, se3_log, transform
@@ -109,6 +110,30 @@ def test_few_frames_need_features_and_the_pose_is_as_good(corridor):
         for one in (slam, by_features)
     )
     assert error < max(0.03, 1.5 * usual)
+
+
+def test_image_alignment_that_follows_a_moving_object_is_not_believed(corridor, monkeypatch):
+    """The patches are searched for again from the predicted pose."""
+
+    misled_poses = []
+
+    def mislead(now, before, xyz, T_before, T_cw, *_):
+        misled_poses.append(se3_exp(np.array([0.3, 0.0, 0.3, 0.0, 0.0, 0.0])) @ T_cw)
+        return misled_poses[-1]
+
+    def track(pyramid, T_cw, *rest):
+        found = track_patches(pyramid, T_cw, *rest)
+        follows = any(T_cw is T for T in misled_poses)  # a third of the patches do not
+        return found._replace(n_matches=len(found.ids) * 3 // 2) if follows else found
+
+    slam, results = driven(corridor)
+    monkeypatch.setattr("vslam.frontend.tracker.align_pose", mislead)
+    monkeypatch.setattr("vslam.frontend.tracker.track_patches", track)
+    misled, others = driven(corridor)
+    T_wc, expected = misled.trajectory().T_wc, slam.trajectory().T_wc
+    np.testing.assert_allclose(T_wc[:, :3, 3], expected[:, :3, 3], atol=0.05)
+    by_patches = [sum(r.n_features == 0 for r in one) for one in (results, others)]
+    assert by_patches[1] > 0.5 * by_patches[0]
 
 
 def run(kitti_tree, threads=1, sequence=None):

@@ -44,6 +44,7 @@ def copy_run(source: Path, folder: Path, **changes: object) -> Path:
     folder.mkdir(parents=True)
     for name in ("trajectory.tum", "trajectory_kitti.txt", "ground_truth_kitti.txt", "config.json"):
         shutil.copy(source / name, folder)
+    (folder / "run.json").write_text("{}")
     report = json.loads((source / "report.json").read_text())
     (folder / "report.json").write_text(json.dumps(report | changes))
     return folder
@@ -443,6 +444,13 @@ def thresholds(run_folder: Path, tmp_path: Path) -> Path:
         )
         thresholds_of(folder, n_features=n, n_levels=7, retired=3)
     return tmp_path / "runs"
+
+
+def test_thresholds_do_not_concern_other_systems(thresholds: Path):
+    """Their runs have no ``run.json``."""
+    for folder in thresholds.iterdir():
+        (folder / "run.json").unlink()
+    assert {run.system for run in collect([thresholds], []).runs} == {"bow"}
 
 
 def test_runs_of_different_thresholds_are_different_systems(thresholds: Path, tmp_path: Path):

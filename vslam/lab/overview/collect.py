@@ -194,7 +194,9 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
 
 def _settings(report: ReportJson, folder: Path) -> dict[str, Any]:
     """The thresholds and options of a run that differ from the defaults, and the version of the
-    method."""
+    method. Only runs of vslam have settings and a ``run.json``; other systems have neither."""
+    if not (folder / "run.json").exists():
+        return {}
     path = folder / "config.json"
     try:
         changed = changed_thresholds(json.loads(path.read_bytes())) if path.exists() else {}

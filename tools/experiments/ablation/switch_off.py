@@ -64,11 +64,13 @@ VARIANTS = (
     Variant("global bundle adjustment", "loops.global_iterations=1"),
 )
 
-Drive = tuple[str, str, str, int | None]  # data set, perturbation, sequence, seed of the town
+Drive = tuple[str, str, str, int | None]  # data set, drive, perturbation, seed of the town
 Measures = dict[str, float | None]
 
 
-def run(variant: Variant, source: str, arguments: list[str], out: Path) -> dict[Drive, Measures]:
+def run(
+    variant: Variant, source: str, perturb: str, arguments: list[str], out: Path
+) -> dict[Drive, Measures]:
     """Measure the variant on the drives of a source; finished runs in the folder are kept."""
     command = ["vslam", "bench", *shlex.split(source), *arguments]
     if variant.thresholds:
@@ -77,8 +79,16 @@ def run(variant: Variant, source: str, arguments: list[str], out: Path) -> dict[
     if subprocess.run(command).returncode:
         raise SystemExit(f"{shlex.join(command)} failed")
     report = OverviewJson.model_validate_json((out / "report.json").read_bytes())
+
+    def applied(perturbs: str) -> str:
+        """The perturbation of the images, without changes of the town, such as moving cars."""
+        for one in perturb.split(","):
+            if one != "none" and perturbs.endswith(one.replace("+", ",")):
+                return one
+        return "none"
+
     return {
-        (one.drive.dataset, one.drive.perturb, one.drive.sequence, one.town): one.measures
+        (one.drive.dataset, str(one.drive), applied(one.drive.perturb), one.town): one.measures
         for one in report.runs
     }
 
@@ -91,9 +101,9 @@ def row_of(
 ) -> dict[str, object]:
     """A row of the table: errors without the piece divided by those with it, and loops.
 
-    ``condition``: data set and perturbation of the drives that the row is about.
+    ``condition``: data set and ``--perturb`` of the drives that the row is about.
     """
-    drives = [drive for drive in runs if drive[:2] == condition]
+    drives = [drive for drive in runs if condition == (drive[0], drive[2])]
 
     def ratios(name: str) -> list[float]:
         pairs = [(runs[drive][name], reference[drive][name]) for drive in drives]
@@ -137,10 +147,10 @@ def main() -> None:
         runs[variant.piece] = {}
         for k, source in enumerate(options.source):
             folder = options.out / variant.piece.replace(" ", "-") / str(k)
-            runs[variant.piece] |= run(variant, source, arguments, folder)
+            runs[variant.piece] |= run(variant, source, options.perturb, arguments, folder)
         rows += [
             row_of(variant, condition, runs[variant.piece], runs[variant.reference])
-            for condition in dict.fromkeys(drive[:2] for drive in runs[variant.piece])
+            for condition in dict.fromkeys((one[0], one[2]) for one in runs[variant.piece])
         ]
     with (options.out / "ablation.csv").open("w", newline="") as file:
         table = csv.DictWriter(file, rows[0], lineterminator="\n")

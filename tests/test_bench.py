@@ -144,6 +144,7 @@ def test_cells_become_folders(stub: Path, tmp_path: Path):
         "ground_truth_kitti.txt",
         "log.txt",
         "report.json",
+        "run.json",
         "trajectory.tum",
     }
     report = grid.read_report(folder)

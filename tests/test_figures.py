@@ -147,8 +147,9 @@ def test_a_table_of_another_version_is_listed_and_marked_on_its_page(figures, ma
     assert [line.partition(":")[0] for line in on_readme] == [*stamps][:1] + [*stamps][2:3]
     marked = figures.mark_older(made / "README.md", PAGE, made)
     before_the_table, _, _ = marked.partition("| drive |")
-    assert "`docs/research/drives.csv`: version 0, commit" in before_the_table
-    assert "- `docs/research/plot.csv`: version 0, commit" in marked
+    version = f"version {figures.METHOD_VERSION - 1}"
+    assert f"`docs/research/drives.csv`: {version}, commit" in before_the_table
+    assert f"- `docs/research/plot.csv`: {version}, commit" in marked
     assert "finished.csv" not in marked
 
     assert figures.make(made, quick=False) == 0  # both are made again

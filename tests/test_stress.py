@@ -246,7 +246,7 @@ def test_the_report_says_it_in_every_form(tmp_path):
         assert "night" in text
         assert "50 % lost" in text
         assert Criterion().words in text
-        assert "above 10 m" in text
+        assert "an ATE of at most 10 m" in text
     assert html.count("<svg") == 2
     assert 'src="http' not in html
     assert [figure.name for figure in draw_curves(report)] == ["00-blur", "00-night"]

@@ -32,7 +32,7 @@ from vslam.run.autosave import (
     MAP,
     ONLINE,
     PROGRESS,
-    Autosave,
+    FolderAutosave,
     Unfinished,
     find_unfinished,
     lock_run,
@@ -76,7 +76,7 @@ def drive(
     """Run over the corridor; with a folder, saving whenever that is possible."""
     sequence = change(open_sequence("kitti", root, "00"))
     settings = RunOptions(detector="bow", threads=2, thresholds=config, compare=compare)
-    autosave = {} if folder is None else {"autosave": Autosave(folder, 1e-6, "kitti 00")}
+    autosave = {} if folder is None else {"autosave": FolderAutosave(folder, 1e-6, "kitti 00")}
     return run_sequence(
         sequence,
         parse_perturbation(law, 0),

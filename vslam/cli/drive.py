@@ -62,7 +62,7 @@ def drive(
     from vslam.cli.tables import print_summary
     from vslam.doctor.nothing_tracked import why_nothing_was_tracked
     from vslam.report.folder import write_results
-    from vslam.run.autosave import MAP, Autosave, remove_autosave
+    from vslam.run.autosave import MAP, FolderAutosave, remove_autosave
     from vslam.run.moments import LoopPictureRecorder, MomentRecorder
     from vslam.run.pipeline import begin, run_sequence
 
@@ -80,7 +80,7 @@ def drive(
         recorder = _recorder(folder, output, unfinished, viewer, moments, pictures)
         # Localising does not change the map, so there is nothing to save during the run.
         period = 0.0 if options.localize else options.autosave
-        autosave = Autosave(folder, period, f"{source.dataset} {source.name}")
+        autosave = FolderAutosave(folder, period, f"{source.dataset} {source.name}")
         with console.progress_bar(source.n_expected) as on_frame:
             outcome = run_sequence(
                 source, perturbation, settings, recorder,

@@ -86,6 +86,22 @@ def _keep_poses(path: Path, frames: int) -> None:
 
 
 class Autosave:
+    """Interface to save a run. This base class saves nothing."""
+
+    def frame(self, result: TrackResult) -> None:
+        """Append the pose of a tracked frame; called for every frame in order."""
+
+    def offer(self, slam: Slam, progress: Callable[[], Progress]) -> None:
+        """Save if saving is due; called after ``frame``."""
+
+    def close(self, slam: Slam, progress: Callable[[], Progress], *, resumable: bool) -> None:
+        """End saving; ``resumable`` says that the run ended early with a complete map."""
+
+
+NO_AUTOSAVE = Autosave()
+
+
+class FolderAutosave(Autosave):
     """Saves into the folder of a run.
 
     If writing fails, for example on a full disk, one warning is logged, the run continues, and
@@ -111,7 +127,6 @@ class Autosave:
             self._warn(ONLINE, error)
 
     def frame(self, result: TrackResult) -> None:
-        """Append the pose of a tracked frame; called for every frame in order."""
         if self._online is None:
             return
         try:
@@ -122,7 +137,6 @@ class Autosave:
             self._online = None
 
     def offer(self, slam: Slam, progress: Callable[[], Progress]) -> None:
-        """Save if saving is due; called after ``frame``."""
         waited = time.monotonic() - self._last
         if not self._seconds or waited < _DUE * self._seconds:
             return
@@ -135,7 +149,6 @@ class Autosave:
             self._save(slam, progress)
 
     def close(self, slam: Slam, progress: Callable[[], Progress], *, resumable: bool) -> None:
-        """End saving; ``resumable`` says that the run ended early with a complete map."""
         if self._seconds and resumable:
             self._save(slam, progress)
         self._writer.shutdown()

@@ -28,7 +28,7 @@ from vslam.machine import give_back_memory, peak_memory_mb, process_age
 from vslam.map import Map
 from vslam.maps.storage import made_with
 from vslam.plugins import reason
-from vslam.run.autosave import Autosave, Unfinished
+from vslam.run.autosave import NO_AUTOSAVE, Autosave, Unfinished
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome, causal_trajectory, ground_truth_of
 from vslam.run.preparation import Played, PreparedFrame, at_their_times
@@ -54,7 +54,7 @@ def run_sequence(
     recorder: Recorder,
     *,
     on_frame: Callable[[TrackResult], None] = lambda result: None,
-    autosave: Autosave | None = None,
+    autosave: Autosave = NO_AUTOSAVE,
     resume: Unfinished | None = None,
     slam: Slam | None = None,
 ) -> RunOutcome:
@@ -74,7 +74,7 @@ def run_sequence(
     continue. A resumed run continues without these detectors, because their maps were not saved.
 
     Args:
-        autosave: saves the state of the run at intervals; None saves nothing.
+        autosave: saves the state of the run at intervals.
         resume: the saved state of an unfinished run. This run continues at the next frame, and its
             outcome covers both parts.
         slam: the result of ``begin`` for the same settings; None calls ``begin`` here.
@@ -106,13 +106,11 @@ def run_sequence(
                 result = main.step(played)
                 if (frame := played.prepared) is not None and frame.problem and not frame.dropped:
                     _log.warning("frame %d skipped: %s", result.index, frame.problem)
-                if autosave is not None:
-                    autosave.frame(result)
+                autosave.frame(result)
                 if result.state != TrackingState.DROPPED:
                     n_recorded = _record_frame(recorder, slam, result, played, n_recorded)
                 on_frame(result)
-                if autosave is not None:
-                    autosave.offer(slam, main.so_far)
+                autosave.offer(slam, main.so_far)
                 for other in others:
                     if other.problem is None:
                         with other.recording_failure(f"frame {result.index}"):
@@ -133,8 +131,7 @@ def run_sequence(
         if not end_reasons and main.problem:
             end_reasons.append(main.problem)
         with main.recording_failure("saving the map"):
-            if autosave is not None:
-                autosave.close(slam, main.so_far, resumable=bool(end_reasons) and main.has_map)
+            autosave.close(slam, main.so_far, resumable=bool(end_reasons) and main.has_map)
     seconds = main.seconds()
     give_back_memory()  # the results are written from a copy of the map, which needs memory
     with main.recording_failure("the final trajectory"):

@@ -138,7 +138,7 @@ class Tracker:
             return Found(TrackingState.LOST)
         if last is None or last.twist is None or self.status is not TrackerStatus.TRACKING:
             return Found(TrackingState.LOST)
-        camera, T_predicted = self._context.camera, T_cw
+        camera, T_aligned = self._context.camera, T_cw
         if frame.coarse is not None and last.coarse is not None:
             size = camera.height, camera.width
             xyz = last.xyz[last.landmark >= 0]
@@ -146,13 +146,13 @@ class Tracker:
                 uv = camera.project(transform(T_cw, xyz))[:, :2]
                 coarsest = np.full(len(xyz), self._config.orb.n_levels - 1)
                 xyz = xyz[frame.mask.shows(uv, coarsest)]
-            T_cw = align_pose(
+            T_aligned = align_pose(
                 frame.coarse, last.coarse, xyz, last.T_cw, T_cw, camera.intrinsics, size
             )
-        track = track_patches(frame.pyramid, T_cw, view, self._context, frame.mask)
-        if track.share < config.patch_retry_ratio:
+        track = track_patches(frame.pyramid, T_aligned, view, self._context, frame.mask)
+        if track.share < config.patch_retry_ratio and T_aligned is not T_cw:
             # The alignment of the image may have followed moving objects.
-            again = track_patches(frame.pyramid, T_predicted, view, self._context, frame.mask)
+            again = track_patches(frame.pyramid, T_cw, view, self._context, frame.mask)
             track = max(track, again, key=lambda one: len(one.ids))
         n_inliers = len(track.ids)
         if n_inliers < max(

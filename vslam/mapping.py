@@ -223,8 +223,8 @@ class Mapper:
         """
         map_ = self._wait_for_mapping()
         self._start_search()
-        if self._search is not None and not self.has_found_loop:
-            self._closing.close(map_, self._search())
+        if self._search is not None and (search := self._search()).loop is None:
+            self._closing.close(map_, search)
             self._search = None
         return map_
 

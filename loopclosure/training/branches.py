@@ -119,7 +119,7 @@ class CapsuleShape(BaseModel):
 
     @property
     def view(self) -> Size:
-        """Height and width of a view, that is, of one of the ``views`` parts of an image."""
+        """Height and width of a view. An image is cut into ``views`` of them."""
         return self.pixels, self.view_width or self.input[1]
 
     @property

@@ -15,22 +15,23 @@ from vslam.errors import UnreadableImageError
 from vslam.features import Extracted, Features, Keypoints, Pyramid, Side
 from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.masks import Mask
-from vslam.frontend.orb import Extraction, build_pyramid, with_keypoints
+from vslam.frontend.orb import Extraction, build_pyramid, extract_at
 from vslam.frontend.pose_alignment import coarse_levels
 from vslam.frontend.side_delay import row_offsets
 from vslam.frontend.sides import Sides, balanced, compare_sides
-from vslam.frontend.stereo import match_stereo
+from vslam.frontend.stereo import StereoMatches, inliers_only, match_stereo
 from vslam.frontend.tracking import TrackingContext
 from vslam.frontend.weak_images import extract_in_any_light
 
 
 class Corners(NamedTuple):
-    """The features of a frame before stereo matching.
+    """The features of a frame that do not depend on tracking.
 
     Attributes:
         found: the features of the image of ``side``.
-        right: the features of the right image, for stereo matching; None if there is no right
-            image, or if the left one is black.
+        right: the features of the right image; None if there is no right image, or if the left one
+            is black.
+        matches: the stereo matches of ``found``; None if ``right`` is None.
         depth: ``(H, W)`` float32 depth image of an RGB-D camera, metres; None for other cameras.
         side: see ``Extracted``.
         sides: the comparison of the left and the right image; None without a right image.
@@ -38,6 +39,7 @@ class Corners(NamedTuple):
 
     found: Extraction
     right: Extraction | None = None
+    matches: StereoMatches | None = None
     depth: DepthImage | None = None
     side: Side = Side.LEFT
     sides: Sides | None = None
@@ -136,8 +138,8 @@ def find_corners(
     mask: Mask | None = None,
     pyramid: Pyramid | None = None,
 ) -> Corners:
-    """The first step of extraction: the features of each image. If the left image is black, only
-    the right image is used, and its features have no stereo match.
+    """The first step of extraction: the features of each image and their stereo matches. If the
+    left image is black, only the right image is used, and its features have no stereo match.
 
     Args:
         left: ``(H, W)`` uint8.
@@ -163,19 +165,20 @@ def find_corners(
     pair = balanced(left, right_image, sides)
     built = pyramid if pair[0] is left else None  # it may have been brightened
     found, right = extract_in_any_light(pair, config, image_map, allowed, built)
-    return Corners(found, right, sides=sides)
+    return Corners(found, right, match_stereo(found, right, camera, config.stereo), sides=sides)
 
 
 def matched(
     corners: Corners, context: TrackingContext, keypoints: Keypoints | None = None
 ) -> Extracted:
-    """The second step of extraction: stereo matching.
+    """The second step of extraction: additional features, and the columns of all features in the
+    right image.
 
     Args:
-        keypoints: positions in the left image for additional features (``with_keypoints``).
+        keypoints: positions in the left image for additional features (``extract_at``).
     """
     camera, config = context.camera, context.config
-    found, right, depth, side, _ = corners
+    found, right, matches, depth, side, _ = corners
     if depth is not None:
         scale = context.scales[found.octave]
         u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
@@ -183,11 +186,14 @@ def matched(
         # moves points by more than alignment corrects.
         return Extracted(_features(found, u_right))
     if keypoints is not None and side == Side.LEFT:
-        found = with_keypoints(found, *keypoints)
-    if right is None:
+        more = extract_at(found, *keypoints)
+        found, order = found.joined(more)
+        if right is not None and matches is not None:
+            matches = matches.joined(match_stereo(more, right, camera, config.stereo), order)
+    if right is None or matches is None:
         u_right = np.full(len(found.xy), np.nan, np.float32)
         return Extracted(_features(found, u_right), found.pyramid, side=side)
-    u_right = match_stereo(found, right, camera, config.stereo)
+    u_right = inliers_only(matches, found.octave)
     rows = row_offsets(found, right, u_right, config.stereo)
     return Extracted(_features(found, u_right), found.pyramid, rows)
 

@@ -44,6 +44,19 @@ class Extraction:
     descriptors: NDArray[np.uint8]
     pyramid: Pyramid
 
+    def joined(self, other: Extraction) -> tuple[Extraction, NDArray[np.int64]]:
+        """These features and those of another extraction from the same image, and the ``(N,)``
+        index of each feature among these features followed by the others."""
+        order = np.argsort(np.concatenate([self.octave, other.octave]), kind="stable")
+        both = Extraction(
+            np.concatenate([self.xy, other.xy])[order],
+            np.concatenate([self.octave, other.octave])[order],
+            np.concatenate([self.angle, other.angle])[order],
+            np.concatenate([self.descriptors, other.descriptors])[order],
+            self.pyramid,
+        )
+        return both, order
+
 
 def extract(
     image: NDArray[np.uint8],
@@ -75,18 +88,17 @@ def extract(
     return Extraction(xy, octave, angle, descriptors, pyramid)
 
 
-def with_keypoints(
-    found: Extraction, xy: NDArray[np.float32], octave: NDArray[np.uint8]
-) -> Extraction:
-    """Add a feature at each of N positions that has no other feature within ``KEYPOINT_REACH``.
+def extract_at(found: Extraction, xy: NDArray[np.float32], octave: NDArray[np.uint8]) -> Extraction:
+    """Extract a feature at each of N positions that has no other feature within
+    ``KEYPOINT_REACH``.
 
     Args:
-        found: the features of the image.
+        found: the other features of the image.
         xy: ``(N, 2)`` full-resolution pixels; rounded to whole pixels of the levels.
         octave: ``(N,)`` pyramid levels.
     """
     shapes = found.pyramid.shapes
-    parts = [(found.xy, found.octave, found.angle, found.descriptors)]
+    parts = [(found.xy[:0], found.octave[:0], found.angle[:0], found.descriptors[:0])]
     for level in np.unique(octave).tolist():
         ratio = shapes[0, ::-1] / shapes[level, ::-1]
         pixel = np.rint((xy[octave == level] + 0.5) / ratio - 0.5)
@@ -102,9 +114,7 @@ def with_keypoints(
         position = ((corners + 0.5) * ratio - 0.5).astype(np.float32)
         descriptors = describe(smoothed(image), corners, angles, PATTERN)
         parts.append((position, np.full(len(corners), level, np.uint8), angles, descriptors))
-    joined = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
-    order = np.argsort(joined[1], kind="stable")
-    xy, octave, angle, descriptors = (array[order] for array in joined)
+    xy, octave, angle, descriptors = map(np.concatenate, zip(*parts, strict=True))
     return Extraction(xy, octave, angle, descriptors, found.pyramid)
 
 

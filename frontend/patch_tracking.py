@@ -18,7 +18,7 @@ from vslam.frontend.masks import Mask
 from vslam.frontend.pose import optimise_pose
 from vslam.frontend.tracking import TrackingContext, predict_landmarks
 from vslam.geometry import Matrix, orthonormalised
-from vslam.map_view import LocalMap, MapView
+from vslam.map_view import MapView
 
 _MARGIN = PATCH_RADIUS + 2  # least distance of a patch centre from the border of its level, pixels
 
@@ -62,10 +62,8 @@ def track_patches(
         T_cw: ``(4, 4)`` initial pose. Landmarks projected with it may be off by about two pixels.
         mask: the mask of the image; None if all pixels are used.
     """
-    known, camera, scales = view.patches, context.camera, context.scales
-    config = context.config.alignment
-    at = np.searchsorted(view.local_landmarks.ids, known.ids)
-    local = LocalMap._make(values[at] for values in view.local_landmarks)
+    known, local = view.patches, view.with_patches
+    camera, scales, config = context.camera, context.scales, context.config.alignment
     uvr, radius, octave = predict_landmarks(T_cw, local, 1.0, mask, context)
     margin = _MARGIN * scales[octave]
     size = np.array([camera.width, camera.height])

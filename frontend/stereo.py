@@ -20,10 +20,28 @@ REFINE_HALF = 4
 MEDIAN_FACTOR = 1.5 * 1.4826  # 1.5 standard deviations, as estimated from the median
 
 
+class StereoMatches(NamedTuple):
+    """Stereo matches of N left features, outliers included.
+
+    Attributes:
+        u_right: ``(N,)`` float32 column in the right image, NaN without a match.
+        sad: ``(N,)`` float32 sum of absolute differences (SAD), -1 without a match.
+    """
+
+    u_right: NDArray[np.float32]
+    sad: NDArray[np.float32]
+
+    def joined(self, other: StereoMatches, order: NDArray[np.int64]) -> StereoMatches:
+        """The matches of these features followed by those of others, reordered by the index
+        ``order``."""
+        pairs = zip(self, other, strict=True)
+        return StereoMatches._make(np.concatenate(pair)[order] for pair in pairs)
+
+
 def match_stereo(
     left: Extraction, right: Extraction, camera: Camera, config: StereoConfig
-) -> NDArray[np.float32]:
-    """``(N,)`` float32, column of each left feature in the right image, NaN without a match.
+) -> StereoMatches:
+    """Match each left feature with a right feature, independently of the other left features.
 
     Candidates lie in the same row (within 2 px at the scale of the right feature), at most one
     octave apart, and at a disparity between 0 and that of a point one baseline away. The candidate
@@ -41,8 +59,7 @@ def match_stereo(
         config.sad_window,
         config.sad_search,
     )
-    drop_outliers(u_right, sad, left.octave)
-    return u_right
+    return StereoMatches(u_right, sad)
 
 
 class _Side(NamedTuple):
@@ -136,15 +153,19 @@ def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, ha
     return u_right, sad
 
 
-@kernel
-def drop_outliers(u_right, sad, octave):
-    """Remove matches whose SAD exceeds ``MEDIAN_FACTOR`` times the median of their octave.
+def inliers_only(matches: StereoMatches, octave: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """The ``u_right`` of the matches, NaN for those whose SAD exceeds ``MEDIAN_FACTOR`` times the
+    median of their octave.
 
     Args:
-        u_right: ``(N,)`` float32; NaN is written for removed matches.
-        sad: ``(N,)`` float32, SAD of each match, -1 for features without a match.
-        octave: ``(N,)`` uint8, sorted.
+        octave: ``(N,)`` uint8 octave of each feature, sorted.
     """
+    return _inliers_only(*matches, octave)
+
+
+@kernel
+def _inliers_only(matched, sad, octave):
+    u_right = matched.copy()
     first = 0
     while first < len(octave):
         last = first
@@ -160,6 +181,7 @@ def drop_outliers(u_right, sad, octave):
                 if sad[i] > limit:
                     u_right[i] = np.nan
         first = last
+    return u_right
 
 
 @kernel

@@ -19,10 +19,10 @@ from vslam.frontend.orb import (
     describe,
     detect_corners,
     extract,
+    extract_at,
     features_per_level,
     orientations,
     smoothed,
-    with_keypoints,
 )
 
 
@@ -355,12 +355,12 @@ def test_features_are_added_where_there_are_none():
     there = found.xy[:5] + np.float32(0.4)
     border = np.array([[2.0, 80.0]], np.float32)
     octave = np.concatenate([[0], found.octave[:5], [0]]).astype(np.uint8)
-    more = with_keypoints(found, np.concatenate([free + 0.3, there, border]), octave)
-    assert len(more.xy) == len(found.xy) + 1
-    assert (np.diff(more.octave.astype(int)) >= 0).all()
-    (k,) = np.flatnonzero((more.xy == free).all(axis=1))
-    assert more.octave[k] == 0
-    assert more.descriptors[k].any()
-    again = with_keypoints(found, found.xy, found.octave)
-    np.testing.assert_array_equal(again.xy, found.xy)
-    np.testing.assert_array_equal(again.descriptors, found.descriptors)
+    more = extract_at(found, np.concatenate([free + 0.3, there, border]), octave)
+    np.testing.assert_array_equal(more.xy, free)
+    assert more.octave.tolist() == [0]
+    assert more.descriptors.any()
+    both, order = found.joined(more)
+    assert (np.diff(both.octave.astype(int)) >= 0).all()
+    np.testing.assert_array_equal(both.xy, np.concatenate([found.xy, more.xy])[order])
+    again = extract_at(found, found.xy, found.octave)
+    assert len(again.xy) == 0

@@ -10,7 +10,7 @@ from vslam.camera import Camera
 from vslam.config import Config, OrbConfig, TrackingConfig, WeakImageConfig
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.orb import extract
-from vslam.frontend.stereo import match_stereo
+from vslam.frontend.stereo import inliers_only, match_stereo
 from vslam.frontend.tracking import TrackingContext
 from vslam.frontend.weak_images import (
     LEAST_SPIKE,
@@ -54,7 +54,7 @@ def spiked(image: np.ndarray, share: float, seed: int) -> np.ndarray:
 def right_matches(left: np.ndarray, right: np.ndarray, config: Config) -> int:
     """Stereo matches within a pixel of the truth."""
     ours, theirs = extract_in_any_light([left, right], config)
-    u_right = match_stereo(ours, theirs, CAMERA, config.stereo)
+    u_right = inliers_only(match_stereo(ours, theirs, CAMERA, config.stereo), ours.octave)
     return int(np.count_nonzero(np.abs(ours.xy[:, 0] - u_right - DISPARITY) < 1.0))
 
 

@@ -36,7 +36,7 @@ STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
     ("corners, orientations, smoothing, descriptors", (("vslam.frontend.orb", "extract_levels"),)),
     ("weak images", (("vslam.frontend.extraction", "extract_in_any_light"),)),
     ("extraction, the rest", (("vslam.frontend.weak_images", "extract"),)),
-    ("features at patches", (("vslam.frontend.extraction", "with_keypoints"),)),
+    ("features at patches", (("vslam.frontend.extraction", "extract_at"),)),
     ("stereo", (("vslam.frontend.extraction", "match_stereo"),)),
     ("sparse image alignment", (("vslam.frontend.tracker", "align_pose"),)),
     ("track by patches", (("vslam.frontend.tracker", "Tracker.track_patches"),)),

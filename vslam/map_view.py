@@ -71,6 +71,7 @@ class MapView:
         n_reference: number of these that at least three keyframes observe (in a map with fewer
             keyframes, all of them).
         patches: image patches of the local landmarks that the newest keyframes observe.
+        with_patches: these landmarks, in the order of ``patches``.
     """
 
     reference: int = 0
@@ -81,6 +82,7 @@ class MapView:
     reference_landmarks: LocalMap = NO_LANDMARKS
     n_reference: int = 0
     patches: LandmarkPatches = NO_PATCHES
+    with_patches: LocalMap = NO_LANDMARKS
 
 
 def view_of(
@@ -97,6 +99,7 @@ def view_of(
     if monocular and map_.restarts:
         # A new sub-map counts as a young map: the monocular keyframe decision depends on it.
         living = living[living >= map_.restarts[-1]]
+    at = np.searchsorted(local.ids, patches.ids)
     return MapView(
         reference=keyframe,
         T_reference=map_.keyframe_pose(keyframe),
@@ -106,4 +109,5 @@ def view_of(
         reference_landmarks=local_map(map_, keyframe, 1),
         n_reference=count_seen_by(map_.arrays, keyframe, min(3, len(living))),
         patches=patches,
+        with_patches=LocalMap._make(values[at] for values in local),
     )

@@ -166,6 +166,7 @@ RULES = {
             ("vslam loops bench", REAL),
             ("vslam bench", HOURS),
             ("python tools/experiments/local_descriptors", "test_loopbench.py runs it"),
+            ("python tools/bench_speed.py", "test_bench_speed.py runs it"),
         )
     ),
     "docs/research/gps.md": Rules(

@@ -16,7 +16,7 @@ from vslam.config import Config, as_config
 from vslam.errors import InputError
 from vslam.features import Extracted, TrackingState, TrackResult
 from vslam.frontend.extraction import FrameImages
-from vslam.frontend.frame import Frame
+from vslam.frontend.frame import Frame, PlacedFrame
 from vslam.frontend.masks import Mask
 from vslam.frontend.relocaliser import Relocaliser
 from vslam.frontend.rig import RigCalibration
@@ -40,6 +40,10 @@ from vslam.odometry import Odometry
 from vslam.session import Session, open_map
 from vslam.shared_map import mapping_executor
 from vslam.trajectory import Trajectory
+
+
+def _ignore(result: TrackResult) -> None:
+    """Do nothing with a result."""
 
 
 class Slam:
@@ -189,7 +193,7 @@ class Slam:
         timestamp: float,
         *,
         mask: NDArray[np.uint8] | NDArray[np.bool_] | None = None,
-        on_pose: Callable[[TrackResult], None] | None = None,
+        on_pose: Callable[[TrackResult], None] = _ignore,
     ) -> TrackResult:
         """Track one rectified stereo pair, RGB-D image or monocular image, and insert it as a
         keyframe if it shows something new.
@@ -227,7 +231,7 @@ class Slam:
         images: FrameImages,
         timestamp: float,
         stage_ms: dict[str, float] | None = None,
-        on_pose: Callable[[TrackResult], None] | None = None,
+        on_pose: Callable[[TrackResult], None] = _ignore,
     ) -> TrackResult:
         """As ``step``, for images that were prepared before, for example in another thread.
 
@@ -266,25 +270,40 @@ class Slam:
         self,
         frame: Frame,
         clock: StageClock,
-        on_pose: Callable[[TrackResult], None] | None = None,
+        on_pose: Callable[[TrackResult], None] = _ignore,
     ) -> TrackResult:
         mapper, tracker = self._mapper, self._tracker
         mapper.admit(frame, tracker.last, tracker.twist)
         clock.lap("wait_for_mapping")
-        if not mapper.n_keyframes:
-            self.rig.extract(frame, tracker.twist)
-            clock.lap("extract")
-            self._follow(frame, frame.T_cw, None)
-            begun = self._mode.begin(mapper.append_pose(frame, tracked=False))
-            found = Found.at_start(frame, begun=begun)
-            if begun:
-                self._odometry.keyframe()
-            clock.lap("keyframe")
-            result = result_of(frame, found, begun, clock.ms, self._odometry)
-            if on_pose is not None:
-                on_pose(result)
-            return result
+        if mapper.n_keyframes:
+            tracked, T_predicted = self._track(frame, clock)
+            found = self._relocaliser.relocalise_if_needed(frame, tracked, mapper)
+            if found is not tracked:
+                clock.lap("relocalise")
+            placed = self._record_pose(frame, found, T_predicted)
+            on_pose(result_of(frame, found, False, dict(clock.ms), self._odometry))
+            is_keyframe = self._update_map(placed, found)
+        else:
+            found = self._begin_map(frame, clock)
+            is_keyframe = not found.is_lost
+            on_pose(result_of(frame, found, is_keyframe, dict(clock.ms), self._odometry))
+        if is_keyframe:
+            self._odometry.keyframe()
+        clock.lap("keyframe")
+        return result_of(frame, found, is_keyframe, clock.ms, self._odometry)
 
+    def _begin_map(self, frame: Frame, clock: StageClock) -> Found:
+        """Try to begin the map with a frame."""
+        self.rig.extract(frame, self._tracker.twist)
+        clock.lap("extract")
+        self._follow(frame, frame.T_cw, None)
+        begun = self._mode.begin(self._mapper.append_pose(frame, tracked=False))
+        return Found.at_start(frame, begun=begun)
+
+    def _track(self, frame: Frame, clock: StageClock) -> tuple[Found, Matrix]:
+        """Track a frame by patches or, if that fails, by features. Returns also the ``(4, 4)`` pose
+        ``T_cw`` that constant velocity predicted."""
+        mapper, tracker = self._mapper, self._tracker
         T_predicted = tracker.predict(frame.timestamp, mapper.frames, mapper.view)
         tracked = tracker.track_patches(frame, T_predicted, mapper.view)
         if tracked.is_lost:
@@ -296,34 +315,35 @@ class Slam:
             T_predicted = tracker.predict(frame.timestamp, mapper.frames, mapper.view)
             tracked = tracker.track(frame, T_predicted, mapper.view, mapper.frames)
         clock.lap("track")
-        by_patches = frame.source is not None
-        found = self._relocaliser.relocalise_if_needed(frame, tracked, mapper)
-        if found is not tracked:
-            clock.lap("relocalise")
+        return tracked, T_predicted
+
+    def _record_pose(self, frame: Frame, found: Found, T_predicted: Matrix) -> PlacedFrame:
+        """Record the pose of a frame and advance the odometry; a lost frame gets the predicted
+        pose."""
+        mapper, tracker = self._mapper, self._tracker
         if found.is_lost:
             frame.T_cw = T_predicted
             self._follow(frame, T_predicted, None)
-            placed = mapper.append_pose(frame, tracked=False)
             tracker.lose()
-        else:
-            found_again = found.relocalised or tracker.status is not TrackerStatus.TRACKING
-            T_moved = T_predicted if found_again else frame.T_cw
-            tracker.accept(frame, found, mapper.frames)
-            self._follow(frame, T_moved, covariance_of(frame, self.context))
-            placed = mapper.append_pose(frame, tracked=True, near=found.keyframe)
-        if on_pose is not None:
-            on_pose(result_of(frame, found, False, dict(clock.ms), self._odometry))
+            return mapper.append_pose(frame, tracked=False)
+        found_again = found.relocalised or tracker.status is not TrackerStatus.TRACKING
+        T_moved = T_predicted if found_again else frame.T_cw
+        tracker.accept(frame, found, mapper.frames)
+        self._follow(frame, T_moved, covariance_of(frame, self.context))
+        return mapper.append_pose(frame, tracked=True, near=found.keyframe)
+
+    def _update_map(self, frame: PlacedFrame, found: Found) -> bool:
+        """Update the map with a frame, and choose the next frame whose features to extract in
+        advance; returns whether the frame became a keyframe."""
+        by_patches = frame.source is not None
         if found.is_lost:
-            is_keyframe = self._mode.begin_after_loss(placed)
+            is_keyframe = self._mode.begin_after_loss(frame)
         else:
-            is_keyframe = self._mode.update_map(placed, found)
+            is_keyframe = self._mode.update_map(frame, found)
             self.rig.observe(frame, frame.twist)
         # If patches failed for this frame, they will probably fail for the next ones.
         self.next_extraction = self._mode.due if by_patches else frame.index + 2
-        if is_keyframe:
-            self._odometry.keyframe()
-        clock.lap("keyframe")
-        return result_of(frame, found, is_keyframe, clock.ms, self._odometry)
+        return is_keyframe
 
     def skip(self, timestamp: float, *, dropped: bool = False) -> TrackResult:
         """Add a frame without images at the predicted pose. Its state is LOST, or DROPPED if there

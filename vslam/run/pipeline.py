@@ -226,19 +226,17 @@ class _Run:
             result = self.slam.skip(timestamp)
             self.skipped.append(f"frame {len(self.tracks)}: {frame.problem}")
         else:
-            result = self.slam.step_images(
-                frame.images,
-                timestamp,
-                frame.stage_ms,
-                partial(self._add_latency, played.arrived) if self.settings.realtime else None,
-            )
+            add_latency = partial(self._add_latency, played.arrived)
+            result = self.slam.step_images(frame.images, timestamp, frame.stage_ms, add_latency)
         self.step_s += time.perf_counter() - start
         self.tracks.append(result)
         self._log.append(result)
         return result
 
     def _add_latency(self, arrived: float, _: TrackResult) -> None:
-        self.latency_ms.append(1e3 * (time.perf_counter() - arrived))
+        """In a real-time run, measure the time from the arrival of a frame to its pose."""
+        if self.settings.realtime:
+            self.latency_ms.append(1e3 * (time.perf_counter() - arrived))
 
     def finish(self) -> None:
         """Complete all mapping."""

@@ -280,6 +280,30 @@ def test_few_images_without_a_partner_are_not_worth_a_warning(tmp_path):
     )
 
 
+def test_images_whose_depth_is_paired_with_another_image_are_counted_apart(copy, caplog):
+    """Depth begins with the fourth image, and at half of the rate: one depth image lies between
+    the images 3 and 4, nearer to the first."""
+    times = [100.0, 100.1, 100.2, 100.3, 100.33]
+    rgb = (copy / "rgb.txt").read_text().split()[1::2]
+    depth = (copy / "depth.txt").read_text().split()[1::2]
+    for name, stamps, files in (("rgb", times, rgb), ("depth", [100.314], depth)):
+        lines = [f"{t} {file}\n" for t, file in zip(stamps, files, strict=False)]
+        (copy / f"{name}.txt").write_text("".join(lines))
+    said = open_tum(copy, "").pairing.measured
+    assert said == (
+        "4 of 5 images are left out, 3 because no depth image is within 20 ms of them (the nearest "
+        "is 214 ms away), and 1 because each depth image is paired only once, with the image "
+        "nearest in time"
+    )
+    (copy / "rgb.txt").write_text(
+        "".join(f"{t} {f}\n" for t, f in zip(times[3:], rgb, strict=False))
+    )
+    assert open_tum(copy, "").pairing.measured == (
+        "1 of 2 images are left out because each depth image is paired only once, with the image "
+        "nearest in time"
+    )
+
+
 @pytest.mark.parametrize(
     ("image", "part"),
     [

@@ -53,7 +53,8 @@ def associate(
 class Pairing:
     """The images that a reader pairs by time, and those that it leaves out.
 
-    The reader of a stream counts while it reads.
+    The reader of a stream counts while it reads. Readers do not log the warnings: the summary and
+    the report of a run, ``vslam doctor`` and ``vslam calibrate`` show them.
 
     Attributes:
         source: file or folder that messages name.
@@ -107,7 +108,7 @@ class Pairing:
     def count(
         self, times: NDArray[np.float64], paired: NDArray[np.int64], seconds: NDArray[np.float64]
     ) -> None:
-        """Count all images of a stored sequence, and log the warnings.
+        """Count all images of a stored sequence.
 
         Args:
             times: ``(N,)`` seconds, of the images.
@@ -117,18 +118,12 @@ class Pairing:
         self.n_pairs = len(paired)
         self.left_out = np.delete(times, paired).tolist()
         self.seconds = seconds.tolist()
-        self.log()
 
     def restart(self) -> None:
         """Begin to count anew, because a stream is read from its beginning."""
         self.n_pairs = 0
         self.left_out.clear()
         self.seconds.clear()
-
-    def log(self) -> None:
-        """Log the warnings."""
-        for warning in self.warnings():
-            _log.warning(warning)
 
     def _gaps(self) -> NDArray[np.float64]:
         """Seconds between each image that is left out and the nearest possible partner, which may

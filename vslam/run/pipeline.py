@@ -381,9 +381,7 @@ def _map_warnings(slam: Slam, camera: Camera) -> list[str]:
         residuals = measure_rig(slam.map, camera)
         return delay_warnings(slam.rig.delay, camera) or residual_warnings(residuals, camera)
     except Exception as error:  # a failed check must not end the run
-        problem = f"the rig could not be checked ({reason(error)})"
-        _log.warning(problem)
-        return [problem]
+        return [f"The rig could not be checked ({reason(error)})."]
 
 
 def _with_earlier(

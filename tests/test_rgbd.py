@@ -286,8 +286,11 @@ def test_images_whose_depth_is_paired_with_another_image_are_counted_apart(copy)
     """Depth begins with the fourth image, and at half of the rate: one depth image lies between
     the images 3 and 4, nearer to the first."""
     times = [100.0, 100.1, 100.2, 100.3, 100.33]
-    rgb = (copy / "rgb.txt").read_text().split()[1::2]
-    depth = (copy / "depth.txt").read_text().split()[1::2]
+    rgb, depth = (
+        [line.split()[1] for line in (copy / f"{name}.txt").read_text().splitlines()
+         if not line.startswith("#")]
+        for name in ("rgb", "depth")
+    )  # fmt: skip
     for name, stamps, files in (("rgb", times, rgb), ("depth", [100.314], depth)):
         lines = [f"{t} {file}\n" for t, file in zip(stamps, files, strict=False)]
         (copy / f"{name}.txt").write_text("".join(lines))

@@ -491,6 +491,18 @@ def test_observations_that_contradict_each_other_are_refused(file, tmp_path):
     assert "a landmark twice" in refusal(changed(file, path, observation_row=rows))
 
 
+def test_culled_landmarks_and_their_observations_must_agree(file, tmp_path):
+    with np.load(file) as data:
+        not_culled, first = data["landmark_alive"].copy(), data["landmark_first_observation"].copy()
+    path = tmp_path / "m.npz"
+    not_culled[3] = False
+    message = refusal(changed(file, path, landmark_alive=not_culled))
+    assert "a culled landmark with observations" in message
+    first[4] = first[3]
+    message = refusal(changed(file, path, landmark_first_observation=first))
+    assert "a landmark without observations that is not culled" in message
+
+
 @pytest.mark.parametrize("name", ["keyframe_T_cw", "row_descriptor", "frame_tracked", "loop_ends"])
 def test_arrays_that_lack_or_are_of_another_kind_are_refused(file, tmp_path, name):
     path = tmp_path / "m.npz"

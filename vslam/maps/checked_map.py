@@ -182,7 +182,9 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
     first, rows = data["landmark_first_observation"], data["observation_row"]
     _check_first("landmark_first_observation", first, sizes["O"])
     alive = data["landmark_alive"]
-    _require(bool(((np.diff(first) > 0) == alive).all()), "a living landmark without observations")
+    observed = np.diff(first) > 0
+    _require(bool(observed[alive].all()), "a landmark without observations that is not culled")
+    _require(bool(alive[observed].all()), "a culled landmark with observations")
     _check_merges(data["landmark_merged_into"], alive)
     _check_ids("observation_row", rows, n_rows)
     _require(_all_differ(rows), "a keypoint that observes two landmarks")

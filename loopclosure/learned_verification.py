@@ -40,7 +40,7 @@ class LearnedTrials:
 
     The chosen candidates are those with the most similar images by local descriptors, if they are
     similar enough. After a failed attempt, only candidates that are clearly more similar than the
-    failed one are chosen for the next ``learned.rest`` keyframes.
+    failed one are chosen for the next ``learned.retry_interval`` keyframes.
 
     Attributes:
         state: the outcome of the last attempt.
@@ -54,12 +54,12 @@ class LearnedTrials:
         """The keyframe ids ``match`` of the candidates to try. Candidates without a rating are
         never chosen."""
         config = self._config
-        min_alike = config.min_alike
+        min_similarity = config.min_similarity
         if keyframe < self.state.resting_until:
-            min_alike = max(min_alike, config.more_alike * self.state.failed_alike)
-        rated = [(one.alike, one.match) for one in candidates if one.alike is not None]
-        best = sorted(rated, reverse=True)[: config.max_candidates]
-        return {match for alike, match in best if alike >= min_alike}
+            min_similarity = max(min_similarity, config.retry_factor * self.state.failed_similarity)
+        known = [(one.similarity, one.match) for one in candidates if one.similarity is not None]
+        best = sorted(known, reverse=True)[: config.max_candidates]
+        return {match for similarity, match in best if similarity >= min_similarity}
 
     def record(self, candidate: LoopCandidate, *, located: bool) -> None:
         """Remember the result of an attempt.
@@ -70,41 +70,43 @@ class LearnedTrials:
         if located:
             self.state = replace(self.state, resting_until=0)
         else:
-            until = candidate.query + 1 + self._config.rest
-            self.state = VerifierState(until, candidate.alike or 0.0)
+            until = candidate.query + 1 + self._config.retry_interval
+            self.state = VerifierState(until, candidate.similarity or 0.0)
 
 
-def rated(
+def with_similarities(
     candidates: Sequence[LoopCandidate],
     glance: Callable[[], DescriptorMaps],
     images: KeyframeImages,
     config: LearnedMatchingConfig,
     beyond: NDArray[np.float64] | None = None,
 ) -> list[LoopCandidate]:
-    """Set ``alike``, the similarity by local descriptors, for candidates that the detector has not
-    rated.
+    """Set ``similarity`` for candidates whose images the detector has not compared by local
+    descriptors.
 
     Args:
-        candidates: best first; at most ``config.rated`` of them are rated.
+        candidates: best first; at most ``config.max_compared`` of them are compared.
         glance: returns the coarse descriptors of the query image; called only if there is a
             candidate to rate.
         beyond: result of :func:`vslam.loopclosure.reach.beyond_reach`; keyframes out of reach are
-            not rated. None if the camera may be anywhere.
+            not compared. None if the camera may be anywhere.
 
     Returns:
         The candidates in the same order.
     """
-    unrated = [one.match for one in candidates if one.alike is None and one.match in images]
+    unknown = [one.match for one in candidates if one.similarity is None and one.match in images]
     if beyond is not None:
-        unrated = [match for match in unrated if beyond[match] <= 0.0]
-    if not unrated:
+        unknown = [match for match in unknown if beyond[match] <= 0.0]
+    if not unknown:
         return list(candidates)
     query = glance()
-    alike = {
-        match: likeness(query, images.glance(match), config.coarse_alike)
-        for match in unrated[: config.rated]
+    similarity = {
+        match: likeness(query, images.glance(match), config.min_coarse_similarity)
+        for match in unknown[: config.max_compared]
     }
-    return [replace(one, alike=alike.get(one.match, one.alike)) for one in candidates]
+    return [
+        replace(one, similarity=similarity.get(one.match, one.similarity)) for one in candidates
+    ]
 
 
 def is_image_redundant(
@@ -341,7 +343,8 @@ def _seen_of_query(
     T_kw = inverse(T_wk) @ T_wm @ T_match_query @ map_.keyframe_pose(edge.query)
     expected = project(map_.arrays.xyz[view.landmarks], T_kw, camera)
     match = images.maps(keyframe)
-    found = locate_near(view.xy, expected, view.maps, match, config.guided_reach, config.alike)
+    least, reach = config.min_fine_similarity, config.guided_reach
+    found = locate_near(view.xy, expected, view.maps, match, reach, least)
     error = np.linalg.norm(found.xy - expected, axis=1) * match.scale
     # 95 % of the distances of a two-dimensional normal distribution are below 2.45 sigma.
     seen = np.count_nonzero(error < 2.45 * config.sigma)
@@ -364,9 +367,11 @@ class LearnedRelocalisation:
         images, config = self._images, self._config
         if images is None or image is None:
             return None
-        candidates = rated(candidates, lambda: images.glance_at(image), images, config.learned)
-        candidates = [one for one in candidates if one.alike is not None]
-        candidates.sort(key=lambda one: -(one.alike or 0.0))
+        candidates = with_similarities(
+            candidates, lambda: images.glance_at(image), images, config.learned
+        )
+        candidates = [one for one in candidates if one.similarity is not None]
+        candidates.sort(key=lambda one: -(one.similarity or 0.0))
         if not candidates:
             return None
         maps = images.network.describe(image)

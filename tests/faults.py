@@ -88,7 +88,7 @@ POINTS = (
     Point("place detector, add", "ring.Oracle.add", 12, ON),
     Point("place detector, query", "ring.Oracle.query", 12, ON),
     Point("verification", "vslam.loopclosure.verification.verify", 1, ON),
-    Point("learned verification", "vslam.loopclosure.verifier.rated", 1, ON),
+    Point("learned verification", "vslam.loopclosure.verifier.with_similarities", 1, ON),
     Point("pose graph", "vslam.closing.solve", 1, ON),
     Point("inserting a keyframe", "vslam.mapping.map_stereo_points", 12, MAPLESS),
     Point("mapping job", "vslam.mapping.map_and_calibrate", 12, MAPLESS),

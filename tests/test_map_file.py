@@ -227,7 +227,7 @@ def test_descriptors_and_images_of_learned_detectors_come_back(tmp_path):
     (before,) = detector.locate(pictures[2], Features.none(), map_)[:1]
     (after,) = again.locate(pictures[2], Features.none(), found.map)[:1]
     assert (before.match, after.match) == (2, 1)
-    assert (before.score, before.alike) == (after.score, after.alike)
+    assert (before.score, before.similarity) == (after.score, after.similarity)
 
     values = found.images.values.copy()
     values[:2] = 0

@@ -43,7 +43,7 @@ class View(NamedTuple):
     xy: NDArray[np.float32]
 
 
-class Sight(NamedTuple):
+class PoseEstimate(NamedTuple):
     """A camera pose, the landmarks of a place that should be visible from it, and which of them are
     found in the image.
 
@@ -70,7 +70,7 @@ def localise(
     camera: Camera,
     config: LearnedMatchingConfig,
     seed: int,
-) -> Sight | str:
+) -> PoseEstimate | str:
     """Estimate the pose of an image at a place.
 
     Args:
@@ -129,7 +129,7 @@ def guided_search(
     query: DescriptorMaps,
     camera: Camera,
     config: LearnedMatchingConfig,
-) -> Sight:
+) -> PoseEstimate:
     """Search for all landmarks of the views near their projections and refine the pose with all
     matches; then repeat both steps."""
     _, first = np.unique(np.concatenate([view.landmarks for view in views]), return_index=True)
@@ -153,7 +153,7 @@ def guided_search(
     seen = np.zeros(len(landmarks), np.bool_)
     seen[hit[inlier]] = True
     visible = np.flatnonzero(np.isfinite(expected[:, 0]))
-    return Sight(landmarks[visible], expected[visible], seen[visible], len(hit), T_cw)
+    return PoseEstimate(landmarks[visible], expected[visible], seen[visible], len(hit), T_cw)
 
 
 def project(xyz: Matrix, T_cw: Matrix, camera: Camera) -> Matrix:

@@ -17,7 +17,7 @@ from vslam.camera import Camera, Image
 from vslam.config import Config, LearnedMatchingConfig, VerificationConfig
 from vslam.features import Features
 from vslam.geometry import Matrix, inverse, orthonormalised, transform
-from vslam.loopclosure.learned_localisation import Sight, localise, project, view_of
+from vslam.loopclosure.learned_localisation import PoseEstimate, localise, project, view_of
 from vslam.loopclosure.local_matching import DescriptorMaps, likeness, locate_near
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loopclosure.verification import (
@@ -26,7 +26,7 @@ from vslam.loopclosure.verification import (
     relative_scale,
     spread_reason,
 )
-from vslam.loops import LoopCandidate, LoopEdge, Sighting
+from vslam.loops import Localisation, LoopCandidate, LoopEdge
 from vslam.map import Map
 from vslam.map_kernels import collect_landmarks
 from vslam.states import VerifierState
@@ -145,36 +145,36 @@ def verify_learned(
     keyframes = [k for k in place_of(map_, match, query, gates).tolist() if k in images]
     if query not in images or not keyframes:
         return replace(edge, reason="no image is stored")
-    sight = localise(
+    estimate = localise(
         map_, images.maps(query), keyframes, images, camera, config, seed=query << 32 | match
     )
-    if isinstance(sight, str):
-        return replace(edge, reason=sight)
-    feature, landmark = observed_features(map_, query, sight, camera, config)
+    if isinstance(estimate, str):
+        return replace(edge, reason=estimate)
+    feature, landmark = observed_features(map_, query, estimate, camera, config)
     # Now that the pose is known, ORB features may match. If enough do, their matches are preferred,
     # because their positions are more precise (about a tenth of a pixel).
     place = collect_landmarks(map_.arrays, np.array(keyframes, np.int64), map_.n_landmarks)
-    guided = guided_match(map_, query, place, sight.T_cw, camera, gates)
+    guided = guided_match(map_, query, place, estimate.T_cw, camera, gates)
     if np.count_nonzero(guided.seen) >= gates.min_inliers:
-        sight = sight._replace(T_cw=guided.T_cw)
+        estimate = estimate._replace(T_cw=guided.T_cw)
         pairs = guided.feature[guided.seen], guided.landmarks[guided.seen]
         feature, landmark = joined(pairs, (feature, landmark))
-    T_query_match = orthonormalised(sight.T_cw @ inverse(map_.keyframe_pose(match)))
+    T_query_match = orthonormalised(estimate.T_cw @ inverse(map_.keyframe_pose(match)))
     edge = replace(
         edge,
-        n_matches=sight.n_matches,
-        n_inliers=int(np.count_nonzero(sight.seen)),
+        n_matches=estimate.n_matches,
+        n_inliers=int(np.count_nonzero(estimate.seen)),
         T_query_match=T_query_match,
         features=feature,
         landmarks=landmark,
     )
     if camera.monocular:
-        scale = relative_scale(map_, edge, sight.T_cw, default=np.nan)
+        scale = relative_scale(map_, edge, estimate.T_cw, default=np.nan)
         if not np.isfinite(scale):
             return replace(edge, reason="too few landmarks on both sides to estimate the scale")
         edge = replace(edge, scale=scale)
     seen = _seen_of_query(map_, edge, keyframes[0], images, camera, config)
-    reason = _rejection_reason(edge, sight, seen, camera, config, gates)
+    reason = _rejection_reason(edge, estimate, seen, camera, config, gates)
     return replace(edge, accepted=not reason, reason=reason or "verified")
 
 
@@ -186,7 +186,7 @@ def recognise(
     images: KeyframeImages,
     camera: Camera,
     config: Config,
-) -> Sighting | None:
+) -> Localisation | None:
     """Estimate the pose of a frame outside the map at the place of a keyframe.
 
     Args:
@@ -201,20 +201,20 @@ def recognise(
     gates = config.verification
     around = [match, *map_.covisible(match)[0].tolist()]
     keyframes = [k for k in around if k in images]
-    sight = localise(map_, query, keyframes, images, camera, config.learned, seed=match)
-    if isinstance(sight, str) or _visibility_reason(sight, camera, config.learned, gates):
+    estimate = localise(map_, query, keyframes, images, camera, config.learned, seed=match)
+    if isinstance(estimate, str) or _visibility_reason(estimate, camera, config.learned, gates):
         return None
-    index = np.flatnonzero(sight.seen)
+    index = np.flatnonzero(estimate.seen)
     feature, near = nearest_features(
-        sight.uv[index], features.xy, features.octave, map_.scales, config.learned
+        estimate.uv[index], features.xy, features.octave, map_.scales, config.learned
     )
     if len(feature) < config.tracking.min_inliers:
         return None
-    return Sighting(match, sight.T_cw, feature, sight.landmarks[index[near]])
+    return Localisation(match, estimate.T_cw, feature, estimate.landmarks[index[near]])
 
 
 def observed_features(
-    map_: Map, query: int, sight: Sight, camera: Camera, config: LearnedMatchingConfig
+    map_: Map, query: int, estimate: PoseEstimate, camera: Camera, config: LearnedMatchingConfig
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Pair features of the query with landmarks of the place that coincide in the image.
 
@@ -225,10 +225,10 @@ def observed_features(
         ``(N,)`` indices of features and ``(N,)`` ids of landmarks, without duplicates.
     """
     a, rows = map_.arrays, map_.rows(query)
-    landmarks, uv = sight.landmarks[sight.seen], sight.uv[sight.seen]
+    landmarks, uv = estimate.landmarks[estimate.seen], estimate.uv[estimate.seen]
     feature, index = nearest_features(uv, a.xy[rows], a.octave[rows], map_.scales, config)
     own = a.landmark[rows][feature]
-    depth = transform(sight.T_cw, a.xyz[landmarks[index]])[:, 2]
+    depth = transform(estimate.T_cw, a.xyz[landmarks[index]])[:, 2]
     ratio = np.where(own >= 0, transform(a.T_cw[query], a.xyz[own])[:, 2] / depth, np.nan)
     known = np.isfinite(ratio)
     # Scale drift of a monocular map changes all ratios by the same factor.
@@ -282,7 +282,7 @@ def nearest_features(
 
 def _rejection_reason(
     edge: LoopEdge,
-    sight: Sight,
+    estimate: PoseEstimate,
     query_seen: tuple[int, int],
     camera: Camera,
     config: LearnedMatchingConfig,
@@ -297,7 +297,7 @@ def _rejection_reason(
     distance = float(np.linalg.norm(inverse(edge.T_query_match)[:3, 3]))
     if distance > gates.max_distance:
         return f"the pose is {distance:.0f} m from the place"
-    if reason := _visibility_reason(sight, camera, config, gates):
+    if reason := _visibility_reason(estimate, camera, config, gates):
         return reason
     seen, total = query_seen
     if seen < config.min_seen_ratio * total:
@@ -306,15 +306,15 @@ def _rejection_reason(
 
 
 def _visibility_reason(
-    sight: Sight, camera: Camera, config: LearnedMatchingConfig, gates: VerificationConfig
+    estimate: PoseEstimate, camera: Camera, config: LearnedMatchingConfig, gates: VerificationConfig
 ) -> str:
     """The reason to reject a pose because too little of the place is seen, or "" if enough is."""
-    seen, total = int(np.count_nonzero(sight.seen)), len(sight.seen)
+    seen, total = int(np.count_nonzero(estimate.seen)), len(estimate.seen)
     if seen < config.min_inliers:
         return f"only {seen} learned matches fit"
-    if seen < gates.min_inlier_ratio * sight.n_matches:
-        return f"only {seen} of {sight.n_matches} learned matches fit"
-    if reason := spread_reason(sight.uv, sight.seen, camera, gates, config.min_elsewhere):
+    if seen < gates.min_inlier_ratio * estimate.n_matches:
+        return f"only {seen} of {estimate.n_matches} learned matches fit"
+    if reason := spread_reason(estimate.uv, estimate.seen, camera, gates, config.min_elsewhere):
         return reason
     if seen < config.min_seen_ratio * total:
         return f"only {seen} of {total} landmarks of the place are seen"
@@ -361,7 +361,7 @@ class LearnedRelocalisation:
 
     def __call__(
         self, map_: Map, image: Image | None, features: Features, candidates: list[LoopCandidate]
-    ) -> Sighting | None:
+    ) -> Localisation | None:
         """Search for a frame at the candidates whose images are most similar to it; returns None if
         no candidate succeeds."""
         images, config = self._images, self._config
@@ -376,9 +376,9 @@ class LearnedRelocalisation:
             return None
         maps = images.network.describe(image)
         for candidate in candidates[: config.learned.max_candidates]:
-            sighting = recognise(
+            localised = recognise(
                 map_, maps, features, candidate.match, images, self._camera, config
             )
-            if sighting is not None:
-                return sighting
+            if localised is not None:
+                return localised
         return None

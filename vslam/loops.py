@@ -32,8 +32,8 @@ class LoopCandidate:
     promising: bool = False
 
 
-class Sighting(NamedTuple):
-    """The place where a frame outside the map was recognised.
+class Localisation(NamedTuple):
+    """The pose of a frame outside the map, and the landmarks of the map that it observes.
 
     Attributes:
         keyframe: the keyframe that the frame resembles.

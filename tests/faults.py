@@ -122,7 +122,7 @@ POINTS = (
     Point("result: ground truth", "vslam.run.outcome.ground_truth_of", 1, MISSING,
           ("ground_truth_kitti.txt",)),
     Point("result: evaluation", "vslam.report.folder.evaluate_run", 1, MISSING),
-    Point("result: world", "vslam.report.folder.world_of", 1, MISSING),
+    Point("result: world", "vslam.report.folder.truth_alignment_of", 1, MISSING),
     Point("result: map", "vslam.report.folder.save_map", 1, MISSING, ("map.npz",)),
     Point("result: frames.csv", "vslam.report.folder.write_frames", 1, MISSING, ("frames.csv",)),
     Point("result: loops", "vslam.report.folder.evaluate_loops", 1, MISSING, LATER),

@@ -25,7 +25,7 @@ from vslam.map import UNPREDICTED, Map
 from vslam.map_kernels import refresh_landmarks
 from vslam.maps import new_output
 from vslam.maps.storage import load_checkpoint, load_map, save_map
-from vslam.maps.stored_map import StoredMap, World
+from vslam.maps.stored_map import StoredMap, TruthAlignment
 from vslam.slam import Slam
 
 CONFIG = Config()
@@ -152,8 +152,8 @@ def test_loops_images_drives_and_world_come_back(slam, tmp_path):
     loop = LoopEdge(living[-1], culled, 0.25, True, "closed", 90, 60, T, scale=1.5)
     first = np.arange(slam.map.n_keyframes + 1)
     images = PerKeyframe(first, np.arange(slam.map.n_keyframes, dtype=np.uint8))
-    world = World("kitti 06", np.diag([2.0, 2.0, 2.0, 1.0]))
-    stored = replace(slam.stored_map("x"), loops=(loop,), images=images, world=world)
+    world = TruthAlignment("kitti 06", np.diag([2.0, 2.0, 2.0, 1.0]))
+    stored = replace(slam.stored_map("x"), loops=(loop,), images=images, truth_alignment=world)
     save_map(tmp_path / "m.npz", stored)
     found = load_map(tmp_path / "m.npz")
     (edge,) = found.loops
@@ -166,9 +166,9 @@ def test_loops_images_drives_and_world_come_back(slam, tmp_path):
     assert found.images is not None
     assert found.images.values.tolist() == living
     assert found.drives == ("x",)
-    assert found.world is not None
-    assert found.world.name == "kitti 06"
-    assert np.array_equal(found.world.S_truth_world, world.S_truth_world)
+    assert found.truth_alignment is not None
+    assert found.truth_alignment.name == "kitti 06"
+    assert np.array_equal(found.truth_alignment.S_truth_world, world.S_truth_world)
 
 
 def test_what_the_detector_knew_comes_back(slam, file, ring):

@@ -17,7 +17,7 @@ SETTINGS = {"min_inliers": 15, "max_draws": 600, "confidence": 0.99}
 
 
 def scene(seed: int, n: int, outliers: float, scale: float = 1.0, noise: float = NOISE):
-    """``T_a_b``, the observations of n landmarks from a and b, and which of them are matched wrongly.
+    """``T_a_b``, the observations of n landmarks from a and b, and which matches are wrong.
 
     Landmarks are as uncertain along the line of sight as 0.1 px of disparity.
     """

@@ -24,7 +24,7 @@ from vslam.map import (
 )
 from vslam.maps.checkpoint import ARRAYS as CHECKPOINT_ARRAYS
 from vslam.maps.checkpoint import checked_checkpoint
-from vslam.maps.stored_map import StoredMap, World, observations
+from vslam.maps.stored_map import StoredMap, TruthAlignment, observations
 
 # These columns are not in the file. They are computed from its list of observations, which is
 # sorted by landmark, and from keyframe_first_row.
@@ -126,7 +126,7 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
         frames=_frames(data, n) if header["frames"] else None,
         drives=tuple(str(drive) for drive in header["drives"]),
         thresholds=dict(header.get("thresholds", {})),
-        world=None if world is None else _world(world),
+        truth_alignment=None if world is None else _truth_alignment(world),
         checkpoint=checkpoint,
     )
 
@@ -277,10 +277,10 @@ def camera_of(header: dict[str, Any]) -> Camera:
     return replace(camera, width=int(camera.width), height=int(camera.height))
 
 
-def _world(fields: dict[str, Any]) -> World:
+def _truth_alignment(fields: dict[str, Any]) -> TruthAlignment:
     S = np.array(fields["S_truth_world"], np.float64)
     _require(S.shape == (4, 4) and bool((np.abs(S) < _MOST).all()), "world")
-    return World(str(fields["name"]), S)
+    return TruthAlignment(str(fields["name"]), S)
 
 
 def _check_first(name: str, first: NDArray[np.int64], end: int) -> None:

@@ -28,7 +28,7 @@ from vslam.states import Checkpoint
 
 
 @dataclass(frozen=True)
-class World:
+class TruthAlignment:
     """The transformation of a map into the frame of a ground truth.
 
     Attributes:
@@ -57,8 +57,8 @@ class StoredMap:
         drives: source of the images of each drive, such as "kitti 06".
         thresholds: the thresholds of the last drive that differed from the defaults, by dotted
             name.
-        world: the transformation of the map into the frame of a ground truth; None without ground
-            truth.
+        truth_alignment: the transformation of the map into the frame of a ground truth; None
+            without ground truth.
         checkpoint: state from which the last drive continues with identical results. The map then
             includes dead keyframes and landmarks, with unchanged ids. None if the map is compact or
             there was no checkpoint.
@@ -72,7 +72,7 @@ class StoredMap:
     frames: FrameTable | None = None
     drives: tuple[str, ...] = ()
     thresholds: dict[str, Any] = field(default_factory=dict)
-    world: World | None = None
+    truth_alignment: TruthAlignment | None = None
     checkpoint: Checkpoint | None = None
 
     def compact(self, *, copy: bool = True) -> StoredMap:
@@ -245,7 +245,7 @@ def appended(one: StoredMap, other: StoredMap) -> StoredMap:
         images=images,
         drives=(*one.drives, *other.drives),
         thresholds=one.thresholds,
-        world=one.world,
+        truth_alignment=one.truth_alignment,
     )
 
 

@@ -334,7 +334,7 @@ def _outcome(
         latency_ms=run.latency_ms,
         n_keyframes=len(keyframes),
         n_landmarks=0,
-        world=run.slam.world,
+        truth_alignment=run.slam.truth_alignment,
         interrupted=interrupted,
     )
     if run.has_map:

@@ -138,10 +138,8 @@ def match_keyframes(
     )
     hit = np.flatnonzero(found >= 0)
     rows_q, rows_m = rows_q[hit], rows_m[found[hit]]
-    if len(hit):
-        keep = consistent_orientation(a.angle[rows_q], a.angle[rows_m])
-        rows_q, rows_m = rows_q[keep], rows_m[keep]
-    return rows_q, rows_m
+    keep = consistent_orientation(a.angle[rows_q], a.angle[rows_m])
+    return rows_q[keep], rows_m[keep]
 
 
 def _consensus(

@@ -206,7 +206,7 @@ def _check_merges(merged_into: NDArray[np.int32], alive: NDArray[np.bool_]) -> N
     """Check that every chain of ``merged_into`` ends at a living landmark or at -1."""
     n = len(merged_into)
     _check_ids("landmark_merged_into", merged_into, n, least=NONE)
-    _require(bool((merged_into[alive] == NONE).all()), "a living landmark that was merged")
+    _require(bool((merged_into[alive] == NONE).all()), "a merged landmark that is not culled")
     # Pointer doubling: each round follows twice as many merges as the round before.
     reached = np.append(np.where(merged_into >= 0, merged_into, n), n)
     for _ in range(n.bit_length()):

@@ -411,8 +411,11 @@ def without_checkpoint(file: Path, to: Path) -> Path:
 
 def merged_in_a_circle(file: Path, to: Path) -> Path:
     with np.load(file) as data:
-        merged, dead = data["landmark_merged_into"].copy(), np.flatnonzero(~data["landmark_alive"])
-    merged[dead[:2]] = dead[[1, 0]]
+        merged, culled = (
+            data["landmark_merged_into"].copy(),
+            np.flatnonzero(~data["landmark_alive"]),
+        )
+    merged[culled[:2]] = culled[[1, 0]]
     return changed(file, to, landmark_merged_into=merged)
 
 

@@ -1,4 +1,4 @@
-"""A map with everything that is needed to continue in it, usually without dead entries."""
+"""A map with everything that is needed to continue in it, usually without culled entries."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ class StoredMap:
         truth_alignment: the transformation of the map into the frame of a ground truth; None
             without ground truth.
         checkpoint: state from which the last drive continues with identical results. The map then
-            includes dead keyframes and landmarks, with unchanged ids. None if the map is compact or
-            there was no checkpoint.
+            includes culled keyframes and landmarks, with unchanged ids. None if the map is compact
+            or there was no checkpoint.
     """
 
     map: Map
@@ -183,7 +183,7 @@ def observations(
 
     Args:
         rows: ``(O,)`` rows that observe the landmarks, sorted by landmark; each row occurs once.
-        first: ``(L + 1,)`` offsets of each landmark in ``rows``; a dead landmark has no rows.
+        first: ``(L + 1,)`` offsets of each landmark in ``rows``; a culled landmark has no rows.
         u_right: ``(R,)`` columns in the right image, for all rows; NaN without a stereo match.
     """
     count = np.diff(first)

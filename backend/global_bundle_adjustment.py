@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vslam.backend.block_cholesky import analyse, factor_solve, panel
 from vslam.backend.bundle_adjustment import (
@@ -33,7 +32,6 @@ def adjust_globally(
     *,
     iterations: int,
     tolerance: float = 1e-6,
-    use: NDArray[np.bool_] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> BundleSolution:
     """Minimise the robust reprojection error, like ``bundle_adjustment.adjust``, for many
@@ -45,12 +43,10 @@ def adjust_globally(
     Args:
         iterations: maximum number of Levenberg-Marquardt iterations.
         tolerance: stop when an iteration reduces the cost by a smaller fraction than this.
-        use: ``(O,)`` bool, whether each observation is used; None uses all.
         stop: called before each iteration; if it returns True, the current estimate is returned.
     """
     n_free, n_observations = problem.n_free, len(problem.camera)
-    used = np.ones(n_observations, np.bool_) if use is None else use
-    pairs = coupled_cameras(problem.first, problem.camera, used, n_free)
+    pairs = coupled_cameras(problem.first, problem.camera, n_free)
     structure = analyse(n_free, pairs)
     # Free cameras in elimination order, followed by the fixed ones.
     cameras = np.concatenate([structure.order, np.arange(n_free, len(problem.T_cw))])
@@ -62,12 +58,10 @@ def adjust_globally(
         uvr=problem.uvr[order],
         inverse_sigma2=problem.inverse_sigma2[order],
         disparity_weight=problem.disparity_weights()[order],
-        used=used[order],
+        used=np.ones(n_observations, np.bool_),
         intrinsics=problem.intrinsics,
     )
-    slots = pair_slots(
-        structure, observations.first, observations.camera, observations.used, n_free
-    )
+    slots = pair_slots(structure, observations.first, observations.camera, n_free)
     T_cw, points = problem.T_cw[cameras], problem.points[points_order]
     T_trial, points_trial = T_cw.copy(), points.copy()
     inlier = np.ones(n_observations, np.bool_)
@@ -153,19 +147,19 @@ def working_order(first, rank, n_cameras):
 
 
 @kernel
-def coupled_cameras(first, camera, used, n_free):
+def coupled_cameras(first, camera, n_free):
     """``(M, 2)`` int64 pairs of free cameras that observe a common point, without repetitions."""
-    start, points = points_of_cameras(first, camera, used, n_free)
+    start, points = points_of_cameras(first, camera, n_free)
     met = np.empty(n_free, np.int64)
     last = np.full(n_free, -1)  # the last camera ``i`` that each camera was paired with
     count = 0
     for i in range(n_free):
-        count += cameras_met(i, start, points, first, camera, used, n_free, last, met)
+        count += cameras_met(i, start, points, first, camera, n_free, last, met)
     last[:] = -1
     pairs = np.empty((count, 2), np.int64)
     count = 0
     for i in range(n_free):
-        n = cameras_met(i, start, points, first, camera, used, n_free, last, met)
+        n = cameras_met(i, start, points, first, camera, n_free, last, met)
         met[:n].sort()
         for k in range(n):
             pairs[count, 0], pairs[count, 1] = i, met[k]
@@ -174,33 +168,33 @@ def coupled_cameras(first, camera, used, n_free):
 
 
 @inner_kernel
-def points_of_cameras(first, camera, used, n_free):
+def points_of_cameras(first, camera, n_free):
     """Points that each free camera observes, as ``start`` int64 and ``points`` ``(N,)`` int32:
     camera k observes ``points[start[k]:start[k + 1]]``."""
     start = np.zeros(n_free + 2, np.int64)
     for o in range(len(camera)):
-        if camera[o] < n_free and used[o]:
+        if camera[o] < n_free:
             start[camera[o] + 2] += 1
     for k in range(n_free + 1):
         start[k + 1] += start[k]
     points = np.empty(start[n_free + 1], np.int32)
     for p in range(len(first) - 1):
         for o in range(first[p], first[p + 1]):
-            if camera[o] < n_free and used[o]:
+            if camera[o] < n_free:
                 points[start[camera[o] + 1]] = p
                 start[camera[o] + 1] += 1
     return start, points
 
 
 @inner_kernel
-def cameras_met(i, start, points, first, camera, used, n_free, last, met):
+def cameras_met(i, start, points, first, camera, n_free, last, met):
     """Write the free cameras with an index above ``i`` that observe a point in common with camera
     ``i`` into ``met``, and return their number. ``last`` prevents repetitions."""
     n = 0
     for p in points[start[i] : start[i + 1]]:
         for o in range(first[p], first[p + 1]):
             j = camera[o]
-            if i < j < n_free and used[o] and last[j] != i:
+            if i < j < n_free and last[j] != i:
                 last[j] = i
                 met[n] = j
                 n += 1
@@ -208,26 +202,25 @@ def cameras_met(i, start, points, first, camera, used, n_free, last, met):
 
 
 @kernel
-def pair_slots(structure, first, camera, used, n_free):
-    """``(N,)`` int32, the slot in the factor of each pair of used observations of a point, in the
-    order in which ``reduce_points_sparsely`` visits these pairs. Cameras are in elimination
-    order."""
+def pair_slots(structure, first, camera, n_free):
+    """``(N,)`` int32, the slot in the factor of each pair of observations of a point, in the order
+    in which ``reduce_points_sparsely`` visits these pairs. Cameras are in elimination order."""
     count = 0
     for p in range(len(first) - 1):
         seen = 0
         for o in range(first[p], first[p + 1]):
-            if used[o] and camera[o] < n_free:
+            if camera[o] < n_free:
                 count += seen
                 seen += 1
     slots = np.empty(count, np.int32)
     count = 0
     for p in range(len(first) - 1):
         for o in range(first[p], first[p + 1]):
-            if not used[o] or camera[o] >= n_free:
+            if camera[o] >= n_free:
                 continue
             slot = structure.first[camera[o]]
             for other in range(o + 1, first[p + 1]):
-                if used[other] and camera[other] < n_free:
+                if camera[other] < n_free:
                     while structure.row[slot] < camera[other]:
                         slot += 1
                     slots[count] = slot
@@ -241,7 +234,7 @@ def reduce_points_sparsely(
 ):
     """Eliminate the points: write the reduced camera system ``S x = rhs`` into ``S``, as panels of
     ``block_cholesky``, and its right-hand side into ``x``."""
-    first, camera, used = observations.first, observations.camera, observations.used
+    first, camera = observations.first, observations.camera
     W, V, g, U, b = equations
     for i in range(len(S)):
         S[i] = 0.0
@@ -259,7 +252,7 @@ def reduce_points_sparsely(
         invert_damped(V[p], damping, N)
         for o in range(first[p], first[p + 1]):
             k = camera[o]
-            if k >= n_free or not used[o]:
+            if k >= n_free:
                 continue
             for i in range(6):
                 w0, w1, w2 = W[o, 0, i], W[o, 1, i], W[o, 2, i]
@@ -270,7 +263,7 @@ def reduce_points_sparsely(
             begin, width = panel(structure, k)
             subtract_coupling(Y, W, o, S, begin, width)
             for other in range(o + 1, first[p + 1]):
-                if used[other] and camera[other] < n_free:
+                if camera[other] < n_free:
                     offset = begin + 6 * (slots[pair] - structure.first[k])
                     subtract_coupling(Y, W, other, S, offset, width)
                     pair += 1

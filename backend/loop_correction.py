@@ -31,7 +31,7 @@ def move_keyframes(
     """
     a = map_.arrays
     if not a.keyframe_alive[keyframes].all():
-        raise ValueError("move_keyframes: some of the keyframes were culled; pass living ones only")
+        raise ValueError("move_keyframes: some of the keyframes were culled; leave them out")
     T_cw_old = a.T_cw[: map_.n_keyframes].copy()
     a.T_cw[keyframes] = T_cw_new
     carry_landmarks(map_, np.arange(map_.n_landmarks), T_cw_old)

@@ -91,10 +91,8 @@ def match_views(
     )
     first = np.flatnonzero(found >= 0)
     second = found[first].astype(np.int64)
-    if len(first):
-        keep = consistent_orientation(before.angle[first], now.angle[second])
-        first, second = first[keep], second[keep]
-    return first, second
+    keep = consistent_orientation(before.angle[first], now.angle[second])
+    return first[keep], second[keep]
 
 
 def reconstruct(

@@ -21,14 +21,14 @@ from vslam.frontend.tracking import (
     refine,
     track_local_map,
 )
-from vslam.loops import LoopCandidate, Sighting
+from vslam.loops import Localisation, LoopCandidate
 from vslam.map import Map
 from vslam.map_view import LocalMap, local_map
 
 Locate = Callable[[Image | None, Features, Map], list[LoopCandidate]]
 # Finds the pose of a frame near one of the candidates by other means than ORB descriptors; returns
 # None if it finds none.
-Recognise = Callable[[Map, Image | None, Features, list[LoopCandidate]], Sighting | None]
+Recognise = Callable[[Map, Image | None, Features, list[LoopCandidate]], Localisation | None]
 
 
 class MapAccess(Protocol):
@@ -93,14 +93,14 @@ class Relocaliser:
             n_inliers = relocalise(frame, place, around, self._context, seed=candidate.match)
             if n_inliers:
                 return self._result(n_inliers, candidate.match)
-        sighting = self._recognise(map_, frame.image, frame.features, candidates)
-        if sighting is None:
+        localised = self._recognise(map_, frame.image, frame.features, candidates)
+        if localised is None:
             return Found(TrackingState.LOST)
-        frame.set_camera_pose(sighting.T_cw)
+        frame.set_camera_pose(localised.T_cw)
         frame.shift = None
-        xyz = map_.arrays.xyz[sighting.landmark]
-        frame.match(sighting.feature, sighting.landmark, xyz)
-        return self._result(len(sighting.feature), sighting.keyframe)
+        xyz = map_.arrays.xyz[localised.landmark]
+        frame.match(localised.feature, localised.landmark, xyz)
+        return self._result(len(localised.feature), localised.keyframe)
 
     def _result(self, n_inliers: int, keyframe: int) -> Found:
         state = judge(n_inliers, n_inliers, self._context)

@@ -71,7 +71,8 @@ def _interleaved(found: list[list[LoopCandidate]]) -> list[LoopCandidate]:
 
 def _joined(first: LoopCandidate, second: LoopCandidate) -> LoopCandidate:
     """Join the candidates of two detectors for the same keyframe. The result is the first candidate
-    with the names of both detectors. If the first candidate has no ``alike``, the ``alike`` of the
+    with the names of both detectors. If the first candidate has no ``similarity``, that of the
     second candidate is used."""
-    alike = second.alike if first.alike is None else first.alike
-    return replace(first, alike=alike, proposed_by=f"{first.proposed_by}+{second.proposed_by}")
+    similarity = second.similarity if first.similarity is None else first.similarity
+    names = f"{first.proposed_by}+{second.proposed_by}"
+    return replace(first, similarity=similarity, proposed_by=names)

@@ -43,7 +43,7 @@ class View(NamedTuple):
     xy: NDArray[np.float32]
 
 
-class Sight(NamedTuple):
+class PoseEstimate(NamedTuple):
     """A camera pose, the landmarks of a place that should be visible from it, and which of them are
     found in the image.
 
@@ -70,7 +70,7 @@ def localise(
     camera: Camera,
     config: LearnedMatchingConfig,
     seed: int,
-) -> Sight | str:
+) -> PoseEstimate | str:
     """Estimate the pose of an image at a place.
 
     Args:
@@ -86,14 +86,16 @@ def localise(
     n_searched, reason = 0, ""
     for keyframe in keyframes[: config.views]:
         view = view_of(map_, keyframe, images)
-        coarse = match_coarse(view.maps, query, config.coarse_alike)
+        coarse = match_coarse(view.maps, query, config.min_coarse_similarity)
         share = homography_share(coarse, view.maps, query)
         if share < config.min_share:
             return reason or f"only {100 * share:.0f} % of the image matches"
         views.append(view)
         n_searched += len(view.xy)
         min_inliers = max(config.min_consensus, round(config.min_consensus_ratio * n_searched))
-        located = locate(view.xy, view.maps, query, coarse, config.reach, config.alike)
+        located = locate(
+            view.xy, view.maps, query, coarse, config.reach, config.min_fine_similarity
+        )
         found = located.found
         xyz = np.vstack([xyz, map_.arrays.xyz[view.landmarks[found]]])
         uv = np.vstack([uv, located.xy[found]])
@@ -127,7 +129,7 @@ def guided_search(
     query: DescriptorMaps,
     camera: Camera,
     config: LearnedMatchingConfig,
-) -> Sight:
+) -> PoseEstimate:
     """Search for all landmarks of the views near their projections and refine the pose with all
     matches; then repeat both steps."""
     _, first = np.unique(np.concatenate([view.landmarks for view in views]), return_index=True)
@@ -140,9 +142,8 @@ def guided_search(
         for view in views:
             chosen = np.flatnonzero((first >= start) & (first < start + len(view.landmarks)))
             xy = view.xy[first[chosen] - start]
-            found[chosen] = locate_near(
-                xy, expected[chosen], view.maps, query, config.guided_reach, config.alike
-            ).xy
+            least, reach = config.min_fine_similarity, config.guided_reach
+            found[chosen] = locate_near(xy, expected[chosen], view.maps, query, reach, least).xy
             start += len(view.landmarks)
         hit = np.flatnonzero(np.isfinite(found[:, 0]))
         T_cw, inlier = optimise_pose(
@@ -152,7 +153,7 @@ def guided_search(
     seen = np.zeros(len(landmarks), np.bool_)
     seen[hit[inlier]] = True
     visible = np.flatnonzero(np.isfinite(expected[:, 0]))
-    return Sight(landmarks[visible], expected[visible], seen[visible], len(hit), T_cw)
+    return PoseEstimate(landmarks[visible], expected[visible], seen[visible], len(hit), T_cw)
 
 
 def project(xyz: Matrix, T_cw: Matrix, camera: Camera) -> Matrix:

@@ -17,7 +17,7 @@ from vslam.camera import Camera, Image
 from vslam.config import Config, LearnedMatchingConfig, VerificationConfig
 from vslam.features import Features
 from vslam.geometry import Matrix, inverse, orthonormalised, transform
-from vslam.loopclosure.learned_localisation import Sight, localise, project, view_of
+from vslam.loopclosure.learned_localisation import PoseEstimate, localise, project, view_of
 from vslam.loopclosure.local_matching import DescriptorMaps, likeness, locate_near
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loopclosure.verification import (
@@ -26,7 +26,7 @@ from vslam.loopclosure.verification import (
     relative_scale,
     spread_reason,
 )
-from vslam.loops import LoopCandidate, LoopEdge, Sighting
+from vslam.loops import Localisation, LoopCandidate, LoopEdge
 from vslam.map import Map
 from vslam.map_kernels import collect_landmarks
 from vslam.states import VerifierState
@@ -40,7 +40,7 @@ class LearnedTrials:
 
     The chosen candidates are those with the most similar images by local descriptors, if they are
     similar enough. After a failed attempt, only candidates that are clearly more similar than the
-    failed one are chosen for the next ``learned.rest`` keyframes.
+    failed one are chosen for the next ``learned.retry_interval`` keyframes.
 
     Attributes:
         state: the outcome of the last attempt.
@@ -54,12 +54,12 @@ class LearnedTrials:
         """The keyframe ids ``match`` of the candidates to try. Candidates without a rating are
         never chosen."""
         config = self._config
-        min_alike = config.min_alike
+        min_similarity = config.min_similarity
         if keyframe < self.state.resting_until:
-            min_alike = max(min_alike, config.more_alike * self.state.failed_alike)
-        rated = [(one.alike, one.match) for one in candidates if one.alike is not None]
-        best = sorted(rated, reverse=True)[: config.max_candidates]
-        return {match for alike, match in best if alike >= min_alike}
+            min_similarity = max(min_similarity, config.retry_factor * self.state.failed_similarity)
+        known = [(one.similarity, one.match) for one in candidates if one.similarity is not None]
+        best = sorted(known, reverse=True)[: config.max_candidates]
+        return {match for similarity, match in best if similarity >= min_similarity}
 
     def record(self, candidate: LoopCandidate, *, located: bool) -> None:
         """Remember the result of an attempt.
@@ -70,41 +70,43 @@ class LearnedTrials:
         if located:
             self.state = replace(self.state, resting_until=0)
         else:
-            until = candidate.query + 1 + self._config.rest
-            self.state = VerifierState(until, candidate.alike or 0.0)
+            until = candidate.query + 1 + self._config.retry_interval
+            self.state = VerifierState(until, candidate.similarity or 0.0)
 
 
-def rated(
+def with_similarities(
     candidates: Sequence[LoopCandidate],
     glance: Callable[[], DescriptorMaps],
     images: KeyframeImages,
     config: LearnedMatchingConfig,
     beyond: NDArray[np.float64] | None = None,
 ) -> list[LoopCandidate]:
-    """Set ``alike``, the similarity by local descriptors, for candidates that the detector has not
-    rated.
+    """Set ``similarity`` for candidates whose images the detector has not compared by local
+    descriptors.
 
     Args:
-        candidates: best first; at most ``config.rated`` of them are rated.
+        candidates: best first; at most ``config.max_compared`` of them are compared.
         glance: returns the coarse descriptors of the query image; called only if there is a
             candidate to rate.
         beyond: result of :func:`vslam.loopclosure.reach.beyond_reach`; keyframes out of reach are
-            not rated. None if the camera may be anywhere.
+            not compared. None if the camera may be anywhere.
 
     Returns:
         The candidates in the same order.
     """
-    unrated = [one.match for one in candidates if one.alike is None and one.match in images]
+    unknown = [one.match for one in candidates if one.similarity is None and one.match in images]
     if beyond is not None:
-        unrated = [match for match in unrated if beyond[match] <= 0.0]
-    if not unrated:
+        unknown = [match for match in unknown if beyond[match] <= 0.0]
+    if not unknown:
         return list(candidates)
     query = glance()
-    alike = {
-        match: likeness(query, images.glance(match), config.coarse_alike)
-        for match in unrated[: config.rated]
+    similarity = {
+        match: likeness(query, images.glance(match), config.min_coarse_similarity)
+        for match in unknown[: config.max_compared]
     }
-    return [replace(one, alike=alike.get(one.match, one.alike)) for one in candidates]
+    return [
+        replace(one, similarity=similarity.get(one.match, one.similarity)) for one in candidates
+    ]
 
 
 def is_image_redundant(
@@ -143,36 +145,36 @@ def verify_learned(
     keyframes = [k for k in place_of(map_, match, query, gates).tolist() if k in images]
     if query not in images or not keyframes:
         return replace(edge, reason="no image is stored")
-    sight = localise(
+    estimate = localise(
         map_, images.maps(query), keyframes, images, camera, config, seed=query << 32 | match
     )
-    if isinstance(sight, str):
-        return replace(edge, reason=sight)
-    feature, landmark = observed_features(map_, query, sight, camera, config)
+    if isinstance(estimate, str):
+        return replace(edge, reason=estimate)
+    feature, landmark = observed_features(map_, query, estimate, camera, config)
     # Now that the pose is known, ORB features may match. If enough do, their matches are preferred,
     # because their positions are more precise (about a tenth of a pixel).
     place = collect_landmarks(map_.arrays, np.array(keyframes, np.int64), map_.n_landmarks)
-    guided = guided_match(map_, query, place, sight.T_cw, camera, gates)
+    guided = guided_match(map_, query, place, estimate.T_cw, camera, gates)
     if np.count_nonzero(guided.seen) >= gates.min_inliers:
-        sight = sight._replace(T_cw=guided.T_cw)
+        estimate = estimate._replace(T_cw=guided.T_cw)
         pairs = guided.feature[guided.seen], guided.landmarks[guided.seen]
         feature, landmark = joined(pairs, (feature, landmark))
-    T_query_match = orthonormalised(sight.T_cw @ inverse(map_.keyframe_pose(match)))
+    T_query_match = orthonormalised(estimate.T_cw @ inverse(map_.keyframe_pose(match)))
     edge = replace(
         edge,
-        n_matches=sight.n_matches,
-        n_inliers=int(np.count_nonzero(sight.seen)),
+        n_matches=estimate.n_matches,
+        n_inliers=int(np.count_nonzero(estimate.seen)),
         T_query_match=T_query_match,
         features=feature,
         landmarks=landmark,
     )
     if camera.monocular:
-        scale = relative_scale(map_, edge, sight.T_cw, default=np.nan)
+        scale = relative_scale(map_, edge, estimate.T_cw, default=np.nan)
         if not np.isfinite(scale):
             return replace(edge, reason="too few landmarks on both sides to estimate the scale")
         edge = replace(edge, scale=scale)
     seen = _seen_of_query(map_, edge, keyframes[0], images, camera, config)
-    reason = _rejection_reason(edge, sight, seen, camera, config, gates)
+    reason = _rejection_reason(edge, estimate, seen, camera, config, gates)
     return replace(edge, accepted=not reason, reason=reason or "verified")
 
 
@@ -184,7 +186,7 @@ def recognise(
     images: KeyframeImages,
     camera: Camera,
     config: Config,
-) -> Sighting | None:
+) -> Localisation | None:
     """Estimate the pose of a frame outside the map at the place of a keyframe.
 
     Args:
@@ -199,20 +201,20 @@ def recognise(
     gates = config.verification
     around = [match, *map_.covisible(match)[0].tolist()]
     keyframes = [k for k in around if k in images]
-    sight = localise(map_, query, keyframes, images, camera, config.learned, seed=match)
-    if isinstance(sight, str) or _visibility_reason(sight, camera, config.learned, gates):
+    estimate = localise(map_, query, keyframes, images, camera, config.learned, seed=match)
+    if isinstance(estimate, str) or _visibility_reason(estimate, camera, config.learned, gates):
         return None
-    index = np.flatnonzero(sight.seen)
+    index = np.flatnonzero(estimate.seen)
     feature, near = nearest_features(
-        sight.uv[index], features.xy, features.octave, map_.scales, config.learned
+        estimate.uv[index], features.xy, features.octave, map_.scales, config.learned
     )
     if len(feature) < config.tracking.min_inliers:
         return None
-    return Sighting(match, sight.T_cw, feature, sight.landmarks[index[near]])
+    return Localisation(match, estimate.T_cw, feature, estimate.landmarks[index[near]])
 
 
 def observed_features(
-    map_: Map, query: int, sight: Sight, camera: Camera, config: LearnedMatchingConfig
+    map_: Map, query: int, estimate: PoseEstimate, camera: Camera, config: LearnedMatchingConfig
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Pair features of the query with landmarks of the place that coincide in the image.
 
@@ -223,10 +225,10 @@ def observed_features(
         ``(N,)`` indices of features and ``(N,)`` ids of landmarks, without duplicates.
     """
     a, rows = map_.arrays, map_.rows(query)
-    landmarks, uv = sight.landmarks[sight.seen], sight.uv[sight.seen]
+    landmarks, uv = estimate.landmarks[estimate.seen], estimate.uv[estimate.seen]
     feature, index = nearest_features(uv, a.xy[rows], a.octave[rows], map_.scales, config)
     own = a.landmark[rows][feature]
-    depth = transform(sight.T_cw, a.xyz[landmarks[index]])[:, 2]
+    depth = transform(estimate.T_cw, a.xyz[landmarks[index]])[:, 2]
     ratio = np.where(own >= 0, transform(a.T_cw[query], a.xyz[own])[:, 2] / depth, np.nan)
     known = np.isfinite(ratio)
     # Scale drift of a monocular map changes all ratios by the same factor.
@@ -280,7 +282,7 @@ def nearest_features(
 
 def _rejection_reason(
     edge: LoopEdge,
-    sight: Sight,
+    estimate: PoseEstimate,
     query_seen: tuple[int, int],
     camera: Camera,
     config: LearnedMatchingConfig,
@@ -295,7 +297,7 @@ def _rejection_reason(
     distance = float(np.linalg.norm(inverse(edge.T_query_match)[:3, 3]))
     if distance > gates.max_distance:
         return f"the pose is {distance:.0f} m from the place"
-    if reason := _visibility_reason(sight, camera, config, gates):
+    if reason := _visibility_reason(estimate, camera, config, gates):
         return reason
     seen, total = query_seen
     if seen < config.min_seen_ratio * total:
@@ -304,15 +306,15 @@ def _rejection_reason(
 
 
 def _visibility_reason(
-    sight: Sight, camera: Camera, config: LearnedMatchingConfig, gates: VerificationConfig
+    estimate: PoseEstimate, camera: Camera, config: LearnedMatchingConfig, gates: VerificationConfig
 ) -> str:
     """The reason to reject a pose because too little of the place is seen, or "" if enough is."""
-    seen, total = int(np.count_nonzero(sight.seen)), len(sight.seen)
+    seen, total = int(np.count_nonzero(estimate.seen)), len(estimate.seen)
     if seen < config.min_inliers:
         return f"only {seen} learned matches fit"
-    if seen < gates.min_inlier_ratio * sight.n_matches:
-        return f"only {seen} of {sight.n_matches} learned matches fit"
-    if reason := spread_reason(sight.uv, sight.seen, camera, gates, config.min_elsewhere):
+    if seen < gates.min_inlier_ratio * estimate.n_matches:
+        return f"only {seen} of {estimate.n_matches} learned matches fit"
+    if reason := spread_reason(estimate.uv, estimate.seen, camera, gates, config.min_elsewhere):
         return reason
     if seen < config.min_seen_ratio * total:
         return f"only {seen} of {total} landmarks of the place are seen"
@@ -341,7 +343,8 @@ def _seen_of_query(
     T_kw = inverse(T_wk) @ T_wm @ T_match_query @ map_.keyframe_pose(edge.query)
     expected = project(map_.arrays.xyz[view.landmarks], T_kw, camera)
     match = images.maps(keyframe)
-    found = locate_near(view.xy, expected, view.maps, match, config.guided_reach, config.alike)
+    least, reach = config.min_fine_similarity, config.guided_reach
+    found = locate_near(view.xy, expected, view.maps, match, reach, least)
     error = np.linalg.norm(found.xy - expected, axis=1) * match.scale
     # 95 % of the distances of a two-dimensional normal distribution are below 2.45 sigma.
     seen = np.count_nonzero(error < 2.45 * config.sigma)
@@ -358,22 +361,24 @@ class LearnedRelocalisation:
 
     def __call__(
         self, map_: Map, image: Image | None, features: Features, candidates: list[LoopCandidate]
-    ) -> Sighting | None:
+    ) -> Localisation | None:
         """Search for a frame at the candidates whose images are most similar to it; returns None if
         no candidate succeeds."""
         images, config = self._images, self._config
         if images is None or image is None:
             return None
-        candidates = rated(candidates, lambda: images.glance_at(image), images, config.learned)
-        candidates = [one for one in candidates if one.alike is not None]
-        candidates.sort(key=lambda one: -(one.alike or 0.0))
+        candidates = with_similarities(
+            candidates, lambda: images.glance_at(image), images, config.learned
+        )
+        candidates = [one for one in candidates if one.similarity is not None]
+        candidates.sort(key=lambda one: -(one.similarity or 0.0))
         if not candidates:
             return None
         maps = images.network.describe(image)
         for candidate in candidates[: config.learned.max_candidates]:
-            sighting = recognise(
+            localised = recognise(
                 map_, maps, features, candidate.match, images, self._camera, config
             )
-            if sighting is not None:
-                return sighting
+            if localised is not None:
+                return localised
         return None

@@ -46,12 +46,12 @@ class CoarseMatches(NamedTuple):
 
     Attributes:
         a, b: ``(N,)`` int64 indices of the cells in each image, row-major.
-        alike: ``(N,)`` float32 cosine similarities.
+        similarity: ``(N,)`` float32 cosine similarities.
     """
 
     a: NDArray[np.int64]
     b: NDArray[np.int64]
-    alike: NDArray[np.float32]
+    similarity: NDArray[np.float32]
 
 
 class Located(NamedTuple):
@@ -72,10 +72,10 @@ class Located(NamedTuple):
 def match_coarse(a: DescriptorMaps, b: DescriptorMaps, least: float) -> CoarseMatches:
     """Mutual nearest neighbours of the coarse descriptors whose cosine is at least ``least``."""
     cells = [one.coarse.reshape(-1, one.coarse.shape[2]).astype(np.float32) for one in (a, b)]
-    best_a, best_b, alike = _nearest(cells[0], np.ascontiguousarray(cells[1].T))
-    mutual = (best_b[best_a] == np.arange(len(best_a))) & (alike >= least)
+    best_a, best_b, similarity = _nearest(cells[0], np.ascontiguousarray(cells[1].T))
+    mutual = (best_b[best_a] == np.arange(len(best_a))) & (similarity >= least)
     chosen = np.flatnonzero(mutual)
-    return CoarseMatches(chosen, best_a[chosen], alike[chosen])
+    return CoarseMatches(chosen, best_a[chosen], similarity[chosen])
 
 
 def positions(cells: NDArray[np.int64], maps: DescriptorMaps) -> NDArray[np.float64]:
@@ -141,7 +141,7 @@ def likeness(a: DescriptorMaps, b: DescriptorMaps, least: float) -> float:
     Args:
         least: least cosine of a match.
     """
-    return float(match_coarse(a, b, least).alike.sum() / _fewest_cells(a, b))
+    return float(match_coarse(a, b, least).similarity.sum() / _fewest_cells(a, b))
 
 
 def homography_share(coarse: CoarseMatches, a: DescriptorMaps, b: DescriptorMaps) -> float:
@@ -244,9 +244,9 @@ def _search(fine, descriptor, x, y, reach):
     middle_j, middle_i = int(np.rint(x)), int(np.rint(y))
     for i in range(max(0, middle_i - reach), min(rows, middle_i + reach + 1)):
         for j in range(max(0, middle_j - reach), min(columns, middle_j + reach + 1)):
-            alike = _cosine(fine, i, j, descriptor)
-            if alike > best:
-                best_i, best_j, best = i, j, alike
+            similarity = _cosine(fine, i, j, descriptor)
+            if similarity > best:
+                best_i, best_j, best = i, j, similarity
     return best_j, best_i, best
 
 
@@ -311,9 +311,9 @@ def _locate(xy, fine_a, fine_b, cell_in_b, columns_b, reach, least):
                     continue
                 tried[n_tried, 0], tried[n_tried, 1] = guess_x, guess_y
                 n_tried += 1
-                found_j, found_i, alike = _search(fine_b, descriptor, guess_x, guess_y, reach)
-                if alike > best:
-                    best_j, best_i, best = found_j, found_i, alike
+                found_j, found_i, similarity = _search(fine_b, descriptor, guess_x, guess_y, reach)
+                if similarity > best:
+                    best_j, best_i, best = found_j, found_i, similarity
         if best >= least:
             _accept_if_mutual(
                 fine_a, fine_b, descriptor, x, y, best_j, best_i, best, reach, other, found[k]

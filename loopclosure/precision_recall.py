@@ -79,7 +79,7 @@ def recall_at_full_precision(curve: PrecisionRecall) -> float:
     return float(curve.recall[curve.precision == 1.0].max())
 
 
-def precision_at_recall(curve: PrecisionRecall, recall: float = 0.7) -> float:
+def precision_at_recall(curve: PrecisionRecall, recall: float) -> float:
     """The highest precision among the thresholds with at least this recall."""
     return float(curve.precision[curve.recall >= recall].max())
 
@@ -127,7 +127,7 @@ def summary(same: NDArray, score: NDArray) -> dict[str, float]:
         "same": float(np.sum(same)),
         "average_precision": average_precision(curve),
         "recall_at_100_precision": recall_at_full_precision(curve),
-        "precision_at_70_recall": precision_at_recall(curve),
+        "precision_at_70_recall": precision_at_recall(curve, 0.7),
         "max_f1": f1,
         "max_f1_threshold": threshold,
     }

@@ -154,7 +154,7 @@ def create_images(name: str, config: Config, weights: Path | None = None) -> Key
         InputError: the network of the local descriptors cannot be read.
     """
     descriptors = config.verification.descriptors
-    if descriptors == "usual":
+    if descriptors == "auto":
         descriptors = "both" if name in LEARNED_VERIFICATION else "orb"
     if name == "none" or descriptors == "orb":
         return None

@@ -24,7 +24,7 @@ SAMPLE_ITERATIONS, REFIT_ITERATIONS = 3, 5
 MIN_FLATNESS = 0.03
 
 
-class Sightings(NamedTuple):
+class ObservedPoints(NamedTuple):
     """The landmarks of N matches on one side of a loop, and their observations there.
 
     Attributes:
@@ -53,8 +53,8 @@ class Alignment(NamedTuple):
 
 
 def align(
-    a: Sightings,
-    b: Sightings,
+    a: ObservedPoints,
+    b: ObservedPoints,
     intrinsics: NDArray[np.float64],
     *,
     seed: int,

@@ -30,7 +30,7 @@ from vslam.frontend.matching import (
 )
 from vslam.frontend.pose import optimise_pose
 from vslam.geometry import Matrix, inverse, orthonormalised, transform
-from vslam.loopclosure.sim3_ransac import Sightings, align
+from vslam.loopclosure.sim3_ransac import ObservedPoints, align
 from vslam.loops import LoopCandidate, LoopEdge
 from vslam.map import Map
 from vslam.map_kernels import collect_landmarks
@@ -138,10 +138,8 @@ def match_keyframes(
     )
     hit = np.flatnonzero(found >= 0)
     rows_q, rows_m = rows_q[hit], rows_m[found[hit]]
-    if len(hit):
-        keep = consistent_orientation(a.angle[rows_q], a.angle[rows_m])
-        rows_q, rows_m = rows_q[keep], rows_m[keep]
-    return rows_q, rows_m
+    keep = consistent_orientation(a.angle[rows_q], a.angle[rows_m])
+    return rows_q[keep], rows_m[keep]
 
 
 def _consensus(
@@ -156,8 +154,8 @@ def _consensus(
     """``T_query_match`` and scale from RANSAC, with the number of inliers. The pose is None if it
     has too few inliers."""
     found = align(
-        _sightings(map_, query, rows_q),
-        _sightings(map_, match, rows_m),
+        _observed_points(map_, query, rows_q),
+        _observed_points(map_, match, rows_m),
         camera.intrinsics,
         seed=query << 32 | match,
         min_inliers=config.min_consensus,
@@ -196,10 +194,10 @@ def relative_scale(map_: Map, edge: LoopEdge, T_cw: Matrix, *, default: float) -
     return float(np.median(depth / depth_of_place))
 
 
-def _sightings(map_: Map, keyframe: int, rows: NDArray[np.int64]) -> Sightings:
+def _observed_points(map_: Map, keyframe: int, rows: NDArray[np.int64]) -> ObservedPoints:
     a = map_.arrays
     points = transform(a.T_cw[keyframe], a.xyz[a.landmark[rows]])
-    return Sightings(points, *_observations(map_, rows))
+    return ObservedPoints(points, *_observations(map_, rows))
 
 
 def _observations(map_: Map, rows: NDArray[np.int64]) -> tuple[Matrix, Matrix]:

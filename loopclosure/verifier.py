@@ -17,8 +17,8 @@ from vslam.loopclosure import verification
 from vslam.loopclosure.learned_verification import (
     LearnedTrials,
     is_image_redundant,
-    rated,
     verify_learned,
+    with_similarities,
 )
 from vslam.loopclosure.reach import beyond_reach
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
@@ -61,14 +61,14 @@ class Verifier:
     def rate(
         self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
     ) -> list[LoopCandidate]:
-        """Set ``alike`` and ``promising`` (see ``LoopCandidate``) of the candidates of a keyframe
+        """Set ``similarity`` and ``promising`` (see ``LoopCandidate``) of a keyframe's candidates
         if this verifier uses them. The order of the candidates stays the same."""
         return candidates
 
     def verify(
         self, map_: Map, candidate: LoopCandidate, refusal: LoopEdge | None = None
     ) -> LoopEdge:
-        """Decide whether a rated candidate is a loop. The map is not changed.
+        """Decide whether a candidate is a loop. The map is not changed.
 
         Args:
             refusal: the rejected edge if the candidate has failed an earlier test, else None.
@@ -132,13 +132,15 @@ class LearnedVerifier(Verifier):
     def rate(
         self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
     ) -> list[LoopCandidate]:
-        """See :class:`Verifier`. Candidates that the detector has not rated are rated by comparing
-        their images, and the promising candidates are marked."""
+        """See :class:`Verifier`. Images of candidates that the detector has not compared are
+        compared, and the promising candidates are marked."""
         images, config = self.images, self._config
-        if keyframe in images and any(one.alike is None for one in candidates):
+        if keyframe in images and any(one.similarity is None for one in candidates):
             beyond = beyond_reach(map_, keyframe, config.siamese)
             glance = images.glance
-            candidates = rated(candidates, lambda: glance(keyframe), images, config.learned, beyond)
+            candidates = with_similarities(
+                candidates, lambda: glance(keyframe), images, config.learned, beyond
+            )
         chosen = self._trials.choose(keyframe, candidates)
         return [replace(one, promising=one.match in chosen) for one in candidates]
 

@@ -222,7 +222,7 @@ def _check_map(map_: Map) -> None:
         assert sorted(chain) == rows_of.get(i, []), f"chain of landmark {i}"
         assert a.n_observations[i] == sum(2 if stereo[r] else 1 for r in chain), f"landmark {i}"
         if not alive[i]:
-            assert not chain, f"dead landmark {i} is observed"
+            assert not chain, f"culled landmark {i} is observed"
         if a.merged_into[i] >= 0:
             assert not alive[i]
             assert a.merged_into[i] != i

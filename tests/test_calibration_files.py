@@ -387,7 +387,7 @@ def test_the_names_of_the_manual_of_opencv(tmp_path):
 def test_a_file_without_a_size_of_another_resolution(tmp_path):
     given = opencv(tmp_path, (LEFT, RIGHT))
     for size in ((376, 240), (480, 752), (1504, 960)):
-        with pytest.raises(InputError, match=r"far from the centre of the \d+x\d+ images"):
+        with pytest.raises(InputError, match=r"far from the middle of the \d+x\d+ images; "):
             read_calibration(given, size)
 
 

@@ -22,6 +22,7 @@ from test_report import make_outcome
 from vslam import machine
 from vslam.cli import main as cli
 from vslam.cli import options, train
+from vslam.cli import run as run_command
 from vslam.datasets import open_sequence
 from vslam.features import TrackingState, TrackResult
 from vslam.loopclosure.registry import DETECTORS
@@ -300,6 +301,14 @@ def test_every_option_has_a_placeholder_and_a_sentence_that_describes_it():
             assert (one.help or "").endswith("."), f"{words}: {one.name}"
             needs = one.param_type_name == "option" and not one.is_flag
             assert not needs or one.metavar, f"{words}: {one.name}"
+
+
+def test_the_help_of_resume_names_the_options_that_can_be_given_with_it():
+    from typer.main import get_command
+
+    options = {one.name: one for one in dict(commands(get_command(cli.app)))["vslam run"].params}
+    named = set(re.findall(r"--[a-z-]+", options["resume"].help))
+    assert named == {options[name].opts[0] for name in run_command._WITH_RESUME - {"resume"}}
 
 
 def test_help_is_grouped_and_short(call, monkeypatch):

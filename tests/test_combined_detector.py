@@ -17,9 +17,9 @@ from vslam.loops import LoopCandidate
 class Told:
     """Finds what it is told to."""
 
-    def __init__(self, name: str, matches: list[int], *, alike: float | None) -> None:
+    def __init__(self, name: str, matches: list[int], *, similarity: float | None) -> None:
         self.name, self.added = name, []
-        self._found = [LoopCandidate(9, m, 1.0 / (1 + m), alike, name) for m in matches]
+        self._found = [LoopCandidate(9, m, 1.0 / (1 + m), similarity, name) for m in matches]
 
     def add(self, keyframe, image, features):
         self.added.append(keyframe)
@@ -32,11 +32,11 @@ class Told:
 
 
 def test_candidates_come_in_turn_and_one_for_each_keyframe():
-    words, network = Told("bow", [1, 4, 6], alike=None), Told("net", [2, 4, 5], alike=0.5)
+    words, network = Told("bow", [1, 4, 6], similarity=None), Told("net", [2, 4, 5], similarity=0.5)
     both = CombinedDetector("both", [words, network])
     map_ = a_map(10, covisible=((1, 2), (1, 6)))  # 1, 2 and 6 show one place
     found = both.query(9, map_)
-    assert [(c.match, c.alike) for c in found] == [
+    assert [(c.match, c.similarity) for c in found] == [
         (1, None),
         (2, 0.5),
         (4, 0.5),

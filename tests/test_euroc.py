@@ -129,10 +129,11 @@ def test_frames_without_a_partner_are_left_out(root, corridor, caplog):
     drop_lines(root / "V9_01/mav0/cam1/data.csv", lambda k: k not in (1, 4, 6))
     sequence = open_euroc(root, "V9_01")
     assert len(sequence) == 3
-    (said,) = caplog.messages
+    assert not caplog.messages
+    (said,) = sequence.pairing.warnings()
     assert said.startswith(f"{root / 'V9_01/mav0'}: 3 of 6 images are left out because no right ")
     assert "correct the times in cam1/data.csv" in said
-    assert sequence.pairing.warnings() == open_raw_euroc(root).pairing.warnings() == [said]
+    assert open_raw_euroc(root).pairing.warnings() == [said]
     np.testing.assert_array_equal(sequence.read(2)[0], corridor.left[4])
     np.testing.assert_array_equal(sequence.read(2)[1], corridor.right[4])
     np.testing.assert_allclose(sequence.ground_truth, corridor.T_wc[[1, 2, 4]], atol=1e-9)

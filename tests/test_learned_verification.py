@@ -15,9 +15,9 @@ from vslam.loopclosure.learned_verification import (
     is_image_redundant,
     joined,
     nearest_features,
-    rated,
     recognise,
     verify_learned,
+    with_similarities,
 )
 from vslam.loopclosure.local_matching import DescriptorMaps
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
@@ -112,7 +112,7 @@ class World:
 
     def verify(self, camera: Camera = CAMERA):
         return verify_learned(
-            self.map, LoopCandidate(1, 0, 0.9, alike=0.5), self.images, camera,
+            self.map, LoopCandidate(1, 0, 0.9, similarity=0.5), self.images, camera,
             CONFIG.learned, CONFIG.verification,
         )  # fmt: skip
 
@@ -190,12 +190,17 @@ def test_each_feature_takes_the_nearest_pixel():
 
 def test_only_what_looks_alike_is_tried_and_less_after_a_try_in_vain():
     config = CONFIG.learned.model_copy(
-        update={"min_alike": 0.35, "more_alike": 1.1, "rest": 8, "max_candidates": 2}
+        update={
+            "min_similarity": 0.35,
+            "retry_factor": 1.1,
+            "retry_interval": 8,
+            "max_candidates": 2,
+        }
     )
     trials = LearnedTrials(config)
 
-    def candidates(*alike: float | None) -> list[LoopCandidate]:
-        return [LoopCandidate(50, match, 0.9, one) for match, one in enumerate(alike)]
+    def candidates(*similarity: float | None) -> list[LoopCandidate]:
+        return [LoopCandidate(50, match, 0.9, one) for match, one in enumerate(similarity)]
 
     assert trials.choose(50, candidates(0.34, None, 0.1)) == set()
     assert trials.choose(50, candidates(0.35, None, 0.5, 0.6)) == {2, 3}
@@ -205,12 +210,12 @@ def test_only_what_looks_alike_is_tried_and_less_after_a_try_in_vain():
     assert trials.choose(59, candidates(0.43)) == {0}
     trials.record(candidates(0.4)[0], located=True)
     assert trials.choose(51, candidates(0.36)) == {0}
-    # However little alike the last one was, the least that is tried stays.
+    # However small the similarity of the last one was, the least that is tried stays.
     trials.record(candidates(0.1)[0], located=False)
     assert trials.choose(52, candidates(0.3)) == set()
 
 
-def test_candidates_that_no_detector_rated_are_rated_where_the_camera_may_be(network):
+def test_candidates_that_no_detector_compared_are_compared_where_the_camera_may_be(network):
     images = KeyframeImages(network)
     rng = np.random.default_rng(3)
     view = cv2.GaussianBlur(rng.integers(0, 256, (192, 640), np.uint8), (0, 0), 2.0)
@@ -222,18 +227,20 @@ def test_candidates_that_no_detector_rated_are_rated_where_the_camera_may_be(net
         LoopCandidate(9, 3, 0.2), LoopCandidate(9, 8, 0.1),
     ]  # fmt: skip
     beyond = np.array([0.0, -1.0, 0.0, 5.0, 0, 0, 0, 0, 0])
-    found = rated(candidates, lambda: images.glance_at(view), images, CONFIG.learned, beyond)
-    assert found[0].alike > 0.9 > found[1].alike
+    found = with_similarities(
+        candidates, lambda: images.glance_at(view), images, CONFIG.learned, beyond
+    )
+    assert found[0].similarity > 0.9 > found[1].similarity
     # Rated by its detector, beyond reach, without an image: as they were.
     assert found[2:] == candidates[2:]
-    first = CONFIG.learned.model_copy(update={"rated": 1})
-    found = rated(candidates, lambda: images.glance_at(view), images, first, beyond)
-    assert [one.alike is not None for one in found] == [True, False, True, False, False]
+    first = CONFIG.learned.model_copy(update={"max_compared": 1})
+    found = with_similarities(candidates, lambda: images.glance_at(view), images, first, beyond)
+    assert [one.similarity is not None for one in found] == [True, False, True, False, False]
 
     def never() -> DescriptorMaps:
         raise AssertionError("there is nothing to rate")
 
-    assert rated(candidates[2:3], never, images, CONFIG.learned) == candidates[2:3]
+    assert with_similarities(candidates[2:3], never, images, CONFIG.learned) == candidates[2:3]
 
 
 def test_no_network_sees_what_an_image_shows_already(network):

@@ -47,12 +47,12 @@ def moved(pixels: np.ndarray, dx: float, dy: float) -> np.ndarray:
 def test_coarse_matches_are_each_others_nearest():
     a, b = maps(field(0)), maps(field(0)[:, ::-1].copy() + 0.3 * field(1))
     found = match_coarse(a, b, 0.3)
-    alike = a.coarse.reshape(-1, 32) @ b.coarse.reshape(-1, 32).T
-    best = alike.argmax(1)
-    mutual = (alike.argmax(0)[best] == np.arange(len(best))) & (alike.max(1) >= 0.3)
+    similarity = a.coarse.reshape(-1, 32) @ b.coarse.reshape(-1, 32).T
+    best = similarity.argmax(1)
+    mutual = (similarity.argmax(0)[best] == np.arange(len(best))) & (similarity.max(1) >= 0.3)
     assert found.a.tolist() == np.flatnonzero(mutual).tolist()
     assert found.b.tolist() == best[mutual].tolist()
-    np.testing.assert_allclose(found.alike, alike.max(1)[mutual], atol=1e-5)
+    np.testing.assert_allclose(found.similarity, similarity.max(1)[mutual], atol=1e-5)
     assert 0 < len(found.a) < len(best)
 
 

@@ -94,15 +94,15 @@ def test_landmarks_of_a_culled_anchor_move_with_the_next_that_sees_them(check_ma
     check_map(world.map)
 
 
-def test_dead_landmarks_stay_where_they_were():
+def test_culled_landmarks_stay_where_they_were():
     world = world_of_five()
     a = world.map.arrays
     world.map.cull_keyframe(4)
-    dead = np.flatnonzero(~a.landmark_alive[: world.map.n_landmarks])
-    assert len(dead) > 0
-    xyz = a.xyz[dead].copy()
+    culled = np.flatnonzero(~a.landmark_alive[: world.map.n_landmarks])
+    assert len(culled) > 0
+    xyz = a.xyz[culled].copy()
     move_keyframes(world.map, np.arange(4), moved_poses(range(4)))
-    np.testing.assert_array_equal(a.xyz[dead], xyz)
+    np.testing.assert_array_equal(a.xyz[culled], xyz)
 
 
 def test_a_culled_keyframe_cannot_be_moved():

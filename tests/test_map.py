@@ -193,14 +193,14 @@ def test_resolve_follows_chains_of_merges_and_forgets_the_erased():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_dropping_the_dead_keeps_what_lives_in_its_order(seed, check_map):
+def test_dropping_culled_landmarks_keeps_the_others_in_order(seed, check_map):
     map_ = random_map(seed, 300)
     before = map_.arrays.xyz[map_.living_landmarks()]
     ids = np.arange(map_.n_landmarks, dtype=np.int32)
     stood_for = resolve(map_.arrays, ids)
     places = map_.arrays.xyz[np.maximum(stood_for, 0)]
     observed = {k: map_.arrays.xyz[map_.landmarks_of(k)] for k in map_.living_keyframes()}
-    new_id = map_.drop_dead_landmarks()
+    new_id = map_.drop_culled_landmarks()
     check_map(map_)
     assert map_.n_landmarks == len(before) < len(ids)
     assert np.array_equal(map_.arrays.xyz[: map_.n_landmarks], before)
@@ -209,10 +209,10 @@ def test_dropping_the_dead_keeps_what_lives_in_its_order(seed, check_map):
     assert np.array_equal(map_.arrays.xyz[new_id[known]], places[known])
     for k, xyz in observed.items():
         assert np.array_equal(map_.arrays.xyz[map_.landmarks_of(k)], xyz)
-    assert not map_.many_dead_landmarks
+    assert not map_.many_culled_landmarks
 
 
-def test_a_landmark_without_observations_is_dead():
+def test_a_landmark_without_observations_is_culled():
     rng = np.random.default_rng(0)
     map_ = Map(SCALES)
     add_keyframe(map_, rng, 8)

@@ -25,7 +25,7 @@ from vslam.map import UNPREDICTED, Map
 from vslam.map_kernels import refresh_landmarks
 from vslam.maps import new_output
 from vslam.maps.storage import load_checkpoint, load_map, save_map
-from vslam.maps.stored_map import StoredMap, World
+from vslam.maps.stored_map import StoredMap, TruthAlignment
 from vslam.slam import Slam
 
 CONFIG = Config()
@@ -152,8 +152,8 @@ def test_loops_images_drives_and_world_come_back(slam, tmp_path):
     loop = LoopEdge(living[-1], culled, 0.25, True, "closed", 90, 60, T, scale=1.5)
     first = np.arange(slam.map.n_keyframes + 1)
     images = PerKeyframe(first, np.arange(slam.map.n_keyframes, dtype=np.uint8))
-    world = World("kitti 06", np.diag([2.0, 2.0, 2.0, 1.0]))
-    stored = replace(slam.stored_map("x"), loops=(loop,), images=images, world=world)
+    world = TruthAlignment("kitti 06", np.diag([2.0, 2.0, 2.0, 1.0]))
+    stored = replace(slam.stored_map("x"), loops=(loop,), images=images, truth_alignment=world)
     save_map(tmp_path / "m.npz", stored)
     found = load_map(tmp_path / "m.npz")
     (edge,) = found.loops
@@ -166,9 +166,9 @@ def test_loops_images_drives_and_world_come_back(slam, tmp_path):
     assert found.images is not None
     assert found.images.values.tolist() == living
     assert found.drives == ("x",)
-    assert found.world is not None
-    assert found.world.name == "kitti 06"
-    assert np.array_equal(found.world.S_truth_world, world.S_truth_world)
+    assert found.truth_alignment is not None
+    assert found.truth_alignment.name == "kitti 06"
+    assert np.array_equal(found.truth_alignment.S_truth_world, world.S_truth_world)
 
 
 def test_what_the_detector_knew_comes_back(slam, file, ring):
@@ -227,7 +227,7 @@ def test_descriptors_and_images_of_learned_detectors_come_back(tmp_path):
     (before,) = detector.locate(pictures[2], Features.none(), map_)[:1]
     (after,) = again.locate(pictures[2], Features.none(), found.map)[:1]
     assert (before.match, after.match) == (2, 1)
-    assert (before.score, before.alike) == (after.score, after.alike)
+    assert (before.score, before.similarity) == (after.score, after.similarity)
 
     values = found.images.values.copy()
     values[:2] = 0
@@ -411,8 +411,11 @@ def without_checkpoint(file: Path, to: Path) -> Path:
 
 def merged_in_a_circle(file: Path, to: Path) -> Path:
     with np.load(file) as data:
-        merged, dead = data["landmark_merged_into"].copy(), np.flatnonzero(~data["landmark_alive"])
-    merged[dead[:2]] = dead[[1, 0]]
+        merged, culled = (
+            data["landmark_merged_into"].copy(),
+            np.flatnonzero(~data["landmark_alive"]),
+        )
+    merged[culled[:2]] = culled[[1, 0]]
     return changed(file, to, landmark_merged_into=merged)
 
 
@@ -489,6 +492,18 @@ def test_observations_that_contradict_each_other_are_refused(file, tmp_path):
     other = first[several] + int(np.flatnonzero(keyframe_of[here] != 0)[0])
     rows[other] = free
     assert "a landmark twice" in refusal(changed(file, path, observation_row=rows))
+
+
+def test_culled_landmarks_and_their_observations_must_agree(file, tmp_path):
+    with np.load(file) as data:
+        not_culled, first = data["landmark_alive"].copy(), data["landmark_first_observation"].copy()
+    path = tmp_path / "m.npz"
+    not_culled[3] = False
+    message = refusal(changed(file, path, landmark_alive=not_culled))
+    assert "a culled landmark with observations" in message
+    first[4] = first[3]
+    message = refusal(changed(file, path, landmark_first_observation=first))
+    assert "a landmark without observations that is not culled" in message
 
 
 @pytest.mark.parametrize("name", ["keyframe_T_cw", "row_descriptor", "frame_tracked", "loop_ends"])

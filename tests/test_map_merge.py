@@ -224,10 +224,17 @@ def test_a_merged_map_is_exported(drives, tmp_path):
     for words in (("g2o",), ("ply", "--no-colours")):
         result = run("export", words[0], tmp_path / "town.npz", *words[1:])
         assert result.exit_code == 0, result.output
-    lines = (tmp_path / "town.g2o").read_text().splitlines()
+    text = (tmp_path / "town.g2o").read_text()
+    lines = text.splitlines()
     ids = [line.split()[1] for line in lines if line.startswith("VERTEX")]
     assert ids == [str(k) for k in range(merged.map.n_keyframes)]
     assert (tmp_path / "town.ply").stat().st_size > 0
+    # The edges are weighted by the thresholds that the map was made with.
+    drifting = replace(merged, thresholds={"pose_graph.rotation_drift": 0.1})
+    save_map(tmp_path / "drifting.npz", drifting)
+    result = run("export", "g2o", tmp_path / "drifting.npz")
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "drifting.g2o").read_text() != text
 
 
 def test_merge_of_maps_that_do_not_meet_writes_nothing(files, tmp_path):

@@ -434,7 +434,7 @@ def test_where_the_unit_of_a_monocular_map_changes_speeds_and_poses_change_with_
 
 
 @pytest.mark.parametrize("adjusting", [False, True])
-def test_where_dead_landmarks_are_dropped_frames_track_the_same_points(adjusting, monkeypatch):
+def test_where_culled_landmarks_are_dropped_frames_track_the_same_points(adjusting, monkeypatch):
     """Not while a global bundle adjustment runs, which knows landmarks by their numbers."""
 
     def kill(map_: Map, keyframe: int) -> None:
@@ -446,7 +446,7 @@ def test_where_dead_landmarks_are_dropped_frames_track_the_same_points(adjusting
     drive.steps([0, 3], 4)
     drive.mapper.merge()
     drive.closing.is_adjusting = adjusting
-    monkeypatch.setattr(Map, "many_dead_landmarks", True)
+    monkeypatch.setattr(Map, "many_culled_landmarks", True)
     held, new = drive.step(), drive.next_frame()
     drive.mapper.append_pose(new, tracked=True)
     drive.mapper.hold(held, new)

@@ -17,7 +17,7 @@ from vslam.frontend.relocaliser import Relocaliser
 from vslam.frontend.tracker import Found
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_exp, se3_log
-from vslam.loops import LoopCandidate, Sighting
+from vslam.loops import Localisation, LoopCandidate
 from vslam.map import Map
 
 HERE, NOT_HERE = 1, KEYFRAMES  # keyframes: one near the frame, and one without landmarks
@@ -29,7 +29,7 @@ class Recognise:
 
     def __init__(self, n: int = 0) -> None:
         self.asked: list[tuple] = []
-        self.sighting = Sighting(
+        self.localised = Localisation(
             keyframe=2,
             T_cw=forward(0.5),
             feature=np.arange(10, 10 + n),
@@ -38,7 +38,7 @@ class Recognise:
 
     def __call__(self, map_, image, features, candidates):
         self.asked.append((map_, image, features, candidates))
-        return self.sighting if len(self.sighting.feature) else None
+        return self.localised if len(self.localised.feature) else None
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def test_where_orb_finds_nothing_the_frame_may_be_recognised_in_another_way(matc
     recognise = Recognise(30)
     place = Place.create(matches, recognise)
     before = map_bytes(place.world)
-    frame, sighting = place.frame, recognise.sighting
+    frame, localised = place.frame, recognise.localised
     frame.shift = np.zeros((len(frame.features), 2), np.float32)  # of matches that are no more
     found = place.find()
     assert (found.state, found.n_inliers, found.keyframe) == (TrackingState.OK, 30, 2)
@@ -162,11 +162,11 @@ def test_where_orb_finds_nothing_the_frame_may_be_recognised_in_another_way(matc
         strict=True,
     ):
         assert given is expected
-    np.testing.assert_array_equal(frame.T_cw, sighting.T_cw)
-    np.testing.assert_array_equal(np.flatnonzero(frame.landmark >= 0), sighting.feature)
-    np.testing.assert_array_equal(frame.landmark[sighting.feature], sighting.landmark)
+    np.testing.assert_array_equal(frame.T_cw, localised.T_cw)
+    np.testing.assert_array_equal(np.flatnonzero(frame.landmark >= 0), localised.feature)
+    np.testing.assert_array_equal(frame.landmark[localised.feature], localised.landmark)
     np.testing.assert_array_equal(
-        frame.xyz[sighting.feature], place.world.map.arrays.xyz[sighting.landmark]
+        frame.xyz[localised.feature], place.world.map.arrays.xyz[localised.landmark]
     )
     assert frame.shift is None
     assert map_bytes(place.world) == before
@@ -248,7 +248,7 @@ def test_a_frame_of_the_right_camera_is_found_where_the_left_one_is():
     place = Place.create([], recognise)
     place.frame.T_camera_left = CAMERA.T_right_left
     place.find()
-    expected = inverse(CAMERA.T_right_left) @ recognise.sighting.T_cw
+    expected = inverse(CAMERA.T_right_left) @ recognise.localised.T_cw
     np.testing.assert_allclose(place.frame.T_cw, expected, atol=1e-12)
 
 

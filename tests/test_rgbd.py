@@ -253,16 +253,18 @@ def test_bad_input_of_tum(copy, tmp_path):
 def test_images_without_depth_are_counted(copy, caplog):
     lines = (copy / "depth.txt").read_text().splitlines()
     (copy / "depth.txt").write_text("\n".join(lines[:-1]))
-    assert len(open_tum(copy, "")) == FRAMES - 1
+    shorter = open_tum(copy, "")
+    assert len(shorter) == FRAMES - 1
+    (one,) = shorter.pairing.warnings()
     (copy / "depth.txt").write_text("\n".join(lines[:-4]))
     source = open_tum(copy, "", max_frames=3)
-    one, four = caplog.messages
+    (four,) = source.pairing.warnings()
     assert f"1 of {FRAMES} images are left out because no depth image is within 20 ms" in one
     assert f"{copy}: 4 of {FRAMES} images are left out because" in four
     assert "; correct the times in rgb.txt or depth.txt" in four
     assert run_source(source).warnings == [four]
-    open_tum(copy, "", monocular=True)
-    assert len(caplog.messages) == 2
+    assert open_tum(copy, "", monocular=True).pairing is None
+    assert not caplog.messages  # the summary of the run shows the warning
 
 
 def test_few_images_without_a_partner_are_not_worth_a_warning(tmp_path):
@@ -277,6 +279,33 @@ def test_few_images_without_a_partner_are_not_worth_a_warning(tmp_path):
     assert said == (
         f"{tmp_path}: 11 of 100 images are left out because no right image is within 5 ms of them "
         "(the nearest is 5996 ms away); correct the times."
+    )
+
+
+def test_images_whose_depth_is_paired_with_another_image_are_counted_apart(copy):
+    """Depth begins with the fourth image, and at half of the rate: one depth image lies between
+    the images 3 and 4, nearer to the first."""
+    times = [100.0, 100.1, 100.2, 100.3, 100.33]
+    rgb, depth = (
+        [line.split()[1] for line in (copy / f"{name}.txt").read_text().splitlines()
+         if not line.startswith("#")]
+        for name in ("rgb", "depth")
+    )  # fmt: skip
+    for name, stamps, files in (("rgb", times, rgb), ("depth", [100.314], depth)):
+        lines = [f"{t} {file}\n" for t, file in zip(stamps, files, strict=False)]
+        (copy / f"{name}.txt").write_text("".join(lines))
+    said = open_tum(copy, "").pairing.measured
+    assert said == (
+        "4 of 5 images are left out, 3 because no depth image is within 20 ms of them (the nearest "
+        "is 214 ms away), and 1 because each depth image is paired only once, with the image "
+        "nearest in time"
+    )
+    (copy / "rgb.txt").write_text(
+        "".join(f"{t} {f}\n" for t, f in zip(times[3:], rgb, strict=False))
+    )
+    assert open_tum(copy, "").pairing.measured == (
+        "1 of 2 images are left out because each depth image is paired only once, with the image "
+        "nearest in time"
     )
 
 

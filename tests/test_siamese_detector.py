@@ -111,7 +111,7 @@ def test_the_same_image_is_the_best_match():
 
 
 @pytest.mark.slow
-def test_recent_covisible_dead_and_unseen_keyframes_are_not_asked():
+def test_recent_covisible_culled_and_unseen_keyframes_are_not_asked():
     places = [0] * 12
     one = detector(places=places)
     one.add(12, None, Features.none())

@@ -8,7 +8,7 @@ from stereo_noise import white_noise
 
 from vslam.camera import Camera
 from vslam.geometry import inverse, se3_exp, se3_log, symmetric_eigen, transform
-from vslam.loopclosure.sim3_ransac import Sightings, align, fit_motion, is_degenerate
+from vslam.loopclosure.sim3_ransac import ObservedPoints, align, fit_motion, is_degenerate
 from vslam.ransac import draw_three, draws_needed, random_index
 
 CAMERA = Camera(718.0, 718.0, 607.0, 185.0, 0.54, 1241, 376)
@@ -17,7 +17,7 @@ SETTINGS = {"min_inliers": 15, "max_draws": 600, "confidence": 0.99}
 
 
 def scene(seed: int, n: int, outliers: float, scale: float = 1.0, noise: float = NOISE):
-    """``T_a_b``, the sightings of n landmarks from a and b, and which of them are matched wrongly.
+    """``T_a_b``, the observations of n landmarks from a and b, and which matches are wrong.
 
     Landmarks are as uncertain along the line of sight as 0.1 px of disparity.
     """
@@ -37,7 +37,7 @@ def scene(seed: int, n: int, outliers: float, scale: float = 1.0, noise: float =
     p_b[wrong], uvr_b[wrong] = p_b[other], uvr_b[other]
     sigma = np.full(n, max(noise, 1e-3) ** -2)
     T[:3, 3] *= scale
-    return T, Sightings(p_a * scale, uvr_a, sigma), Sightings(p_b, uvr_b, sigma), wrong
+    return T, ObservedPoints(p_a * scale, uvr_a, sigma), ObservedPoints(p_b, uvr_b, sigma), wrong
 
 
 def errors(T: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
@@ -146,8 +146,8 @@ def test_degenerate_sets_are_refused(kind):
         points[:] = [1.0, 1.0, 12.0]
     few = slice(0, {"two": 2, "none": 0}.get(kind, 30))
     in_b = transform(inverse(T), points)
-    a = Sightings(points[few], CAMERA.project(points)[few], a.inverse_sigma2[few])
-    b = Sightings(in_b[few], CAMERA.project(in_b)[few], b.inverse_sigma2[few])
+    a = ObservedPoints(points[few], CAMERA.project(points)[few], a.inverse_sigma2[few])
+    b = ObservedPoints(in_b[few], CAMERA.project(in_b)[few], b.inverse_sigma2[few])
     assert align(a, b, CAMERA.intrinsics, seed=0, **SETTINGS) is None
 
 

@@ -194,10 +194,10 @@ def test_tracking_sees_nothing_of_mapping_before_the_merge(corridor, config, mon
 @pytest.mark.slow
 @pytest.mark.parametrize("config", [CONFIG, EAGER], ids=["usual", "a keyframe each frame"])
 @pytest.mark.parametrize("dark", [(), range(9, 14)])
-def test_dropping_dead_landmarks_changes_no_byte(corridor, config, dark, monkeypatch, check_map):
+def test_dropping_culled_landmarks_changes_no_byte(corridor, config, dark, monkeypatch, check_map):
     sizes, bytes_ = [], []
     for drop in (False, True):
-        monkeypatch.setattr(Map, "many_dead_landmarks", drop)
+        monkeypatch.setattr(Map, "many_culled_landmarks", drop)
         slam, results = run(corridor, config, black=dark)
         check_map(slam.map)
         sizes.append(slam.map.n_landmarks)

@@ -22,7 +22,7 @@ from vslam.loopclosure.verifier import (
 from vslam.loops import LoopCandidate, LoopEdge
 from vslam.states import VerifierState
 
-PLAIN = LoopCandidate(1, 0, 0.9, alike=0.5)
+PLAIN = LoopCandidate(1, 0, 0.9, similarity=0.5)
 PROMISING = replace(PLAIN, promising=True)
 REFUSAL = LoopEdge.of(PLAIN, "proposed for only 1 of the 3 consecutive keyframes needed")
 BOTH = (LearnedVerifier, OrbThenLearnedVerifier)
@@ -46,7 +46,7 @@ def configured(descriptors: str):
 @pytest.mark.parametrize(
     ("descriptors", "expected"),
     [
-        ("usual", OrbThenLearnedVerifier),
+        ("auto", OrbThenLearnedVerifier),
         ("both", OrbThenLearnedVerifier),
         ("learned", LearnedVerifier),
     ],
@@ -130,14 +130,16 @@ def test_a_failed_attempt_says_all_that_spoke_against_it_and_is_remembered(
     verifier = kind(CONFIG, CAMERA, KeyframeImages(network))
     edge = verifier.verify(by_night.map, PROMISING, refusal)
     assert (edge.accepted, edge.reason) == (False, reason)
-    expected = VerifierState(PROMISING.query + 1 + CONFIG.learned.rest, PROMISING.alike)
+    expected = VerifierState(
+        PROMISING.query + 1 + CONFIG.learned.retry_interval, PROMISING.similarity
+    )
     assert verifier.state() == expected
     other = kind(CONFIG, CAMERA, KeyframeImages(network))
     assert other.state() != expected
     other.restore(verifier.state())
     assert other.state() == expected
     # It rests, and so does the one that was restored.
-    again = LoopCandidate(2, 0, 0.9, alike=PROMISING.alike)
+    again = LoopCandidate(2, 0, 0.9, similarity=PROMISING.similarity)
     assert [one.rate(by_night.map, 2, [again]) for one in (verifier, other)] == [[again]] * 2
     fresh = kind(CONFIG, CAMERA, KeyframeImages(network))
     assert fresh.rate(by_night.map, 2, [again]) == [replace(again, promising=True)]
@@ -150,7 +152,7 @@ def test_candidates_are_rated_by_their_images_within_reach(network, by_night, ki
     unrated = LoopCandidate(1, 0, 0.9)
     (rated,) = kind(config, CAMERA, by_night.images).rate(by_night.map, 1, [unrated])
     assert rated.promising
-    assert rated.alike >= CONFIG.learned.min_alike
+    assert rated.similarity >= CONFIG.learned.min_similarity
     # The map has one straight step: by default it puts the place out of reach.
     assert kind(CONFIG, CAMERA, by_night.images).rate(by_night.map, 1, [unrated]) == [unrated]
     blind = kind(config, CAMERA, KeyframeImages(network))

@@ -262,12 +262,12 @@ def drives(folder: Path) -> None:
     """A map with a checkpoint, a loop and a place in the world, and one that meets it."""
     from vslam.loops import LoopEdge
     from vslam.maps.storage import save_map
-    from vslam.maps.stored_map import World
+    from vslam.maps.stored_map import TruthAlignment
 
     stored = _drive(range(24), 0).stored_map("ring 0")
     n = stored.map.n_keyframes
     loop = LoopEdge(n - 1, 0, 0.5, True, "closed", 40, 30, np.eye(4))
-    stored = replace(stored, loops=(loop,), world=World("ring", np.eye(4)))
+    stored = replace(stored, loops=(loop,), truth_alignment=TruthAlignment("ring", np.eye(4)))
     save_map(folder / "map.npz", stored, resumable=True)
     save_map(folder / "other.npz", _drive(range(18, 40), 1).stored_map("ring 1"))
 

@@ -140,14 +140,8 @@ def calibration_doubts(camera: Camera) -> list[str]:
     """Reasons why a calibration is implausible, one sentence each without a full stop; empty if
     there are none. Such a camera can exist, but more often the calibration belongs to other
     images."""
-    sizes, centre = (camera.width, camera.height), (camera.cx, camera.cy)
-    shares = [c / size for c, size in zip(centre, sizes, strict=True)]
-    doubts = []
-    if max(abs(share - 0.5) for share in shares) > _OFF_CENTRE:
-        doubts.append(
-            f"the principal point ({camera.cx:.1f}, {camera.cy:.1f}) is far from the middle of the "
-            f"{camera.width}x{camera.height} images; {_cause(*shares)}"
-        )
+    off_centre = principal_point_doubt((camera.cx, camera.cy), (camera.width, camera.height))
+    doubts = [off_centre] if off_centre else []
     fields = field_of_view(camera)
     if not all(_NARROWEST <= angle <= _WIDEST for angle in fields):
         doubts.append(
@@ -156,6 +150,19 @@ def calibration_doubts(camera: Camera) -> list[str]:
             "of another size, or its focal lengths are not in pixels"
         )
     return doubts
+
+
+def principal_point_doubt(principal: tuple[float, float], size: tuple[int, int]) -> str:
+    """Why a principal point (pixels) is implausible for the size of the images, as a sentence
+    without a full stop; empty if it is plausible."""
+    (cx, cy), (width, height) = principal, size
+    across, down = cx / width, cy / height
+    if max(abs(across - 0.5), abs(down - 0.5)) <= _OFF_CENTRE:
+        return ""
+    return (
+        f"the principal point ({cx:.1f}, {cy:.1f}) is far from the middle of the "
+        f"{width}x{height} images; {_cause(across, down)}"
+    )
 
 
 def _cause(across: float, down: float) -> str:

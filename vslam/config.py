@@ -14,6 +14,15 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from vslam.errors import InputError, did_you_mean, plain_reason
 
 _Model = TypeVar("_Model", bound=BaseModel)
+# Thresholds of the section ``learned`` by the names that older maps and configurations have.
+_RENAMED = {
+    "rated": "max_compared",
+    "min_alike": "min_similarity",
+    "rest": "retry_interval",
+    "more_alike": "retry_factor",
+    "coarse_alike": "min_coarse_similarity",
+    "alike": "min_fine_similarity",
+}
 
 
 class Section(BaseModel):
@@ -400,9 +409,9 @@ class MappingConfig(Section):
 class VerificationConfig(Section):
     """Geometric verification of loop candidates [OS1, VII-B; OS2, III-C]."""
 
-    descriptors: Literal["usual", "orb", "learned", "both"] = "usual"
+    descriptors: Literal["auto", "orb", "learned", "both"] = "auto"
     """Which descriptors verify candidates, whatever detector proposed them: `orb`, `learned` (the
-    network's local descriptors), or `both`, which uses the learned ones where ORB fails. `usual`
+    network's local descriptors), or `both`, which uses the learned ones where ORB fails. `auto`
     selects `orb` for the detectors `bow` and `capsule-paper` and for plug-ins, and `both` for all
     other detectors. [own]"""
     match_distance: int = Field(50, ge=0, le=256)
@@ -452,7 +461,7 @@ class LearnedMatchingConfig(Section):
     max_candidates: int = Field(2, ge=1)
     """Upper bound of the number of candidates that are tried for a keyframe or a lost frame.
     [own]"""
-    rated: int = Field(5, ge=0)
+    max_compared: int = Field(5, ge=0)
     """If the detector has not compared its candidates by local descriptors, this many of its best
     candidates are compared before verification. [own]"""
     views: int = Field(2, ge=1)
@@ -460,20 +469,20 @@ class LearnedMatchingConfig(Section):
     most_shared: float = Field(0.4, gt=0, le=1)
     """The image of a keyframe is not kept for the network if the keyframe shares at least this
     share of its landmarks with another keyframe whose image is kept. [own]"""
-    min_alike: float = Field(0.35, ge=0, le=1)
+    min_similarity: float = Field(0.35, ge=0, le=1)
     """Two images are matched only if their similarity by local descriptors is at least this.
     [own]"""
-    rest: int = Field(8, ge=0)
-    """After a failed attempt, `more_alike` applies to this many keyframes. [own]"""
-    more_alike: float = Field(1.1, ge=1)
-    """In the `rest` keyframes after a failed attempt, a place is tried only if its similarity is at
-    least this many times the similarity of the failed attempt. [own]"""
+    retry_interval: int = Field(8, ge=0)
+    """After a failed attempt, `retry_factor` applies to this many keyframes. [own]"""
+    retry_factor: float = Field(1.1, ge=1)
+    """In the `retry_interval` keyframes after a failed attempt, a place is tried only if its
+    similarity is at least this many times the similarity of the failed attempt. [own]"""
     min_share: float = Field(0.1, ge=0, le=1)
     """At least this share of the cells of the network's coarse feature map must agree with one
     homography. [own]"""
-    coarse_alike: float = Field(0.3, ge=-1, le=1)
+    min_coarse_similarity: float = Field(0.3, ge=-1, le=1)
     """Two coarse descriptors match only if their cosine is at least this. [own]"""
-    alike: float = Field(0.5, ge=-1, le=1)
+    min_fine_similarity: float = Field(0.5, ge=-1, le=1)
     """Two fine descriptors match only if their cosine is at least this. [own]"""
     reach: int = Field(5, ge=1)
     """The fine match is searched for up to this far to each side of the coarse match, in cells of
@@ -741,7 +750,8 @@ class Config(Section):
     @model_validator(mode="before")
     @classmethod
     def _nest(cls, given: Any) -> Any:
-        """Move thresholds given by their dotted names into their sections."""
+        """Move thresholds given by their dotted names into their sections, and rename those of
+        older versions."""
         if not isinstance(given, dict):
             return given
         nested = {name: value for name, value in given.items() if "." not in str(name)}
@@ -752,6 +762,11 @@ class Config(Section):
                 nested[section] = {**values, key: given[name]}
             else:
                 nested[name] = given[name]  # validation reports it as an unknown key
+        learned, verification = nested.get("learned"), nested.get("verification")
+        if isinstance(learned, dict):
+            nested["learned"] = {_RENAMED.get(key, key): value for key, value in learned.items()}
+        if isinstance(verification, dict) and verification.get("descriptors") == "usual":
+            nested["verification"] = {**verification, "descriptors": "auto"}
         return nested
 
 

@@ -18,7 +18,7 @@ class LoopCandidate:
         query: keyframe whose place is searched for; -1 for a frame that is not in the map.
         match: keyframe of the map that shows the same place; it has not been culled.
         score: the detector's own measure; greater means more similar.
-        alike: similarity of the two images by the network's local descriptors. Learned verification
+        similarity: that of the two images by the network's local descriptors. Learned verification
             is tried only for similar images. None if it was not computed.
         promising: whether the candidate is verified even if the consistency test rejects it.
         proposed_by: name of the detector that proposed it; several names are joined by ``+``.
@@ -27,13 +27,13 @@ class LoopCandidate:
     query: int
     match: int
     score: float
-    alike: float | None = None
+    similarity: float | None = None
     proposed_by: str = ""
     promising: bool = False
 
 
-class Sighting(NamedTuple):
-    """The place where a frame outside the map was recognised.
+class Localisation(NamedTuple):
+    """The pose of a frame outside the map, and the landmarks of the map that it observes.
 
     Attributes:
         keyframe: the keyframe that the frame resembles.

@@ -4,9 +4,9 @@ A *row* is one keypoint of one keyframe; the rows of a keyframe are consecutive.
 is also the table of observations: ``landmark[row]`` is the landmark that the keypoint observes, and
 ``next_row`` links the rows of each landmark into a chain. Covisibility is not stored, but counted
 from the rows when it is needed. The use of arrays instead of objects follows DPVO's PatchGraph. The
-entries of culled keyframes and of culled or merged landmarks remain, marked as dead. Ids of
-keyframes are never reused; ids of landmarks change only when dead landmarks are dropped. Arrays
-grow by half their size.
+entries of culled keyframes and landmarks remain, marked as such; a landmark that was merged into
+another one counts as culled. Ids of keyframes are never reused; ids of landmarks change only when
+culled landmarks are dropped. Arrays grow by half their size.
 
 To add a column, declare it in ``Arrays`` or ``KeyframeTable`` with an empty array of its dtype and
 shape as the default. It is then grown, copied, selected, appended, saved and loaded with the other
@@ -29,7 +29,7 @@ from vslam.loops import LoopEdge
 from vslam.map_kernels import count_shared, detach_keyframe, resolve
 
 NONE = -1
-_FEW_LANDMARKS = 8192  # take about 1 MB; dropping fewer dead landmarks is not worth it
+_FEW_LANDMARKS = 8192  # take about 1 MB; dropping fewer culled landmarks is not worth it
 
 
 class Arrays(NamedTuple):
@@ -138,7 +138,7 @@ class Map:
         arrays: the columns that kernels use.
         keyframes: the other columns of keyframes.
         scalars: numbers that describe the map as a whole.
-        n_keyframes, n_landmarks, n_rows: number of entries in use, including dead ones.
+        n_keyframes, n_landmarks, n_rows: number of entries in use, including culled ones.
     """
 
     def __init__(self, scales: NDArray[np.float64]) -> None:
@@ -302,13 +302,13 @@ class Map:
         self.scalars = replace(self.scalars, session=self.scalars.session + 1)
 
     @property
-    def many_dead_landmarks(self) -> bool:
-        """Whether dead landmarks take so much memory that ``drop_dead_landmarks`` is worth it."""
+    def many_culled_landmarks(self) -> bool:
+        """Whether culled landmarks take so much memory that dropping them is worth it."""
         living = int(np.count_nonzero(self.arrays.landmark_alive[: self.n_landmarks]))
         return self.n_landmarks - living > max(_FEW_LANDMARKS, living // 2)
 
-    def drop_dead_landmarks(self) -> NDArray[np.int32]:
-        """Remove dead landmarks and renumber the others in their order.
+    def drop_culled_landmarks(self) -> NDArray[np.int32]:
+        """Remove culled landmarks and renumber the others in their order.
 
         Most landmarks die within a few keyframes of their creation.
 

@@ -107,9 +107,9 @@ class LandmarkCounts:
             seen.clear()
 
 
-def drop_dead_landmarks(map_: Map, frames: Sequence[Frame]) -> None:
-    """Drop the map's dead landmarks, and renumber the landmarks that the frames track."""
-    new_id = map_.drop_dead_landmarks()
+def drop_culled_landmarks(map_: Map, frames: Sequence[Frame]) -> None:
+    """Drop the map's culled landmarks, and renumber the landmarks that the frames track."""
+    new_id = map_.drop_culled_landmarks()
     for frame in {id(frame): frame for frame in frames}.values():
         tracked = frame.landmark >= 0
         frame.landmark = frame.landmark.copy()
@@ -130,8 +130,8 @@ def observe_keyframe(frame: Frame, map_: Map, keyframe: int) -> None:
 
 
 def update_landmarks(frame: Frame, map_: Map) -> None:
-    """Update a frame's landmarks: ids of merged landmarks are replaced, ids of dead ones become -1,
-    and ``frame.xyz`` is set to their present positions.
+    """Update a frame's landmarks: ids of merged landmarks are replaced, ids of culled ones become
+    -1, and ``frame.xyz`` is set to their present positions.
 
     If two tracked landmarks were merged, only the first of the two features keeps the landmark.
     """

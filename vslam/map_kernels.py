@@ -47,7 +47,7 @@ def link_many(a, rows, landmarks):
 
 @kernel
 def unlink(a, row):
-    """Remove one observation. A landmark that has no observations left is dead."""
+    """Remove one observation. A landmark that has no observations left is culled."""
     landmark = a.landmark[row]
     if a.head[landmark] == row:
         a.head[landmark] = a.next_row[row]
@@ -121,7 +121,7 @@ def merge_landmarks(a, loser, winner):
 
 @kernel
 def resolve(a, landmarks):
-    """``(N,)`` int32, the living landmark that each id was merged into, or -1 if it is dead."""
+    """``(N,)`` int32, the living landmark that each id was merged into, or -1 if it was culled."""
     out = np.empty(len(landmarks), np.int32)
     for i in range(len(landmarks)):
         landmark = landmarks[i]

@@ -35,7 +35,7 @@ from vslam.map_frames import (
     add_frame,
     add_two_views,
     count_shared_landmarks,
-    drop_dead_landmarks,
+    drop_culled_landmarks,
     find_old_place,
     has_more_points,
     observe_keyframe,
@@ -399,10 +399,10 @@ class Mapper:
             yield map_
 
     def _make_room(self, map_: Map, frame: Frame) -> None:
-        """Drop dead landmarks if there are many. The ids of the other landmarks then change, so
+        """Drop culled landmarks if there are many. The ids of the other landmarks then change, so
         nothing is dropped during a global bundle adjustment, which refers to landmarks by id."""
-        if not self._closing.is_adjusting and map_.many_dead_landmarks:
-            drop_dead_landmarks(map_, (*self._held, frame))
+        if not self._closing.is_adjusting and map_.many_culled_landmarks:
+            drop_culled_landmarks(map_, (*self._held, frame))
 
     def _set_newest(self, keyframe: int, frame: Frame) -> None:
         """Record that a frame became the newest keyframe, and make it the reference."""

@@ -18,7 +18,7 @@ from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, orthonormalised, se3_log
 from vslam.map import Map
 from vslam.mapping import Mapper
-from vslam.maps.stored_map import StoredMap, World
+from vslam.maps.stored_map import StoredMap, TruthAlignment
 from vslam.modes import Mode
 from vslam.odometry import Odometry
 from vslam.states import Checkpoint
@@ -36,14 +36,15 @@ class OpenedMap:
         checkpoint: state from which the drive continues with identical results; None for a new
             drive, or if the map was saved without one.
         drives: sources of the images of the earlier drives, such as "kitti 06".
-        world: the transformation of the map into the frame of a ground truth; None if unknown.
+        truth_alignment: the transformation of the map into the frame of a ground truth; None if
+            unknown.
     """
 
     map: Map | None = None
     frames: FrameTable | None = None
     checkpoint: Checkpoint | None = None
     drives: tuple[str, ...] = ()
-    world: World | None = None
+    truth_alignment: TruthAlignment | None = None
 
 
 def open_map(
@@ -81,11 +82,12 @@ def open_map(
         images.restore(stored.images, context.camera.width)
     closing.closed = list(stored.loops)
     drives = stored.drives if map_.n_keyframes else ()
+    alignment = stored.truth_alignment
     if resume:
-        return OpenedMap(map_, stored.frames, stored.checkpoint, drives[:-1], stored.world)
+        return OpenedMap(map_, stored.frames, stored.checkpoint, drives[:-1], alignment)
     if map_.n_keyframes and not localize:
         map_.begin_drive()
-    return OpenedMap(map_, drives=drives, world=stored.world)
+    return OpenedMap(map_, drives=drives, truth_alignment=alignment)
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,7 @@ class Session:
             frames=self.mapper.frames.table(),
             drives=(*opened.drives, drive) if self.mode.changes_map else opened.drives,
             thresholds=changed_thresholds(self.context.config.model_dump()),
-            world=opened.world,
+            truth_alignment=opened.truth_alignment,
             checkpoint=self.state(),
         )
 

@@ -34,7 +34,7 @@ from vslam.map import Map
 from vslam.map_frames import in_first_part, keyframe_trajectory
 from vslam.mapping import Mapper
 from vslam.maps.storage import load_checkpoint, load_map, save_map
-from vslam.maps.stored_map import StoredMap, World
+from vslam.maps.stored_map import StoredMap, TruthAlignment
 from vslam.modes import MapBuilding, Mode
 from vslam.odometry import Odometry
 from vslam.session import Session, open_map
@@ -404,9 +404,9 @@ class Slam:
         return self._tracker.last
 
     @property
-    def world(self) -> World | None:
+    def truth_alignment(self) -> TruthAlignment | None:
         """The transformation of the loaded map into a ground truth's frame; None if unknown."""
-        return self._session.opened.world
+        return self._session.opened.truth_alignment
 
     @property
     def is_mapping(self) -> bool:

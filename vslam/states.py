@@ -102,11 +102,11 @@ class VerifierState:
 
     Attributes:
         resting_until: before this keyframe, only clearly more similar candidates are tried.
-        failed_alike: similarity of the two images of the failed attempt.
+        failed_similarity: similarity of the two images of the failed attempt.
     """
 
     resting_until: int = 0
-    failed_alike: float = 0.0
+    failed_similarity: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -191,7 +191,7 @@ class SiameseDetector:
         for keyframe in np.argsort(-p, kind="stable")[: self._config.reranked].tolist():
             if p[keyframe] >= 0 and keyframe in self._images:
                 glance = self._images.glance(keyframe)
-                rating[keyframe] = likeness(query, glance, self._learned.coarse_alike)
+                rating[keyframe] = likeness(query, glance, self._learned.min_coarse_similarity)
         return rating
 
     def _best(
@@ -213,8 +213,8 @@ class SiameseDetector:
             best = int(np.argmax(rating))
             if rating[best] < 0.0:
                 break
-            alike = None if self._images is None else float(rating[best])
-            found.append(LoopCandidate(query, best, float(p[best]), alike, self.name))
+            similarity = None if self._images is None else float(rating[best])
+            found.append(LoopCandidate(query, best, float(p[best]), similarity, self.name))
             around, _ = map_.covisible(best, self._config.min_shared)
             rating[around[around < len(rating)]] = -1.0
             rating[best] = -1.0

@@ -22,6 +22,7 @@ from vslam.calibration.models import (
     Lens,
     without_zeros,
 )
+from vslam.camera import principal_point_doubt
 from vslam.errors import InputError
 from vslam.untrusted import MOST_PIXELS
 
@@ -38,9 +39,6 @@ _PAIR_KEYS = ("T_left_right", "baseline", "right_delay")
 _DEPTH_KEYS = ("depth_scale", "virtual_baseline")
 _OWN_KEYS = {"left", "right", *_PAIR_KEYS, *_DEPTH_KEYS}
 _OWN_CAMERA_KEYS = {"lens", "size", "focal", "centre", "distortion"}
-# Largest plausible distance of the principal point from the middle, as a share of the image size.
-# A calibration for images of twice the size gives 0.5, one for half the size 0.25.
-_OFF_CENTRE = 0.2
 _ROUNDED = 1e-3  # tolerance of rotations, whose numbers are rounded in files
 _LONGEST_DELAY_S = 0.1  # between the two images of a pair
 
@@ -241,11 +239,10 @@ def _matrix_camera(
     numbers = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
     if "image_width" in document or size is None:
         size = _size_of(document, size, "image_width", "image_height")
-    elif max(abs(c / n - 0.5) for c, n in zip(numbers[2:], size, strict=True)) > _OFF_CENTRE:
+    elif doubt := principal_point_doubt((matrix[0, 2], matrix[1, 2]), size):
         raise InputError(
-            f"{source}: the principal point ({numbers[2]:.1f}, {numbers[3]:.1f}) is far from the "
-            f"centre of the {size[0]}x{size[1]} images; give a calibration for this resolution and "
-            "orientation, or, if this one is correct, add image_width and image_height to it."
+            f"{source}: {doubt}; give a calibration for this resolution and orientation, or, if "
+            "this one is correct, add image_width and image_height to it."
         )
     return _camera(source, lens, tuple(map(float, numbers)), document.numbers(D), size)
 

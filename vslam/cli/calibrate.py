@@ -116,6 +116,8 @@ def calibrate(
     stereo = len(raw.sizes) == 2
     made = _board(board, size, square, marker, dictionary.upper(), stereo=stereo)
     frames, examined = _search(raw, made)
+    for warning in [] if raw.pairing is None else raw.pairing.warnings():
+        typer.echo(f"warning: {warning}", err=True)
     try:
         found = estimate(made, frames, raw.sizes, lens)
     except InputError as error:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from vslam.datasets.frames import TimedFrame
     from vslam.map import Map
     from vslam.maps.reconstruction import Reconstruction
+    from vslam.maps.stored_map import StoredMap
     from vslam.report.finished_run import FinishedRun
 
     Colours = NDArray[np.uint8]
@@ -229,16 +230,19 @@ def _beside(run: Path, name: str) -> Path:
 def _graph(run: Path) -> tuple[PoseGraph, Map]:
     """The pose graph and the map of a run, or of a map file.
 
-    A map file does not store the thresholds that weight the edges; the default ones are used.
+    The thresholds that weight the edges are those of the run, or of the map's last drive.
     """
     from vslam.backend.pose_graph import essential_graph
-    from vslam.config import Config, load_config
+    from vslam.config import as_config, load_config
     from vslam.maps.storage import load_map
     from vslam.report.finished_run import read_run
 
-    is_file = run.is_file()
-    stored = load_map(run) if is_file else read_run(run)
-    config = Config() if is_file else load_config(run / "config.json")
+    stored: StoredMap | FinishedRun
+    if run.is_file():
+        stored = load_map(run)
+        config = as_config(stored.thresholds, str(run))
+    else:
+        stored, config = read_run(run), load_config(run / "config.json")
     graph = essential_graph(stored.map, stored.loops, config.pose_graph, driven=True)
     return graph, stored.map
 

@@ -126,7 +126,13 @@ def run(
         option(MAP, "SECONDS", "Time between saves of the map; 0 saves only at the end.", min=0),
     ] = 60.0,
     resume: Annotated[
-        Path | None, option(MAP, "FOLDER", "Continue a run that was interrupted.")
+        Path | None,
+        option(
+            MAP,
+            "FOLDER",
+            "Continue an interrupted run in its folder, with its own options. Only --record, "
+            "--view, --keep-open, --report, --ply, --save-map and --quiet can be given again.",
+        ),
     ] = None,
     threads: Threads = None,
     realtime: Annotated[

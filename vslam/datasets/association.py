@@ -53,7 +53,8 @@ def associate(
 class Pairing:
     """The images that a reader pairs by time, and those that it leaves out.
 
-    The reader of a stream counts while it reads.
+    The reader of a stream counts while it reads. Readers do not log the warnings: the summary and
+    the report of a run, ``vslam doctor`` and ``vslam calibrate`` show them.
 
     Attributes:
         source: file or folder that messages name.
@@ -77,8 +78,20 @@ class Pairing:
     def measured(self) -> str:
         """How many images are left out, and why."""
         n = len(self.left_out)
-        why = f" because no {self.partner} is within {1e3 * self.within_s:g} ms of them"
-        return f"{n} of {n + self.n_pairs} images are left out" + (why + self._gap() if n else "")
+        said = f"{n} of {n + self.n_pairs} images are left out"
+        if not n:
+            return said
+        apart = self._gaps()
+        far = apart[apart > self.within_s]
+        alone = f"because no {self.partner} is within {1e3 * self.within_s:g} ms of them"
+        if len(far) and np.isfinite(far).all():
+            alone += f" (the nearest is {1e3 * float(np.median(far)):.0f} ms away)"
+        taken = f"because each {self.partner} is paired only once, with the image nearest in time"
+        if len(far) == n:
+            return f"{said} {alone}"
+        if not len(far):
+            return f"{said} {taken}"
+        return f"{said}, {len(far)} {alone}, and {n - len(far)} {taken}"
 
     @property
     def is_poor(self) -> bool:
@@ -95,7 +108,7 @@ class Pairing:
     def count(
         self, times: NDArray[np.float64], paired: NDArray[np.int64], seconds: NDArray[np.float64]
     ) -> None:
-        """Count all images of a stored sequence, and log the warnings.
+        """Count all images of a stored sequence.
 
         Args:
             times: ``(N,)`` seconds, of the images.
@@ -105,7 +118,6 @@ class Pairing:
         self.n_pairs = len(paired)
         self.left_out = np.delete(times, paired).tolist()
         self.seconds = seconds.tolist()
-        self.log()
 
     def restart(self) -> None:
         """Begin to count anew, because a stream is read from its beginning."""
@@ -113,20 +125,16 @@ class Pairing:
         self.left_out.clear()
         self.seconds.clear()
 
-    def log(self) -> None:
-        """Log the warnings."""
-        for warning in self.warnings():
-            _log.warning(warning)
-
-    def _gap(self) -> str:
-        """The median time between an image that is left out and the nearest possible partner."""
+    def _gaps(self) -> NDArray[np.float64]:
+        """Seconds between each image that is left out and the nearest possible partner, which may
+        be paired with another image; infinite if there is none."""
+        times = np.array(self.left_out)
         if not self.seconds:
-            return ""
-        times, known = np.array(self.left_out), np.sort(self.seconds)
+            return np.full(len(times), np.inf)
+        known = np.sort(self.seconds)
         after = np.searchsorted(known, times).clip(0, len(known) - 1)
         before = (after - 1).clip(0)
-        apart = np.minimum(abs(known[after] - times), abs(times - known[before]))
-        return f" (the nearest is {1e3 * float(np.median(apart)):.0f} ms away)"
+        return np.minimum(abs(known[after] - times), abs(times - known[before]))
 
 
 def poses_at(

@@ -161,15 +161,12 @@ def _play(
         return image
 
     with _opened(path) as bag:
-        try:
-            for pair in _synchronised(_messages(bag, path, topics), topics, pairing):
-                yield TimedFrame(
-                    stamp_of(pair[0]) / 10**9,
-                    partial(read, pair),
-                    colour=partial(_in_colour, path, topics[0], pair[0]),
-                )
-        finally:
-            pairing.log()
+        for pair in _synchronised(_messages(bag, path, topics), topics, pairing):
+            yield TimedFrame(
+                stamp_of(pair[0]) / 10**9,
+                partial(read, pair),
+                colour=partial(_in_colour, path, topics[0], pair[0]),
+            )
 
 
 def _in_colour(path: Path, topic: str, message: Message) -> NDArray[np.uint8]:

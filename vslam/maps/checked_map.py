@@ -24,7 +24,7 @@ from vslam.map import (
 )
 from vslam.maps.checkpoint import ARRAYS as CHECKPOINT_ARRAYS
 from vslam.maps.checkpoint import checked_checkpoint
-from vslam.maps.stored_map import StoredMap, World, observations
+from vslam.maps.stored_map import StoredMap, TruthAlignment, observations
 
 # These columns are not in the file. They are computed from its list of observations, which is
 # sorted by landmark, and from keyframe_first_row.
@@ -126,7 +126,7 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
         frames=_frames(data, n) if header["frames"] else None,
         drives=tuple(str(drive) for drive in header["drives"]),
         thresholds=dict(header.get("thresholds", {})),
-        world=None if world is None else _world(world),
+        truth_alignment=None if world is None else _truth_alignment(world),
         checkpoint=checkpoint,
     )
 
@@ -182,7 +182,9 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
     first, rows = data["landmark_first_observation"], data["observation_row"]
     _check_first("landmark_first_observation", first, sizes["O"])
     alive = data["landmark_alive"]
-    _require(bool(((np.diff(first) > 0) == alive).all()), "a living landmark without observations")
+    observed = np.diff(first) > 0
+    _require(bool(observed[alive].all()), "a landmark without observations that is not culled")
+    _require(bool(alive[observed].all()), "a culled landmark with observations")
     _check_merges(data["landmark_merged_into"], alive)
     _check_ids("observation_row", rows, n_rows)
     _require(_all_differ(rows), "a keypoint that observes two landmarks")
@@ -204,7 +206,7 @@ def _check_merges(merged_into: NDArray[np.int32], alive: NDArray[np.bool_]) -> N
     """Check that every chain of ``merged_into`` ends at a living landmark or at -1."""
     n = len(merged_into)
     _check_ids("landmark_merged_into", merged_into, n, least=NONE)
-    _require(bool((merged_into[alive] == NONE).all()), "a living landmark that was merged")
+    _require(bool((merged_into[alive] == NONE).all()), "a merged landmark that is not culled")
     # Pointer doubling: each round follows twice as many merges as the round before.
     reached = np.append(np.where(merged_into >= 0, merged_into, n), n)
     for _ in range(n.bit_length()):
@@ -275,10 +277,10 @@ def camera_of(header: dict[str, Any]) -> Camera:
     return replace(camera, width=int(camera.width), height=int(camera.height))
 
 
-def _world(fields: dict[str, Any]) -> World:
+def _truth_alignment(fields: dict[str, Any]) -> TruthAlignment:
     S = np.array(fields["S_truth_world"], np.float64)
     _require(S.shape == (4, 4) and bool((np.abs(S) < _MOST).all()), "world")
-    return World(str(fields["name"]), S)
+    return TruthAlignment(str(fields["name"]), S)
 
 
 def _check_first(name: str, first: NDArray[np.int64], end: int) -> None:

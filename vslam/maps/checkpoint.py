@@ -77,7 +77,7 @@ def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
             "verified": [[turn, loop_entry(edge)] for turn, edge in consistency.verified],
             "turn": consistency.turn,
             "resting_until": closing.verifier.resting_until,
-            "in_vain": closing.verifier.failed_alike,
+            "in_vain": closing.verifier.failed_similarity,
             "followed": closing.followed,
         },
     }

@@ -117,10 +117,10 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
         "scalars": asdict(map_.scalars),
         "checkpoint": None if checkpoint is None else checkpoint_entry(checkpoint),
         "world": None
-        if stored.world is None
+        if stored.truth_alignment is None
         else {
-            "name": stored.world.name,
-            "S_truth_world": stored.world.S_truth_world.tolist(),
+            "name": stored.truth_alignment.name,
+            "S_truth_world": stored.truth_alignment.S_truth_world.tolist(),
         },
     }
     arrays = {

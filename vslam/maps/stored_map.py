@@ -1,4 +1,4 @@
-"""A map with everything that is needed to continue in it, usually without dead entries."""
+"""A map with everything that is needed to continue in it, usually without culled entries."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from vslam.states import Checkpoint
 
 
 @dataclass(frozen=True)
-class World:
+class TruthAlignment:
     """The transformation of a map into the frame of a ground truth.
 
     Attributes:
@@ -57,11 +57,11 @@ class StoredMap:
         drives: source of the images of each drive, such as "kitti 06".
         thresholds: the thresholds of the last drive that differed from the defaults, by dotted
             name.
-        world: the transformation of the map into the frame of a ground truth; None without ground
-            truth.
+        truth_alignment: the transformation of the map into the frame of a ground truth; None
+            without ground truth.
         checkpoint: state from which the last drive continues with identical results. The map then
-            includes dead keyframes and landmarks, with unchanged ids. None if the map is compact or
-            there was no checkpoint.
+            includes culled keyframes and landmarks, with unchanged ids. None if the map is compact
+            or there was no checkpoint.
     """
 
     map: Map
@@ -72,7 +72,7 @@ class StoredMap:
     frames: FrameTable | None = None
     drives: tuple[str, ...] = ()
     thresholds: dict[str, Any] = field(default_factory=dict)
-    world: World | None = None
+    truth_alignment: TruthAlignment | None = None
     checkpoint: Checkpoint | None = None
 
     def compact(self, *, copy: bool = True) -> StoredMap:
@@ -183,7 +183,7 @@ def observations(
 
     Args:
         rows: ``(O,)`` rows that observe the landmarks, sorted by landmark; each row occurs once.
-        first: ``(L + 1,)`` offsets of each landmark in ``rows``; a dead landmark has no rows.
+        first: ``(L + 1,)`` offsets of each landmark in ``rows``; a culled landmark has no rows.
         u_right: ``(R,)`` columns in the right image, for all rows; NaN without a stereo match.
     """
     count = np.diff(first)
@@ -245,7 +245,7 @@ def appended(one: StoredMap, other: StoredMap) -> StoredMap:
         images=images,
         drives=(*one.drives, *other.drives),
         thresholds=one.thresholds,
-        world=one.world,
+        truth_alignment=one.truth_alignment,
     )
 
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from vslam.errors import InputError, ResultsError
 from vslam.evaluation.loops import LoopEvaluation, evaluate_loops
+from vslam.evaluation.map_alignment import truth_alignment_of
 from vslam.evaluation.trajectories import Evaluation, evo_command
-from vslam.evaluation.worlds import world_of
 from vslam.maps.formats import save_ply
 from vslam.maps.storage import save_map
 from vslam.report.frame_table import write_covariances, write_frames
@@ -211,7 +211,7 @@ def _write_data(
     if (stored := outcome.stored) is not None:
         if outcome.settings.map_file is None and evaluation is not None:
             with written.part("the map's place in the ground truth"):
-                stored = replace(stored, world=world_of(outcome, evaluation))
+                stored = replace(stored, truth_alignment=truth_alignment_of(outcome, evaluation))
         with written.file("map.npz") as file:
             save_map(file, stored)
         if map_file is not None:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from vslam.config import changed_thresholds
 from vslam.errors import InputError
 from vslam.evaluation.loops import LoopEvaluation, evaluate_loops
+from vslam.evaluation.map_alignment import error_in_map
 from vslam.evaluation.trajectories import Evaluation, evaluate_trajectory
-from vslam.evaluation.worlds import error_in_map
 from vslam.features import TrackingState, TrackResult
 from vslam.geometry import inverses
 from vslam.loops import LoopCorrection

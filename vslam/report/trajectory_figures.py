@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from vslam.evaluation.loops import LoopEvaluation
+from vslam.evaluation.map_alignment import truth_alignment_of
 from vslam.evaluation.trajectories import Evaluation
-from vslam.evaluation.worlds import world_of
 from vslam.geometry import inverses
 from vslam.report.drawing import (
     AMBER,
@@ -179,5 +179,5 @@ def _aligned(outcome: RunOutcome, evaluation: Evaluation | None, points: Points)
     """Transform ``(N, 3)`` points of the estimated world into the frame of the ground truth."""
     if evaluation is None:
         return points
-    S = world_of(outcome, evaluation).S_truth_world
+    S = truth_alignment_of(outcome, evaluation).S_truth_world
     return np.asarray(points @ S[:3, :3].T + S[:3, 3])

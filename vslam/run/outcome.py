@@ -13,7 +13,7 @@ from vslam.datasets.frames import Source
 from vslam.features import TrackingState, TrackResult
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.map import Map
-from vslam.maps.stored_map import StoredMap, World
+from vslam.maps.stored_map import StoredMap, TruthAlignment
 from vslam.run.options import RunOptions
 from vslam.trajectory import Trajectory
 
@@ -47,7 +47,8 @@ class RunOutcome:
         peak_memory_mb: peak memory of the process.
         n_landmarks, n_keyframes: size of the final map.
         map: the final map; None for a trajectory from another system or after mapping failed.
-        world: transform from the continued map to the world of its ground truth; None if unknown.
+        truth_alignment: transform from the continued map to the world of its ground truth; None if
+            unknown.
         in_map: ``(N,)`` bool, frames tracked in the map that the run continued or in sub-maps that
             loops joined to it; None for a run that started a new map.
         stored: the map with all data needed to continue it; None if the run only localised in it.
@@ -79,7 +80,7 @@ class RunOutcome:
     latency_ms: list[float] = field(default_factory=list)
     map: Map | None = None
     stored: StoredMap | None = None
-    world: World | None = None
+    truth_alignment: TruthAlignment | None = None
     in_map: NDArray[np.bool_] | None = None
     loops: list[LoopEdge] = field(default_factory=list)
     corrections: list[LoopCorrection] = field(default_factory=list)

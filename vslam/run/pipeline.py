@@ -332,7 +332,7 @@ def _outcome(
         latency_ms=run.latency_ms,
         n_keyframes=len(keyframes),
         n_landmarks=0,
-        world=run.slam.world,
+        truth_alignment=run.slam.truth_alignment,
         interrupted=interrupted,
     )
     if run.has_map:
@@ -379,9 +379,7 @@ def _map_warnings(slam: Slam, camera: Camera) -> list[str]:
         residuals = measure_rig(slam.map, camera)
         return delay_warnings(slam.rig.delay, camera) or residual_warnings(residuals, camera)
     except Exception as error:  # a failed check must not end the run
-        problem = f"the rig could not be checked ({reason(error)})"
-        _log.warning(problem)
-        return [problem]
+        return [f"The rig could not be checked ({reason(error)})."]
 
 
 def _with_earlier(

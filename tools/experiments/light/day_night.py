@@ -89,7 +89,7 @@ class Localiser:
         config = as_config(
             {
                 "relocalization": {"max_candidates": candidates},
-                "learned": {"max_candidates": candidates, "rated": candidates},
+                "learned": {"max_candidates": candidates, "max_compared": candidates},
                 "siamese": {"max_candidates": candidates},
             }
         )

@@ -68,7 +68,7 @@ def measure(folder: Path, of_place: int) -> tuple[NDArray[np.bool_], NDArray[np.
         for found, images in zip(pairs, (same[:1], other[:2]), strict=True):
             for g in images:
                 a, b = local.of(queries[q]), local.of(gallery[g])
-                loose = match_coarse(a, b, LearnedMatchingConfig().coarse_alike)
+                loose = match_coarse(a, b, LearnedMatchingConfig().min_coarse_similarity)
                 cells = homography_inliers(match_coarse(a, b, LEAST_COSINE), a, b)
                 found.append((homography_share(loose, a, b) >= MIN_SHARE, cells >= MIN_CELLS))
     return np.array(pairs[0]), np.array(pairs[1])

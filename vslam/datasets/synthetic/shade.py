@@ -161,7 +161,7 @@ def _lit(shadow, frame, light, slope, x, y, z):
 
 
 @inline
-def _pool(pools, frame, x, y, z):
+def _pool(pools, frame, x, z):
     """Light of the street lamps at a world point, 1 under a lamp."""
     a = (x - frame[0]) / frame[2]
     b = (z - frame[1]) / frame[2]
@@ -382,7 +382,7 @@ def _shade_run(run, visible, number, atlas, light, shadows, pools, camera, buffe
             if sun > 0.0:
                 received += sun * _lit(shadow, frame, light, slope, x, up, far)
             if lamps:
-                received += _POOL_GAIN * gain * glow * _pool(pool, pool_frame, x, up, far)
+                received += _POOL_GAIN * gain * glow * _pool(pool, pool_frame, x, far)
         if beams:
             rx = (x0 + i - cx) / fx
             beam = math.exp(-3.0 * rx * rx - 30.0 * (ry - 0.08) * (ry - 0.08))

@@ -163,8 +163,8 @@ class LocalDescriptorCache:
     """Local descriptors of images, computed once per image. Only the coarse ones are kept; see
     ``DescriptorMaps``."""
 
-    def __init__(self, network: LocalDescriptors | None = None) -> None:
-        self._network = network
+    def __init__(self) -> None:
+        self._network: LocalDescriptors | None = None
         self._kept: dict[bytes, DescriptorMaps] = {}
 
     def of(self, image: Image) -> DescriptorMaps:

@@ -11,7 +11,7 @@ import numpy as np
 
 from vslam.evaluation.trajectories import Evaluation
 from vslam.geometry import Matrix
-from vslam.maps.stored_map import World
+from vslam.maps.stored_map import TruthAlignment
 from vslam.run.outcome import RunOutcome
 
 
@@ -21,27 +21,27 @@ def name_of_world(outcome: RunOutcome) -> str:
     return f"{outcome.sequence.dataset} {outcome.sequence.name.partition('+')[0]}"
 
 
-def world_of(outcome: RunOutcome, evaluation: Evaluation) -> World:
+def truth_alignment_of(outcome: RunOutcome, evaluation: Evaluation) -> TruthAlignment:
     """The transformation from a map to its ground truth: the alignment of the trajectory of the
     run that made the map."""
     truth = outcome.ground_truth
     assert truth is not None
     kept = np.isin(outcome.trajectory.timestamps, truth.timestamps)
     T_wc, aligned = outcome.trajectory.T_wc[kept], evaluation.T_wc_aligned
-    return World(name_of_world(outcome), _similarity(T_wc, aligned))
+    return TruthAlignment(name_of_world(outcome), _similarity(T_wc, aligned))
 
 
 def error_in_map(outcome: RunOutcome) -> float | None:
     """Position RMSE (m) of the frames that were localised in the map that a run continued; None if
     the transformation from this map to the ground truth of the run is unknown."""
-    world, truth = outcome.world, outcome.ground_truth
-    if world is None or truth is None or outcome.in_map is None:
+    alignment, truth = outcome.truth_alignment, outcome.ground_truth
+    if alignment is None or truth is None or outcome.in_map is None:
         return None
     frames = np.isin(outcome.trajectory.timestamps, truth.timestamps) & outcome.in_map
-    if world.name != name_of_world(outcome) or not frames.any():
+    if alignment.name != name_of_world(outcome) or not frames.any():
         return None
     true = truth.T_wc[np.isin(truth.timestamps, outcome.trajectory.timestamps[frames]), :3, 3]
-    S, position = world.S_truth_world, outcome.trajectory.T_wc[frames, :3, 3]
+    S, position = alignment.S_truth_world, outcome.trajectory.T_wc[frames, :3, 3]
     return float(np.sqrt(((position @ S[:3, :3].T + S[:3, 3] - true) ** 2).sum(axis=1).mean()))
 
 

@@ -77,7 +77,6 @@ RULES = {
             ("make ", "CI runs it, and this test in it"),
             ("vslam calibrate", BOARDS),
             ("source .venv", "there is no other environment here"),
-            ("vslam report runs --serve", "it serves until it is stopped"),
         ),
     ),
     "CONTRIBUTING.md": Rules(

@@ -505,16 +505,11 @@ def _straight_route(desk: Path, corridor) -> None:
     write_kitti(desk / "poses" / "07.txt", T_wc)
 
 
-def _image(desk: Path, corridor) -> None:
-    cv2.imwrite("IMAGE.png", corridor.left[0])
-
-
 PREPARE: dict[str, Callable[[Path, object], None]] = {
     "README.md": _videos,
     "datasets.md": _straight_route,
     "docs/howto/bench.md": _earlier_run,
     "docs/howto/calibrate.md": _videos,
-    "docs/explanation/design.md": _image,
     "docs/howto/gps.md": _fixes,
     "docs/howto/masks.md": _video_and_mask,
     "docs/howto/rgbd.md": _depth_sources,

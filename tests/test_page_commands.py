@@ -140,7 +140,6 @@ RULES = {
             ("pip", INSTALL),
             ("uvx", INSTALL),
             ("python tools/wheel_test.py", INSTALL),
-            ("python3 -m venv clean", INSTALL),
         )
     ),
     "docs/howto/kitti.md": Rules(),

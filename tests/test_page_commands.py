@@ -77,7 +77,6 @@ RULES = {
             ("make ", "CI runs it, and this test in it"),
             ("vslam calibrate", BOARDS),
             ("source .venv", "there is no other environment here"),
-            ("vslam report runs --serve", "it serves until it is stopped"),
         ),
     ),
     "CONTRIBUTING.md": Rules(
@@ -141,7 +140,6 @@ RULES = {
             ("pip", INSTALL),
             ("uvx", INSTALL),
             ("python tools/wheel_test.py", INSTALL),
-            ("python3 -m venv clean", INSTALL),
         )
     ),
     "docs/howto/kitti.md": Rules(),
@@ -507,16 +505,11 @@ def _straight_route(desk: Path, corridor) -> None:
     write_kitti(desk / "poses" / "07.txt", T_wc)
 
 
-def _image(desk: Path, corridor) -> None:
-    cv2.imwrite("IMAGE.png", corridor.left[0])
-
-
 PREPARE: dict[str, Callable[[Path, object], None]] = {
     "README.md": _videos,
     "datasets.md": _straight_route,
     "docs/howto/bench.md": _earlier_run,
     "docs/howto/calibrate.md": _videos,
-    "docs/explanation/design.md": _image,
     "docs/howto/gps.md": _fixes,
     "docs/howto/masks.md": _video_and_mask,
     "docs/howto/rgbd.md": _depth_sources,

@@ -225,8 +225,8 @@ def test_run_without_pages_is_enough_for_a_report_later(kitti_tree, tmp_path):
         "map.npz", "report.json", "run.json", "trajectory.tum", "trajectory_causal.tum",
         "trajectory_kitti.txt", "trajectory_odom.tum", "trajectory_online.tum",
     }  # fmt: skip
-    readme = (Path(__file__).parents[1] / "README.md").read_text()
-    assert [path.name for path in folder.iterdir() if f"`{path.name}`" not in readme] == []
+    page = (Path(__file__).parents[1] / "docs/tutorial/report.md").read_text()
+    assert [path.name for path in folder.iterdir() if f"`{path.name}`" not in page] == []
     with (folder / "frames.csv").open(newline="") as file:
         frames = list(csv.DictReader(file))
     assert [int(frame["frame"]) for frame in frames] == list(range(28))

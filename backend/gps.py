@@ -251,7 +251,7 @@ def _umeyama(p: Array, q: Array, up: Array, fixed: float | None) -> Array:
 
 
 def _mapped(S: Array, points: Array) -> Array:
-    """``(..., M, 3)`` images of ``(M, 3)`` points under ``(..., 4, 4)`` similarities."""
+    """``(M, 3)`` points transformed by ``(..., 4, 4)`` similarities, as ``(..., M, 3)``."""
     return points @ np.swapaxes(S[..., :3, :3], -2, -1) + S[..., None, :3, 3]
 
 

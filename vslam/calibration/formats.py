@@ -288,7 +288,7 @@ def _ros_names(document: Document) -> Document:
 
 
 def _lens(document: Document, unnamed: str = "") -> Lens:
-    """The lens of a distortion model; an empty name means the model ``unnamed``."""
+    """The lens of the distortion model that a file names, or of ``unnamed`` if it names none."""
     word = document.text("distortion_model") or unnamed
     if word not in _LENSES:
         raise InputError(

@@ -45,14 +45,14 @@ HEAD = """## How it was measured
 
 The command below, under *Setting*, writes these sections. It runs one process at a time. *Load* \
 is the load of the machine when the command began. *Whole process* is the time from the start of \
-Python to its end, including the vocabulary, the kernels from Numba's cache and all files written. \
-*Frame loop* is the time from the first image to the last pose. vslam runs with the detector \
-`bow`, because ORB-SLAM3 always looks for loops. For its report, vslam evaluates the trajectory by \
-the ground truth and draws figures. ORB-SLAM3 does neither; for a fair comparison, vslam with \
-`--no-report` gets no ground truth. *Reading images* is the CPU time for decoding both images of a \
-frame, measured in separate processes with vslam's own reader for vslam and `cv2.imread` for \
-ORB-SLAM3. The rows without reading images subtract it. The real-time run and the profile, which \
-`tools/profile_frame.py` takes with one thread, are done once per case.
+Python to its end. It includes reading the vocabulary, loading the kernels from Numba's cache and \
+writing all files. *Frame loop* is the time from the first image to the last pose. vslam runs with \
+the detector `bow`, because ORB-SLAM3 always looks for loops. For its report, vslam evaluates the \
+trajectory by the ground truth and draws figures. ORB-SLAM3 does neither; for a fair comparison, \
+vslam with `--no-report` gets no ground truth. *Reading images* is the CPU time for decoding both \
+images of a frame, measured in separate processes with vslam's own reader for vslam and \
+`cv2.imread` for ORB-SLAM3. The rows without reading images subtract it. The real-time run and the \
+profile, which `tools/profile_frame.py` takes with one thread, are done once per case.
 """
 BEGIN, END = "## How it was measured\n", "\n## Limits\n"  # the rest of the page is hand-written
 READING = """
@@ -392,7 +392,8 @@ def section(
     """The section of the page about a case."""
     return (
         f"## {case.title}\n\n{case.frames} frames. "
-        f"Reading both images: {reading[FULL]:.1f} ms CPU, by OpenCV {reading[ORBSLAM3]:.1f}.\n\n"
+        f"Reading both images takes {reading[FULL]:.1f} ms of CPU time with vslam's reader and "
+        f"{reading[ORBSLAM3]:.1f} ms with OpenCV.\n\n"
         f"{comparison(measured)}\n\n{latency(runs, case)}\n\n{stages(runs[FULL][-1].report)}\n\n"
         f"{memory(runs[LEAN][-1])}\n\n{profile(case)}"
     )

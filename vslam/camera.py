@@ -166,7 +166,8 @@ def principal_point_doubt(principal: tuple[float, float], size: tuple[int, int])
 
 
 def _cause(across: float, down: float) -> str:
-    """The probable cause of a principal point at these shares of the image's width and height."""
+    """The probable cause of an implausible principal point, given as shares of the image's width
+    (``across``) and height (``down``)."""
     if min(across, down) <= 0.0 or not 1 / _SAME_RATIO < across / down < _SAME_RATIO:
         return "check the order of its numbers, and whether the images were cropped or turned"
     ratio = across + down  # 1 for a principal point in the middle

@@ -274,7 +274,7 @@ class Mapper:
         that shares no landmark with the map begins a sub-map.
 
         Args:
-            predicted: whether the pose was predicted, if the frame begins a sub-map.
+            predicted: whether the pose was predicted; matters only if the frame begins a sub-map.
         """
         with self._changing() as map_:
             self._make_room(map_, frame)

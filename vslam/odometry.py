@@ -158,7 +158,8 @@ class Odometry:
         self.now = PoseUncertainty(local, drift, self.now.n_keyframes)
 
     def keyframe(self) -> None:
-        """Record that the last frame became a keyframe, whose error new landmarks inherit."""
+        """Record that the last frame became a keyframe. Its error is added to the drift, because
+        new landmarks inherit it."""
         now = self.now
         self.now = PoseUncertainty(now.local, now.drift + now.local, now.n_keyframes + 1)
 

@@ -200,7 +200,7 @@ def _inner_rectangle(model: CameraModel, R_own_rectified: Array, source: str) ->
 
 
 def _check_view(model: CameraModel, R_own_rectified: Array, camera: Camera, source: str) -> None:
-    """Refuse a rectified view of which the image shows some part twice or not at all."""
+    """Refuse a rectified view if the image shows a part of it twice or not at all."""
     xy = np.concatenate(_borders(camera.width, camera.height))
     rays = camera.backproject(xy, np.ones(len(xy))) @ R_own_rectified.T
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)

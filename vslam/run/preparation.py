@@ -151,8 +151,8 @@ class _Mailbox:
         self.error: Exception | None = None
 
     def put(self, arrival: _Arrival) -> None:
-        """Replace the newest frame. The first frame of a run is never replaced: wait until it has
-        been taken."""
+        """Replace the newest frame. After the first frame of a run, which must not be replaced,
+        wait until it has been taken."""
         with self._changed:
             if self._newest is not None:
                 self._dropped.append(self._newest.frame.timestamp)

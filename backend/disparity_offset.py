@@ -66,11 +66,14 @@ def _calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None
     adjust_locally(map_, keyframe, camera, config)
 
 
-def offset_sigma(map_: Map, config: StereoConfig) -> float:
+def offset_sigma(information: float, config: StereoConfig) -> float:
     """Standard deviation of the part of the disparity offset's error that comes from the noise of
     its estimate, in pixels. The share of a true offset that the prior suppresses is an error of the
-    calibration and not included."""
-    information = map_.scalars.offset_information
+    calibration and not included.
+
+    Args:
+        information: of the measurements, see ``Scalars.offset_information``.
+    """
     if information <= 0.0:
         return 0.0
     prior = config.offset_sigma**-2.0 if config.offset_sigma > 0.0 else 0.0

@@ -423,8 +423,8 @@ def _factors(
     for (i, j), T, sigma in zip(
         edges.tolist(), T_i_j, np.repeat(sigmas[:, ::-1], 3, axis=1), strict=True
     ):
-        model = noise.Diagonal.Sigmas(sigma)
-        vision.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(T), model))
+        between = noise.Diagonal.Sigmas(sigma)
+        vision.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(T), between))
     crowding = np.sqrt(positions.crowding)
     antenna = _antenna(positions, scale)
     for k, (i, n) in enumerate(zip(positions.keyframe.tolist(), crowding.tolist(), strict=True)):

@@ -311,14 +311,16 @@ def covariance_of(frame: Frame, context: TrackingContext) -> Matrix:
     return A @ covariance @ A.T
 
 
-def offset_effect_of(frame: Frame, context: TrackingContext) -> Matrix | None:
-    """``(6, 3)`` effect of the disparity offset on the motion to a tracked frame, per pixel; see
-    ``offset_effect``. None if the camera has no disparities."""
-    if context.camera.sensor != "stereo" or frame.side != Side.LEFT:
-        return None
+def offset_effect_of(frame: Frame, context: TrackingContext) -> Matrix:
+    """``(6, 3)`` effect of the disparity offset on the motion to a tracked frame of a stereo
+    camera, per pixel; see ``offset_effect``."""
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
     points, uvr, weight, intrinsics, _ = _observed_points(frame, matched, context)
-    return offset_effect(frame.T_cw, points, uvr, weight, intrinsics)
+    effect = offset_effect(frame.T_camera_w, points, uvr, weight, intrinsics)
+    if frame.side == Side.LEFT:
+        return effect
+    # The cameras are parallel, so their translations are nearly the same.
+    return adjoint(inverse(frame.T_camera_left)) @ effect
 
 
 def _observed_points(

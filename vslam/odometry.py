@@ -33,7 +33,7 @@ from vslam.geometry import Matrix, inverse, orthonormalised
 # Factor on the computed covariance of the drift, and the correlation of consecutive steps of the
 # drift. They were chosen on three rendered drives so that the squared errors over 1 s and 10 s
 # match the covariances, and tested on others (docs/research/uncertainty.md).
-DRIFT, CORRELATION = 1.3, 0.5
+DRIFT, CORRELATION = 1.4, 0.4
 # Standard deviations of the acceleration of a lost camera, in m/s^2 and rad/s^2.
 ACCELERATION, TURNING = 2.0, 1.0
 

@@ -309,13 +309,9 @@ class Slam:
             found_again = found.relocalised or tracker.status is not TrackerStatus.TRACKING
             T_moved = T_predicted if found_again else frame.T_cw
             tracker.accept(frame, found, mapper.frames)
-            effect, sigma = offset_effect_of(frame, self.context), self.rig.offset_sigma
-            self._follow(
-                frame,
-                T_moved,
-                covariance_of(frame, self.context),
-                None if effect is None else sigma * effect,
-            )
+            covariance, sigma = covariance_of(frame, self.context), self.rig.offset_sigma
+            effect = sigma * offset_effect_of(frame, self.context) if sigma > 0.0 else None
+            self._follow(frame, T_moved, covariance, effect)
             placed = mapper.append_pose(frame, tracked=True, near=found.keyframe)
         if on_pose is not None:
             on_pose(result_of(frame, found, False, dict(clock.ms), self._odometry))

@@ -16,16 +16,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
 from vslam.backend.local_mapping import adjust_locally, assemble, map_keyframe
 from vslam.camera import Camera
-from vslam.config import Config
+from vslam.config import Config, StereoConfig
 from vslam.features import shifted_columns
 from vslam.map import Map
 from vslam.map_kernels import collect_landmarks
 
 STEP = 0.2  # pixels between the three offsets for which the cost is computed
 ITERATIONS = 15
+# Variance of the error of the estimate, times its information. It is not 1, because the errors of
+# an observation by several keyframes are correlated (docs/research/uncertainty.md).
+VARIANCE = 3.0
 TOLERANCE = 1e-5  # least relative decrease of the cost; STEP changes the cost by some thousandths
 
 
@@ -59,6 +64,20 @@ def _calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None
     a, n = map_.arrays, map_.n_rows
     a.u_right[:n] = shifted_columns(a.u_right[:n], a.xy[:n, 0], change)
     adjust_locally(map_, keyframe, camera, config)
+
+
+def offset_sigma(information: float, config: StereoConfig) -> float:
+    """Standard deviation of the part of the disparity offset's error that comes from the noise of
+    its estimate, in pixels. The share of a true offset that the prior suppresses is an error of the
+    calibration and not included.
+
+    Args:
+        information: of the measurements, see ``Scalars.offset_information``.
+    """
+    if information <= 0.0:
+        return 0.0
+    prior = config.offset_sigma**-2.0 if config.offset_sigma > 0.0 else 0.0
+    return float(np.sqrt(VARIANCE * information) / (prior + information))
 
 
 def remaining_offset(problem: BundleProblem) -> tuple[float, float]:

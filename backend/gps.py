@@ -12,16 +12,31 @@ the others have a Gaussian loss.
 The error of GPS is mostly a bias that changes slowly (atmosphere, reflections): a hundred fixes in
 ten seconds provide little more information than one. So all fixes within ``CORRELATION_S`` together
 have the weight of a single fix.
+
+How far a metric map drifts depends on the camera, its calibration and the loops that were closed.
+The drift model of the pose graph must hold for all of them, so that a good map would be bent
+towards the bias of the fixes. Therefore its standard deviations are multiplied by the factor for
+which the fixes are most likely (empirical Bayes: MacKay, Bayesian Interpolation, 1992).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.backend.pose_graph import GAP, WEAK, PoseGraph, edge_sigmas, minimised, parts_of
+from vslam.backend.pose_graph import (
+    COVISIBLE,
+    GAP,
+    TREE,
+    WEAK,
+    PoseGraph,
+    edge_sigmas,
+    minimised,
+    parts_of,
+)
 from vslam.backend.similarity_graph import scale_of
 from vslam.config import PoseGraphConfig
 from vslam.errors import InputError
@@ -39,6 +54,11 @@ _METRIC = 0.02  # standard deviation of the scale of a metric map, from errors o
 _MAX_UNSURE = 0.1  # largest accepted uncertainty of the two directions of an ``Alignment``, rad
 _LOOSE = np.array([0.3, 0.3, 0.3, 100.0, 100.0, 100.0])  # standard deviations of priors, rad and m
 _STRETCH = 0.1  # ``_optimised(stretch=...)`` of a monocular map while its local scale is estimated
+# Factors on the standard deviations of the drift, of which the most likely one is used.
+_DRIFTS = (4.0, 1.0, 0.25, 0.0625)
+_HELD = (
+    1e-3  # standard deviation with which ``_likeliest_drift`` holds a part of the map, rad and m
+)
 _WINDOW = 25  # keyframes before and after a keyframe from which its local scale is estimated
 
 Array = NDArray[np.float64]
@@ -144,12 +164,15 @@ def anchor(
         if not metric:
             scale = _local_scale(T_wk, T_enu_k, scale, part)
     used = np.ones(len(positions.seconds), np.bool_)
+    drift = 1.0
     for _ in range(2):
         chi2 = _chi2(positions, T_enu_k, scale)
         # Receivers underestimate their errors, so the gate is widened if the residuals are larger.
         used = chi2 <= GATE * max(1.0, float(np.median(chi2)) / _MEDIAN)
         chosen = positions.select(used)
-        T_enu_k = _optimised(graph, seconds, T_enu_k, scale, chosen, config)
+        if metric:
+            drift = _likeliest_drift(graph, seconds, T_enu_k, scale, chosen, config, part)
+        T_enu_k = _optimised(graph, seconds, T_enu_k, scale, chosen, config, drift=drift)
     distance = np.linalg.norm(_residuals(positions, T_enu_k, scale)[used], axis=1)
     residual = float(np.sqrt(np.mean(distance**2)))
     return Anchored(T_enu_k, scale, used, residual, main.S_enu_w, main.unsure_about <= _MAX_UNSURE)
@@ -297,7 +320,66 @@ def _local_scale(T_wk: Array, T_enu_k: Array, scale: Array, part: NDArray[np.int
     return scale
 
 
+def _likeliest_drift(
+    graph: PoseGraph,
+    seconds: Array,
+    T_enu_k: Array,
+    scale: Array,
+    positions: Positions,
+    config: PoseGraphConfig,
+    part: NDArray[np.int64],
+) -> float:
+    """The factor of ``_DRIFTS`` for which the fixes are most likely, given the edges.
+
+    The likelihood of the fixes is an integral over all poses of the keyframes, here by Laplace's
+    approximation: it depends on the error at the optimum and on the determinants of the normal
+    matrices with and without the fixes.
+
+    Args:
+        part: ``(N,)`` label of the part of the map that each keyframe belongs to.
+    """
+    import gtsam
+
+    def log_determinant(factors: Any, values: Any) -> float:
+        # GTSAM returns that of the triangular root.
+        return 2.0 * float(factors.linearize(values).eliminateMultifrontal().logDeterminant())
+
+    held = gtsam.noiseModel.Isotropic.Sigma(6, _HELD)
+    surprise = []
+    for drift in _DRIFTS:
+        vision, fixes, start = _factors(
+            graph, seconds, T_enu_k, scale, positions, config, drift=drift
+        )
+        both = gtsam.NonlinearFactorGraph(vision)
+        both.push_back(fixes)
+        result = minimised(both, start, config)
+        after = log_determinant(both, result)
+        # Vision alone does not determine where each part of the map is, so it is held.
+        for i in np.unique(part, return_index=True)[1].tolist():
+            vision.add(gtsam.PriorFactorPose3(i, result.atPose3(i), held))
+        before = log_determinant(vision, result)
+        surprise.append(2.0 * both.error(result) + after - before)
+    return _DRIFTS[int(np.argmin(surprise))]
+
+
 def _optimised(
+    graph: PoseGraph,
+    seconds: Array,
+    T_enu_k: Array,
+    scale: Array,
+    positions: Positions,
+    config: PoseGraphConfig,
+    **options: float,
+) -> Array:
+    """``(N, 4, 4)`` poses that best agree with edges and fixes, starting from ``T_enu_k``. The
+    options are those of ``_factors``."""
+    vision, fixes, start = _factors(graph, seconds, T_enu_k, scale, positions, config, **options)
+    vision.push_back(fixes)
+    result = minimised(vision, start, config)
+    return np.array([result.atPose3(i).matrix() for i in range(len(T_enu_k))])
+
+
+def _factors(
     graph: PoseGraph,
     seconds: Array,
     T_enu_k: Array,
@@ -307,19 +389,24 @@ def _optimised(
     *,
     cauchy: float | None = None,
     stretch: float = 0.0,
-) -> Array:
-    """``(N, 4, 4)`` poses that best agree with edges and fixes, starting from ``T_enu_k``.
+    drift: float = 1.0,
+) -> tuple[Any, Any, Any]:
+    """The ``gtsam.NonlinearFactorGraph`` of the edges, that of the fixes, and the ``gtsam.Values``
+    of ``T_enu_k``.
 
     Args:
         cauchy: scale of the Cauchy loss of the fixes, in standard deviations of the fixes; None
             uses a Gaussian loss.
         stretch: relative standard deviation of the lengths of edges, in addition to
             ``edge_sigmas``.
+        drift: factor on the standard deviations of tree and covisibility edges.
     """
     import gtsam
 
     noise = gtsam.noiseModel
-    factors, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    vision, fixes, start = (
+        gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph(), gtsam.Values()
+    )  # fmt: skip
     loose = noise.Diagonal.Sigmas(_LOOSE)
     for i, T in enumerate(T_enu_k):
         pose = gtsam.Pose3(T)
@@ -327,22 +414,22 @@ def _optimised(
         # This prior determines the poses of parts without fixes, and the rotation about a straight
         # drive.
         if graph.fixed[i]:
-            factors.add(gtsam.PriorFactorPose3(i, pose, loose))
+            vision.add(gtsam.PriorFactorPose3(i, pose, loose))
     edges, T_i_j = graph.edges, graph.T_i_j.copy()
     T_i_j[:, :3, 3] *= scale[edges].mean(axis=1)[:, None]
     sigmas = edge_sigmas(edges, T_i_j, graph.kind, seconds[edges], len(T_enu_k), config)
+    sigmas[(graph.kind == TREE) | (graph.kind == COVISIBLE)] *= drift
     sigmas[:, 0] = np.hypot(sigmas[:, 0], stretch * np.linalg.norm(T_i_j[:, :3, 3], axis=1))
     for (i, j), T, sigma in zip(
         edges.tolist(), T_i_j, np.repeat(sigmas[:, ::-1], 3, axis=1), strict=True
     ):
-        drift = noise.Diagonal.Sigmas(sigma)
-        factors.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(T), drift))
+        between = noise.Diagonal.Sigmas(sigma)
+        vision.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(T), between))
     crowding = np.sqrt(positions.crowding)
     antenna = _antenna(positions, scale)
     for k, (i, n) in enumerate(zip(positions.keyframe.tolist(), crowding.tolist(), strict=True)):
         plain = noise.Diagonal.Sigmas(n * positions.sigma[k])
         loss = None if cauchy is None else noise.mEstimator.Cauchy.Create(cauchy / n)
         model = plain if loss is None else noise.Robust.Create(loss, plain)
-        factors.add(gtsam.GPSFactorArm(i, positions.enu[k], antenna[k], model))
-    result = minimised(factors, start, config)
-    return np.array([result.atPose3(i).matrix() for i in range(len(T_enu_k))])
+        fixes.add(gtsam.GPSFactorArm(i, positions.enu[k], antenna[k], model))
+    return vision, fixes, start

@@ -11,6 +11,9 @@ from vslam.reprojection import chi_square, chi_square_ratio, residual, unpacked
 
 ROUNDS = 4
 ITERATIONS = 10
+# Side of the cells of ``pose_covariance``, pixels: the width of the window that is aligned in the
+# coarsest octave. Larger cells give the same covariances (docs/research/uncertainty.md).
+CELL = 32
 
 
 def optimise_pose(
@@ -55,9 +58,12 @@ def pose_covariance(
 ) -> NDArray[np.float64]:
     """Covariance of an optimised pose relative to the landmarks.
 
-    The covariance is the inverse of the normal matrix times the variance factor of the
-    observations. The variance factor is estimated from the residuals (Hartley and Zisserman,
-    Multiple View Geometry, 5.2 and A6.3.2).
+    If the errors of all observations were independent and as large as their weights say, the
+    covariance would be the inverse of the normal matrix times a variance factor. They are not:
+    observations of near landmarks have larger errors, because errors of depth matter more there,
+    and one corner is often observed in several octaves. So the spread of the gradient is measured
+    instead of assumed (the sandwich estimator of White, Econometrica 1980), from sums over the
+    cells of a grid, within which errors may be correlated (Liang and Zeger, Biometrika 1986).
 
     Args:
         T_cw: ``(4, 4)`` optimised pose.
@@ -70,27 +76,97 @@ def pose_covariance(
     """
     if disparity_weight is None:
         disparity_weight = np.full(len(points), intrinsics[5])
-    H, chi2, n = _information(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics)
+    cell = np.floor(uvr[:, :2] / CELL).astype(np.int64) @ np.array([1, 1 << 20])
+    order = np.argsort(cell, kind="stable")
+    _, first = np.unique(cell[order], return_index=True)
+    H, gradients, chi2, n = _gradients(
+        T_cw,
+        points[order],
+        uvr[order],
+        inverse_sigma2[order],
+        disparity_weight[order],
+        intrinsics,
+        np.append(first, len(cell)),
+    )
     if n <= 6:
         return np.full((6, 6), np.nan)
+    # Few cells do not determine the spread of the gradient, so the spread that the weights of the
+    # observations imply counts like as many cells as there are unknowns.
+    share = 6.0 / (6.0 + len(gradients))
+    spread = (1.0 - share) * gradients.T @ gradients + share * chi2 / n * H
     try:
-        found: NDArray[np.float64] = np.linalg.inv(H) * (chi2 / (n - 6))
+        inverse_H = np.linalg.inv(H)
     except np.linalg.LinAlgError:
         return np.full((6, 6), np.nan)
+    found: NDArray[np.float64] = inverse_H @ spread @ inverse_H * (n / (n - 6))
     return found
 
 
+def offset_effect(
+    T_cw: NDArray[np.float64],
+    points: NDArray[np.float64],
+    uvr: NDArray[np.float64],
+    inverse_sigma2: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """How an error of the disparity offset changes the motion of a stereo camera.
+
+    If all disparities are too large by one pixel, the point at depth z is too near by the share
+    ``z / bf`` and suggests a translation that is too short by this share.
+
+    Args:
+        T_cw: ``(4, 4)`` optimised pose.
+        points, uvr, inverse_sigma2, intrinsics: see ``optimise_pose``; inliers only.
+
+    Returns:
+        ``(6, 3)`` matrix that maps the translation of the motion to its error ``xi = [v, w]`` per
+        pixel; NaN if the observations do not determine the pose.
+    """
+    seen = np.full((len(points), 3), np.nan)
+    seen[:, :2] = uvr[:, :2]
+    share = (points @ T_cw[2, :3] + T_cw[2, 3]) / intrinsics[4]
+    matrices = []
+    for weight in (inverse_sigma2, inverse_sigma2 * share):
+        cells, unused = np.array([0, len(points)]), np.zeros(len(points))
+        matrices.append(_gradients(T_cw, points, seen, weight, unused, intrinsics, cells)[0])
+    try:
+        effect: NDArray[np.float64] = np.linalg.solve(*matrices)[:, :3]
+    except np.linalg.LinAlgError:
+        return np.full((6, 3), np.nan)
+    return effect
+
+
 @kernel
-def _information(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics):
-    """Normal matrix, sum of the chi-squares of all observations, and number of coordinates."""
+def _gradients(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics, first):
+    """Normal matrix; ``(C, 6)`` gradients of each cell's observations; sum of the chi-squares of
+    all observations; number of their coordinates.
+
+    Args:
+        first: ``(C + 1,)`` index of the first observation of each cell, and the number of
+            observations.
+    """
+    n_cells = len(first) - 1
+    H, gradients, chi2, n = np.zeros((6, 6)), np.empty((n_cells, 6)), 0.0, 0
     inlier = np.ones(len(points), np.bool_)
-    H, _, chi2, _, n = normal_equations(
-        T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics, inlier, False
-    )
+    for cell in range(n_cells):
+        i = slice(first[cell], first[cell + 1])
+        of_cell, gradients[cell], chi2_of_cell, _, n_of_cell = normal_equations(
+            T_cw,
+            points[i],
+            uvr[i],
+            inverse_sigma2[i],
+            disparity_weight[i],
+            intrinsics,
+            inlier[i],
+            False,
+        )
+        H += of_cell
+        chi2 += chi2_of_cell
+        n += n_of_cell
     for row in range(6):
         for column in range(row):
             H[column, row] = H[row, column]
-    return H, chi2, n
+    return H, gradients, chi2, n
 
 
 @kernel

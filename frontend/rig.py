@@ -30,6 +30,7 @@ class RigCalibration:
     Attributes:
         disparity_offset: pixels to be added to every measured disparity. The owner of the map sets
             it to the map's disparity offset at each merge.
+        offset_sigma: standard deviation of the error of this estimate, in pixels, set likewise.
         delay: the measured delay of the right image.
         sides: a summary of the comparisons of left and right images.
         problems: a sentence for each frame whose right image could not be read.
@@ -40,7 +41,7 @@ class RigCalibration:
         Args:
             scales: ``(levels,)`` pyramid scale factors.
         """
-        self.disparity_offset = 0.0
+        self.disparity_offset, self.offset_sigma = 0.0, 0.0
         self.delay = SideDelay(camera, config)
         self.sides = ComparedSides()
         self.problems: list[str] = []

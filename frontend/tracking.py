@@ -26,7 +26,7 @@ from vslam.frontend.matching import (
     search_windows,
 )
 from vslam.frontend.orb import scale_factors
-from vslam.frontend.pose import optimise_pose, pose_covariance
+from vslam.frontend.pose import offset_effect, optimise_pose, pose_covariance
 from vslam.geometry import Matrix, compose, inverse, transform
 from vslam.map_view import LocalMap
 from vslam.odometry import adjoint
@@ -309,6 +309,20 @@ def covariance_of(frame: Frame, context: TrackingContext) -> Matrix:
         return covariance
     A = adjoint(inverse(frame.T_camera_left))
     return A @ covariance @ A.T
+
+
+def offset_effect_of(frame: Frame, sigma: float, context: TrackingContext) -> Matrix | None:
+    """``(6, 3)`` effect of the disparity offset on the motion to a tracked frame of a stereo camera
+    if the offset is wrong by ``sigma`` pixels, see ``offset_effect``; None if ``sigma`` is 0."""
+    if sigma == 0.0:
+        return None
+    matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
+    points, uvr, weight, intrinsics, _ = _observed_points(frame, matched, context)
+    effect = sigma * offset_effect(frame.T_camera_w, points, uvr, weight, intrinsics)
+    if frame.side == Side.LEFT:
+        return effect
+    # The cameras are parallel, so their translations are nearly the same.
+    return adjoint(inverse(frame.T_camera_left)) @ effect
 
 
 def _observed_points(

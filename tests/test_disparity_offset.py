@@ -7,8 +7,9 @@ import pytest
 from stereo_noise import white_noise
 
 from vslam.backend.bundle_adjustment import BundleProblem
-from vslam.backend.disparity_offset import remaining_offset
+from vslam.backend.disparity_offset import VARIANCE, offset_sigma, remaining_offset
 from vslam.camera import Camera
+from vslam.config import StereoConfig
 from vslam.features import MIN_DISPARITY, shifted_columns
 
 CAMERA = Camera(700.0, 700.0, 600.0, 180.0, 0.54, 1200, 370)
@@ -73,3 +74,16 @@ def test_columns_move_left_but_no_point_gets_behind_the_camera() -> None:
     moved = shifted_columns(u_right, u, -0.5)
     np.testing.assert_allclose(moved, [90.5, 100.0 - MIN_DISPARITY, np.nan], atol=1e-5)
     np.testing.assert_allclose(shifted_columns(u_right, u, 0.5), [89.5, 99.4, np.nan], atol=1e-5)
+
+
+def test_the_error_of_the_estimate_shrinks_with_the_information() -> None:
+    config = StereoConfig(offset_sigma=0.2)
+
+    def sigma(information: float) -> float:
+        return offset_sigma(information, config)
+
+    assert sigma(0.0) == 0.0  # nothing has been estimated yet
+    assert sigma(1e4) == pytest.approx(np.sqrt(VARIANCE) * 0.01, rel=0.01)
+    assert sigma(4e4) == pytest.approx(0.5 * sigma(1e4), rel=0.01)
+    free = StereoConfig(offset_sigma=0.0)  # of a loaded map, whose offset is kept
+    assert offset_sigma(1e4, free) == pytest.approx(np.sqrt(VARIANCE) * 0.01)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from vslam.backend import gps
 from vslam.backend.gps import Positions, align, anchor
 from vslam.backend.pose_graph import TREE, WEAK, PoseGraph, edge_sigmas
 from vslam.config import Config
@@ -254,6 +255,23 @@ def test_the_test_refuses_what_has_jumped_and_little_else():
         (R_ENU_CAMERA @ true[:, :3, :3]).transpose(0, 2, 1) @ anchored.T_enu_k[:, :3, :3]
     ).magnitude()
     assert np.degrees(angles.mean()) < 1.0
+
+
+@pytest.mark.parametrize(("drift", "gain"), [(0.02, 0.75), (2.0, 1.1)])
+def test_an_accurate_map_is_bent_less_than_one_that_drifts(monkeypatch, drift, gain):
+    """The fixes decide how far the edges are believed."""
+    true, found = drive(300, drift=drift)
+    positions, _ = measured(true)
+    graph = graph_of(found, positions.seconds)
+
+    def error():
+        anchored = anchor(graph, positions.seconds, positions, CONFIG, metric=True)
+        T = inverses(anchored.T_enu_k[:-1]) @ anchored.T_enu_k[1:]
+        return float(np.linalg.norm((T - inverses(true[:-1]) @ true[1:])[:, :3, 3], axis=1).mean())
+
+    believed = error()
+    monkeypatch.setattr(gps, "_DRIFTS", (1.0,))
+    assert believed < gain * error()
 
 
 @pytest.mark.parametrize("metric", [True, False])

@@ -174,7 +174,10 @@ RULES = {
         )
     ),
     "docs/research/uncertainty.md": Rules(
-        not_run=(("python tools/experiments/uncertainty", "test_odometry.py runs it"),)
+        not_run=(
+            ("vslam synth", "test_synthetic.py renders drives"),
+            ("python tools/experiments/uncertainty", "test_odometry.py runs it"),
+        )
     ),
     "docs/research/loops.md": Rules(
         not_run=(

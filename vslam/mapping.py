@@ -18,7 +18,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.backend.disparity_offset import map_and_calibrate
+from vslam.backend.disparity_offset import map_and_calibrate, offset_sigma
 from vslam.backend.local_mapping import refresh_keyframe
 from vslam.backend.triangulation import map_stereo_points
 from vslam.closing import LoopClosing, LoopSearch
@@ -359,7 +359,9 @@ class Mapper:
         local = local_map(map_, keyframe, config.local_keyframes)
         patches = self._patches.of(map_, local.ids)
         self.view = view_of(map_, keyframe, local, patches, monocular=self._camera.monocular)
-        self.rig.disparity_offset = map_.scalars.disparity_offset
+        known = map_.scalars
+        self.rig.disparity_offset = known.disparity_offset
+        self.rig.offset_sigma = offset_sigma(known.offset_information, self._config.stereo)
 
     def refer_to_nearest(self, frame: Frame) -> None:
         """Make the keyframe that shares the most landmarks with a frame the reference (ORB-SLAM,

@@ -11,30 +11,33 @@ the keyframe that maps them. Consecutive keyframes share landmarks, so that thei
 correlated: the drift grows like a random walk with correlated steps (a first-order autoregressive
 process).
 
+A stereo camera adds a third part. Its disparity offset is estimated during the drive
+(``backend/disparity_offset.py``), and the error of this estimate makes all motions too long or too
+short by the same share: in contrast to the drift, it does not average out.
+
 Covariances are those of ``xi = [v, w]``, metres and radians, in the frame of the camera: with an
 estimated pose ``T_cw``, the true one is ``exp(xi) T_cw``. The covariance describes odometry alone:
 it ignores that loop closures reduce the drift, that the scale of a monocular map is unknown, and
-that the calibration has errors.
+errors of the calibration other than the estimated offset.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.geometry import Matrix, inverse, orthonormalised
 
-# Factors on the computed covariances of the local error and of the drift, and the correlation of
-# consecutive steps of the drift. They were chosen on four rendered drives so that the squared
-# errors over 1 s and 10 s match the covariances, and tested on four others
-# (docs/research/uncertainty.md).
-LOCAL, DRIFT, CORRELATION = 1.8, 3.3, 0.5
+# Factor on the computed covariance of the drift, and the correlation of consecutive steps of the
+# drift. They were chosen on three rendered drives so that the squared errors over 1 s and 10 s
+# match the covariances, and tested on others (docs/research/uncertainty.md).
+DRIFT, CORRELATION = 1.4, 0.4
 # Standard deviations of the acceleration of a lost camera, in m/s^2 and rad/s^2.
 ACCELERATION, TURNING = 2.0, 1.0
 
-N_NUMBERS = 43  # length of ``PoseUncertainty.numbers``
+N_NUMBERS = 49  # length of ``PoseUncertainty.numbers``
 N_STATE = 16 + N_NUMBERS + 1  # length of ``Odometry.state``
 _UPPER = np.triu_indices(6)
 
@@ -48,36 +51,39 @@ class PoseUncertainty:
         drift: ``(6, 6)`` sum of the local covariances of all keyframes since the start of the
             drive.
         n_keyframes: number of these keyframes.
+        offset: ``(6,)`` error of the pose relative to the start of the drive if the disparity
+            offset is wrong by one standard deviation.
     """
 
     local: Matrix
     drift: Matrix
     n_keyframes: int
+    offset: Matrix = field(default_factory=lambda: np.zeros(6))
 
     def numbers(self) -> NDArray[np.float64]:
-        """``(43,)`` the upper triangles of ``local`` and ``drift``, row by row, and
+        """``(49,)`` the upper triangles of ``local`` and ``drift``, row by row, ``offset`` and
         ``n_keyframes``; ``of_numbers`` is the inverse."""
-        return np.array([*self.local[_UPPER], *self.drift[_UPPER], self.n_keyframes])
+        return np.array([*self.local[_UPPER], *self.drift[_UPPER], *self.offset, self.n_keyframes])
 
     @classmethod
     def of_numbers(cls, numbers: NDArray[np.float64]) -> PoseUncertainty:
-        """Restore an uncertainty from the ``(43,)`` array of ``numbers``."""
+        """Restore an uncertainty from the ``(49,)`` array of ``numbers``."""
         both = np.zeros((2, 6, 6))
-        for matrix, values in zip(both, numbers[:-1].reshape(2, -1), strict=True):
+        for matrix, values in zip(both, numbers[:-7].reshape(2, -1), strict=True):
             matrix[_UPPER] = values
             matrix.T[_UPPER] = values
-        return cls(both[0], both[1], int(numbers[-1]))
+        return cls(both[0], both[1], int(numbers[-1]), np.array(numbers[-7:-1]))
 
     @property
     def near(self) -> Matrix:
         """``(6, 6)`` covariance of the pose relative to the landmarks around the camera."""
-        total: Matrix = LOCAL * self.local
-        return total
+        return self.local
 
     @property
     def covariance(self) -> Matrix:
         """``(6, 6)`` covariance of the pose relative to the start of the drive."""
-        total: Matrix = self.near + DRIFT * _growth(self.n_keyframes) * self.drift
+        drift = DRIFT * _growth(self.n_keyframes) * self.drift
+        total: Matrix = self.near + drift + np.outer(self.offset, self.offset)
         return total
 
 
@@ -94,7 +100,9 @@ def relative_covariance(
     n = last.n_keyframes - first.n_keyframes
     A = adjoint(T_last_first)
     grown = last.drift - A @ first.drift @ A.T
-    total: Matrix = LOCAL * (last.local + A @ first.local @ A.T) + DRIFT * _growth(n) * grown
+    offset = last.offset - A @ first.offset
+    local = last.local + A @ first.local @ A.T
+    total: Matrix = local + DRIFT * _growth(n) * grown + np.outer(offset, offset)
     return total
 
 
@@ -134,7 +142,13 @@ class Odometry:
         self.now = PoseUncertainty(np.zeros((6, 6)), np.zeros((6, 6)), 0)
         self._lost_s = 0.0
 
-    def move(self, T_now_last: Matrix, elapsed: float, covariance: Matrix | None) -> None:
+    def move(
+        self,
+        T_now_last: Matrix,
+        elapsed: float,
+        covariance: Matrix | None,
+        of_offset: Matrix | None = None,
+    ) -> None:
         """Advance to the next frame.
 
         Args:
@@ -143,6 +157,8 @@ class Odometry:
             covariance: ``(6, 6)`` covariance of the optimised pose (``pose_covariance``); None if
                 the pose is only predicted with constant velocity. The error of a predicted pose
                 grows with the square of the time since tracking was lost.
+            of_offset: ``(6, 3)`` error of the motion, by its translation, if the disparity offset
+                is wrong by one standard deviation (``offset_effect``); None if it has no effect.
         """
         self.T_odom_camera = orthonormalised(self.T_odom_camera @ inverse(T_now_last))
         A = adjoint(T_now_last)
@@ -155,13 +171,16 @@ class Odometry:
             grown = np.diag(deviation**2 * (self._lost_s**4 - before**4))
             local = _symmetric(A @ self.now.local @ A.T) + grown
         drift = _symmetric(A @ self.now.drift @ A.T)
-        self.now = PoseUncertainty(local, drift, self.now.n_keyframes)
+        offset = A @ self.now.offset
+        if of_offset is not None and np.isfinite(of_offset).all():
+            offset += of_offset @ T_now_last[:3, 3]
+        self.now = PoseUncertainty(local, drift, self.now.n_keyframes, offset)
 
     def keyframe(self) -> None:
         """Record that the last frame became a keyframe. Its error is added to the drift, because
         new landmarks inherit it."""
         now = self.now
-        self.now = PoseUncertainty(now.local, now.drift + now.local, now.n_keyframes + 1)
+        self.now = replace(now, drift=now.drift + now.local, n_keyframes=now.n_keyframes + 1)
 
     def resume(self, T_odom_camera: Matrix, uncertainty: PoseUncertainty) -> None:
         """Continue from the last frame of a drive whose state was not saved."""

@@ -21,7 +21,7 @@ from vslam.frontend.masks import Mask
 from vslam.frontend.relocaliser import Relocaliser
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracker import Found, Tracker, TrackerStatus, result_of
-from vslam.frontend.tracking import TrackingContext, covariance_of
+from vslam.frontend.tracking import TrackingContext, covariance_of, offset_effect_of
 from vslam.geometry import Matrix, inverse
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.learned_verification import LearnedRelocalisation
@@ -329,7 +329,8 @@ class Slam:
         found_again = found.relocalised or tracker.status is not TrackerStatus.TRACKING
         T_moved = T_predicted if found_again else frame.T_cw
         tracker.accept(frame, found, mapper.frames)
-        self._follow(frame, T_moved, covariance_of(frame, self.context))
+        offset_effect = offset_effect_of(frame, self.rig.offset_sigma, self.context)
+        self._follow(frame, T_moved, covariance_of(frame, self.context), offset_effect)
         return mapper.append_pose(frame, tracked=True, near=found.keyframe)
 
     def _update_map(self, frame: PlacedFrame, found: Found) -> bool:
@@ -357,19 +358,26 @@ class Slam:
         found = Found(TrackingState.DROPPED if dropped else TrackingState.LOST)
         return result_of(frame, found, False, {}, self._odometry)
 
-    def _follow(self, frame: Frame, T_cw: Matrix, covariance: Matrix | None) -> None:
+    def _follow(
+        self,
+        frame: Frame,
+        T_cw: Matrix,
+        covariance: Matrix | None,
+        of_offset: Matrix | None = None,
+    ) -> None:
         """Advance the odometry to the next frame, before its pose is recorded.
 
         Args:
             T_cw: ``(4, 4)`` pose of the frame by continuous motion from the last one; it differs
                 from the pose in the map if the camera was relocalised.
+            covariance, of_offset: see ``Odometry.move``.
         """
         frames = self._mapper.frames
         T_now_last, elapsed = np.eye(4), 0.0
         if len(frames):
             T_now_last = T_cw @ inverse(frames.pose(-1))
             elapsed = frame.timestamp - frames.timestamp(-1)
-        self._odometry.move(T_now_last, elapsed, covariance)
+        self._odometry.move(T_now_last, elapsed, covariance, of_offset)
 
     def resume_odometry(self, last: TrackResult) -> None:
         """Continue ``T_odom_camera`` and the uncertainty from the last result of a drive that was

@@ -149,4 +149,4 @@ class Checkpoint:
     policy: PolicyState
     closing: ClosingState
     rig: RigState = field(default_factory=RigState)
-    odometry: tuple[float, ...] = (*np.eye(4).ravel().tolist(), *[0.0] * 44)
+    odometry: tuple[float, ...] = (*np.eye(4).ravel().tolist(), *[0.0] * 50)

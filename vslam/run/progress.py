@@ -22,7 +22,7 @@ from vslam.maps.new_output import replaced_file
 from vslam.odometry import N_NUMBERS, PoseUncertainty
 from vslam.untrusted import ARCHIVE_ERRORS, read_json, read_npz
 
-SCHEMA = 3
+SCHEMA = 4
 _STATES = tuple(TrackingState)
 _POSE, _NUMBERS = 16, 7 + 16 + N_NUMBERS  # columns of the pose, and of the numbers after it
 _UNKNOWN = np.full(N_NUMBERS, np.nan)

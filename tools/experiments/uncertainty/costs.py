@@ -41,7 +41,9 @@ def main() -> None:
     options = parser.parse_args()
     n, camera = options.repeats, run(options, None).sequence.camera  # compiles the kernels
     spent: dict[str, list[float]] = defaultdict(list)
-    for owner, name in ((tracking, "pose_covariance"), (Odometry, "move")):
+    for owner, name in (
+        (tracking, "pose_covariance"), (tracking, "offset_effect"), (Odometry, "move")
+    ):  # fmt: skip
         setattr(owner, name, timed(getattr(owner, name), spent[name]))
     outcomes: dict[str, list[RunOutcome]] = defaultdict(list)
     with TemporaryDirectory() as folder:

@@ -341,8 +341,13 @@ def _likeliest_drift(
     import gtsam
 
     def log_determinant(factors: Any, values: Any) -> float:
-        # GTSAM returns that of the triangular root.
-        return 2.0 * float(factors.linearize(values).eliminateMultifrontal().logDeterminant())
+        try:
+            # GTSAM returns that of the triangular root.
+            return 2.0 * float(factors.linearize(values).eliminateMultifrontal().logDeterminant())
+        except RuntimeError:
+            # The edges are so much stiffer than the priors that the system cannot be solved, as on
+            # a drive of less than a metre. Such a factor is not used.
+            return np.inf
 
     held = gtsam.noiseModel.Isotropic.Sigma(6, _HELD)
     surprise = []
@@ -358,8 +363,10 @@ def _likeliest_drift(
         for i in np.unique(part, return_index=True)[1].tolist():
             vision.add(gtsam.PriorFactorPose3(i, result.atPose3(i), held))
         before = log_determinant(vision, result)
-        surprise.append(2.0 * both.error(result) + after - before)
-    return _DRIFTS[int(np.argmin(surprise))]
+        unknown = not np.isfinite([after, before]).all()
+        surprise.append(np.inf if unknown else 2.0 * both.error(result) + after - before)
+    best = int(np.argmin(surprise))
+    return _DRIFTS[best] if np.isfinite(surprise[best]) else 1.0
 
 
 def _optimised(

@@ -331,6 +331,23 @@ def test_a_short_drive_is_refused():
         anchor(graph, positions.seconds, positions, CONFIG, metric=True)
 
 
+def test_two_keyframes_suffice_for_an_accurate_receiver():
+    """Their edge is so short that GTSAM cannot solve the system without the fixes."""
+    true = np.tile(np.eye(4), (2, 1, 1))
+    true[1, 2, 3] = 0.35
+    keyframe, ahead = np.array([0, 1, 1, 1, 1, 1]), 0.35 * np.arange(6.0)
+    offset = np.zeros((6, 3))
+    offset[:, 2] = ahead - true[keyframe, 2, 3]
+    enu = (np.eye(3)[2] * ahead[:, None]) @ R_ENU_CAMERA.T
+    positions = Positions(
+        np.arange(6) * 0.1, keyframe, offset, np.zeros((6, 3)), enu, np.full((6, 3), 0.01)
+    )
+    graph = graph_of(true, np.array([0.0, 0.1]))
+    anchored = anchor(graph, np.array([0.0, 0.1]), positions, CONFIG, metric=True)
+    assert anchored.used.all()
+    assert error_of(anchored, enu[:2]) < 0.01
+
+
 def test_the_scale_of_a_monocular_map_is_found_where_it_drifts():
     true, found = drive(500, drift=0.5, shrink=0.001)  # by a factor of 1.6 to the end
     found[:, :3, 3] *= 0.2

@@ -56,9 +56,8 @@ _LOOSE = np.array([0.3, 0.3, 0.3, 100.0, 100.0, 100.0])  # standard deviations o
 _STRETCH = 0.1  # ``_optimised(stretch=...)`` of a monocular map while its local scale is estimated
 # Factors on the standard deviations of the drift, of which the most likely one is used.
 _DRIFTS = (4.0, 1.0, 0.25, 0.0625)
-_HELD = (
-    1e-3  # standard deviation with which ``_likeliest_drift`` holds a part of the map, rad and m
-)
+# Standard deviation with which ``_likeliest_drift`` holds each part of the map, rad and m.
+_HELD = 1e-3
 _WINDOW = 25  # keyframes before and after a keyframe from which its local scale is estimated
 
 Array = NDArray[np.float64]
@@ -411,9 +410,8 @@ def _factors(
     import gtsam
 
     noise = gtsam.noiseModel
-    vision, fixes, start = (
-        gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph(), gtsam.Values()
-    )  # fmt: skip
+    vision, fixes = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
+    start = gtsam.Values()
     loose = noise.Diagonal.Sigmas(_LOOSE)
     for i, T in enumerate(T_enu_k):
         pose = gtsam.Pose3(T)

@@ -21,8 +21,10 @@ which the fixes are most likely (empirical Bayes: MacKay, Bayesian Interpolation
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,10 +55,10 @@ _UP_WEIGHT = 1e-3  # see _umeyama
 _METRIC = 0.02  # standard deviation of the scale of a metric map, from errors of its calibration
 _MAX_UNSURE = 0.1  # largest accepted uncertainty of the two directions of an ``Alignment``, rad
 _LOOSE = np.array([0.3, 0.3, 0.3, 100.0, 100.0, 100.0])  # standard deviations of priors, rad and m
-_STRETCH = 0.1  # ``_optimised(stretch=...)`` of a monocular map while its local scale is estimated
+_STRETCH = 0.1  # ``_factors(stretch=...)`` of a monocular map while its local scale is estimated
 # Factors on the standard deviations of the drift, of which the most likely one is used.
 _DRIFTS = (4.0, 1.0, 0.25, 0.0625)
-# Standard deviation with which ``_likeliest_drift`` holds each part of the map, rad and m.
+# Standard deviation with which ``_likeliest`` holds each part of the map, rad and m.
 _HELD = 1e-3
 _WINDOW = 25  # keyframes before and after a keyframe from which its local scale is estimated
 
@@ -157,21 +159,20 @@ def anchor(
     stretch = 0.0 if metric else _STRETCH
     while width > _CAUCHY:
         width = max(width / _NARROWING, _CAUCHY)
-        T_enu_k = _optimised(
+        factors = _factors(
             graph, seconds, T_enu_k, scale, positions, config, cauchy=width, stretch=stretch
         )
+        T_enu_k = _optimised(factors, config)
         if not metric:
             scale = _local_scale(T_wk, T_enu_k, scale, part)
     used = np.ones(len(positions.seconds), np.bool_)
-    drift = 1.0
     for _ in range(2):
         chi2 = _chi2(positions, T_enu_k, scale)
         # Receivers underestimate their errors, so the gate is widened if the residuals are larger.
         used = chi2 <= GATE * max(1.0, float(np.median(chi2)) / _MEDIAN)
         chosen = positions.select(used)
-        if metric:
-            drift = _likeliest_drift(graph, seconds, T_enu_k, scale, chosen, config, part)
-        T_enu_k = _optimised(graph, seconds, T_enu_k, scale, chosen, config, drift=drift)
+        final = partial(_factors, graph, seconds, T_enu_k, scale, chosen, config)
+        T_enu_k = _likeliest(final, part, config) if metric else _optimised(final(), config)
     distance = np.linalg.norm(_residuals(positions, T_enu_k, scale)[used], axis=1)
     residual = float(np.sqrt(np.mean(distance**2)))
     return Anchored(T_enu_k, scale, used, residual, main.S_enu_w, main.unsure_about <= _MAX_UNSURE)
@@ -319,70 +320,66 @@ def _local_scale(T_wk: Array, T_enu_k: Array, scale: Array, part: NDArray[np.int
     return scale
 
 
-def _likeliest_drift(
-    graph: PoseGraph,
-    seconds: Array,
-    T_enu_k: Array,
-    scale: Array,
-    positions: Positions,
-    config: PoseGraphConfig,
-    part: NDArray[np.int64],
-) -> float:
-    """The factor of ``_DRIFTS`` for which the fixes are most likely, given the edges.
+def _likeliest(
+    factors: Callable[..., _Factors], part: NDArray[np.int64], config: PoseGraphConfig
+) -> Array:
+    """``(N, 4, 4)`` optimised poses for the factor of ``_DRIFTS`` with which the fixes are most
+    likely, given the edges.
 
     The likelihood of the fixes is an integral over all poses of the keyframes, here by Laplace's
     approximation: it depends on the error at the optimum and on the determinants of the normal
     matrices with and without the fixes.
 
     Args:
+        factors: ``_factors`` without ``drift``.
         part: ``(N,)`` label of the part of the map that each keyframe belongs to.
     """
     import gtsam
 
-    def log_determinant(factors: Any, values: Any) -> float:
-        try:
-            # GTSAM returns that of the triangular root.
-            return 2.0 * float(factors.linearize(values).eliminateMultifrontal().logDeterminant())
-        except RuntimeError:
-            # The edges are so much stiffer than the priors that the system cannot be solved, as on
-            # a drive of less than a metre. Such a factor is not used.
-            return np.inf
-
     held = gtsam.noiseModel.Isotropic.Sigma(6, _HELD)
-    surprise = []
+    best, least = None, np.inf
     for drift in _DRIFTS:
-        vision, fixes, start = _factors(
-            graph, seconds, T_enu_k, scale, positions, config, drift=drift
-        )
+        vision, fixes, start = factors(drift=drift)
         both = gtsam.NonlinearFactorGraph(vision)
         both.push_back(fixes)
         result = minimised(both, start, config)
-        after = log_determinant(both, result)
+        after = _log_determinant(both, result)
         # Vision alone does not determine where each part of the map is, so it is held.
         for i in np.unique(part, return_index=True)[1].tolist():
             vision.add(gtsam.PriorFactorPose3(i, result.atPose3(i), held))
-        before = log_determinant(vision, result)
-        unknown = not np.isfinite([after, before]).all()
-        surprise.append(np.inf if unknown else 2.0 * both.error(result) + after - before)
-    best = int(np.argmin(surprise))
-    return _DRIFTS[best] if np.isfinite(surprise[best]) else 1.0
+        surprise = 2.0 * both.error(result) + after - _log_determinant(vision, result)
+        if surprise < least:  # False for NaN
+            best, least = result, surprise
+    return _optimised(factors(), config) if best is None else _poses(best)
 
 
-def _optimised(
-    graph: PoseGraph,
-    seconds: Array,
-    T_enu_k: Array,
-    scale: Array,
-    positions: Positions,
-    config: PoseGraphConfig,
-    **options: float,
-) -> Array:
-    """``(N, 4, 4)`` poses that best agree with edges and fixes, starting from ``T_enu_k``. The
-    options are those of ``_factors``."""
-    vision, fixes, start = _factors(graph, seconds, T_enu_k, scale, positions, config, **options)
-    vision.push_back(fixes)
-    result = minimised(vision, start, config)
-    return np.array([result.atPose3(i).matrix() for i in range(len(T_enu_k))])
+def _log_determinant(factors: Any, values: Any) -> float:
+    """Logarithm of the determinant of the normal matrix; NaN if GTSAM cannot eliminate it. This
+    happens if edges are much stiffer than the priors, as on a drive of less than a metre."""
+    try:
+        # GTSAM returns that of the triangular root.
+        return 2.0 * float(factors.linearize(values).eliminateMultifrontal().logDeterminant())
+    except RuntimeError:
+        return np.nan
+
+
+def _optimised(factors: _Factors, config: PoseGraphConfig) -> Array:
+    """``(N, 4, 4)`` poses that best agree with edges and fixes."""
+    factors.vision.push_back(factors.fixes)
+    return _poses(minimised(factors.vision, factors.start, config))
+
+
+def _poses(values: Any) -> Array:
+    return np.array([values.atPose3(i).matrix() for i in range(values.size())])
+
+
+class _Factors(NamedTuple):
+    """The ``gtsam.NonlinearFactorGraph`` of the edges, that of the fixes, and the ``gtsam.Values``
+    of the keyframes to start from."""
+
+    vision: Any
+    fixes: Any
+    start: Any
 
 
 def _factors(
@@ -396,9 +393,8 @@ def _factors(
     cauchy: float | None = None,
     stretch: float = 0.0,
     drift: float = 1.0,
-) -> tuple[Any, Any, Any]:
-    """The ``gtsam.NonlinearFactorGraph`` of the edges, that of the fixes, and the ``gtsam.Values``
-    of ``T_enu_k``.
+) -> _Factors:
+    """The factors of edges and fixes, to be optimised from ``T_enu_k``.
 
     Args:
         cauchy: scale of the Cauchy loss of the fixes, in standard deviations of the fixes; None
@@ -437,4 +433,4 @@ def _factors(
         loss = None if cauchy is None else noise.mEstimator.Cauchy.Create(cauchy / n)
         model = plain if loss is None else noise.Robust.Create(loss, plain)
         fixes.add(gtsam.GPSFactorArm(i, positions.enu[k], antenna[k], model))
-    return vision, fixes, start
+    return _Factors(vision, fixes, start)

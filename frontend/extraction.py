@@ -29,16 +29,14 @@ class Corners(NamedTuple):
 
     Attributes:
         found: the features of the image of ``side``.
-        right: the features of the right image; None if there is no right image, or if the left one
-            is black.
-        matches: the stereo matches of ``found``; None if ``right`` is None.
+        matches: the stereo matches of ``found``; None if there is no right image, or if the left
+            one is black.
         depth: ``(H, W)`` float32 depth image of an RGB-D camera, metres; None for other cameras.
         side: see ``Extracted``.
         sides: the comparison of the left and the right image; None without a right image.
     """
 
     found: Extraction
-    right: Extraction | None = None
     matches: StereoMatches | None = None
     depth: DepthImage | None = None
     side: Side = Side.LEFT
@@ -165,7 +163,7 @@ def find_corners(
     pair = balanced(left, right_image, sides)
     built = pyramid if pair[0] is left else None  # it may have been brightened
     found, right = extract_in_any_light(pair, config, image_map, allowed, built)
-    return Corners(found, right, match_stereo(found, right, camera, config.stereo), sides=sides)
+    return Corners(found, match_stereo(found, right, camera, config.stereo), sides=sides)
 
 
 def matched(
@@ -178,7 +176,7 @@ def matched(
         keypoints: positions in the left image for additional features (``extract_at``).
     """
     camera, config = context.camera, context.config
-    found, right, matches, depth, side, _ = corners
+    found, matches, depth, side, _ = corners
     if depth is not None:
         scale = context.scales[found.octave]
         u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
@@ -188,13 +186,14 @@ def matched(
     if keypoints is not None and side == Side.LEFT:
         more = extract_at(found, *keypoints)
         found, order = found.joined(more)
-        if right is not None and matches is not None:
-            matches = matches.joined(match_stereo(more, right, camera, config.stereo), order)
-    if right is None or matches is None:
+        if matches is not None:
+            added = match_stereo(more, matches.right, camera, config.stereo)
+            matches = matches.joined(added, order)
+    if matches is None:
         u_right = np.full(len(found.xy), np.nan, np.float32)
         return Extracted(_features(found, u_right), found.pyramid, side=side)
     u_right = inliers_only(matches, found.octave)
-    rows = row_offsets(found, right, u_right, config.stereo)
+    rows = row_offsets(found, matches.right, u_right, config.stereo)
     return Extracted(_features(found, u_right), found.pyramid, rows)
 
 

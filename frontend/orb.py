@@ -47,10 +47,11 @@ class Extraction:
     def joined(self, other: Extraction) -> tuple[Extraction, NDArray[np.int64]]:
         """These features and those of another extraction from the same image, and the ``(N,)``
         index of each feature among these features followed by the others."""
-        order = np.argsort(np.concatenate([self.octave, other.octave]), kind="stable")
+        octave = np.concatenate([self.octave, other.octave])
+        order = np.argsort(octave, kind="stable")
         both = Extraction(
             np.concatenate([self.xy, other.xy])[order],
-            np.concatenate([self.octave, other.octave])[order],
+            octave[order],
             np.concatenate([self.angle, other.angle])[order],
             np.concatenate([self.descriptors, other.descriptors])[order],
             self.pyramid,

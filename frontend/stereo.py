@@ -24,18 +24,20 @@ class StereoMatches(NamedTuple):
     """Stereo matches of N left features, outliers included.
 
     Attributes:
+        right: the features of the right image.
         u_right: ``(N,)`` float32 column in the right image, NaN without a match.
         sad: ``(N,)`` float32 sum of absolute differences (SAD), -1 without a match.
     """
 
+    right: Extraction
     u_right: NDArray[np.float32]
     sad: NDArray[np.float32]
 
     def joined(self, other: StereoMatches, order: NDArray[np.int64]) -> StereoMatches:
         """The matches of these features followed by those of others, reordered by the index
         ``order``."""
-        pairs = zip(self, other, strict=True)
-        return StereoMatches._make(np.concatenate(pair)[order] for pair in pairs)
+        u_right = np.concatenate([self.u_right, other.u_right])[order]
+        return StereoMatches(self.right, u_right, np.concatenate([self.sad, other.sad])[order])
 
 
 def match_stereo(
@@ -59,7 +61,7 @@ def match_stereo(
         config.sad_window,
         config.sad_search,
     )
-    return StereoMatches(u_right, sad)
+    return StereoMatches(right, u_right, sad)
 
 
 class _Side(NamedTuple):
@@ -160,7 +162,7 @@ def inliers_only(matches: StereoMatches, octave: NDArray[np.uint8]) -> NDArray[n
     Args:
         octave: ``(N,)`` uint8 octave of each feature, sorted.
     """
-    return _inliers_only(*matches, octave)
+    return _inliers_only(matches.u_right, matches.sad, octave)
 
 
 @kernel

@@ -300,29 +300,29 @@ def refine(
     return int(np.count_nonzero(inlier))
 
 
-def covariance_of(frame: Frame, context: TrackingContext) -> Matrix:
-    """``(6, 6)`` covariance of the pose ``T_cw`` of a tracked frame relative to the points that it
-    tracks; see ``pose_covariance``."""
+def uncertainty_of(
+    frame: Frame, offset_sigma: float, context: TrackingContext
+) -> tuple[Matrix, Matrix | None]:
+    """The uncertainty of a tracked frame.
+
+    Args:
+        offset_sigma: standard deviation of the disparity offset, pixels; 0 for cameras without one.
+
+    Returns:
+        ``(6, 6)`` covariance of the pose ``T_cw`` relative to the points that the frame tracks
+        (``pose_covariance``), and ``(6, 3)`` effect on the motion if the disparity offset is wrong
+        by ``offset_sigma`` (``offset_effect``); None if that is 0.
+    """
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
-    covariance = pose_covariance(frame.T_camera_w, *_observed_points(frame, matched, context))
+    observed = _observed_points(frame, matched, context)
+    covariance, effect = pose_covariance(frame.T_camera_w, *observed), None
+    if offset_sigma > 0.0:
+        effect = offset_sigma * offset_effect(frame.T_camera_w, *observed[:4])
     if frame.side == Side.LEFT:
-        return covariance
+        return covariance, effect
     A = adjoint(inverse(frame.T_camera_left))
-    return A @ covariance @ A.T
-
-
-def offset_effect_of(frame: Frame, sigma: float, context: TrackingContext) -> Matrix | None:
-    """``(6, 3)`` effect of the disparity offset on the motion to a tracked frame of a stereo camera
-    if the offset is wrong by ``sigma`` pixels, see ``offset_effect``; None if ``sigma`` is 0."""
-    if sigma == 0.0:
-        return None
-    matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
-    points, uvr, weight, intrinsics, _ = _observed_points(frame, matched, context)
-    effect = sigma * offset_effect(frame.T_camera_w, points, uvr, weight, intrinsics)
-    if frame.side == Side.LEFT:
-        return effect
     # The cameras are parallel, so their translations are nearly the same.
-    return adjoint(inverse(frame.T_camera_left)) @ effect
+    return A @ covariance @ A.T, None if effect is None else A @ effect
 
 
 def _observed_points(

@@ -21,7 +21,7 @@ from vslam.frontend.masks import Mask
 from vslam.frontend.relocaliser import Relocaliser
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracker import Found, Tracker, TrackerStatus, result_of
-from vslam.frontend.tracking import TrackingContext, covariance_of, offset_effect_of
+from vslam.frontend.tracking import TrackingContext, uncertainty_of
 from vslam.geometry import Matrix, inverse
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.learned_verification import LearnedRelocalisation
@@ -329,8 +329,8 @@ class Slam:
         found_again = found.relocalised or tracker.status is not TrackerStatus.TRACKING
         T_moved = T_predicted if found_again else frame.T_cw
         tracker.accept(frame, found, mapper.frames)
-        offset_effect = offset_effect_of(frame, self.rig.offset_sigma, self.context)
-        self._follow(frame, T_moved, covariance_of(frame, self.context), offset_effect)
+        uncertainty = uncertainty_of(frame, self.rig.offset_sigma, self.context)
+        self._follow(frame, T_moved, *uncertainty)
         return mapper.append_pose(frame, tracked=True, near=found.keyframe)
 
     def _update_map(self, frame: PlacedFrame, found: Found) -> bool:

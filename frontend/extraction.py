@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
-from threading import Lock
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +21,7 @@ from vslam.frontend.sides import Sides, balanced, compare_sides
 from vslam.frontend.stereo import StereoMatches, inliers_only, match_stereo
 from vslam.frontend.tracking import TrackingContext
 from vslam.frontend.weak_images import extract_in_any_light
+from vslam.workers import Job, Urgency, Workers
 
 
 class Corners(NamedTuple):
@@ -84,35 +84,37 @@ class FrameImages:
         self._context = context
         self._image_map = image_map
         self._second: Image | DepthImage | None = None
-        self._corners: Corners | None = None
-        self._lock = Lock()
+        self._started: Job[Corners] | None = None
         if context.tracks_patches:
             self.pyramid = build_pyramid(left, context.config.orb)
             self.coarse = coarse_levels(self.pyramid)
 
-    def find_corners(self) -> Corners:
-        """Read the second image, and extract the features that do not depend on tracking. Another
-        thread may call this before the features are needed."""
-        with self._lock:
-            if self._corners is None:
-                self._corners = self._find_corners()
-            return self._corners
+    def start_corners(self, workers: Workers) -> None:
+        """Start to compute ``corners`` in another thread, before they are needed."""
+        if self._started is None:
+            self._image_map = partial(workers.map, urgency=Urgency.CORNERS)
+            self._started = workers.submit(self._find_corners, Urgency.CORNERS)
+
+    @cached_property
+    def corners(self) -> Corners:
+        """The features that do not depend on tracking. This reads the second image."""
+        return self._find_corners() if self._started is None else self._started.result()
 
     @cached_property
     def extracted(self) -> Extracted:
         """The features."""
-        return matched(self.find_corners(), self._context)
+        return matched(self.corners, self._context)
 
     def extracted_with(self, keypoints: Keypoints) -> Extracted:
         """The features, and additional features at given positions and levels of the left image."""
-        return matched(self.find_corners(), self._context, keypoints)
+        return matched(self.corners, self._context, keypoints)
 
     @cached_property
     def image(self) -> Image:
         """The ``(H, W)`` uint8 image that the features are extracted from, for place recognition.
         Masked pixels are filled (``Mask.filled``)."""
         image = self.left
-        if self.find_corners().side == Side.RIGHT:
+        if self.corners.side == Side.RIGHT:
             image = np.array(self._second, np.uint8)  # a copy, because the caller owns the image
         return image if self.mask is None else self.mask.filled(image)
 

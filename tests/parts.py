@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Executor, Future
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,24 +12,22 @@ from vslam.features import Extracted, Features
 from vslam.frontend.frame import Frame
 from vslam.geometry import se3_exp, transform
 from vslam.map_view import LocalMap, MapView
+from vslam.workers import Job, Urgency, Workers
 
 CAMERA = Camera(400.0, 400.0, 320.0, 120.0, 0.5, 640, 240)
 ALL, NOTHING = slice(None), slice(0, 0)  # of the points of a ``Points``
 
 
-class InstantExecutor(Executor):
-    """An executor whose job is finished before ``submit`` returns."""
+class InstantWorkers(Workers):
+    """Workers whose jobs are done before ``submit`` returns."""
 
-    def __init__(self, *_: object) -> None:
-        pass
+    def __init__(self, threads: int = 2) -> None:
+        super().__init__(1)
 
-    def submit(self, function, /, *arguments, **options) -> Future:
-        future: Future = Future()
-        try:
-            future.set_result(function(*arguments, **options))
-        except BaseException as error:
-            future.set_exception(error)
-        return future
+    def submit(self, work: Callable, urgency: Urgency) -> Job:
+        job = super().submit(work, urgency)
+        job.wait()
+        return job
 
 
 def frame_of(

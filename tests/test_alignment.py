@@ -25,6 +25,7 @@ from vslam.geometry import inverse, se3_exp, transform
 from vslam.map import Map
 from vslam.map_kernels import link_many, unlink
 from vslam.mapping import Mapper
+from vslam.workers import Workers
 
 CONFIG = Config().alignment
 NO_SHIFT = np.zeros((1, 2), np.float32)
@@ -373,7 +374,7 @@ def two_keyframes():
     config = Config()
     closing = LoopClosing(NoDetector(), verifier_for(config, CAMERA), CAMERA, config, threads=1)
     rig = RigCalibration(CAMERA, config.stereo, CONTEXT.scales)
-    mapper = Mapper(CONTEXT, closing, rig, None)
+    mapper = Mapper(CONTEXT, closing, rig, Workers(1))
     frames = []
     for index in range(2):
         frame = Frame.of(extracted_at(100, 50, 0, 3), CAMERA, index, 0.1 * index)

@@ -25,7 +25,7 @@ FOLDERS = {
 # From the ground up; a module belongs to the longest name here that it lies within. What stands
 # together on one level may not import each other, save where SIBLINGS says so.
 LEVELS: tuple[tuple[str, ...], ...] = (
-    ("vslam.errors", "vslam.machine", "vslam.method"),
+    ("vslam.errors", "vslam.machine", "vslam.method", "vslam.workers"),
     ("vslam.kernels", "vslam.plugins", "vslam.untrusted", "vslam.lock_file"),
     ("vslam.config", "vslam.geometry", "vslam.ransac", "vslam.camera"),
     ("vslam.odometry",),

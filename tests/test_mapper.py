@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import ring
-from parts import CAMERA, InstantExecutor, Points, ahead, frame_of
+from parts import CAMERA, InstantWorkers, Points, ahead, frame_of
 
 from vslam.camera import Camera
 from vslam.closing import LoopSearch
@@ -26,12 +26,13 @@ from vslam.mapping import Mapper
 from vslam.slam import Slam
 from vslam.starter import TwoViewStart
 from vslam.states import MapperState
+from vslam.workers import Workers
 
 POINTS = Points.create()
 RING = ring.Ring.create(zoom=True)
 # A job runs as late as can be, where its result is needed, or as early as can be, at once.
 late_and_early = pytest.mark.parametrize(
-    "executor", [lambda: None, InstantExecutor], ids=["late", "early"]
+    "workers", [lambda: Workers(1), InstantWorkers], ids=["late", "early"]
 )
 
 AT_THE_END = -1  # in place of a keyframe
@@ -85,7 +86,7 @@ class Drive:
 
     def __init__(
         self,
-        executor=None,
+        workers: Workers | None = None,
         closing: Closing | None = None,
         camera: Camera = CAMERA,
         see: Callable[[int], Features] = see_points,
@@ -97,7 +98,7 @@ class Drive:
         self.context = TrackingContext.create(camera, config)
         self.closing = closing or Closing()
         self.rig = RigCalibration(camera, config.stereo, self.context.scales)
-        self.mapper = Mapper(self.context, self.closing, self.rig, executor)
+        self.mapper = Mapper(self.context, self.closing, self.rig, workers or Workers(1))
         self.last: Frame | None = None
         self._see, self._at = see, poses
 
@@ -158,8 +159,8 @@ def test_the_first_keyframe_is_mapped_at_once():
 
 @late_and_early
 @pytest.mark.parametrize("after", [1, 2, 4])
-def test_a_keyframe_is_merged_at_the_frame_that_is_due_and_no_other(executor, after):
-    drive = Drive(executor(), merge_after_frames=after)
+def test_a_keyframe_is_merged_at_the_frame_that_is_due_and_no_other(workers, after):
+    drive = Drive(workers(), merge_after_frames=after)
     drive.steps([0, 3], 4)
     mapper, shown = drive.mapper, drive.mapper.view
     assert (mapper.last_frame, shown.reference, shown.n_keyframes) == (3, 1, 2)
@@ -179,7 +180,7 @@ def test_a_keyframe_is_merged_at_the_frame_that_is_due_and_no_other(executor, af
 
 
 @late_and_early
-def test_whoever_needs_the_map_merges(executor):
+def test_whoever_needs_the_map_merges(workers):
     for use in (
         lambda drive: drive.mapper.merge(),
         lambda drive: drive.mapper.finish(),
@@ -187,7 +188,7 @@ def test_whoever_needs_the_map_merges(executor):
         lambda drive: drive.mapper.refer_to_nearest(drive.last),
         lambda drive: drive.mapper.map_far_points(drive.last),
     ):
-        drive = Drive(executor(), merge_after_frames=9)
+        drive = Drive(workers(), merge_after_frames=9)
         drive.steps([0, 3], 4)
         shown = drive.mapper.view
         use(drive)
@@ -205,11 +206,11 @@ def test_a_keyframe_merges_the_one_before():
     assert not drive.mapper.is_merged  # the new one is not, though
 
 
-def trace_on_the_ring(executor, look: Callable[[Mapper], object] = lambda mapper: None) -> list:
+def trace_on_the_ring(workers, look: Callable[[Mapper], object] = lambda mapper: None) -> list:
     """Drive on the ring with noisy features; returns what tracking sees at each frame, and the
     final map. ``look`` is called after each frame."""
     drive = Drive(
-        executor,
+        workers,
         camera=ring.CAMERA,
         see=lambda k: RING.see(0.4 * k, 1),
         poses=lambda k: inverse(RING.pose(0.4 * k)) @ RING.pose(0),
@@ -230,16 +231,16 @@ def trace_on_the_ring(executor, look: Callable[[Mapper], object] = lambda mapper
 
 
 def test_nothing_tells_whether_a_keyframe_is_mapped_early_or_late():
-    assert trace_on_the_ring(InstantExecutor()) == trace_on_the_ring(None)
+    assert trace_on_the_ring(InstantWorkers()) == trace_on_the_ring(Workers(1))
 
 
 def test_completing_a_keyframe_early_changes_no_result():
-    assert trace_on_the_ring(None, Mapper.complete) == trace_on_the_ring(None)
+    assert trace_on_the_ring(Workers(1), Mapper.complete) == trace_on_the_ring(Workers(1))
 
 
 @late_and_early
-def test_completing_shows_tracking_nothing(executor):
-    drive = Drive(executor(), merge_after_frames=9)
+def test_completing_shows_tracking_nothing(workers):
+    drive = Drive(workers(), merge_after_frames=9)
     drive.steps([0, 3], 5)
     mapper, shown = drive.mapper, drive.mapper.view
     held = [drive.last, drive.next_frame()]
@@ -256,8 +257,8 @@ def test_completing_shows_tracking_nothing(executor):
 
 
 @late_and_early
-def test_the_map_is_not_to_be_had_while_a_keyframe_is_mapped(executor):
-    drive = Drive(executor(), merge_after_frames=9)
+def test_the_map_is_not_to_be_had_while_a_keyframe_is_mapped(workers):
+    drive = Drive(workers(), merge_after_frames=9)
     drive.steps([0, 3], 5)
     for use in (lambda: drive.mapper.map, drive.mapper.trajectory):
         with pytest.raises(RuntimeError, match="a keyframe is being mapped"):
@@ -273,21 +274,21 @@ def test_a_trajectory_is_not_to_be_had_even_if_all_frames_follow_the_reference_k
     drive = Drive()
     drive.steps([0, 3], 6)
     map_ = drive.mapper.complete()
-    drive.mapper = Mapper(drive.context, drive.closing, drive.rig, None, map_)
+    drive.mapper = Mapper(drive.context, drive.closing, drive.rig, Workers(1), map_)
     drive.step(keyframe=True)
     with pytest.raises(RuntimeError, match="a keyframe is being mapped"):
         drive.mapper.trajectory()
 
 
 @late_and_early
-def test_the_map_counts_what_frames_saw_when_it_is_free(executor):
-    drive = Drive(executor(), merge_after_frames=9)
+def test_the_map_counts_what_frames_saw_when_it_is_free(workers):
+    drive = Drive(workers(), merge_after_frames=9)
     drive.steps([0, 3], 4)
     visible, found = np.array([3, 4, 5], np.int32), np.array([4], np.int32)
     for _ in range(2):
         drive.mapper.count(visible, found)
     counters = [], []
-    for one in (drive, Drive(executor(), merge_after_frames=9)):
+    for one in (drive, Drive(workers(), merge_after_frames=9)):
         if one is not drive:
             one.steps([0, 3], 4)
         arrays = one.mapper.complete().arrays
@@ -306,14 +307,14 @@ MOVES = [se3_exp(np.array(twist)) for twist in ([0.3, 0, 0, 0, 0.02, 0], [0, 0, 
 
 
 @late_and_early
-def test_held_frames_follow_a_merge(executor):
+def test_held_frames_follow_a_merge(workers):
     """One that is placed follows its keyframe, one that is not follows the reference keyframe."""
 
     def move(map_: Map, keyframe: int) -> None:
         for k in range(keyframe + 1 if keyframe else 0):
             map_.arrays.T_cw[k] = map_.arrays.T_cw[k] @ MOVES[k]
 
-    drive = Drive(executor(), Closing(move), merge_after_frames=9)
+    drive = Drive(workers(), Closing(move), merge_after_frames=9)
     drive.step(keyframe=True)
     placed = drive.step()
     T_0 = drive.mapper.view.T_reference
@@ -332,7 +333,7 @@ def test_held_frames_follow_a_merge(executor):
 
 
 @late_and_early
-def test_held_frames_track_what_became_of_their_landmarks(executor):
+def test_held_frames_track_what_became_of_their_landmarks(workers):
     gone = 7
 
     def change(map_: Map, keyframe: int) -> None:
@@ -341,7 +342,7 @@ def test_held_frames_track_what_became_of_their_landmarks(executor):
             map_.arrays.xyz[: map_.n_landmarks] += 0.25
             map_.scalars = replace(map_.scalars, disparity_offset=0.125)
 
-    drive = Drive(executor(), Closing(change), merge_after_frames=9)
+    drive = Drive(workers(), Closing(change), merge_after_frames=9)
     drive.steps([0, 3], 4)
     held = [drive.last, drive.next_frame()]
     drive.mapper.hold(*held)
@@ -364,10 +365,10 @@ def see_without_depth(k: int) -> Features:
     return features
 
 
-def monocular_drive(executor, closing: Closing) -> Drive:
+def monocular_drive(workers, closing: Closing) -> Drive:
     """A monocular map of two keyframes, 0.6 m apart."""
     camera = CAMERA.left_camera()
-    drive = Drive(executor, closing, camera, see_without_depth, merge_after_frames=9)
+    drive = Drive(workers, closing, camera, see_without_depth, merge_after_frames=9)
     begin_with_two_views(drive)
     return drive
 
@@ -406,14 +407,14 @@ def drive_twist(k: int) -> np.ndarray:
 
 
 @late_and_early
-def test_where_the_unit_of_a_monocular_map_changes_speeds_and_poses_change_with_it(executor):
+def test_where_the_unit_of_a_monocular_map_changes_speeds_and_poses_change_with_it(workers):
     def double(map_: Map, keyframe: int) -> None:
         if keyframe == 2:
             map_.arrays.xyz[: map_.n_landmarks] *= 2.0
             map_.arrays.T_cw[:3, :3, 3] *= 2.0
             map_.unit_scale[:] = [2.0] * 3
 
-    drive = monocular_drive(executor(), Closing(double))
+    drive = monocular_drive(workers(), Closing(double))
     placed = drive.step()
     drive.step(keyframe=True)
     unplaced = drive.next_frame()
@@ -571,8 +572,8 @@ def fail(map_: Map, keyframe: int) -> None:
     ],
     ids=["merge", "complete", "finish", "insert", "drive"],
 )
-def test_a_job_that_fails_says_so_once_and_the_map_says_so_from_then_on(executor, first):
-    drive = Drive(executor(), Closing(fail), merge_after_frames=3)
+def test_a_job_that_fails_says_so_once_and_the_map_says_so_from_then_on(workers, first):
+    drive = Drive(workers(), Closing(fail), merge_after_frames=3)
     drive.steps([0, 3], 5)
     mapper, frame = drive.mapper, drive.last
     view, pose = mapper.view, mapper.frames.pose(-1).tobytes()
@@ -691,7 +692,7 @@ def test_a_mapper_that_is_restored_goes_on_as_the_one_that_was_not():
     state, map_ = one.mapper.state(), one.mapper.complete()
     other = Drive()
     other.mapper = Mapper(
-        other.context, other.closing, other.rig, None, map_.copy(), one.mapper.frames.table()
+        other.context, other.closing, other.rig, Workers(1), map_.copy(), one.mapper.frames.table()
     )
     assert other.mapper.reference == 1  # the newest keyframe, where nothing else is known
     other.mapper.restore(state)
@@ -738,7 +739,7 @@ def test_only_the_same_drive_counts_frames_from_its_newest_keyframe(same_drive):
     map_ = one.mapper.map.copy()
     if not same_drive:
         map_.begin_drive()
-    other = Mapper(one.context, one.closing, one.rig, None, map_, one.mapper.frames.table())
+    other = Mapper(one.context, one.closing, one.rig, Workers(1), map_, one.mapper.frames.table())
     other.continue_drive()
     assert other.last_frame == (3 if same_drive else -1)
     assert other.last_timestamp == (map_.timestamps[1] if same_drive else -np.inf)

@@ -9,7 +9,7 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 import pytest
-from parts import InstantExecutor
+from parts import InstantWorkers
 
 from vslam.backend.local_mapping import local_window
 from vslam.config import Config, KeyframeConfig, MappingConfig, OrbConfig, TrackingConfig
@@ -187,7 +187,7 @@ def test_two_in_threads_of_their_own_have_the_bytes_of_one(corridor):
 def test_tracking_sees_nothing_of_mapping_before_the_merge(corridor, config, monkeypatch):
     """Mapping as late as can be (when it is merged) and as early as can be: a race would show."""
     late = bytes_of(*run(corridor, config, threads=1))
-    monkeypatch.setattr("vslam.shared_map.ThreadPoolExecutor", InstantExecutor)
+    monkeypatch.setattr("vslam.slam.Workers", InstantWorkers)
     assert bytes_of(*run(corridor, config, threads=2)) == late
 
 

@@ -50,7 +50,14 @@ STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
     ("local bundle adjustment", (("vslam.backend.local_mapping", "adjust_locally"),)),
     ("cull keyframes", (("vslam.backend.local_mapping", "cull_keyframes"),)),
     ("local mapping, the rest", (("vslam.mapping", "map_and_calibrate"),)),
-    ("loops", (("vslam.closing", "LoopClosing.process"), ("vslam.closing", "LoopClosing.finish"))),
+    (
+        "loops",
+        (
+            ("vslam.closing", "LoopClosing.search"),
+            ("vslam.closing", "LoopClosing.close"),
+            ("vslam.closing", "LoopClosing.finish"),
+        ),
+    ),
     ("merge", (("vslam.mapping", "Mapper.merge"),)),
     ("frame loop, the rest", (("vslam.run.pipeline", "run_sequence"),)),
     ("results", (("vslam.report.folder", "write_results"),)),

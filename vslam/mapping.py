@@ -11,7 +11,6 @@ keyframe. A loop that it finds is closed before the next change of the map.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor
 from contextlib import contextmanager
 from functools import partial
 
@@ -46,6 +45,7 @@ from vslam.shared_map import SharedMap
 from vslam.starter import TwoViewStart
 from vslam.states import MapperState
 from vslam.trajectory import Trajectory
+from vslam.workers import Job, Workers
 
 _CLOSE_AFTER_FRAMES = 10  # a found loop is closed this long after its keyframe, or at the next one
 
@@ -65,7 +65,7 @@ class Mapper:
         context: TrackingContext,
         closing: LoopClosing,
         rig: RigCalibration,
-        executor: Executor | None,
+        workers: Workers,
         map_: Map | None = None,
         frames: FrameTable | None = None,
     ) -> None:
@@ -74,14 +74,14 @@ class Mapper:
             context: camera, thresholds and pyramid scales.
             closing: processes new keyframes for loop closing.
             rig: corrects frames, and receives the map's disparity offset.
-            executor: runs mapping jobs, one at a time; None runs each when its result is needed.
+            workers: run mapping jobs, one at a time, and searches for loops.
             map_: a map to continue in; None begins an empty one.
             frames: poses of earlier frames of the same drive.
         """
         self.view = MapView()
         self.last_frame = -1
         self.last_timestamp = -np.inf
-        self._shared = SharedMap(map_ or Map(context.scales), executor)
+        self._shared = SharedMap(map_ or Map(context.scales), workers)
         self._camera = context.camera
         self._config = context.config
         self._closing = closing
@@ -89,7 +89,7 @@ class Mapper:
         self._patches = RecentPatches(context.config.alignment.keyframes)
         self._is_merged = True
         self._next_search: Callable[[Map], LoopSearch] | None = None  # starts after the merge
-        self._search: Callable[[], LoopSearch] | None = None
+        self._search: Job[LoopSearch] | None = None
         self._held: tuple[Frame, ...] = ()
         self._counts = LandmarkCounts()
         self.frames = FramePoses(self, frames)
@@ -116,7 +116,7 @@ class Mapper:
     @property
     def has_found_loop(self) -> bool:
         """Whether a loop was found that is not closed yet; waits for the search."""
-        return self._search is not None and self._search().loop is not None
+        return self._search is not None and self._search.result().loop is not None
 
     @property
     def is_mapping(self) -> bool:
@@ -223,7 +223,7 @@ class Mapper:
         """
         map_ = self._wait_for_mapping()
         self._start_search()
-        if self._search is not None and (search := self._search()).loop is None:
+        if self._search is not None and (search := self._search.result()).loop is None:
             self._closing.close(map_, search)
             self._search = None
         return map_
@@ -251,7 +251,7 @@ class Mapper:
         """Merge, close the loop that was found, if any, and return the map."""
         map_ = self.merge()
         if self._search is not None:
-            search, self._search = self._search(), None
+            search, self._search = self._search.result(), None
             with self._shared.change():
                 self._closing.close(map_, search)
             self._renew_view()

@@ -2,35 +2,25 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from concurrent.futures import wait as wait_for
 from contextlib import contextmanager
-from functools import cache
+from functools import partial
 from typing import TypeVar
 
 from vslam.map import Map
+from vslam.workers import Job, Urgency, Workers
 
 T = TypeVar("T")
-
-
-def mapping_executor(threads: int) -> Executor | None:
-    """A second thread for mapping jobs; None if there is only one thread in all."""
-    return ThreadPoolExecutor(1, "mapping") if threads > 1 else None
 
 
 class SharedMap:
     """A map, and the job that may write it; there is at most one job at a time."""
 
-    def __init__(self, map_: Map, executor: Executor | None) -> None:
-        """``executor`` runs the jobs; with None, each job runs when its result is needed."""
+    def __init__(self, map_: Map, workers: Workers) -> None:
         self._map = map_
-        self._executor = executor
-        self._job: Callable[[], None] | None = None
-        self._future: Future[None] | None = None
+        self._workers = workers
+        self._job: Job[None] | None = None
         self._failure = ""
-        self._process = os.getpid()
 
     @property
     def is_busy(self) -> bool:
@@ -44,7 +34,7 @@ class SharedMap:
         Raises:
             RuntimeError: a job may be writing it, a job failed, or this process is a fork.
         """
-        self._refuse_fork()
+        self._workers.refuse_fork()
         if self._failure:
             raise RuntimeError(self._failure)
         if self._job is not None:
@@ -53,26 +43,11 @@ class SharedMap:
 
     def start(self, job: Callable[[Map], None]) -> None:
         """Start a job that may write the map until ``wait`` is called."""
-        map_ = self.map
-        if self._executor is None:
-            self._job = lambda: job(map_)
-        else:
-            self._future = self._executor.submit(job, map_)
-            self._job = self._future.result
+        self._job = self._workers.submit(partial(job, self.map), Urgency.MAPPING)
 
-    def start_reading(self, job: Callable[[Map], T]) -> Callable[[], T]:
-        """Start a job that only reads the map; returns a function that waits for the job's result.
-        That function must be called before the map is written again."""
-        map_ = self.map
-        if self._executor is None:
-            return cache(lambda: job(map_))
-        future = self._executor.submit(job, map_)
-
-        def result() -> T:
-            wait_for([future])  # after Ctrl-C here, a later call can wait again
-            return future.result()
-
-        return result
+    def start_reading(self, job: Callable[[Map], T]) -> Job[T]:
+        """Start a job that only reads the map. It must be done before the map is written again."""
+        return self._workers.submit(partial(job, self.map), Urgency.LOOPS)
 
     def wait(self) -> Map:
         """Wait for the job, if there is one, and return the map.
@@ -81,13 +56,12 @@ class SharedMap:
             RuntimeError: an earlier job failed, or this process is a fork. An error of this job is
                 raised unchanged.
         """
-        self._refuse_fork()
+        self._workers.refuse_fork()
         if self._job is not None:
-            if self._future is not None:
-                wait_for([self._future])  # after Ctrl-C here, a later call can wait again
+            self._job.wait()
             job, self._job = self._job, None
             with self._invalidated_on_error():
-                job()
+                job.result()
         return self.map
 
     @contextmanager
@@ -112,12 +86,3 @@ class SharedMap:
                 "from a map that was saved before"
             )
             raise
-
-    def _refuse_fork(self) -> None:
-        """Raise an error in a forked process: it lacks the thread that runs the jobs, and would
-        wait for it forever."""
-        if self._executor is not None and os.getpid() != self._process:
-            raise RuntimeError(
-                "this Slam was created before the process was forked, which does not copy its "
-                "threads; create it after the fork, or use threads=1"
-            )

@@ -38,8 +38,8 @@ from vslam.maps.stored_map import StoredMap, TruthAlignment
 from vslam.modes import MapBuilding, Mode
 from vslam.odometry import Odometry
 from vslam.session import Session, open_map
-from vslam.shared_map import mapping_executor
 from vslam.trajectory import Trajectory
+from vslam.workers import Workers
 
 
 def _ignore(result: TrackResult) -> None:
@@ -64,8 +64,9 @@ class Slam:
         context: camera, thresholds and pyramid scales, for ``FrameImages``.
         detector: proposes loop candidates and places for relocalisation.
         rig: measurements of the stereo pair, such as the delay of its right camera.
-        next_extraction: index of a later frame whose features will probably be needed, so that
-            another thread may call its ``FrameImages.find_corners`` in advance; -1 if none.
+        workers: run the mapping jobs; they can also prepare frames in advance.
+        next_extraction: index of a later frame whose features will probably be needed, so that its
+            ``FrameImages.start_corners`` may be called in advance; -1 if none.
     """
 
     def __init__(
@@ -113,8 +114,8 @@ class Slam:
         verifier = verifier_for(config, camera, images)
         self._closing = closing = LoopClosing(detector, verifier, camera, config, threads=threads)
         opened = open_map(start, context, closing, localize=localize, resume=resume)
-        executor = mapping_executor(threads)
-        self._mapper = mapper = Mapper(context, closing, rig, executor, opened.map, opened.frames)
+        self.workers = workers = Workers(threads)
+        self._mapper = mapper = Mapper(context, closing, rig, workers, opened.map, opened.frames)
         self._tracker = tracker = Tracker(context)
         recognise = LearnedRelocalisation(images, camera, config)
         self._relocaliser = Relocaliser(context, detector.locate, recognise)

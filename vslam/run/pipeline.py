@@ -99,6 +99,7 @@ def run_sequence(
                 frames,
                 slam.context,
                 settings,
+                slam.workers,
                 live=sequence.live,
                 begin=len(main.tracks),
                 next_extraction=lambda: slam.next_extraction,

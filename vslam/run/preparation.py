@@ -1,10 +1,9 @@
 """Decoding and perturbation of frames and extraction of their features, a few frames ahead of
 tracking.
 
-A small thread pool prepares each frame independently of the others and keeps their order, so that
-the result does not depend on the number of threads. In real time, a frame is prepared when it
-arrives, its two images in parallel. Frames that arrive too fast are dropped, and it depends on the
-machine which frames these are.
+Each frame is prepared independently of the others, so that the result does not depend on the number
+of threads. In real time, a frame is prepared when it arrives, its two images in parallel. Frames
+that arrive too fast are dropped, and it depends on the machine which frames these are.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from queue import SimpleQueue
 from typing import Generic, TypeVar
 
@@ -27,8 +26,11 @@ from vslam.frontend.extraction import FrameImages
 from vslam.frontend.masks import Mask
 from vslam.frontend.tracking import TrackingContext
 from vslam.run.options import RunOptions
+from vslam.workers import Job, Urgency, Workers
 
 T = TypeVar("T")
+
+_AHEAD = 2  # number of frames that are prepared in advance, for each thread
 
 
 @dataclass(frozen=True)
@@ -209,6 +211,7 @@ def at_their_times(
     frames: Iterator[TimedFrame],
     context: TrackingContext,
     settings: RunOptions,
+    workers: Workers,
     *,
     live: bool,
     begin: int = 0,
@@ -218,25 +221,26 @@ def at_their_times(
     at its timestamp; otherwise, all frames arrive at the start.
 
     Args:
+        workers: prepare frames and extract features in advance.
         begin: index of the first frame.
         next_extraction: returns ``Slam.next_extraction``, the index of the frame whose features
             will be needed next and are therefore extracted in advance.
     """
     if settings.realtime:
-        with ThreadPoolExecutor(2, "side") as pool, ThreadPoolExecutor(1, "corners") as corners:
+        with ThreadPoolExecutor(2, "side") as pool:
             image_map = map if settings.threads == 1 else pool.map
 
             def prepare(number: int, frame: TimedFrame) -> PreparedFrame:
                 prepared = prepare_frame(frame, context, image_map)
                 is_due = 0 <= next_extraction() <= begin + number
                 if prepared.images is not None and is_due and settings.threads > 1:
-                    corners.submit(prepared.images.find_corners)
+                    prepared.images.start_corners(workers)
                 return prepared
 
             yield from play(frames, prepare, settings.threads, live=live)
         return
     start = time.perf_counter()
-    ahead = prepared_frames(frames, context, settings.threads, begin, next_extraction)
+    ahead = prepared_frames(frames, context, workers, begin, next_extraction)
     for timestamp, prepared in ahead:
         yield Played(timestamp, prepared, start)
 
@@ -244,39 +248,34 @@ def at_their_times(
 def prepared_frames(
     frames: Iterator[TimedFrame],
     context: TrackingContext,
-    threads: int,
+    workers: Workers,
     begin: int = 0,
     next_extraction: Callable[[], int] = lambda: -1,
 ) -> Iterator[tuple[float, PreparedFrame]]:
-    """Yield timestamps and prepared frames in order; several threads prepare a few frames ahead."""
-    if threads == 1:
-        for frame in frames:
-            yield frame.timestamp, prepare_frame(frame, context)
-        return
-    ahead: deque[tuple[float, Future[PreparedFrame]]] = deque()
+    """Yield timestamps and prepared frames in order. If there are several threads, some frames are
+    prepared in advance."""
+    ahead: deque[tuple[float, Job[PreparedFrame]]] = deque()
+    n_ahead = _AHEAD * workers.threads if workers.threads > 1 else 1
     requested = -1
-    with ThreadPoolExecutor(threads, "extraction") as pool:
-        try:
-            for frame in frames:
-                ahead.append((frame.timestamp, pool.submit(prepare_frame, frame, context)))
-                if len(ahead) == 2 * threads:
-                    timestamp, prepared = ahead.popleft()
-                    yield timestamp, prepared.result()
-                    begin += 1
-                    due = next_extraction()
-                    if due > requested and 0 <= due - begin < len(ahead):
-                        pool.submit(_find_corners, ahead[due - begin][1])
-                        requested = due
-            for timestamp, prepared in ahead:
+    try:
+        for frame in frames:
+            prepare = partial(prepare_frame, frame, context)
+            ahead.append((frame.timestamp, workers.submit(prepare, Urgency.READING)))
+            if len(ahead) == n_ahead:
+                timestamp, prepared = ahead.popleft()
                 yield timestamp, prepared.result()
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def _find_corners(prepared: Future[PreparedFrame]) -> None:
-    images = prepared.result().images
-    if images is not None:
-        images.find_corners()
+                begin += 1
+                due = next_extraction()
+                if due > requested and 0 <= due - begin < len(ahead):
+                    images = ahead[due - begin][1].result().images
+                    if images is not None:
+                        images.start_corners(workers)
+                    requested = due
+        for timestamp, prepared in ahead:
+            yield timestamp, prepared.result()
+    finally:
+        for _, prepared in reversed(ahead):
+            prepared.cancel()
 
 
 def prepare_frame(

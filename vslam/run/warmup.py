@@ -71,6 +71,7 @@ from vslam.map import Map
 from vslam.map_view import local_map
 from vslam.mapping import Mapper
 from vslam.slam import Slam
+from vslam.workers import Workers
 
 WIDTH, HEIGHT, DISPARITY, STEP, FRAMES = 480, 240, 12, 6, 6
 CAMERA = Camera(240.0, 240.0, WIDTH / 2, HEIGHT / 2, 0.5, WIDTH, HEIGHT)
@@ -224,7 +225,7 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
     closing = LoopClosing(NoDetector(), verifier, CAMERA, config, threads=1)
     context = TrackingContext.create(CAMERA, config)
     rig = RigCalibration(CAMERA, config.stereo, context.scales)
-    mapper = Mapper(context, closing, rig, None)
+    mapper = Mapper(context, closing, rig, Workers(1))
     rng = np.random.default_rng(0)
     n = 400
     points = rng.uniform([-5.0, -4.0, 9.0], [9.0, 4.0, 12.0], (n, 3))

@@ -1,0 +1,193 @@
+"""Threads that run the jobs of a pipeline. A thread that waits for a job runs other jobs meanwhile.
+
+On two cores, the main thread and one worker share all work: there are never more busy threads than
+cores, and neither idles while a job is queued. Jobs begin in the order of their ``Urgency``. When a
+job runs, and in which thread, must not change its result.
+"""
+
+from __future__ import annotations
+
+import heapq
+import os
+import threading
+import weakref
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import CancelledError
+from enum import IntEnum
+from functools import partial
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+Given = TypeVar("Given")
+
+
+class Urgency(IntEnum):
+    """The kinds of jobs, most urgent first."""
+
+    MAPPING = 0
+    CORNERS = 1  # of the next keyframe
+    LOOPS = 2
+    READING = 3
+
+
+class Workers:
+    """Runs jobs in ``threads - 1`` threads, and in every thread that waits for a result. With one
+    thread, a job thus runs when its result is needed."""
+
+    def __init__(self, threads: int) -> None:
+        self.threads = threads
+        self._queue = queue = _Queue()
+        self._process = os.getpid()
+        self._started = [
+            threading.Thread(target=queue.work, name=f"worker-{k}", daemon=True)
+            for k in range(1, threads)
+        ]
+        for thread in self._started:
+            thread.start()
+        # Also called at the end of the process, while a running job can still be completed.
+        weakref.finalize(self, _stop, queue, self._started)
+
+    def submit(self, work: Callable[[], T], urgency: Urgency) -> Job[T]:
+        """Queue a function; the job that is returned gives its result."""
+        return self._queue.add(work, urgency)
+
+    def map(
+        self, function: Callable[[Given], T], items: Iterable[Given], urgency: Urgency
+    ) -> Iterator[T]:
+        """As the built-in ``map``, in parallel."""
+        jobs = [self.submit(partial(function, item), urgency) for item in items]
+        return (job.result() for job in jobs)
+
+    def refuse_fork(self) -> None:
+        """Raise a RuntimeError in a forked process, which has none of the threads."""
+        if self._started and os.getpid() != self._process:
+            raise RuntimeError(
+                "this Slam was created before the process was forked, which does not copy its "
+                "threads; create it after the fork, or use threads=1"
+            )
+
+
+class Job(Generic[T]):
+    """A function that was queued by ``Workers.submit``, and its result."""
+
+    def __init__(self, work: Callable[[], T], queue: _Queue) -> None:
+        self.has_begun = False
+        self.is_done = False
+        self.error: BaseException | None = None
+        self._work = work
+        self._queue = queue
+        self._value: T | None = None
+
+    def wait(self) -> None:
+        """Return when the job is done, whether or not it failed. The calling thread runs the job if
+        it has not begun, and otherwise other queued jobs. If Ctrl-C interrupts the wait, this can
+        be called again."""
+        self._queue.wait_for(self)
+
+    def result(self) -> T:
+        """Wait for the job, and return its result or raise its exception; a cancelled job raises
+        ``CancelledError``."""
+        self.wait()
+        if self.error is not None:
+            raise self.error
+        return self._value  # type: ignore[return-value]
+
+    def cancel(self) -> None:
+        """Prevent that the job begins; if it has begun, wait for it."""
+        self._queue.cancel(self)
+
+    def run(self) -> None:
+        """Run the function and keep its result or its exception."""
+        try:
+            self._value = self._work()
+        except BaseException as error:
+            self.error = error
+
+
+class _Thread(threading.local):
+    """What a queue knows of each thread."""
+
+    runs_job = False
+
+
+class _Queue:
+    """Jobs that have not begun, and the threads that wait for a change."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._thread = _Thread()
+        self._jobs: list[tuple[Urgency, int, Job]] = []  # type: ignore[type-arg]  # of any type
+        self._added = 0
+        self._closed = False
+
+    def add(self, work: Callable[[], T], urgency: Urgency) -> Job[T]:
+        job = Job(work, self)
+        with self._changed:
+            heapq.heappush(self._jobs, (urgency, self._added, job))
+            self._added += 1
+            self._changed.notify_all()
+        return job
+
+    def work(self) -> None:
+        """Run jobs until the queue is closed."""
+        while True:
+            with self._changed:
+                while (job := self._begin_next()) is None:
+                    if self._closed:
+                        return
+                    self._changed.wait()
+            self._run(job)
+
+    def wait_for(self, awaited: Job[T]) -> None:
+        """See ``Job.wait``. Within a job, other jobs are not run, because they would delay it."""
+        while True:
+            with self._changed:
+                if awaited.is_done:
+                    return
+                if not awaited.has_begun:
+                    awaited.has_begun = True
+                    job: Job | None = awaited  # type: ignore[type-arg]
+                else:
+                    job = None if self._thread.runs_job else self._begin_next()
+                if job is None:
+                    self._changed.wait()
+                    continue
+            self._run(job)
+            if job is not awaited and isinstance(job.error, KeyboardInterrupt):
+                raise job.error  # Ctrl-C is meant for the caller
+
+    def cancel(self, job: Job[T]) -> None:
+        with self._changed:
+            if not job.has_begun:
+                job.has_begun = job.is_done = True
+                job.error = CancelledError()
+        self.wait_for(job)
+
+    def close(self) -> None:
+        with self._changed:
+            self._jobs.clear()
+            self._closed = True
+            self._changed.notify_all()
+
+    def _begin_next(self) -> Job | None:  # type: ignore[type-arg]  # of any type
+        while self._jobs:
+            _, _, job = heapq.heappop(self._jobs)
+            if not job.has_begun:
+                job.has_begun = True
+                return job
+        return None
+
+    def _run(self, job: Job[T]) -> None:
+        outer, self._thread.runs_job = self._thread.runs_job, True
+        job.run()
+        self._thread.runs_job = outer
+        with self._changed:
+            job.is_done = True
+            self._changed.notify_all()
+
+
+def _stop(queue: _Queue, threads: list[threading.Thread]) -> None:
+    queue.close()
+    for thread in threads:
+        if thread is not threading.current_thread():
+            thread.join()

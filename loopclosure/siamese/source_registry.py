@@ -1,9 +1,10 @@
-"""Opens sources of images by name, for training networks and comparing detectors.
+"""Opens sources of images by name. They are used to train networks and to compare detectors.
 
-A source is a set of images with a matrix that states for each pair whether the images show the same
-place (1) or different places (-1) or whether this is unknown (0). Unknown pairs are never used.
-Images of different sources show different places, unless the sources belong to the same family (for
-example two sets of photographs of one region); then their relation is unknown.
+A source is a set of images with a matrix. For each pair of images, the matrix states whether they
+show the same place (1) or different places (-1), or whether this is unknown (0). Unknown pairs are
+never used. Images of different sources show different places, unless the sources belong to the same
+family. An example of a family is two sets of photographs of the same region. Between sources of the
+same family, the relation is unknown.
 
 On the command line, a source is named ``KIND:PATH`` or ``KIND:PATH[option=value,...]``. The kinds
 and their options are:
@@ -49,8 +50,8 @@ _READERS: dict[str, tuple[Callable[..., list[ImageSource]], tuple[str, ...]]] = 
 
 
 def split_spec(spec: str) -> tuple[str, str, dict[str, str]]:
-    """Split ``kind:path[key=value,...]`` into its kind, path and options. The path is empty if the
-    text has another form."""
+    """Split a specification ``kind:path[key=value,...]`` into kind, path and options. The path is
+    empty if the text does not have this form."""
     kind, _, rest = spec.partition(":")
     found = re.fullmatch(r"(.+?)(?:\[(.*)\])?", rest)
     if found is None:
@@ -60,7 +61,7 @@ def split_spec(spec: str) -> tuple[str, str, dict[str, str]]:
 
 
 def open_source(spec: str) -> list[ImageSource]:
-    """Open the source ``kind:path[options]``; see the kinds above.
+    """Open the source ``kind:path[options]``. The docstring of this module lists the kinds.
 
     Raises:
         InputError: the kind or an option is unknown, or data is missing or malformed.

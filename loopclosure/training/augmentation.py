@@ -1,4 +1,5 @@
-"""Random changes of an image that preserve its place: viewpoint, light, occlusion, sensor."""
+"""Random changes of an image that still shows the same place: viewpoint, light, occlusion,
+sensor."""
 
 from __future__ import annotations
 
@@ -8,12 +9,14 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from vslam.loopclosure.siamese.images import turn_homography
 
-_TURNED, _ZOOMED = 0.5, 0.5  # shares of the images that are turned and zoomed, if enabled
+_TURNED, _ZOOMED = 0.5, 0.5  # shares of images that are rotated and zoomed, if enabled
 
 
 class Augmentation(BaseModel):
-    """Strengths of the changes; 0 disables a change. The paper changes perspective and luminance
-    and masks parts of the image."""
+    """Strengths of the random changes. A strength of 0 disables a change.
+
+    The paper changes perspective and luminance, and masks parts of the image.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -37,8 +40,8 @@ class Augmentation(BaseModel):
     mirror: bool = Field(True, description="Mirror both images of every second pair.")
 
 
-# Only changes of light and occlusion are stronger: rendered pairs already differ in viewpoint, and
-# the noise and blur of a camera average out at the network's resolution.
+# Only changes of light and occlusion are stronger. Rendered pairs already differ in viewpoint. The
+# noise and blur of a camera average out at the resolution of the network.
 STRONG = Augmentation(
     homography=0.08, shift=0.12, log_gain=0.5, bias=30.0, log_gamma=0.5, masks=3, mask_area=0.15,
 )  # fmt: skip
@@ -47,10 +50,10 @@ STRONG = Augmentation(
 def augment(
     image: NDArray[np.uint8], strength: Augmentation, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Change an ``(H, W)`` image at random.
+    """Apply random changes to an ``(H, W)`` image.
 
-    The changes are applied in the order of image formation: viewpoint, occlusion, light, lens,
-    sensor, quantisation to 8 bits.
+    The changes are applied in the order in which an image is formed: viewpoint, occlusion, light,
+    lens, sensor, quantisation to 8 bits.
     """
     import cv2
 
@@ -63,10 +66,10 @@ def augment(
     border = cv2.BORDER_REFLECT_101
     if strength.turn > 0 and rng.random() < _TURNED:
         H = H @ turn_homography(width, height, rng.uniform(-1, 1) * strength.turn)
-        # The scene beyond the border is unknown; it becomes black or a mirror image.
+        # The scene beyond the border is unknown, so it becomes black or a mirror image.
         border = cv2.BORDER_CONSTANT if rng.random() < 0.5 else border
     if strength.zoom > 0 and rng.random() < _ZOOMED:
-        # Enlarging the image around its centre approximates driving on.
+        # Enlarging the image around its centre approximates driving forwards.
         factor = np.exp(rng.uniform(0, strength.zoom))
         x, y = (1.0 - factor) * width / 2, (1.0 - factor) * height / 2
         H = H @ np.array([[factor, 0, x], [0, factor, y], [0, 0, 1.0]])
@@ -78,7 +81,8 @@ def augment(
     curve = np.exp(strength.log_gain * rng.standard_normal()) * curve
     curve += strength.bias * rng.standard_normal()
     out = np.asarray(cv2.LUT(out, np.clip(np.rint(curve), 0, 255).astype(np.uint8)), np.uint8)
-    # Negative draws have no effect, so that half of the images stay sharp or free of noise.
+    # Negative draws have no effect. Half of the images therefore stay sharp, and half free of
+    # noise.
     blur, noise = rng.uniform(-1, 1, 2) * (strength.blur, strength.noise)
     if blur > 0.2:
         out = np.asarray(cv2.GaussianBlur(out, (0, 0), float(blur)), np.uint8)

@@ -1,4 +1,4 @@
-"""The model card, which describes the origin of weights and is written beside them."""
+"""The model card, which describes the origin of weights. It is written beside the weights."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def describe(
     data: list[str],
     device: str,
 ) -> dict[str, Any]:
-    """Collect everything that a reader needs to judge or reproduce the weights."""
+    """Collect the information that a reader needs to judge or reproduce the weights."""
     return {
         "network": network.name,
         "parameters": network.n_parameters(),
@@ -60,7 +60,7 @@ def describe(
 
 
 def write_card(card: dict[str, Any], weights: Path) -> tuple[Path, Path]:
-    """Write ``NAME.json`` and ``NAME.md`` beside the weights; returns both paths.
+    """Write ``NAME.json`` and ``NAME.md`` beside the weights. Returns both paths.
 
     Raises:
         ResultsError: a file cannot be written.

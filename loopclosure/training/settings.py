@@ -1,4 +1,4 @@
-"""The settings of a training, and presets."""
+"""The settings of a training run, and presets."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from vslam.loopclosure.training.branches import CapsuleShape
 
 
 class TrainSettings(BaseModel):
-    """The settings of a training; ``settings.json`` stores them and ``--settings`` reads them."""
+    """The settings of a training run. ``settings.json`` stores them, and ``--settings`` reads
+    them."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -92,17 +93,18 @@ _BEST = TrainSettings(
     validation_images=400,
 )
 PRESETS = {
-    # The settings of the paper. The strengths of the augmentation and the mining are not stated
-    # there.
+    # The settings of the paper. The paper does not state the strengths of the augmentation or how
+    # pairs are mined.
     "paper": TrainSettings(),
-    # The contrastive loss compares every image of a batch with every other image, and the
-    # augmentation is stronger. Most pairs show the same place, because this loss takes images of
-    # different places from the other pairs. Half of a batch comes from one source, because
-    # different places look most similar within a source. Small batches, short epochs and little
-    # mining and validation suit training on two cores.
+    # The contrastive loss compares every image of a batch with every other image. The augmentation
+    # is stronger. Most pairs show the same place, because this loss takes images of different
+    # places from the other pairs. Half of a batch comes from one source, because different places
+    # look most similar within a source. Small batches, short epochs, and little mining and
+    # validation suit training on two cores.
     "best": _BEST,
-    # The same settings for a start from ImageNet weights (--weights). Filters for edges and corners
-    # stay fixed, and the rest of the extractor learns slowly.
+    # The same settings for training that starts from ImageNet weights (--weights). The first blocks
+    # of the extractor, which detect edges and corners, are frozen. The rest of the extractor learns
+    # slowly.
     "pretrained": _BEST.model_copy(
         update={
             "shape": CapsuleShape(extractor="lite0", pixels=129),
@@ -117,7 +119,7 @@ PRESETS = {
 
 
 def load_settings(path: Path) -> TrainSettings:
-    """Read settings in JSON; keys left out keep their defaults.
+    """Read settings from a JSON file. Keys that are missing keep their defaults.
 
     Raises:
         InputError: the file is missing or not JSON, a key is unknown, or a value is out of range.

@@ -413,7 +413,7 @@ def _factors(
     Args:
         cauchy: scale of the Cauchy loss of the fixes, in standard deviations of the fixes; None
             uses a Gaussian loss.
-        stretch: relative standard deviation of the lengths of edges. It is added to
+        stretch: relative standard deviation of the lengths of edges. It is added in quadrature to
             ``edge_sigmas``.
         drift: factor that multiplies the standard deviations of tree and covisibility edges.
     """

@@ -1,9 +1,9 @@
-"""Pose-graph optimisation after a loop closure, and a test whether its result is plausible.
+"""Pose-graph optimisation after a loop closure, and a test of whether its result is plausible.
 
 The graph is the essential graph of ORB-SLAM (Mur-Artal et al., T-RO 2015, III-D and VII-C). It
 consists of the spanning tree, strong covisibility edges and loop edges. Poses are ``T_cw`` on input
-and output. GTSAM optimises the graph with its built-in factors. It is imported when the first loop
-is closed.
+and output. GTSAM optimises the graph with its built-in factors. It is imported inside the functions
+that need it, because the import is slow.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class GraphCheck:
 
     Attributes:
         consistent: whether the correction is plausible.
-        reason: "consistent", or a short explanation why the correction is not plausible.
+        reason: "consistent", or a short explanation of why the correction is not plausible.
         strain: total chi-square of the tree, covisibility and gap edges. It measures how much drift
             the correction implies, relative to the drift model.
         closed: number of loop edges that were violated before the optimisation. The limit on the

@@ -127,7 +127,7 @@ def move_keyframes_similarly(
         S_wc: ``(N, 4, 4)`` new similarities of these keyframes (camera to world).
 
     Returns:
-        ``(n_keyframes,)`` factor that lengths around each keyframe were multiplied by.
+        ``(n_keyframes,)`` factor by which lengths around each keyframe were multiplied.
     """
     a, n = map_.arrays, map_.n_keyframes
     motion = np.zeros((n, 4, 4))
@@ -147,8 +147,8 @@ def move_keyframes_similarly(
 
 
 def loop_in_new_units(edge: LoopEdge, growth: NDArray[np.float64]) -> LoopEdge:
-    """Convert a loop edge after a correction. ``growth`` is the factor that the correction
-    multiplied lengths around each keyframe by."""
+    """Convert a loop edge after a correction. ``growth`` is the factor by which the correction
+    multiplied lengths around each keyframe."""
     assert edge.T_query_match is not None
     T = edge.T_query_match.copy()
     T[:3, 3] *= growth[edge.match]

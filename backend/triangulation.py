@@ -344,7 +344,7 @@ def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_
 
     Returns:
         True if the landmark was triangulated. False if there is neither enough parallax nor a
-            stereo depth, or if the rays do not meet in front of both cameras.
+        stereo depth, or if the rays do not meet in front of both cameras.
     """
     dot = dot3(ray_1, ray_2)
     square_1, square_2 = dot3(ray_1, ray_1), dot3(ray_2, ray_2)

@@ -46,8 +46,8 @@ def align_frame(
 
     Returns:
         ``(N, 2)`` float32 for ``Frame.shift``: the offset from each feature to its aligned
-            position, in full-resolution pixels. NaN where a match was not aligned. None if the
-            frame has no pyramid or no landmark has a patch.
+        position, in full-resolution pixels. NaN where a match was not aligned. None if the frame
+        has no pyramid or no landmark has a patch.
     """
     features = frame.features
     if frame.pyramid is None or not len(known.ids):

@@ -1,4 +1,4 @@
-"""A frame: the features of an image, the pose of the camera, and the landmarks it tracks."""
+"""A frame: the features of an image, the pose of the camera, and the tracked landmarks."""
 
 from __future__ import annotations
 

@@ -60,8 +60,8 @@ def needs_keyframe(
     """Whether a stereo or RGB-D frame should become a keyframe.
 
     A keyframe is needed if the last one is old. A keyframe is also needed if the view has changed
-    enough or too few close points are tracked. In this second case, local mapping must be idle or
-    the need urgent.
+    enough, or if too few close points are tracked. For these last two reasons, a keyframe is made
+    only if local mapping is idle or the need is urgent.
 
     A lack of close points is a reason for a keyframe only if a new keyframe would provide more of
     them. On a motorway, close points are scarce and leave the view before they are seen twice. Even
@@ -88,8 +88,8 @@ def needs_keyframe(
     lacks_close = evidence.tracked_close < required and gains
     moved_on = evidence.n_inliers < config.max_tracked_ratio * evidence.n_reference
     if evidence.untracked_close is None:
-        # Patches are tracked longer than features. The number of inliers therefore reveals a change
-        # of view too late.
+        # Patches are tracked longer than features. The number of inliers alone therefore reveals a
+        # change of view too late, so the number of close points is tested as well.
         moved_on |= evidence.tracked_close < config.patch_kept_close * evidence.first_close
     if evidence.seconds_since_keyframe >= max_interval_s:
         return True
@@ -185,8 +185,8 @@ class KeyframePolicy:
         )
 
     def wants_keyframe(self, evidence: KeyframeEvidence) -> bool:
-        """Whether the frame should become a keyframe. Places that are already mapped are not
-        considered; ``is_known`` tests for them."""
+        """Whether the frame should become a keyframe. This does not test whether the place is
+        already mapped; ``is_known`` does."""
         camera = self._context.camera
         if camera.monocular:
             return needs_monocular_keyframe(evidence, self._config)
@@ -199,9 +199,11 @@ class KeyframePolicy:
         also share enough of them with the old keyframe.
 
         A lack of close points is not a reason to map a known place again, because the old keyframe
-        did not provide more of them. A minimum number of inliers is required. The reason is the end
-        of a map: its last keyframe has few landmarks that three keyframes observe. Beyond it, both
-        ratios would hold until tracking is lost.
+        did not provide more of them.
+
+        A minimum number of inliers is required, because of the end of a map. The last keyframe of a
+        map has few landmarks that at least three keyframes observe. If the camera drives beyond the
+        end, both ratios would therefore hold until tracking is lost.
 
         Args:
             n_inliers: number of landmarks tracked in the frame.

@@ -44,8 +44,9 @@ class Mask:
         return cls(used, levels)
 
     def shows(self, xy: NDArray[np.floating], octave: NDArray[np.integer]) -> NDArray[np.bool_]:
-        """``(N,)`` bool: whether the mask allows features at ``(N, 2)`` positions (full-resolution
-        pixels) of ``(N,)`` octaves. Positions outside the image are clamped to its border."""
+        """``(N,)`` bool, True for features that the mask allows. Their positions are ``(N, 2)``
+        full-resolution pixels, and their octaves are ``(N,)``. Positions outside the image are
+        clamped to its border."""
         shapes = self.levels.shapes[octave]
         ratio = self.levels.shapes[0, ::-1] / shapes[:, ::-1]
         pixel = np.rint((np.nan_to_num(xy) + 0.5) / ratio - 0.5)

@@ -60,8 +60,8 @@ def track_patches(
 
     Args:
         pyramid: the pyramid of the image.
-        T_cw: ``(4, 4)`` initial pose (world to camera). It may be wrong by as much as shifts
-            projected landmarks by about two pixels.
+        T_cw: ``(4, 4)`` initial pose (world to camera). Its error may shift projected landmarks by
+            about two pixels.
         mask: the mask of the image; None if all pixels are used.
     """
     known, local = view.patches, view.with_patches

@@ -144,9 +144,10 @@ def _widened(array: NDArray, n: int) -> NDArray:
 
 
 def certainty_of(frame: Frame, config: AlignmentConfig) -> NDArray[np.uint8] | int:
-    """``(N,)`` uint8 certainty of each feature's position (``Arrays.certainty``): the variance of a
-    keypoint's position, divided by the variance of this position. 1 for all features of a frame
-    without a pyramid.
+    """``(N,)`` uint8 certainty of each feature's position (``Arrays.certainty``).
+
+    The certainty is the variance of a keypoint's position, divided by the variance of this
+    position. It is 1 for all features of a frame without a pyramid.
 
     The position of an aligned match is accurate. A feature without a match is also considered
     accurate, because a landmark that is created from it is defined by its position. A match that

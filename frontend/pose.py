@@ -61,9 +61,10 @@ def pose_covariance(
     """Covariance of an optimised pose relative to the landmarks.
 
     If the errors of all observations were independent and as large as their weights say, the
-    covariance would be the inverse of the normal matrix times a variance factor. In practice, they
-    are neither. Observations of near landmarks have larger errors, because depth errors matter more
-    there. One corner is often observed in several octaves, so errors are correlated.
+    covariance would be the inverse of the normal matrix times a variance factor. In practice,
+    neither is true. Observations of near landmarks have larger errors than their weights say,
+    because depth errors matter more there. Errors are correlated, because one corner is often
+    observed in several octaves.
 
     Therefore, the spread of the gradient is measured instead of assumed (the sandwich estimator of
     White, Econometrica 1980). The gradients are summed over the cells of a grid, within which
@@ -150,9 +151,9 @@ def _gradients(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics, 
         first: ``(C + 1,)`` index of the first observation of each cell. The last entry is the
             number of observations.
 
-        Returns:
+    Returns:
         The ``(6, 6)`` normal matrix; ``(C, 6)`` gradients of the cells; sum of the chi-squares of
-            all observations; number of coordinates of all observations.
+        all observations; number of coordinates of all observations.
     """
     n_cells = len(first) - 1
     H, gradients, chi2, n = np.zeros((6, 6)), np.empty((n_cells, 6)), 0.0, 0
@@ -210,7 +211,7 @@ def normal_equations(T, points, uvr, inverse_sigma2, disparity_weight, intrinsic
 
     Returns:
         Lower triangle of the normal matrix, right-hand side, sum of the chi-squares of the
-            observations, number of observations, and number of coordinates of the observations.
+        observations, number of observations, and number of coordinates of the observations.
     """
     fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
     H = np.zeros((6, 6))

@@ -136,7 +136,7 @@ def _align(image, before, points, T_start, intrinsics, ratio_x, ratio_y):
 
     Returns:
         The ``(4, 4)`` motion, and the correlation between all windows and the image. If the
-            alignment fails, ``T_start`` and 0 are returned.
+        alignment fails, ``T_start`` and 0 are returned.
     """
     n = len(points)
     template = np.empty((n, PIXELS), np.float32)

@@ -131,8 +131,8 @@ def relocalise(
 
     Returns:
         Number of inliers, or 0 if the pose was not found. A pose is accepted if it has at least
-            ``relocalization.min_inliers`` inliers and they do not all lie on one object
-            (``count_elsewhere``).
+        ``relocalization.min_inliers`` inliers and they do not all lie on one object
+        (``count_elsewhere``).
     """
     inliers = _locate(frame, place, surroundings, context, seed)
     config = context.config.relocalization

@@ -47,10 +47,11 @@ def match_stereo(
     """Match each left feature with a right feature, independently of the other left features.
 
     A candidate must meet three conditions. It lies in the same row, within 2 px at the scale of the
-    right feature. It is at most one octave apart. Its disparity is between 0 and the disparity of a
-    point at a distance of one baseline. The candidate with the closest descriptor is chosen. Then a
-    SAD window at the level of the left feature is shifted along the row to locate the match with
-    sub-pixel accuracy.
+    right feature. Its octave differs by at most one. Its disparity is between 0 and the disparity
+    of a point at a distance of one baseline.
+
+    The candidate with the closest descriptor is chosen. Then a SAD window at the level of the left
+    feature is shifted along the row, to locate the match with sub-pixel accuracy.
     """
     u_right, sad = _match(
         _Side.of_extraction(left),

@@ -125,8 +125,8 @@ class Tracker:
         since the map was loaded, the pose of the reference keyframe is returned.
 
         Args:
+            timestamp: seconds.
             frames: poses of all earlier frames, including lost frames.
-        timestamp: seconds.
 
         Returns:
         ``(4, 4)`` pose ``T_cw`` (world to camera).

@@ -93,8 +93,8 @@ def grain(image, stride, least):
 
     Returns:
         Standard deviation of the noise, in grey levels; share of the pixels that are spikes. A
-            spike is brighter than both neighbours, or darker than both. The difference must exceed
-            ``least`` grey levels and four standard deviations.
+        spike is brighter than both neighbours, or darker than both. The difference must exceed
+        ``least`` grey levels and four standard deviations.
     """
     height, width = image.shape
     counts = np.zeros(1021, np.int64)

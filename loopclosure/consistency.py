@@ -51,7 +51,7 @@ class LoopConsistency:
 
         Returns:
             The candidates whose place was resembled by enough consecutive keyframes, and a rejected
-                edge for each other candidate.
+            edge for each other candidate.
         """
         self._turn += 1
         series: dict[frozenset[int], ResembledPlace] = {}
@@ -89,7 +89,7 @@ class LoopConsistency:
 
         Returns:
             The edge. It is marked as not accepted if too few keyframes agree so far. A keyframe
-                counts once, even if several of its edges agree.
+            counts once, even if several of its edges agree.
         """
         if not edge.accepted:
             return edge

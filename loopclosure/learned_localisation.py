@@ -79,7 +79,7 @@ def localise(
         seed: seed of the random samples; the same seed gives the same result.
 
     Returns:
-        The pose and the landmarks, or a short explanation why no pose was found.
+        The pose and the landmarks, or a short explanation of why no pose was found.
     """
     views: list[View] = []
     xyz, uv = np.empty((0, 3)), np.empty((0, 2))

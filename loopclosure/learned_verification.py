@@ -2,9 +2,9 @@
 
 Learned descriptors still match when the appearance has changed too much for ORB descriptors.
 
-The steps are those of :mod:`vslam.loopclosure.verification`. An initial pose is estimated. Guided
-matching uses all landmarks of the place. The pose is refined. The same tests reject places that
-only look similar.
+The steps are those of :mod:`vslam.loopclosure.verification`. First, an initial pose is estimated.
+Then, guided matching uses all landmarks of the place, and the pose is refined. Finally, the same
+tests reject places that only look similar.
 """
 
 from __future__ import annotations
@@ -139,12 +139,11 @@ def verify_learned(
     config: LearnedMatchingConfig,
     gates: VerificationConfig,
 ) -> LoopEdge:
-    """Verify a candidate by learned local descriptors. ``verification.verify`` uses ORB
-    descriptors.
+    """Verify a candidate by learned local descriptors, as :func:`verification.verify` does by ORB.
 
     Returns:
         The edge. It is either accepted, or it has the reason for its rejection. Its features and
-            landmarks are the inliers that coincide with a keypoint of the query.
+        landmarks are the inliers that coincide with a keypoint of the query.
     """
     query, match = candidate.query, candidate.match
     edge = LoopEdge.of(candidate, matched_by="learned")
@@ -202,7 +201,7 @@ def recognise(
 
     Returns:
         The pose and the observed landmarks. None if the frame fails the tests of a loop, or if too
-            few of its keypoints coincide with landmarks to continue tracking.
+        few of its keypoints coincide with landmarks to continue tracking.
     """
     gates = config.verification
     around = [match, *map_.covisible(match)[0].tolist()]
@@ -340,7 +339,7 @@ def _seen_of_query(
 
     Returns:
         Number of landmarks of the query that are found at their projections in this image, and
-            number of landmarks of the query that should be visible in it.
+        number of landmarks of the query that should be visible in it.
     """
     assert edge.T_query_match is not None
     T_match_query = inverse(edge.T_query_match)

@@ -43,9 +43,12 @@ def precision_recall(same: NDArray, score: NDArray) -> PrecisionRecall:
     """
     same, score = np.asarray(same, bool), np.asarray(score, np.float64)
     if same.shape != score.shape or same.ndim != 1:
-        raise InputError(f"precision-recall: {same.shape} labels do not fit {score.shape} scores.")
+        raise InputError(
+            f"precision-recall: the labels have the shape {same.shape}, but the scores have the "
+            f"shape {score.shape}."
+        )
     if not same.any():
-        raise InputError("precision-recall: empty ground truth, no pair shows the same place.")
+        raise InputError("precision-recall: empty ground truth; no pair shows the same place.")
     if np.isnan(score).any():
         raise InputError("precision-recall: a score is NaN; check the weights of the detector.")
     return curve_of(same, score, int(same.sum()))

@@ -63,7 +63,9 @@ def require_detector(name: str, weights: Path | None = None, option: str = "--de
     elif weights is not None and name == "none":
         raise InputError("--weights: the detector 'none' has no weights; leave the option out.")
     elif weights is not None and not weights.is_file():
-        raise InputError(f"--weights {weights}: no such file; name a vocabulary, .npz or .txt.")
+        raise InputError(
+            f"--weights {weights}: no such file; name a vocabulary file (.npz or .txt)."
+        )
 
 
 def problem_of(detector: LoopDetector) -> str | None:
@@ -88,7 +90,7 @@ def detector_with_images(
 
     Returns:
         The detector, and the store of images. The store is None if candidates are verified only by
-            ORB descriptors.
+        ORB descriptors.
 
     Raises:
         InputError, ValueError: see :func:`create_detector`.
@@ -185,7 +187,7 @@ def parse_weights(given: Collection[str], detectors: Collection[str]) -> dict[st
         name, equals, file = item.partition("=")
         if not equals or name not in detectors:
             raise InputError(
-                f"--weights {item}: must be NAME=FILE with a name of --detectors"
+                f"--weights {item}: must be NAME=FILE, where NAME is one of --detectors"
                 f"{did_you_mean(name, detectors)}: {', '.join(detectors)}."
             )
         files[name] = Path(file).expanduser().absolute()

@@ -1,5 +1,6 @@
-"""Geometric verification of loop candidates: tests whether it is the same place, and finds the
-relative pose.
+"""Geometric verification of loop candidates.
+
+Verification tests whether two keyframes show the same place, and estimates their relative pose.
 
 The first steps are those of ORB-SLAM (T-RO 2015, VII-B; for stereo T-RO 2017, III-D). The
 descriptors of two keyframes are matched, and a motion is estimated by RANSAC. Then all landmarks of
@@ -78,8 +79,8 @@ def verify(
 
     Returns:
         An edge. It is accepted with the reason "verified", or rejected with another reason. The
-            pose and the numbers of matches come from the last step that was completed. The inliers
-            are features of the query and landmarks of the place, without duplicates.
+        pose and the numbers of matches come from the last step that was completed. The inliers are
+        features of the query and landmarks of the place, without duplicates.
     """
     query, match = candidate.query, candidate.match
     edge = LoopEdge.of(candidate)

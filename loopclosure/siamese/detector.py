@@ -97,8 +97,7 @@ class SiameseDetector:
     def locate(
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
-        """The keyframes in the map that are most similar to a frame outside the map, most similar
-        first.
+        """The keyframes in the map that are most similar to a frame outside the map, best first.
 
         No threshold is applied, because relocalisation verifies all candidates by geometry.
         """

@@ -44,7 +44,9 @@ def read_fabmap(folder: Path, truth: str = "", side: str = "left") -> list[Image
     named = Path(truth).expanduser() if truth else None
     path = named or next(iter(sorted(folder.glob("*.mat"))), None)
     if path is None:
-        raise InputError(f"{folder}: no ground-truth matrix; name it: fabmap:DIR[truth=FILE.mat].")
+        raise InputError(
+            f"{folder}: no ground-truth matrix; name one with fabmap:DIR[truth=FILE.mat]."
+        )
     loops = read_loop_matrix(path)
     n = len(loops)
     if 2 * n == len(files):

@@ -111,9 +111,9 @@ def read_loop_matrix(path: Path) -> NDArray[np.bool_]:
     """Read a loop matrix as ``(N, N)`` bool. It is True where two images close a loop.
 
     The loop matrix is the largest square matrix of a ``.mat`` file. It may be dense or sparse, and
-    may have any name. In the files of Oxford and Lip6, the name is ``truth``. In those for KITTI,
-    it is the name of the sequence. Most matrices mark each pair once, in the row of the later
-    image.
+    may have any name. In the files of Oxford and Lip6, its name is ``truth``. In the files for
+    KITTI, it is the name of the sequence. Most matrices mark each pair once, in the row of the
+    later image.
 
     Raises:
         InputError: there is no such file, or the file contains no loop matrix.

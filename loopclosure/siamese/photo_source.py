@@ -20,7 +20,7 @@ from vslam.loopclosure.siamese.image_source import (
     names_of,
 )
 
-_STRETCH = 25  # number of consecutive video frames that validation does not split
+_STRETCH = 25  # consecutive video frames that are not split between training and validation
 _UNLIMITED = 1_000_000
 
 

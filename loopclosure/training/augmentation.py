@@ -21,16 +21,24 @@ class Augmentation(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     homography: float = Field(
-        0.10, ge=0, le=0.4, description="Largest shift of a corner, relative to each side."
+        0.10,
+        ge=0,
+        le=0.4,
+        description="Largest shift of a corner of the image, relative to each side.",
     )
-    shift: float = Field(0.10, ge=0, le=0.5, description="Largest shift, relative to the width.")
-    turn: float = Field(0.0, ge=0, le=45, description="Largest turn of the camera, degrees.")
+    shift: float = Field(
+        0.10, ge=0, le=0.5, description="Largest horizontal shift, relative to the width."
+    )
+    turn: float = Field(0.0, ge=0, le=45, description="Largest rotation of the camera, degrees.")
     zoom: float = Field(
-        0.0, ge=0, le=1, description="Largest log of the zoom, which imitates driving on."
+        0.0,
+        ge=0,
+        le=1,
+        description="Largest log of the zoom factor. A zoom imitates driving forwards.",
     )
-    log_gain: float = Field(0.35, ge=0, description="Standard deviation of the log gain.")
+    log_gain: float = Field(0.35, ge=0, description="Standard deviation of the log of the gain.")
     bias: float = Field(20.0, ge=0, description="Standard deviation of the bias, grey levels.")
-    log_gamma: float = Field(0.25, ge=0, description="Standard deviation of log gamma.")
+    log_gamma: float = Field(0.25, ge=0, description="Standard deviation of the log of gamma.")
     masks: int = Field(3, ge=0, description="Largest number of masks.")
     mask_area: float = Field(
         0.10, ge=0, le=0.5, description="Largest share of the image that one mask covers."

@@ -60,26 +60,29 @@ class CapsuleShape(BaseModel):
 
     extractor: Literal["light", "lite0"] = "light"
     pixels: int = Field(227, ge=32, description="Height of the input.")
-    width: int | None = Field(None, ge=32, description="Width of the input; None: a square.")
+    width: int | None = Field(None, ge=32, description="Width of the input; None for a square.")
     views: int = Field(
-        1, ge=1, le=16, description="Number of parts of the image, from left to right."
+        1, ge=1, le=16, description="Number of views (parts of the image), from left to right."
     )
-    view_width: int | None = Field(None, ge=32, description="Columns of a part; None: all.")
+    view_width: int | None = Field(None, ge=32, description="Columns of a view; None for all.")
     half_angle: float = Field(
-        0.0, ge=0, le=60, description="Degrees from middle to side for unrolling; 0: no unrolling."
+        0.0,
+        ge=0,
+        le=60,
+        description="Degrees from the middle to a side for unrolling; 0 disables it.",
     )
     middle: float = Field(
         1.0, gt=0, le=1, description="Share of the height that the middle column keeps."
     )
     blocks: tuple[tuple[int, int, int], ...] = LIGHT_BLOCKS
-    types: int = Field(32, ge=1, description="Types of primary capsules.")
+    types: int = Field(32, ge=1, description="Number of types of primary capsules.")
     size: int = Field(8, ge=1, description="Dimension of a primary capsule.")
-    outputs: int = Field(64, ge=1, description="Output capsules.")
+    outputs: int = Field(64, ge=1, description="Number of output capsules.")
     depth: int = Field(16, ge=1, description="Dimension of an output capsule.")
-    iterations: int = Field(3, ge=1, description="Iterations of the routing.")
+    iterations: int = Field(3, ge=1, description="Number of routing iterations.")
     over: Literal["primary", "output"] = "primary"
     kept: int | None = Field(
-        None, description="Number of places kept per type; None before pruning."
+        None, description="Number of places that are kept per type; None before pruning."
     )
 
     @model_validator(mode="after")

@@ -40,9 +40,9 @@ def route(
     """Dynamic routing. Gradients flow only through the last iteration.
 
     The sums are rearranged as ``s_j = Σ_t W_tj (Σ_p c_tpj u_tp)`` and
-    ``û_j|i · v_j = u_tp · (W_tjᵀ v_j)``. Sums over the places of vectors of size A then replace the
-    ``I J D`` numbers of the prediction vectors. These numbers would have to be written once and
-    read five times.
+    ``û_j|i · v_j = u_tp · (W_tjᵀ v_j)``. In this form, sums over the places replace the prediction
+    vectors. The sums are vectors of size A, whereas the prediction vectors have ``I J D`` numbers,
+    which would have to be written once and read five times.
 
     Args:
         u: ``(N, T, P, A)`` primary capsules.
@@ -55,9 +55,9 @@ def route(
 
     Returns:
         Output capsules ``v`` ``(N, J, D)``, and the coupling coefficients as numerators ``e``
-            ``(N, T, J, P)`` and denominators ``total`` ``(N, 1, J, 1)`` or ``(1,)``.
-            :func:`couplings` divides them. They are not divided here, because it is enough to
-            divide the sums over P, which takes a sixth of the divisions.
+        ``(N, T, J, P)`` and denominators ``total`` ``(N, 1, J, 1)`` or ``(1,)``. :func:`couplings`
+        divides the numerators by the denominators. They are returned undivided, because ``route``
+        itself divides only the sums over P, which takes a sixth of the divisions.
     """
     n, types, places, size = u.shape
     outputs, _, _, depth = W.shape

@@ -83,7 +83,7 @@ def load_checkpoint(
             f"{path}: written by another version of vslam; use another --out."
         ) from error
     except Exception as error:  # torch raises many types
-        raise InputError(f"{path}: not a readable checkpoint; remove it to start anew.") from error
+        raise InputError(f"{path}: not a readable checkpoint; remove it to start again.") from error
     # The learning rate may change, so that a training run that has diverged can be resumed.
     # Settings that are used only at the end may change as well.
     free = {key: getattr(settings, key) for key in ("learning_rate", "patience", "learned_share")}

@@ -142,7 +142,7 @@ def divide(
     for part in (train, validation):
         relation = collection.relation[np.ix_(part, part)]
         if not len(part) or not (relation == DIFFERENT).any():
-            raise InputError("--data: too few places to divide; add a source of images.")
+            raise InputError("--data: too few places to split; add a source of images.")
     return train, validation
 
 
@@ -183,7 +183,7 @@ def draw_pairs(
     """Draw pairs of images for training.
 
     Args:
-        chosen: ``(M,)`` indices of the images that are drawn from.
+        chosen: ``(M,)`` indices of the images from which pairs are drawn.
         count: number of pairs.
         hard: ``(M, K)`` similar images of other places, padded with -1; see :func:`mine`.
         hard_share: share of the pairs of different places for which the second image is drawn from

@@ -52,7 +52,7 @@ def starting_network(
 
     Returns:
         The network, the settings that fit it, and entries for the model card. The network is None
-            for random weights.
+        for random weights.
 
     Raises:
         InputError: the weights are missing, damaged or belong to another network.

@@ -93,7 +93,7 @@ def validate(
 
     Returns:
         The figures of :func:`vslam.loopclosure.precision_recall.summary`, and the scores and labels
-            of the pairs that the figures are computed from.
+        of the pairs that the figures are computed from.
     """
     images = collection.images[chosen]
     augmented = np.stack(
@@ -118,8 +118,8 @@ def validate(
 
 @torch.no_grad()
 def blend(network: SiameseNetwork, before: dict[str, Tensor], share: float) -> None:
-    """Interpolate the weights in place: share 0 gives the weights ``before``, share 1 the current
-    ones.
+    """Interpolate the weights of a network in place. Share 0 gives the weights ``before``, and
+    share 1 gives the current weights.
 
     Interpolated weights keep most of what fine-tuning has learned. They also forget less of what
     the original network had learned (WiSE-FT, Wortsman et al., CVPR 2022).

@@ -23,7 +23,7 @@ def to_tensor(images: NDArray[np.uint8]) -> Tensor:
 
 
 class Unrolling(nn.Module):
-    """Cylindrical projection of images. In the projected image, a rotation of the camera is a
+    """Cylindrical projection of images. In a projected image, a rotation of the camera appears as a
     shift.
 
     The method is that of Szeliski, Image Alignment and Stitching: A Tutorial, 2006, section 2.3. In

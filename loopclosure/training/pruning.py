@@ -1,7 +1,7 @@
 """Pruning: removes the primary capsules with the lowest coupling coefficients.
 
-The paper ranks primary capsules by their coupling coefficients, and sets the W_ij of the lowest 20
-% to 0. Multiplying by zeros saves no time, so these capsules are removed here.
+The paper ranks primary capsules by their coupling coefficients. It sets the W_ij of the lowest 20 %
+to 0. Multiplying by zeros saves no time, so these capsules are removed here.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ def mean_couplings(network: SiameseNetwork, batches: Iterable[Tensor]) -> Tensor
         total = summed if total is None else total + summed
         count += len(c)
     if total is None:
-        raise InputError("pruning: no images to rank the capsules with; name training data.")
+        raise InputError(
+            "pruning: there are no images to rank the capsules with; name training data."
+        )
     return (total / count).view(branch.shape.types, -1)
 
 

@@ -44,8 +44,9 @@ def extract_in_any_light(
 ) -> list[Extraction]:
     """Extract the ORB features of ``(H, W)`` uint8 images that were taken at the same time.
 
-    Noisy images are filtered first, and the contrast of faint images is raised. If one image needs
-    this, all images are processed in the same way, because stereo matching compares their patches.
+    Noisy images are filtered first. The contrast of faint images, which have low contrast and few
+    corners, is raised. If one image needs this, all images are processed in the same way, because
+    stereo matching compares their patches.
 
     Args:
         image_map: applies a function to all images, either sequentially or in parallel. The result

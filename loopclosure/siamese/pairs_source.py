@@ -80,8 +80,8 @@ def relation_of_views(views: NDArray[np.float64]) -> NDArray[np.int8]:
     look along the same street. Otherwise, the relation is unknown.
 
     Two images look along the same street if three conditions are met. Their directions are similar
-    or opposite. They are less than 160 m apart. One image is less than 25 m beside the line of
-    sight of the other.
+    or opposite. They are less than 160 m apart. One camera is less than 25 m to the side of the
+    line of sight of the other.
 
     Args:
         views: ``(N, 3)`` x and z in metres, and yaw in degrees from z towards x.

@@ -19,7 +19,7 @@ and their options are:
     ``near``: distance in metres within which two images show the same place; the default is 5.
     ``truth``: ``.mat`` file with a loop matrix, which marks the pairs that show the same place.
 ``fabmap:DIR``: Oxford CityCentre or NewCollege (Cummins and Newman 2008), or another ordered set of
-    images with a loop matrix, for example those of Lip6 (``fabmap_source``).
+    images with a loop matrix, for example the sets of Lip6 (``fabmap_source``).
     ``truth``: ``.mat`` file with the loop matrix; the default is the first one in the folder.
     ``side``: ``left`` or ``right``. This camera is used if the matrix has one row for each pair;
     the default is left.

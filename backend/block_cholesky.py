@@ -1,12 +1,14 @@
-"""Sparse Cholesky factorisation of symmetric systems of 6x6 blocks, one block row per keyframe.
+"""Sparse Cholesky factorisation of symmetric systems with one row of 6x6 blocks per keyframe.
 
-The structure is analysed once for all iterations of an optimiser. The analysis gives a minimum
-degree elimination order (George and Liu, "The evolution of the minimum degree ordering algorithm",
-SIAM Review 1989) and the fill-in. A graph of a few thousand keyframes is small enough to simulate
-the elimination on bit sets: the degrees are exact, and the neighbours that a keyframe has when it
-is eliminated are the nonzero blocks of its column of the factor. The numeric factorisation is
-left-looking (Davis, "Direct Methods for Sparse Linear Systems", section 4.8) and works on blocks.
-Everything is deterministic: the same input gives the same bytes on every run.
+The structure of the matrix is analysed once for all iterations of an optimiser. The analysis
+computes a minimum degree elimination order (George and Liu, "The evolution of the minimum degree
+ordering algorithm", SIAM Review 1989) and the fill-in. It simulates the elimination on bit sets,
+which is feasible for a few thousand keyframes. The degrees are therefore exact. When a keyframe is
+eliminated, its remaining neighbours are the nonzero blocks of its column of the factor.
+
+The numeric factorisation is left-looking (Davis, "Direct Methods for Sparse Linear Systems",
+section 4.8) and works on blocks. The result is deterministic: the same input produces
+byte-identical output on every run.
 """
 
 from __future__ import annotations
@@ -22,18 +24,20 @@ BLOCK = 6
 
 
 class Structure(NamedTuple):
-    """Positions of the nonzero blocks ("slots") of the factor of a system of ``n`` block rows, in
-    elimination order.
+    """Positions of the nonzero blocks in the Cholesky factor of a system of ``n`` block rows.
+
+    Block rows and columns are in elimination order. A "slot" is the position of one nonzero block
+    in memory.
 
     Attributes:
-        order: ``(n,)`` int64, the caller's index of the i-th block in elimination order.
+        order: ``(n,)`` int64, the caller's index of each block row, in elimination order.
         first: ``(n + 1,)`` int64; the slots of column c are ``first[c]:first[c + 1]``.
         row: ``(slots,)`` int32, block row of each slot, ascending within a column. The first slot
             of a column is on the diagonal.
         row_first: ``(n + 1,)`` int64; the blocks of row r to the left of the diagonal are
             ``row_slot[row_first[r]:row_first[r + 1]]``.
         row_slot, row_column: ``(slots - n,)`` int32, slot and column of each block below the
-            diagonal, row by row, columns ascending.
+            diagonal. The blocks are sorted by row, then by column.
     """
 
     order: NDArray[np.int64]
@@ -73,7 +77,8 @@ def _analyse(n, pairs):
     position = np.full(n, -1, np.int64)
     first = np.zeros(n + 1, np.int64)
     for step in range(n):
-        # Choose a block of minimum degree; a tie goes to the lowest index, the oldest keyframe.
+        # Choose a block of minimum degree. Of equal degrees, the lowest index (the oldest keyframe)
+        # wins.
         chosen, least = -1, n
         for i in range(n):
             if position[i] < 0 and degree[i] < least:
@@ -81,7 +86,7 @@ def _analyse(n, pairs):
         order[step], position[chosen] = chosen, step
         first[step + 1] = first[step] + least + 1
         # The neighbours of the chosen block become neighbours of each other. The chosen block keeps
-        # its set of neighbours, which is its column of the factor.
+        # its set of neighbours, which are the blocks of its column of the factor.
         for i in range(n):
             if not adjacent[chosen, i // 64] >> np.uint64(i % 64) & one:
                 continue
@@ -93,8 +98,8 @@ def _analyse(n, pairs):
             for word in range(words):
                 count += np.int64(popcount(adjacent[i, word]))
             degree[i] = count
-    # Sort by transposing twice: visiting the columns in ascending order sorts the columns of each
-    # row, and then visiting the rows in ascending order sorts the rows of each column.
+    # Sort by transposing twice. Visiting the columns in ascending order sorts the columns of each
+    # row. Then visiting the rows in ascending order sorts the rows of each column.
     slots = first[n]
     row_first = np.zeros(n + 1, np.int64)
     for step in range(n):
@@ -126,11 +131,11 @@ def _analyse(n, pairs):
 
 @kernel
 def panel(structure, column):
-    """Offset ``begin`` of the panel of a column in ``S``, and the width of the panel.
+    """Index in ``S`` at which the panel of a column begins, and the width of the panel.
 
-    A panel holds the transposed blocks of one column side by side: element (i, j) of the k-th block
-    is ``S[begin + j * width + 6 * k + i]``. So the rows of a panel are long, as vector instructions
-    require.
+    A panel holds the transposed blocks of one column side by side. Element (i, j) of the k-th block
+    is ``S[begin + j * width + 6 * k + i]``. The rows of a panel are therefore long, which suits
+    vector instructions.
     """
     first = structure.first[column]
     return BLOCK * BLOCK * first, BLOCK * (structure.first[column + 1] - first)
@@ -142,10 +147,11 @@ def factor_solve(structure, S, x):
 
     Args:
         structure: the ``Structure`` of S.
-        S: ``(36 * slots,)`` float64, the lower triangle in elimination order, one panel per column
-            (see ``panel``), with zeros in the fill-in. Only the lower triangle of diagonal blocks
-            is read. S is overwritten with the factor.
-        x: ``(n, 6)`` float64 right-hand side in elimination order; overwritten with the solution.
+        S: ``(36 * slots,)`` float64, the lower triangle in elimination order, with one panel per
+            column (see ``panel``). The blocks of the fill-in are zero. Only the lower triangle of
+            diagonal blocks is read. S is overwritten with the factor.
+        x: ``(n, 6)`` float64 right-hand side in elimination order. It is overwritten with the
+            solution.
     """
     first, row = structure.first, structure.row
     n = len(x)
@@ -199,11 +205,12 @@ def factor_solve(structure, S, x):
 
 @inner_kernel
 def add_product(S, start, pivot, end, row, place, update):
-    """Add to ``update`` what an earlier column, with slots ``start:end``, subtracts from the
-    current column.
+    """Add the contribution of an earlier column to ``update``, which is later subtracted from the
+    current column. The slots of the earlier column are ``start:end``.
 
-    ``pivot`` is the slot of the earlier column whose row is that of the current column. Blocks that
-    are adjacent in both columns are multiplied together, because long rows fill vector registers.
+    ``pivot`` is the slot of the earlier column whose row equals the index of the current column.
+    Blocks that are adjacent in both columns are multiplied together, because long rows fill vector
+    registers.
     """
     width = np.uintp(BLOCK * (end - start))
     begin = np.uintp(BLOCK * BLOCK * start)
@@ -214,8 +221,8 @@ def add_product(S, start, pivot, end, row, place, update):
         after = slot + 1
         while after < end and place[row[after]] == target + BLOCK * (after - slot):
             after += 1
-        # Unsigned indices, because the test whether a signed index is negative would prevent
-        # vectorisation.
+        # Indices are unsigned. For signed indices, the compiler would test whether they are
+        # negative, which prevents vectorisation.
         t, length = np.uintp(target), np.uintp(BLOCK * (after - slot))
         a0 = begin + np.uintp(BLOCK * (slot - start))
         a1, a2, a3 = a0 + width, a0 + width + width, a0 + width + width + width
@@ -237,7 +244,7 @@ def add_product(S, start, pivot, end, row, place, update):
 
 @inner_kernel
 def factor_panel(S, base, width):
-    """Factor the diagonal block of a column, and divide the blocks below by the factor. Returns
+    """Factor the diagonal block of a column, and divide the blocks below it by the factor. Returns
     False if the diagonal block is not positive definite."""
     begin, columns = np.uintp(base), np.uintp(width)
     for j in range(np.uintp(BLOCK)):

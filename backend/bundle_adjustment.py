@@ -1,9 +1,9 @@
 """Bundle adjustment of keyframe poses and landmarks: Levenberg-Marquardt on the Schur complement.
 
-As in ORB-SLAM2 (section III-C), reprojection errors of monocular (u, v) and stereo (u, v, u_right)
-observations are minimised with the Huber loss. Landmarks are eliminated one at a time. The reduced
-camera system is dense and is solved by Cholesky factorisation (Triggs et al., "Bundle adjustment -
-a modern synthesis", section 6).
+As in ORB-SLAM2 (section III-C), the reprojection errors of monocular (u, v) and stereo (u, v,
+u_right) observations are minimised with the Huber loss. Landmarks are eliminated one at a time. The
+reduced camera system is dense and is solved by Cholesky factorisation (Triggs et al., "Bundle
+adjustment - a modern synthesis", section 6).
 """
 
 from __future__ import annotations
@@ -21,15 +21,18 @@ from vslam.reprojection import chi_square, residual, unpacked
 
 @dataclass(frozen=True)
 class BundleProblem:
-    """Cameras, landmarks, and observations sorted by landmark.
+    """The input of bundle adjustment: K cameras, P landmarks, and O observations sorted by
+    landmark.
 
     Attributes:
         T_cw: ``(K, 4, 4)`` poses of the cameras (world to camera).
-        n_free: the first ``n_free`` cameras are optimised, the others are held fixed.
+        n_free: number of cameras that are optimised. They come first. The other cameras are held
+            fixed.
         points: ``(P, 3)`` landmarks in the world frame.
         first: ``(P + 1,)`` int64; the observations of point p are ``first[p]:first[p + 1]``.
         camera: ``(O,)`` int64, index of the camera of each observation.
-        uvr: ``(O, 3)`` float64 observed u, v, u_right; NaN u_right for a monocular observation.
+        uvr: ``(O, 3)`` float64 observed u, v, u_right, in pixels; u_right is NaN for a monocular
+            observation.
         inverse_sigma2: ``(O,)`` float64, inverse variance of u and v.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         disparity_weight: ``(O,)`` float64, ratio of the standard deviation of u and v to the
@@ -48,15 +51,15 @@ class BundleProblem:
     disparity_weight: NDArray[np.float64] | None = None
 
     def disparity_weights(self) -> NDArray[np.float64]:
-        """``(O,)`` float64, ``disparity_weight`` or the default from ``intrinsics``."""
+        """``(O,)`` float64: ``disparity_weight``, or the default ratio from ``intrinsics``."""
         if self.disparity_weight is not None:
             return self.disparity_weight
         return np.full(len(self.camera), self.intrinsics[5])
 
 
 class Observations(NamedTuple):
-    """The observations of a ``BundleProblem`` as arguments of kernels; ``used`` is ``(O,)`` bool,
-    whether each observation is used."""
+    """The observations of a ``BundleProblem``, as arguments of kernels. ``used`` is an ``(O,)``
+    bool mask of the observations that are used."""
 
     first: NDArray[np.int64]
     camera: NDArray[np.int64]
@@ -68,12 +71,12 @@ class Observations(NamedTuple):
 
 
 class NormalEquations(NamedTuple):
-    """The normal equations of Gauss-Newton in blocks.
+    """The block-wise normal equations of Gauss-Newton.
 
     Attributes:
-        W: ``(O, 3, 6)`` mixed blocks, point by camera, one per observation.
-        V, g: ``(P, 3, 3)`` and ``(P, 3)``, Hessian and right-hand side of the points.
-        U, b: ``(K, 6, 6)`` and ``(K, 6)``, Hessian and right-hand side of the free cameras.
+        W: ``(O, 3, 6)`` blocks that couple a point and a camera, one per observation.
+        V, g: ``(P, 3, 3)`` Hessian and ``(P, 3)`` right-hand side of the points.
+        U, b: ``(K, 6, 6)`` Hessian and ``(K, 6)`` right-hand side of the free cameras.
     """
 
     W: NDArray[np.float64]
@@ -88,10 +91,10 @@ class BundleSolution:
     """The result of bundle adjustment.
 
     Attributes:
-        T_cw: ``(K, 4, 4)`` poses of the cameras.
+        T_cw: ``(K, 4, 4)`` poses of the cameras (world to camera).
         points: ``(P, 3)`` landmarks in the world frame.
         cost: half the sum of the Huber losses.
-        inlier: ``(O,)`` bool, observations that pass the chi-square test.
+        inlier: ``(O,)`` bool, True for observations that pass the chi-square test.
         iterations: number of iterations that were run.
     """
 
@@ -114,7 +117,8 @@ def adjust(
     Args:
         iterations: maximum number of iterations.
         use: ``(O,)`` bool, whether each observation is used; None uses all.
-        tolerance: stop when an iteration reduces the cost by a smaller fraction than this.
+        tolerance: the optimisation stops when an iteration reduces the cost by a smaller fraction
+            than this.
     """
     T_cw, points, cost, inlier, count = _adjust(
         problem.T_cw,
@@ -129,7 +133,7 @@ def adjust(
 
 
 def observations_of(problem: BundleProblem, use: NDArray[np.bool_] | None) -> Observations:
-    """The observations of a problem as arguments of kernels. ``use`` is explained in ``adjust``."""
+    """The observations of a problem, as arguments of kernels. ``adjust`` explains ``use``."""
     return Observations(
         problem.first,
         problem.camera,
@@ -142,8 +146,8 @@ def observations_of(problem: BundleProblem, use: NDArray[np.bool_] | None) -> Ob
 
 
 def empty_equations(n_free: int, n_points: int, n_observations: int) -> NormalEquations:
-    """Allocate the normal equations. W is set to 0, because blocks of fixed cameras and of unused
-    observations are never written."""
+    """Allocate the normal equations. W is set to 0, because the blocks of fixed cameras and of
+    unused observations are never written."""
     return NormalEquations(
         np.zeros((n_observations, 3, 6)),
         np.empty((n_points, 3, 3)),
@@ -206,7 +210,7 @@ def _adjust(T_start, n_free, points_start, observations, equations, iterations, 
                 if trial < cost:
                     small = cost - trial < tolerance * cost
                     cost = trial
-                    # Swap instead of copying: the next step overwrites the whole trial.
+                    # Swap instead of copying. The next step overwrites the whole trial.
                     T_cw, T_trial = T_trial, T_cw
                     points, points_trial = points_trial, points
                     damping, growth, improved = max(damping * 0.1, 1e-9), 2.0, True
@@ -293,8 +297,8 @@ def linearise(T_cw, n_free, points, observations, equations):
 
 @inner_kernel
 def reduce_points(n_free, observations, equations, damping, S, rhs, V_inverse):
-    """Eliminate the points: write the reduced camera system ``S x = rhs`` (upper triangle of S) and
-    the inverses of the damped point blocks."""
+    """Eliminate the points. Writes the reduced camera system ``S x = rhs`` (the upper triangle of
+    S) and the inverses of the damped point blocks."""
     first, camera, used = observations.first, observations.camera, observations.used
     W, V, g, U, b = equations
     S[:] = 0.0
@@ -334,8 +338,8 @@ def reduce_points(n_free, observations, equations, damping, S, rhs, V_inverse):
 
 @inner_kernel
 def invert_damped(V, damping, N):
-    """Write the inverse of a point's ``(3, 3)`` block with a damped diagonal into ``N``. If the
-    block is singular, write zeros, so that the point does not move."""
+    """Damp the diagonal of a point's ``(3, 3)`` block and write the inverse into ``N``. If the
+    block is singular, zeros are written, so that the point does not move."""
     scale = 1.0 + damping
     v00, v11, v22 = V[0, 0] * scale, V[1, 1] * scale, V[2, 2] * scale
     v01, v02, v12 = V[0, 1], V[0, 2], V[1, 2]
@@ -372,8 +376,11 @@ def step_points(n_free, observations, equations, camera_step, V_inverse, points,
 
 @kernel
 def step_cameras(n_free, camera_step, T_cw, T_trial):
-    """Move each free camera by its twist. Matrices are copied element by element, because Numba
-    takes seconds to compile the broadcasting check of a whole-array assignment."""
+    """Move each free camera by its twist.
+
+    Matrices are copied element by element, because Numba takes seconds to compile the broadcasting
+    check of a whole-array assignment.
+    """
     for k in range(n_free):
         T = orthonormalised(compose(se3_exp(camera_step[6 * k : 6 * k + 6]), T_cw[k]))
         for i in range(4):
@@ -383,8 +390,8 @@ def step_cameras(n_free, camera_step, T_cw, T_trial):
 
 @kernel
 def cholesky_solve(S, x):
-    """Solve ``S x = rhs`` in place, where ``x`` holds the right-hand side on entry. Only the upper
-    triangle of S is read. Returns False if S is not positive definite."""
+    """Solve ``S x = rhs`` in place. ``x`` holds the right-hand side on entry and the solution on
+    return. Only the upper triangle of S is read. Returns False if S is not positive definite."""
     n = len(x)
     for i in range(n):
         row = S[i]

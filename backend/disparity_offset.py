@@ -1,12 +1,14 @@
 """Estimates a constant error of all disparities of a stereo pair from the motion of the camera.
 
-After calibration, there may still be an unknown rotation of some hundredths of a degree between the
-two cameras, or an error of a tenth of a pixel in a principal point. Both shift all disparities by
-nearly the same amount, so that depths are wrong by a fraction that grows with the depth. A single
-stereo pair does not reveal this. A moving camera does, because one motion must explain how both
-near and far points move in the image. So the offset is one more unknown of bundle adjustment,
-common to all keyframes (self-calibration: Triggs et al., "Bundle adjustment - a modern synthesis",
-section 10).
+Two calibration errors cause such an offset. The rotation between the two cameras may be wrong by
+some hundredths of a degree, or a principal point may be wrong by a tenth of a pixel. Both errors
+shift all disparities by nearly the same amount. Depths are then wrong by a fraction that grows with
+the depth.
+
+A single stereo pair does not reveal the offset. A moving camera does, because one motion must
+explain how both near and far points move in the image. So the offset becomes an additional unknown
+of bundle adjustment that is common to all keyframes (self-calibration: Triggs et al., "Bundle
+adjustment - a modern synthesis", section 10).
 
 The offset is estimated in disjoint windows of keyframes. The estimates are weighted by their
 information (inverse variance) and combined with a prior of mean 0.
@@ -28,14 +30,15 @@ from vslam.map_kernels import collect_landmarks
 
 STEP = 0.2  # pixels between the three offsets for which the cost is computed
 ITERATIONS = 15
-# Variance of the error of the estimate, times its information. It is not 1, because the errors of
-# an observation by several keyframes are correlated (docs/research/uncertainty.md).
+# Variance of the error of the estimate, in multiples of the inverse of its information. It is not
+# 1, because the errors of one landmark's observations in several keyframes are correlated
+# (docs/research/uncertainty.md).
 VARIANCE = 3.0
-TOLERANCE = 1e-5  # least relative decrease of the cost; STEP changes the cost by some thousandths
+TOLERANCE = 1e-5  # least relative decrease of the cost; STEP changes it by some thousandths
 
 
 def map_and_calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Run ``map_keyframe``; for a stereo camera, also update the disparity offset after every
+    """Run ``map_keyframe``. For a stereo camera, also update the disparity offset after every
     ``stereo.offset_keyframes`` keyframes."""
     map_keyframe(map_, keyframe, camera, config)
     if config.stereo.offset_sigma > 0.0 and camera.sensor == "stereo":
@@ -67,12 +70,13 @@ def _calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None
 
 
 def offset_sigma(information: float, config: StereoConfig) -> float:
-    """Standard deviation of the part of the disparity offset's error that comes from the noise of
-    its estimate, in pixels. The share of a true offset that the prior suppresses is an error of the
-    calibration and not included.
+    """Standard deviation of the disparity offset due to the noise of its estimate, in pixels.
+
+    The prior suppresses a share of a true offset. This share is an error of the calibration and is
+    not included.
 
     Args:
-        information: of the measurements, see ``Scalars.offset_information``.
+        information: information of the measurements, see ``Scalars.offset_information``.
     """
     if information <= 0.0:
         return 0.0
@@ -82,9 +86,9 @@ def offset_sigma(information: float, config: StereoConfig) -> float:
 
 def remaining_offset(problem: BundleProblem) -> tuple[float, float]:
     """The offset that must be added to all disparities of a bundle problem, in pixels, and its
-    information (inverse variance); 0, 0 if the problem does not determine the offset.
+    information (inverse variance). Returns 0, 0 if the problem does not determine the offset.
 
-    The cost after bundle adjustment is nearly quadratic in the offset, so a parabola is fitted to
+    After bundle adjustment, the cost is nearly quadratic in the offset. So a parabola is fitted to
     the costs at three offsets.
     """
     first = adjust(problem, iterations=5)

@@ -16,11 +16,12 @@ from vslam.reprojection import chi_square_ratio, unpacked
 
 
 def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Project the landmarks of a keyframe into its neighbours, and the landmarks of the neighbours
-    into the keyframe.
+    """Merge the landmarks of a keyframe and its neighbours that represent the same points.
 
-    If the projection of a landmark matches a feature that observes another landmark, the two are
-    merged; if it matches a feature without a landmark, an observation is added.
+    The landmarks of the keyframe are projected into its neighbours, and the landmarks of the
+    neighbours into the keyframe. If a projected landmark matches a feature that observes another
+    landmark, the two landmarks are merged. If it matches a feature without a landmark, an
+    observation is added.
     """
     neighbours = fusion_neighbours(map_, keyframe, config)
     for neighbour in neighbours:
@@ -30,9 +31,12 @@ def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config)
 
 
 def fusion_neighbours(map_: Map, keyframe: int, config: Config) -> list[int]:
-    """Ids of the ``mapping.fuse_neighbours`` keyframes that share most landmarks with a keyframe,
-    and of the five keyframes that share most landmarks with each of these neighbours
-    (ORB-SLAM2)."""
+    """Ids of the keyframes near a keyframe whose landmarks are fused with its own (ORB-SLAM2).
+
+    They are the ``mapping.fuse_neighbours`` keyframes that share the most landmarks with the
+    keyframe. For each of them, the five keyframes that share the most landmarks with it are
+    included as well.
+    """
     first, _ = map_.covisible(keyframe)
     chosen = first[: config.mapping.fuse_neighbours].tolist()
     known = {keyframe, *chosen}
@@ -52,14 +56,15 @@ def fuse_loop(
     camera: Camera,
     config: Config,
 ) -> int:
-    """Fuse landmarks of both sides of a loop that represent the same points (ORB-SLAM, VII-D).
+    """Fuse the landmarks of both sides of a loop that represent the same points (ORB-SLAM, VII-D).
 
-    First the pairs that verification matched are fused. Then the landmarks of each side are
+    First, the pairs that loop verification matched are fused. Then the landmarks of each side are
     projected into the keyframes of the other side.
 
     Args:
-        edge: the loop; its ``features`` and ``landmarks`` must be set.
-        query_side, match_side: keyframes around the two ends of the loop, with corrected poses.
+        edge: the loop. Its ``features`` and ``landmarks`` must be set.
+        query_side, match_side: ids of the keyframes around the two ends of the loop. Their poses
+            must already be corrected.
 
     Returns:
         Number of fusions.
@@ -80,8 +85,8 @@ def fuse_loop(
 
 @kernel
 def _fuse_pairs(a, rows, landmarks, keyframe):
-    """Let each row observe its landmark. If the row already observes another landmark, merge the
-    two. Returns the number of fusions."""
+    """Make each row observe its landmark. If the row already observes another landmark, the two
+    landmarks are merged. Returns the number of fusions."""
     fused = 0
     for i in range(len(rows)):
         row, landmark = rows[i], landmarks[i]
@@ -101,7 +106,7 @@ def _fuse_pairs(a, rows, landmarks, keyframe):
 def fuse_into(
     map_: Map, landmarks: NDArray[np.int32], keyframe: int, camera: Camera, config: Config
 ) -> int:
-    """Fuse ``(N,)`` landmarks with the features and landmarks of a keyframe; returns the number of
+    """Fuse ``(N,)`` landmarks with the features and landmarks of a keyframe. Returns the number of
     fusions."""
     a, rows = map_.arrays, map_.rows(keyframe)
     grid = FeatureGrid.of_positions(a.xy[rows], camera.width, camera.height)
@@ -169,7 +174,7 @@ def _fuse(
             continue
         octave = predict_octave(distance, a.distance_range[landmark, 1], log_scale, len(scales))
         r = window * scales[octave]
-        # With a literal -1, Numba would compile ``link`` a second time, for a literal argument.
+        # With a literal -1, Numba would compile ``link`` a second time for a literal argument.
         best, best_distance = np.int64(-1), max_distance + 1
         column_first, column_last = max(0, int((u - r) / CELL)), int((u + r) / CELL)
         column_last = min(columns - 1, column_last)

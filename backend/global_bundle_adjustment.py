@@ -1,9 +1,9 @@
 """Bundle adjustment of hundreds of keyframes with loops.
 
-The problem, the loss and the steps are those of ``bundle_adjustment``; only the reduced camera
-system is solved differently. Keyframes that share no landmark are not coupled, so the system is
-stored as sparse 6x6 blocks and factorised by ``block_cholesky`` (Triggs et al., "Bundle adjustment
-- a modern synthesis", section 6.3).
+The problem, the loss and the optimisation steps are those of ``bundle_adjustment``. Only the
+reduced camera system is solved differently. Keyframes that share no landmark are not coupled in
+this system. It is therefore stored as sparse 6x6 blocks and factorised by ``block_cholesky``
+(Triggs et al., "Bundle adjustment - a modern synthesis", section 6.3).
 """
 
 from __future__ import annotations
@@ -34,21 +34,22 @@ def adjust_globally(
     tolerance: float = 1e-6,
     stop: Callable[[], bool] | None = None,
 ) -> BundleSolution:
-    """Minimise the robust reprojection error, like ``bundle_adjustment.adjust``, for many
-    keyframes.
+    """Minimise the robust reprojection error of many keyframes.
 
-    A keyframe must not observe a landmark more than once. The global interpreter lock is released
-    nearly all the time.
+    The function does the same as ``bundle_adjustment.adjust``, but exploits the sparsity of the
+    problem. A keyframe must not observe a landmark more than once. The global interpreter lock is
+    released nearly all the time.
 
     Args:
         iterations: maximum number of Levenberg-Marquardt iterations.
-        tolerance: stop when an iteration reduces the cost by a smaller fraction than this.
-        stop: called before each iteration; if it returns True, the current estimate is returned.
+        tolerance: the optimisation stops when an iteration reduces the cost by a smaller fraction
+            than this.
+        stop: called before each iteration. If it returns True, the current estimate is returned.
     """
     n_free, n_observations = problem.n_free, len(problem.camera)
     pairs = coupled_cameras(problem.first, problem.camera, n_free)
     structure = analyse(n_free, pairs)
-    # Free cameras in elimination order, followed by the fixed ones.
+    # The free cameras in elimination order, followed by the fixed cameras.
     cameras = np.concatenate([structure.order, np.arange(n_free, len(problem.T_cw))])
     rank = np.argsort(cameras)
     points_order, order = working_order(problem.first, rank[problem.camera], len(cameras))
@@ -107,13 +108,13 @@ def adjust_globally(
 def working_order(first, rank, n_cameras):
     """Sort points and observations for cache-friendly access to the reduced camera system.
 
-    The observations of a point are sorted by the elimination order of their cameras, so that the
-    earlier of two observations gives the column of their block, and the later one gives the row.
-    Points are sorted by their first camera, so that blocks that are written in sequence are close
-    together in memory.
+    The observations of a point are sorted by the elimination order of their cameras. The earlier of
+    two observations then determines the column of their block, and the later one determines the
+    row. Points are sorted by their first camera. Blocks that are written one after another are then
+    close together in memory.
 
     Args:
-        first: ``(P + 1,)`` as in ``BundleProblem``.
+        first: ``(P + 1,)``, see ``BundleProblem``.
         rank: ``(O,)`` position of each observation's camera in the elimination order.
 
     Returns:
@@ -148,7 +149,7 @@ def working_order(first, rank, n_cameras):
 
 @kernel
 def coupled_cameras(first, camera, n_free):
-    """``(M, 2)`` int64 pairs of free cameras that observe a common point, without repetitions."""
+    """``(M, 2)`` int64 pairs of free cameras that observe a common point. Each pair occurs once."""
     start, points = points_of_cameras(first, camera, n_free)
     met = np.empty(n_free, np.int64)
     last = np.full(n_free, -1)  # the last camera ``i`` that each camera was paired with
@@ -169,8 +170,12 @@ def coupled_cameras(first, camera, n_free):
 
 @inner_kernel
 def points_of_cameras(first, camera, n_free):
-    """Points that each free camera observes, as ``start`` int64 and ``points`` ``(N,)`` int32:
-    camera k observes ``points[start[k]:start[k + 1]]``."""
+    """The points that each free camera observes.
+
+    Returns:
+        ``start`` int64, and ``points`` ``(N,)`` int32. Camera k observes
+        ``points[start[k]:start[k + 1]]``.
+    """
     start = np.zeros(n_free + 2, np.int64)
     for o in range(len(camera)):
         if camera[o] < n_free:
@@ -188,8 +193,11 @@ def points_of_cameras(first, camera, n_free):
 
 @inner_kernel
 def cameras_met(i, start, points, first, camera, n_free, last, met):
-    """Write the free cameras with an index above ``i`` that observe a point in common with camera
-    ``i`` into ``met``, and return their number. ``last`` prevents repetitions."""
+    """Find the free cameras that observe a point in common with camera ``i`` and have a larger
+    index than ``i``.
+
+    They are written into ``met``, and their number is returned. ``last`` prevents repetitions.
+    """
     n = 0
     for p in points[start[i] : start[i + 1]]:
         for o in range(first[p], first[p + 1]):
@@ -203,8 +211,11 @@ def cameras_met(i, start, points, first, camera, n_free, last, met):
 
 @kernel
 def pair_slots(structure, first, camera, n_free):
-    """``(N,)`` int32, the slot in the factor of each pair of observations of a point, in the order
-    in which ``reduce_points_sparsely`` visits these pairs. Cameras are in elimination order."""
+    """``(N,)`` int32 slot in the Cholesky factor for each pair of observations of a point.
+
+    The pairs are in the order in which ``reduce_points_sparsely`` visits them. Cameras are in
+    elimination order.
+    """
     count = 0
     for p in range(len(first) - 1):
         seen = 0
@@ -232,8 +243,10 @@ def pair_slots(structure, first, camera, n_free):
 def reduce_points_sparsely(
     structure, slots, n_free, observations, equations, damping, S, x, V_inverse
 ):
-    """Eliminate the points: write the reduced camera system ``S x = rhs`` into ``S``, as panels of
-    ``block_cholesky``, and its right-hand side into ``x``."""
+    """Eliminate the points, which gives the reduced camera system ``S x = rhs``.
+
+    ``S`` is written as panels of ``block_cholesky``. The right-hand side is written into ``x``.
+    """
     first, camera = observations.first, observations.camera
     W, V, g, U, b = equations
     for i in range(len(S)):

@@ -1,7 +1,7 @@
 """Takes a snapshot of the map for global bundle adjustment, and merges the solution into the map.
 
-Global bundle adjustment takes seconds, so it works on a snapshot while tracking and local mapping
-continue (Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017, section III-D).
+Global bundle adjustment takes seconds. It therefore works on a snapshot, while tracking and local
+mapping continue (Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017, section III-D).
 """
 
 from __future__ import annotations
@@ -23,15 +23,16 @@ from vslam.map_kernels import refresh_landmarks, unlink
 
 @dataclass(frozen=True)
 class GlobalSnapshot:
-    """A copy of the map as a bundle problem, and the ids of its cameras, points and observations.
+    """A copy of the map as a bundle problem, with the ids of its cameras, points and observations.
 
     Attributes:
-        problem: the bundle problem; free keyframes come first, fixed ones last.
-        keyframes: ``(K,)`` int64, id of each camera of the problem.
-        landmarks: ``(P,)`` int32, id of each point.
-        rows: ``(O,)`` int64, row of each observation in the map's arrays.
-        n_keyframes, n_landmarks: numbers of keyframes and landmarks ever created at the time of the
-            snapshot. Ids from these numbers on are newer than the snapshot.
+        problem: the bundle problem. Free keyframes come first, followed by the fixed keyframes.
+        keyframes: ``(K,)`` int64 keyframe id of each camera of the problem.
+        landmarks: ``(P,)`` int32 landmark id of each point of the problem.
+        rows: ``(O,)`` int64 row of each observation in the map's arrays.
+        n_keyframes, n_landmarks: numbers of keyframes and landmarks that had ever been created at
+            the time of the snapshot. Keyframes and landmarks with an id of at least these numbers
+            are newer than the snapshot.
     """
 
     problem: BundleProblem
@@ -43,10 +44,11 @@ class GlobalSnapshot:
 
 
 def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
-    """Copy all living keyframes and landmarks into a bundle problem.
+    """Copy all keyframes and landmarks that have not been culled into a bundle problem.
 
-    The first keyframe of each connected part of the map is fixed, because nothing else determines
-    the position of the part. Keyframes are connected if they observe a common landmark.
+    The first keyframe of each connected part of the map is held fixed, because nothing else
+    determines the position of the part. Two keyframes are connected if they observe a common
+    landmark.
     """
     living = map_.living_keyframes()
     landmarks = map_.living_landmarks().astype(np.int32)
@@ -60,7 +62,7 @@ def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
 
 @kernel
 def connected_parts(a, landmarks, n_keyframes):
-    """``(K,)`` int64, for each keyframe the first keyframe of its connected part of the map.
+    """``(K,)`` int64: for each keyframe, the first keyframe of its connected part of the map.
 
     Keyframes that observe a common landmark are connected (union-find).
     """
@@ -87,12 +89,12 @@ def connected_parts(a, landmarks, n_keyframes):
 
 
 def merge_solution(map_: Map, snapshot: GlobalSnapshot, solution: BundleSolution) -> None:
-    """Apply the solution of a snapshot to the map, which may have changed in the meantime.
+    """Apply the solution of a snapshot to the map. The map may have changed since the snapshot.
 
-    Keyframes and landmarks of the snapshot that are still alive take their new positions. Newer
+    Keyframes and landmarks of the snapshot that still exist take their new positions. Newer
     keyframes keep their pose relative to their parent in the spanning tree (Mur-Artal and Tardós,
-    ORB-SLAM2, III-D), and newer landmarks move with their anchor keyframe. An observation that
-    failed the chi-square test is removed if its row still observes the same landmark.
+    ORB-SLAM2, III-D). Newer landmarks move with their anchor keyframe. An observation that failed
+    the chi-square test is removed if its row still observes the same landmark.
     """
     a = map_.arrays
     T_cw_old = a.T_cw[: map_.n_keyframes].copy()

@@ -1,22 +1,23 @@
-"""Georeferences a finished map: GPS fixes are added to its pose graph.
+"""Georeferences a finished map by adding GPS fixes to its pose graph.
 
-The map frame is first aligned with the local east-north-up frame (ENU) by RANSAC over Umeyama's
-closed form (TPAMI 1991). Parts of the map that tracking did not connect are aligned separately.
-Then the keyframes are optimised with the edges of the essential graph and a GPS factor for each
-fix. No keyframe is held fixed.
+First, RANSAC with Umeyama's closed form (TPAMI 1991) aligns the map frame with the local
+east-north-up frame (ENU). Parts of the map that tracking did not connect are aligned separately.
+Then the keyframes are optimised. The graph has the edges of the essential graph and a GPS factor
+for each fix. No keyframe is held fixed.
 
-At first, fixes have a Cauchy loss whose scale is large and shrinks, so that even a map that has
-drifted far is pulled to its fixes. Afterwards, fixes that fail a chi-square test are discarded, and
-the others have a Gaussian loss.
+At first, fixes have a Cauchy loss with a large scale, which shrinks from one optimisation to the
+next. Even a map that has drifted far is then pulled to its fixes. Afterwards, fixes that fail a
+chi-square test are discarded, and the remaining fixes have a Gaussian loss.
 
-The error of GPS is mostly a bias that changes slowly (atmosphere, reflections): a hundred fixes in
-ten seconds provide little more information than one. So all fixes within ``CORRELATION_S`` together
-have the weight of a single fix.
+The error of GPS is mostly a bias that changes slowly (atmosphere, reflections). A hundred fixes in
+ten seconds therefore provide little more information than one. For this reason, all fixes within
+``CORRELATION_S`` together have the weight of a single fix.
 
-How far a metric map drifts depends on the camera, its calibration and the loops that were closed.
-The drift model of the pose graph must hold for all of them, so that a good map would be bent
-towards the bias of the fixes. Therefore its standard deviations are multiplied by the factor for
-which the fixes are most likely (empirical Bayes: MacKay, Bayesian Interpolation, 1992).
+The drift of a metric map depends on the camera, its calibration and the loops that were closed. One
+drift model of the pose graph must hold for all maps. With this model, a good map would be bent
+towards the bias of the fixes. Therefore, the standard deviations of the drift model are multiplied
+by the factor for which the fixes are most likely (empirical Bayes: MacKay, Bayesian Interpolation,
+1992).
 """
 
 from __future__ import annotations
@@ -46,36 +47,36 @@ from vslam.geometry import inverses
 
 CORRELATION_S = 10.0  # docs/research/gps.md compares other values
 GATE = 11.34  # chi-square with three degrees of freedom that 1 % of correct fixes exceed
-_MEDIAN = 2.366  # median of this chi-square distribution
+_MEDIAN = 2.366  # median of the chi-square distribution with three degrees of freedom
 _CAUCHY = 2.0  # smallest scale of the Cauchy loss, in standard deviations
 _NARROWING = 3.0  # factor by which this scale shrinks from one optimisation to the next
 _DRIFT = 0.02  # tolerance of RANSAC for the drift of the map, as a fraction of the map's radius
 _DRAWS, _MOST_DRAWN = 1000, 500  # RANSAC: number of samples, and number of fixes to draw from
 _UP_WEIGHT = 1e-3  # see _umeyama
-_METRIC = 0.02  # standard deviation of the scale of a metric map, from errors of its calibration
-_MAX_UNSURE = 0.1  # largest accepted uncertainty of the two directions of an ``Alignment``, rad
+_METRIC = 0.02  # standard deviation of a metric map's scale, due to calibration errors
+_MAX_UNSURE = 0.1  # largest accepted standard deviation of the directions of an ``Alignment``, rad
 _LOOSE = np.array([0.3, 0.3, 0.3, 100.0, 100.0, 100.0])  # standard deviations of priors, rad and m
 _STRETCH = 0.1  # ``_factors(stretch=...)`` of a monocular map while its local scale is estimated
-# Factors on the standard deviations of the drift, of which the most likely one is used.
+# Factors on the standard deviations of the drift. The most likely factor is used.
 _DRIFTS = (4.0, 1.0, 0.25, 0.0625)
 # Standard deviation with which ``_likeliest`` holds each part of the map, rad and m.
 _HELD = 1e-3
-_WINDOW = 25  # keyframes before and after a keyframe from which its local scale is estimated
+_WINDOW = 25  # number of keyframes on each side from which the local scale is estimated
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Positions:
-    """M positions of an antenna that GPS measured, and the SLAM estimates of the same positions.
+    """M antenna positions that GPS measured, and the SLAM estimates of the same positions.
 
     Attributes:
         seconds: ``(M,)`` times of the measurements, seconds.
-        keyframe: ``(M,)`` int64, index of the keyframe in whose frame ``arm`` and ``lever``
-            are given.
+        keyframe: ``(M,)`` int64 index of a keyframe. ``arm`` and ``lever`` are given in the frame
+            of this keyframe.
         arm: ``(M, 3)`` estimated position of the camera, in units of the map.
-        lever: ``(M, 3)`` from the camera to the antenna, in metres.
-        enu: ``(M, 3)`` measured position in metres east, north and up of a reference point.
+        lever: ``(M, 3)`` vector from the camera to the antenna, in metres.
+        enu: ``(M, 3)`` measured position relative to a reference point: east, north, up, in metres.
         sigma: ``(M, 3)`` standard deviations of ``enu`` in metres.
     """
 
@@ -92,8 +93,8 @@ class Positions:
 
     @property
     def crowding(self) -> Array:
-        """``(M,)`` number of positions within a window of ``CORRELATION_S`` around each position,
-        including that position."""
+        """``(M,)`` number of positions in a time window of ``CORRELATION_S`` around each position,
+        including the position itself."""
         times = np.sort(self.seconds)
         first = np.searchsorted(times, self.seconds - 0.5 * CORRELATION_S, "left")
         last = np.searchsorted(times, self.seconds + 0.5 * CORRELATION_S, "right")
@@ -102,16 +103,16 @@ class Positions:
 
 @dataclass(frozen=True)
 class Anchored:
-    """The keyframes in the ENU frame.
+    """The keyframes of a georeferenced map, in the ENU frame.
 
     Attributes:
-        T_enu_k: ``(N, 4, 4)`` poses of the keyframes, in metres.
+        T_enu_k: ``(N, 4, 4)`` poses of the keyframes (camera to ENU), in metres.
         scale: ``(N,)`` metres per unit of the map at each keyframe.
-        used: ``(M,)`` bool, the fixes that passed the chi-square test.
+        used: ``(M,)`` bool, True for fixes that passed the chi-square test.
         residual_m: root mean square distance of the used fixes from the trajectory.
         S_enu_w: ``(4, 4)`` alignment of the whole map before the optimisation.
-        level: False if the fixes lie on a straight line, so that the camera was assumed to be
-            upright to determine the rotation about this line.
+        level: False if the fixes lie on a straight line. The rotation about the line is then
+            determined by the assumption that the camera is upright.
     """
 
     T_enu_k: Array
@@ -125,17 +126,20 @@ class Anchored:
 def anchor(
     graph: PoseGraph, seconds: Array, positions: Positions, config: PoseGraphConfig, *, metric: bool
 ) -> Anchored:
-    """Move the keyframes of a finished map to the poses in the ENU frame that best agree with its
-    essential graph and the GPS fixes.
+    """Georeference a finished map.
+
+    The keyframes are moved to the poses in the ENU frame that agree best with the essential graph
+    and the GPS fixes.
 
     Args:
         graph: the essential graph of the map.
         seconds: ``(N,)`` times of the keyframes.
-        metric: whether the unit of the map is the metre up to errors of the calibration. For a
-            monocular map it is not; then the scale and its drift are estimated without a prior.
+        metric: whether the unit of the map is the metre, up to errors of the calibration. It is
+            False for a monocular map. In this case, the scale and its drift are estimated without a
+            prior.
 
     Raises:
-        InputError: the drive is too short for its direction to be known.
+        InputError: the drive is too short to determine its direction.
     """
     T_wk = inverses(graph.T_cw)
     measured = (graph.kind != WEAK) & (graph.kind != GAP)
@@ -168,7 +172,7 @@ def anchor(
     used = np.ones(len(positions.seconds), np.bool_)
     for _ in range(2):
         chi2 = _chi2(positions, T_enu_k, scale)
-        # Receivers underestimate their errors, so the gate is widened if the residuals are larger.
+        # Receivers underestimate their errors, so the gate is widened if the residuals are large.
         used = chi2 <= GATE * max(1.0, float(np.median(chi2)) / _MEDIAN)
         chosen = positions.select(used)
         final = partial(_factors, graph, seconds, T_enu_k, scale, chosen, config)
@@ -180,10 +184,10 @@ def anchor(
 
 @dataclass(frozen=True)
 class Alignment:
-    """A similarity from the map to ENU, and its uncertainty.
+    """A similarity transform from the map to ENU, and its uncertainty.
 
     Attributes:
-        S_enu_w: ``(4, 4)`` similarity from the map to ENU.
+        S_enu_w: ``(4, 4)`` similarity transform from the map to ENU.
         unsure: standard deviation of the direction of the drive, rad.
         unsure_about: standard deviation of the rotation about the direction of the drive, rad.
     """
@@ -196,13 +200,13 @@ class Alignment:
 def align(T_wk: Array, positions: Positions, *, metric: bool, seed: int = 0) -> Alignment:
     """Align a map with its fixes by RANSAC.
 
-    The scale of a metric map is estimated as well, because a calibrated baseline that is 1 % too
-    long makes the map 1 % too large. The estimate is the mean of the scale of the fixes and of the
-    scale 1 of the calibration, weighted by their inverse variances (``_METRIC`` is the standard
-    deviation of the calibration).
+    The scale of a metric map is estimated as well. If the calibrated baseline is 1 % too long, for
+    example, the map is 1 % too large. The estimate is a weighted mean of two scales: the scale that
+    the fixes suggest, and the scale of the calibration, which is 1. The weights are the inverse
+    variances. ``_METRIC`` is the standard deviation of the calibrated scale.
 
     Args:
-        T_wk: ``(N, 4, 4)`` poses of the keyframes in the map.
+        T_wk: ``(N, 4, 4)`` poses of the keyframes in the map (camera to world).
         positions: at least three GPS positions.
         metric: see ``anchor``.
         seed: seed of the random samples.
@@ -245,12 +249,12 @@ def align(T_wk: Array, positions: Positions, *, metric: bool, seed: int = 0) -> 
 
 
 def _umeyama(p: Array, q: Array, up: Array, fixed: float | None) -> Array:
-    """``(..., 4, 4)`` similarities that map ``(..., M, 3)`` points p to q. Their scale is
-    ``fixed``; if ``fixed`` is None, the scale is estimated.
+    """``(..., 4, 4)`` similarity transforms that map ``(..., M, 3)`` points p to q. Their scale is
+    ``fixed``. If ``fixed`` is None, the scale is estimated.
 
-    Points on a line do not determine the rotation about this line. In this case the upward axes
-    ``up`` of the camera determine it. In all other cases these axes have too little weight to
-    matter.
+    Points on a line do not determine the rotation about this line. In this case, the upward axes
+    ``up`` of the camera determine the rotation. In all other cases, these axes have too little
+    weight to matter.
     """
     p_mean, q_mean = p.mean(axis=-2), q.mean(axis=-2)
     p0, q0 = p - p_mean[..., None, :], q - q_mean[..., None, :]
@@ -274,12 +278,13 @@ def _umeyama(p: Array, q: Array, up: Array, fixed: float | None) -> Array:
 
 
 def _mapped(S: Array, points: Array) -> Array:
-    """``(M, 3)`` points transformed by ``(..., 4, 4)`` similarities, as ``(..., M, 3)``."""
+    """``(M, 3)`` points transformed by ``(..., 4, 4)`` similarities. The result is
+    ``(..., M, 3)``."""
     return points @ np.swapaxes(S[..., :3, :3], -2, -1) + S[..., None, :3, 3]
 
 
 def _aligned(T_wk: Array, S_enu_w: Array) -> tuple[Array, Array]:
-    """Poses ``T_enu_k`` and scales of keyframes after an alignment."""
+    """Poses ``T_enu_k`` and scales of the keyframes after an alignment."""
     scale = float(scale_of(S_enu_w))
     T_enu_k = S_enu_w @ T_wk
     T_enu_k[:, :3, :3] /= scale
@@ -287,7 +292,7 @@ def _aligned(T_wk: Array, S_enu_w: Array) -> tuple[Array, Array]:
 
 
 def _points(T: Array, points: Array) -> Array:
-    """``(M, 3)`` points moved by ``(M, 4, 4)`` poses."""
+    """``(M, 3)`` points, each transformed by one of ``(M, 4, 4)`` poses."""
     return np.einsum("mij,mj->mi", T[:, :3, :3], points) + T[:, :3, 3]
 
 
@@ -305,9 +310,12 @@ def _chi2(positions: Positions, T_enu_k: Array, scale: Array) -> Array:
 
 
 def _local_scale(T_wk: Array, T_enu_k: Array, scale: Array, part: NDArray[np.int64]) -> Array:
-    """``(N,)`` metres per unit of the map at each keyframe: the length of the path around the
-    keyframe in ENU, divided by the length of the same path in the map. The path stays within the
-    keyframe's part of the map. Where its length is 0, the previous ``scale`` is returned."""
+    """``(N,)`` metres per unit of the map at each keyframe.
+
+    The scale is the length of the path around the keyframe in ENU, divided by the length of the
+    same path in the map. The path stays within the keyframe's part of the map. Where its length is
+    0, the previous ``scale`` is returned.
+    """
     scale = scale.copy()
     for label in np.unique(part):
         inside = np.flatnonzero(part == label)
@@ -323,15 +331,15 @@ def _local_scale(T_wk: Array, T_enu_k: Array, scale: Array, part: NDArray[np.int
 def _likeliest(
     factors: Callable[..., _Factors], part: NDArray[np.int64], config: PoseGraphConfig
 ) -> Array:
-    """``(N, 4, 4)`` optimised poses for the factor of ``_DRIFTS`` with which the fixes are most
-    likely, given the edges.
+    """``(N, 4, 4)`` optimised poses. The drift factor is the one of ``_DRIFTS`` for which the fixes
+    are most likely, given the edges.
 
-    The likelihood of the fixes is an integral over all poses of the keyframes, here by Laplace's
-    approximation: it depends on the error at the optimum and on the determinants of the normal
-    matrices with and without the fixes.
+    The likelihood of the fixes is an integral over all poses of the keyframes. It is computed by
+    Laplace's approximation. This approximation depends on the error at the optimum and on the
+    determinants of the normal matrices with and without the fixes.
 
     Args:
-        factors: ``_factors`` without ``drift``.
+        factors: the function ``_factors``, with all arguments except ``drift``.
         part: ``(N,)`` label of the part of the map that each keyframe belongs to.
     """
     import gtsam
@@ -344,7 +352,7 @@ def _likeliest(
         both.push_back(fixes)
         result = minimised(both, start, config)
         after = _log_determinant(both, result)
-        # Vision alone does not determine where each part of the map is, so it is held.
+        # Vision alone does not determine where each part of the map is, so each part is held.
         for i in np.unique(part, return_index=True)[1].tolist():
             vision.add(gtsam.PriorFactorPose3(i, result.atPose3(i), held))
         surprise = 2.0 * both.error(result) + after - _log_determinant(vision, result)
@@ -354,17 +362,18 @@ def _likeliest(
 
 
 def _log_determinant(factors: Any, values: Any) -> float:
-    """Logarithm of the determinant of the normal matrix; NaN if GTSAM cannot eliminate it. This
-    happens if edges are much stiffer than the priors, as on a drive of less than a metre."""
+    """Logarithm of the determinant of the normal matrix. NaN if GTSAM cannot eliminate the matrix.
+    This happens if the edges are much stiffer than the priors, for example on a drive of less than
+    a metre."""
     try:
-        # GTSAM returns that of the triangular root.
+        # GTSAM returns the log determinant of the triangular root.
         return 2.0 * float(factors.linearize(values).eliminateMultifrontal().logDeterminant())
     except RuntimeError:
         return np.nan
 
 
 def _optimised(factors: _Factors, config: PoseGraphConfig) -> Array:
-    """``(N, 4, 4)`` poses that best agree with edges and fixes."""
+    """``(N, 4, 4)`` poses that agree best with the edges and the fixes."""
     factors.vision.push_back(factors.fixes)
     return _poses(minimised(factors.vision, factors.start, config))
 
@@ -374,8 +383,13 @@ def _poses(values: Any) -> Array:
 
 
 class _Factors(NamedTuple):
-    """The ``gtsam.NonlinearFactorGraph`` of the edges, that of the fixes, and the ``gtsam.Values``
-    of the keyframes to start from."""
+    """The factors of an optimisation, and where it starts.
+
+    Attributes:
+        vision: ``gtsam.NonlinearFactorGraph`` of the edges.
+        fixes: ``gtsam.NonlinearFactorGraph`` of the fixes.
+        start: ``gtsam.Values``, the initial poses of the keyframes.
+    """
 
     vision: Any
     fixes: Any
@@ -394,14 +408,14 @@ def _factors(
     stretch: float = 0.0,
     drift: float = 1.0,
 ) -> _Factors:
-    """The factors of edges and fixes, to be optimised from ``T_enu_k``.
+    """The factors of edges and fixes. The optimisation starts from ``T_enu_k``.
 
     Args:
         cauchy: scale of the Cauchy loss of the fixes, in standard deviations of the fixes; None
             uses a Gaussian loss.
-        stretch: relative standard deviation of the lengths of edges, in addition to
+        stretch: relative standard deviation of the lengths of edges. It is added in quadrature to
             ``edge_sigmas``.
-        drift: factor on the standard deviations of tree and covisibility edges.
+        drift: factor that multiplies the standard deviations of tree and covisibility edges.
     """
     import gtsam
 
@@ -412,8 +426,8 @@ def _factors(
     for i, T in enumerate(T_enu_k):
         pose = gtsam.Pose3(T)
         start.insert(i, pose)
-        # This prior determines the poses of parts without fixes, and the rotation about a straight
-        # drive.
+        # This prior determines the poses of parts without fixes. On a straight drive, it also
+        # determines the rotation about the direction of the drive.
         if graph.fixed[i]:
             vision.add(gtsam.PriorFactorPose3(i, pose, loose))
     edges, T_i_j = graph.edges, graph.T_i_j.copy()

@@ -22,13 +22,15 @@ from vslam.map_kernels import (
 )
 from vslam.reprojection import stack_uvr
 
-RECENT_KEYFRAMES = 3  # a landmark is on probation for this many keyframes (ORB-SLAM, VI-B)
+RECENT_KEYFRAMES = 3  # how long a landmark is on probation, in keyframes (ORB-SLAM, VI-B)
 
 
 def map_keyframe(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Run local mapping for a keyframe that was just inserted and linked to its landmarks: cull
-    recent landmarks, triangulate and fuse landmarks, run local bundle adjustment, and cull
-    keyframes."""
+    """Run local mapping for a keyframe that was just inserted and linked to its landmarks.
+
+    The steps are: cull recent landmarks, triangulate new landmarks, fuse landmarks, run local
+    bundle adjustment, and cull keyframes.
+    """
     cull_recent_landmarks(map_, keyframe, camera, config)
     triangulate_with_neighbours(map_, keyframe, camera, config)
     refresh_keyframe(map_, keyframe)
@@ -45,11 +47,11 @@ def refresh_keyframe(map_: Map, keyframe: int) -> None:
 
 
 def cull_recent_landmarks(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Erase recent landmarks that tracking rarely finds, or that too few keyframes observe."""
+    """Erase recent landmarks that tracking rarely finds or that too few keyframes observe."""
     a, n = map_.arrays, map_.n_landmarks
     first = int(np.searchsorted(a.first_keyframe[:n], keyframe - RECENT_KEYFRAMES))
-    # A stereo observation counts twice. One stereo and one monocular observation are too few in a
-    # stereo map, and two observations are too few in a monocular map.
+    # A stereo observation counts twice. In a stereo map, one stereo and one monocular observation
+    # are too few. In a monocular map, two observations are too few.
     too_few = 2 if camera.monocular else 3
     _cull_landmarks(a, first, n, keyframe, config.mapping.min_found_ratio, too_few)
 
@@ -69,8 +71,9 @@ def adjust_locally(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
     """Local bundle adjustment (ORB-SLAM, VI-D).
 
     The keyframe, its covisible keyframes and all landmarks that they observe are optimised. Other
-    keyframes that observe these landmarks are fixed, and so is the first keyframe, which defines
-    the world frame. Observations that fail the chi-square test afterwards are removed.
+    keyframes that observe these landmarks are held fixed. The first keyframe of the map is also
+    held fixed, because it defines the world frame. Observations that fail the chi-square test
+    afterwards are removed.
     """
     free, fixed, landmarks = local_window(map_, keyframe, config)
     problem, rows = assemble(map_, free, fixed, landmarks, camera)
@@ -91,8 +94,8 @@ def adjust_locally(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
 def local_window(
     map_: Map, keyframe: int, config: Config
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
-    """Ids of the free keyframes, the fixed keyframes and the landmarks of local bundle
-    adjustment."""
+    """Ids of the keyframes and landmarks of local bundle adjustment: free keyframes, fixed
+    keyframes, landmarks."""
     strong = strong_neighbours(map_, keyframe, config)
     window = np.concatenate([[keyframe], strong])[: config.mapping.max_ba_keyframes]
     landmarks, others = window_landmarks(
@@ -112,8 +115,8 @@ def local_window(
 def strong_neighbours(map_: Map, keyframe: int, config: Config) -> NDArray[np.int64]:
     """Ids of the neighbours of a keyframe in the covisibility graph, most shared landmarks first.
 
-    Neighbours that share few landmarks are left out; if all do, the best one is returned (ORB-SLAM,
-    III-D).
+    Neighbours that share few landmarks are left out. If all neighbours share few, the best one is
+    returned (ORB-SLAM, III-D).
     """
     neighbours, shared = map_.covisible(keyframe)
     return neighbours[(shared >= config.mapping.min_shared) | (np.arange(len(shared)) == 0)]
@@ -121,8 +124,8 @@ def strong_neighbours(map_: Map, keyframe: int, config: Config) -> NDArray[np.in
 
 @kernel
 def window_landmarks(a, window, n_landmarks, n_keyframes):
-    """``(P,)`` int32, landmarks that the keyframes of a window observe; ``(K,)`` bool, whether each
-    keyframe outside the window observes any of them."""
+    """``(P,)`` int32 landmarks that the keyframes of a window observe, and a ``(K,)`` bool mask of
+    the keyframes outside the window that observe any of these landmarks."""
     seen = np.zeros(n_landmarks, np.bool_)
     others = np.zeros(n_keyframes, np.bool_)
     for keyframe in window:
@@ -147,14 +150,14 @@ def assemble(
     landmarks: NDArray[np.int32],
     camera: Camera,
 ) -> tuple[BundleProblem, NDArray[np.int64]]:
-    """The bundle problem of some keyframes and landmarks.
+    """The bundle problem of the given keyframes and landmarks.
 
     Args:
-        free, fixed: ids of the keyframes to optimise and to hold fixed.
-        landmarks: ``(P,)`` ids.
+        free, fixed: ids of the keyframes that are optimised, and of those that are held fixed.
+        landmarks: ``(P,)`` ids of the landmarks.
 
     Returns:
-        The problem, and ``(O,)`` int64, the row of each observation in the map's arrays.
+        The problem, and the ``(O,)`` int64 row of each observation in the map's arrays.
     """
     a = map_.arrays
     cameras = np.concatenate([free, fixed])
@@ -177,16 +180,19 @@ def assemble(
 
 @kernel
 def remove_observations(a, rows):
-    """Unlink each of ``(N,)`` rows that still observes a landmark."""
+    """Unlink each of ``(N,)`` rows, if it still observes a landmark."""
     for row in rows:
         if a.landmark[row] >= 0:
             unlink(a, row)
 
 
 def cull_keyframes(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Cull redundant covisible keyframes. A keyframe is redundant if at least three other keyframes
-    also observe most of its close landmarks, at a finer or about the same scale (ORB-SLAM, VI-E).
-    For a monocular camera, all landmarks count as close."""
+    """Cull redundant keyframes among the covisible keyframes of a keyframe.
+
+    A keyframe is redundant if most of its close landmarks are also observed by at least three other
+    keyframes, at a finer or about the same scale (ORB-SLAM, VI-E). For a monocular camera, all
+    landmarks count as close.
+    """
     neighbours, shared = map_.covisible(keyframe)
     close = config.stereo.close_depth_baselines * camera.baseline
     restarts = map_.restarts
@@ -200,9 +206,11 @@ def cull_keyframes(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
 
 @kernel
 def count_redundant(a, keyframe, bf, close_depth):
-    """Number of close landmarks of a keyframe, and number of those close landmarks that at least
-    three other keyframes observe at a finer or about the same scale. If ``bf`` is 0 (monocular
-    camera), all landmarks count as close."""
+    """Number of close landmarks of a keyframe, and number of those that are redundant.
+
+    A landmark is redundant if at least three other keyframes observe it at a finer or about the
+    same scale. If ``bf`` is 0 (monocular camera), all landmarks count as close.
+    """
     seen, redundant = 0, 0
     for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
         landmark = a.landmark[row]

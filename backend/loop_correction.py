@@ -15,16 +15,18 @@ def move_keyframes(
 ) -> None:
     """Set the poses of keyframes, and move each landmark rigidly with its anchor keyframe.
 
-    The anchor of a landmark is the keyframe that first observed it (ORB-SLAM, VII-C) or, if that
-    keyframe was culled, the oldest one that observes it. A landmark whose anchor is not among
-    ``keyframes`` does not move. The landmark keeps its position relative to the anchor, so its
-    distance range stays the same and its normal is rotated with the anchor. Both are exact only if
-    all keyframes that observe the landmark move alike. Culled keyframes need no update, because
-    their poses are stored relative to living keyframes.
+    The anchor of a landmark is the keyframe that first observed it (ORB-SLAM, VII-C). If that
+    keyframe was culled, the anchor is the oldest keyframe that observes the landmark. A landmark
+    whose anchor is not among ``keyframes`` does not move.
+
+    The landmark keeps its position relative to the anchor. Its distance range therefore stays the
+    same, and its normal is rotated with the anchor. The range and the normal are exact only if all
+    keyframes that observe the landmark move in the same way. Culled keyframes need no update,
+    because their poses are stored relative to other keyframes.
 
     Args:
-        keyframes: ``(N,)`` ids of living keyframes.
-        T_cw_new: ``(N, 4, 4)`` their new poses.
+        keyframes: ``(N,)`` ids of keyframes that have not been culled.
+        T_cw_new: ``(N, 4, 4)`` new poses of these keyframes (world to camera).
 
     Raises:
         ValueError: a keyframe was culled and has no pose of its own.
@@ -38,11 +40,11 @@ def move_keyframes(
 
 
 def carry_landmarks(map_: Map, landmarks: NDArray[np.int64], T_cw_old: NDArray[np.float64]) -> None:
-    """Move landmarks rigidly with their anchors, from the poses ``T_cw_old`` to those in the map.
+    """Move landmarks rigidly with their anchors, from the old poses to the poses in the map.
 
     Args:
         landmarks: ``(N,)`` int64 ids; erased landmarks are skipped.
-        T_cw_old: ``(K, 4, 4)`` previous poses of all keyframes.
+        T_cw_old: ``(K, 4, 4)`` previous poses of all keyframes (world to camera).
     """
     a, n = map_.arrays, map_.n_keyframes
     moved = np.any(T_cw_old != a.T_cw[:n], axis=(1, 2)) & a.keyframe_alive[:n]
@@ -50,20 +52,21 @@ def carry_landmarks(map_: Map, landmarks: NDArray[np.int64], T_cw_old: NDArray[n
 
 
 def carry_landmarks_by(map_: Map, motion: NDArray[np.float64], moved: NDArray[np.bool_]) -> None:
-    """Move all landmarks by the motions of their anchors.
+    """Move all landmarks by the given motions of their anchors.
 
     Args:
-        motion: ``(K, 4, 4)`` transform, in the world frame, of the landmarks anchored in each
-            keyframe. After a similarity, the caller must refresh the normals and distance ranges of
-            the landmarks.
-        moved: ``(K,)`` bool, whether each keyframe moves; ``motion`` is ignored where False.
+        motion: ``(K, 4, 4)`` transform in the world frame, for the landmarks that are anchored in
+            each keyframe. If the transforms are similarities, the caller must refresh the normals
+            and distance ranges of the landmarks afterwards.
+        moved: ``(K,)`` bool, True for keyframes that move. For the other keyframes, ``motion`` is
+            ignored.
     """
     _carry(map_.arrays, np.arange(map_.n_landmarks), motion, moved)
 
 
 @kernel
 def _motions(T_cw_old, T_cw_new, moved):
-    """``(K, 4, 4)`` motion of each keyframe in the world frame: a point p that is fixed to the
+    """``(K, 4, 4)`` motion of each keyframe in the world frame. A point p that is fixed to the
     keyframe moves to ``motion p``."""
     motion = np.zeros((len(moved), 4, 4))
     for k in range(len(moved)):
@@ -94,7 +97,8 @@ def _carry(a, landmarks, motion, moved):
 
 @inner_kernel
 def anchor_of(a, landmark):
-    """Id of the keyframe that a landmark moves with, or -1 if no living keyframe observes it."""
+    """Id of the keyframe that a landmark moves with, or -1 if no keyframe of the map observes
+    it."""
     first = a.first_keyframe[landmark]
     if a.keyframe_alive[first]:
         return first

@@ -1,8 +1,9 @@
 """Pose-graph optimisation after a loop closure, and a test of whether its result is plausible.
 
-The graph is the essential graph of ORB-SLAM (Mur-Artal et al., T-RO 2015, III-D and VII-C):
-spanning tree, strong covisibility edges and loop edges. Poses are ``T_cw`` on input and output.
-GTSAM optimises the graph with its built-in factors; it is imported at the first loop.
+The graph is the essential graph of ORB-SLAM (Mur-Artal et al., T-RO 2015, III-D and VII-C). It
+consists of the spanning tree, strong covisibility edges and loop edges. Poses are ``T_cw`` on input
+and output. GTSAM optimises the graph with its built-in factors. It is imported inside the functions
+that need it, because the import is slow.
 """
 
 from __future__ import annotations
@@ -27,19 +28,20 @@ HOLD = 1e-6  # standard deviation of the prior that fixes a keyframe, m and rad
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """Keyframes and measurements of their relative poses.
+    """Keyframes and the measurements of their relative poses.
 
     Attributes:
         keyframes: ``(N,)`` int64 ids, ascending.
-        T_cw: ``(N, 4, 4)`` initial poses.
+        T_cw: ``(N, 4, 4)`` initial poses (world to camera).
         edges: ``(E, 2)`` int64, indices i, j into ``keyframes``.
         T_i_j: ``(E, 4, 4)`` measured pose of camera j in the frame of camera i.
-        kind: ``(E,)`` uint8, TREE, COVISIBLE, WEAK, LOOP or GAP.
-        sigmas: ``(E, 2)`` standard deviations of translation (m) and rotation (rad), per axis.
-        fixed: ``(N,)`` bool, keyframes that are held fixed: one in each connected part.
-        scale: ``(E,)`` factor that converts lengths in the unit around j to the unit around i.
-            ``T_i_j`` is in the unit around i. The factor is 1 except for loops of monocular maps
-            (``similarity_graph``).
+        kind: ``(E,)`` uint8 kind of each edge: TREE, COVISIBLE, WEAK, LOOP or GAP.
+        sigmas: ``(E, 2)`` standard deviations per axis of translation (m) and rotation (rad).
+        fixed: ``(N,)`` bool, True for keyframes that are held fixed. There is one in each connected
+            part.
+        scale: ``(E,)`` factor that converts lengths from the map's unit around j to its unit around
+            i. ``T_i_j`` is in the unit around i. The factor differs from 1 only for loops of
+            monocular maps (``similarity_graph``).
     """
 
     keyframes: NDArray[np.int64]
@@ -58,12 +60,12 @@ class GraphCheck:
 
     Attributes:
         consistent: whether the correction is plausible.
-        reason: "consistent", or in a few words why the correction is not plausible.
-        strain: total chi-square of the tree, covisibility and gap edges, that is, how much drift
-            the correction implies relative to the drift model.
-        closed: number of loop edges that were violated before the optimisation; the limit on the
-            strain is proportional to it.
-        loop_error: ``(E,)`` chi-square of the loop edges, NaN for other edges.
+        reason: "consistent", or a short explanation of why the correction is not plausible.
+        strain: total chi-square of the tree, covisibility and gap edges. It measures how much drift
+            the correction implies, relative to the drift model.
+        closed: number of loop edges that were violated before the optimisation. The limit on the
+            strain is proportional to this number.
+        loop_error: ``(E,)`` chi-square of each loop edge; NaN for other edges.
     """
 
     consistent: bool
@@ -80,26 +82,26 @@ def essential_graph(
     *,
     driven: bool = False,
 ) -> PoseGraph:
-    """The essential graph of a map, to be built *before* the new loop changes the map.
+    """The essential graph of a map. It must be built *before* the new loop changes the map.
 
-    The measurements of tree and covisibility edges are taken from the poses in the map. If
-    landmarks of the new loop were already fused, keyframes on both sides of it would be covisible,
-    and their edges would preserve the drift. So correct the map and fuse landmarks only after the
-    graph was found to be consistent.
+    The measurements of tree and covisibility edges are taken from the poses in the map. Suppose
+    that landmarks of the new loop were already fused. Then keyframes on both sides of the loop
+    would be covisible, and their edges would preserve the drift. Therefore, correct the map and
+    fuse landmarks only after the graph has been found to be consistent.
 
-    A loop edge replaces any other edge between its two keyframes. If a keyframe of a loop was
-    culled, the living keyframe that its pose is stored relative to takes its place. If several
-    loops then connect the same keyframes, only the last one is used.
+    A loop edge replaces any other edge between its two keyframes. A culled keyframe of a loop is
+    replaced by the keyframe that its pose is stored relative to. If several loops then connect the
+    same two keyframes, only the last loop is used.
 
-    If the camera was lost between the two keyframes of a tree edge and they share hardly any
-    landmarks, their relative pose was not measured, but at best predicted. The kind of this edge is
-    GAP if the pose was predicted and ``driven`` is true, otherwise WEAK.
+    Suppose that the camera was lost between the two keyframes of a tree edge, and they share hardly
+    any landmarks. Their relative pose was then not measured, but at best predicted. Such an edge is
+    a GAP edge if the pose was predicted and ``driven`` is true. Otherwise it is a WEAK edge.
 
     Args:
-        loops: all closed loops, the new one last; each has a pose.
-        driven: whether the camera is on a vehicle. Then a GAP edge is trusted as far as the motion
-            of a car can be predicted over the time between its two keyframes. A camera that is not
-            on a vehicle may have been carried anywhere, so a WEAK edge says almost nothing.
+        loops: all closed loops, with the new loop at the end. Each loop must have a pose.
+        driven: whether the camera is on a vehicle. If so, the motion between the two keyframes of a
+            GAP edge can be predicted, and the edge is trusted to this extent. A camera that is not
+            on a vehicle may have been carried anywhere, so its WEAK edges say almost nothing.
 
     Raises:
         ValueError: a loop has no pose.
@@ -110,7 +112,7 @@ def essential_graph(
     T_cw = map_.arrays.T_cw[living]
     pairs, shared = covisible_pairs(map_.arrays, living, map_.n_keyframes, config.min_shared_tree)
     seen = set(map(tuple, pairs.tolist()))
-    # The kind of each edge by its two ends; later entries overwrite earlier ones.
+    # The kind of each edge, by its two ends. Later entries overwrite earlier ones.
     kind = dict.fromkeys(map(tuple, pairs[shared >= config.min_shared].tolist()), COVISIBLE)
     restarts = np.array(map_.restarts, np.int64)
     unpredicted_restarts = np.array(map_.unpredicted_restarts, np.int64)
@@ -155,9 +157,11 @@ def essential_graph(
 
 
 def connectivity(map_: Map) -> NDArray[np.int64]:
-    """``(n_keyframes,)`` int64, how well each keyframe is connected to the earlier part of the map:
-    the largest number of landmarks that any earlier keyframe shares with this keyframe or any later
-    one; 0 for the first keyframe."""
+    """``(n_keyframes,)`` int64: how well each keyframe is connected to the earlier part of the map.
+
+    The value for a keyframe is the largest number of landmarks that a keyframe before it shares
+    with the keyframe itself or a later one. The value is 0 for the first keyframe.
+    """
     living = map_.living_keyframes()
     pairs, shared = covisible_pairs(map_.arrays, living, map_.n_keyframes, 1)
     most = np.zeros(map_.n_keyframes, np.int64)
@@ -168,8 +172,8 @@ def connectivity(map_: Map) -> NDArray[np.int64]:
 
 
 def _spans(pair: tuple[int, int], keyframes: NDArray[np.int64]) -> bool:
-    """Whether any of the sorted ids ``keyframes`` is greater than the first of a pair of ids, and
-    not greater than the second."""
+    """Whether any of the sorted ids ``keyframes`` is greater than the first id of the pair and not
+    greater than its second id."""
     low, high = np.searchsorted(keyframes, pair, side="right")
     return bool(low < high)
 
@@ -182,16 +186,17 @@ def edge_sigmas(
     n: int,
     config: PoseGraphConfig,
 ) -> NDArray[np.float64]:
-    """``(E, 2)`` standard deviations of the edges, translation (m) and rotation (rad).
+    """``(E, 2)`` standard deviations of the edges: translation (m) and rotation (rad).
 
     Drift is modelled as a random walk, so the variance of a tree or covisibility edge grows with
-    its length. All these edges are derived from one measurement, the estimated path. If they were
-    treated as independent, a path with more edges would be stiffer. Therefore the variance of each
-    edge is multiplied by the number of edges that cover the path at the ends of the edge. Together
-    the edges are then as stiff as the drift model, regardless of their number.
+    its length. All these edges are derived from one measurement: the estimated path. If the edges
+    were treated as independent, a path with more edges would be stiffer. Therefore, the variance of
+    an edge is multiplied by the number of edges that cover the path at the ends of the edge. All
+    edges together are then as stiff as the drift model, regardless of their number.
 
     The translation of a GAP edge may be wrong by a share of the predicted distance, or by the
-    distance that a slow car drives in that time. Nothing is known about a WEAK edge.
+    distance that a slow car drives in the elapsed time. The larger of these two errors is used.
+    Almost nothing is known about a WEAK edge.
 
     Args:
         seconds: ``(E, 2)`` timestamps of the ends of the edges.
@@ -217,7 +222,8 @@ def edge_sigmas(
 
 
 def parts_of(edges: NDArray[np.int64], n: int) -> NDArray[np.int64]:
-    """``(n,)`` int64, the first node of the connected part that each node is in (union-find)."""
+    """``(n,)`` int64: for each node, the first node of its connected part of the graph
+    (union-find)."""
     part = list(range(n))
 
     def first_of(node: int) -> int:
@@ -233,16 +239,16 @@ def parts_of(edges: NDArray[np.int64], n: int) -> NDArray[np.int64]:
 
 
 def load_optimiser() -> None:
-    """Import GTSAM before the first loop. The import takes a tenth of a second, which is too long
-    while frames of a live camera are waiting."""
+    """Import GTSAM before the first loop. The import takes a tenth of a second. During a loop
+    closure this would be too long, because frames of a live camera would have to wait."""
     import gtsam  # noqa: F401
 
 
 def optimise(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
-    """``(N, 4, 4)`` poses ``T_cw`` that best agree with the edges, by Levenberg-Marquardt.
+    """``(N, 4, 4)`` poses ``T_cw`` that agree best with the edges, found by Levenberg-Marquardt.
 
-    Loop edges have the Cauchy loss, so that a loop that contradicts the others loses its influence
-    and is detected by ``check_pose_graph``. All other edges have a Gaussian loss.
+    Loop edges have the Cauchy loss. A loop that contradicts the others then loses its influence and
+    is detected by ``check_pose_graph``. All other edges have a Gaussian loss.
     """
     import gtsam
 
@@ -268,13 +274,13 @@ def optimised_values(
     factor_types: tuple[Any, Any],
     config: PoseGraphConfig,
 ) -> Any:
-    """The ``gtsam.Values`` of the keyframes that best agree with the edges.
+    """The ``gtsam.Values`` of the keyframes that agree best with the edges.
 
     Args:
-        poses: initial values of the N keyframes, objects of GTSAM.
-        measured: measurements of the E edges, objects of the same type.
+        poses: initial values of the N keyframes, as GTSAM objects.
+        measured: measurements of the E edges, as GTSAM objects of the same type.
         sigmas: ``(E, D)`` standard deviations of the edges.
-        factor_types: GTSAM's prior and between factors of this type.
+        factor_types: the classes of GTSAM's prior factor and between factor for this type.
     """
     import gtsam
 
@@ -312,14 +318,16 @@ def check_pose_graph(
     """Test whether an optimised graph is plausible. If it is not, the new loop is wrong and must be
     rejected.
 
-    There are two tests. First, a loop edge whose residual is still large contradicts the other
-    loops or too much of the path. Second, the strain (the total chi-square of tree, covisibility
-    and gap edges) has six degrees of freedom per closed loop if the drift follows the model; if it
-    is several times larger, no plausible drift explains the loop. A single loop across a WEAK edge
-    always passes, because it causes no strain.
+    There are two tests. The first test is the residual of each loop edge. A loop edge whose
+    residual is still large contradicts the other loops, or too much of the path.
+
+    The second test is the strain: the total chi-square of the tree, covisibility and gap edges. If
+    the drift follows the model, the strain has six degrees of freedom per closed loop. If the
+    strain is several times larger, no plausible drift explains the loop. A single loop across a
+    WEAK edge always passes the tests, because it causes no strain.
 
     Args:
-        T_cw: ``(N, 4, 4)`` result of ``optimise``.
+        T_cw: ``(N, 4, 4)`` poses that ``optimise`` returned.
     """
     before = edge_errors(graph.T_cw, graph.edges, graph.T_i_j, graph.sigmas)
     after = edge_errors(T_cw, graph.edges, graph.T_i_j, graph.sigmas)
@@ -332,8 +340,8 @@ def check_edge_errors(
     after: NDArray[np.float64],
     config: PoseGraphConfig,
 ) -> GraphCheck:
-    """``check_pose_graph`` for given ``(E,)`` chi-squares of the edges before and after the
-    optimisation."""
+    """Like ``check_pose_graph``, but takes the ``(E,)`` chi-squares of the edges before and after
+    the optimisation."""
     loop = graph.kind == LOOP
     loop_error = np.where(loop, after, np.nan)
     strain = float(after[~loop & (graph.kind != WEAK)].sum())
@@ -353,8 +361,8 @@ def check_edge_errors(
 
 @kernel
 def edge_errors(T_cw, edges, T_i_j, sigmas):
-    """``(E,)`` chi-square of each edge: the logarithm of the residual motion is divided by the
-    standard deviations, and its squared norm is returned."""
+    """``(E,)`` chi-square of each edge. The residual motion is expressed as a twist, and the twist
+    is divided by the standard deviations. The squared norm of the result is returned."""
     chi2 = np.empty(len(edges))
     for e in range(len(edges)):
         T = compose(T_cw[edges[e, 0]], inverse(T_cw[edges[e, 1]]))

@@ -1,10 +1,10 @@
-"""Pose-graph optimisation of a monocular map, whose scale drifts as well (ORB-SLAM, T-RO 2015,
-VII-C; Strasdat et al., "Scale drift-aware large scale monocular SLAM", RSS 2010).
+"""Pose-graph optimisation of a monocular map, whose scale drifts (ORB-SLAM, T-RO 2015, VII-C;
+Strasdat et al., "Scale drift-aware large scale monocular SLAM", RSS 2010).
 
-Each keyframe has a similarity ``S_wc``, a ``(4, 4)`` matrix with the scale in its upper left 3x3
-block, so that ``@`` composes similarities. It maps points from the camera frame to the world.
-Lengths in the camera frame are in the unit that the map has around the keyframe before the
-correction. Initially all scales are 1; only loop edges measure other scales. GTSAM optimises the
+Each keyframe has a similarity transform ``S_wc`` from the camera frame to the world. It is a
+``(4, 4)`` matrix with the scale in its upper left 3x3 block, so that ``@`` composes similarities.
+Lengths in the camera frame are in the unit that the map had around the keyframe before the
+correction. Initially, all scales are 1. Only loop edges measure other scales. GTSAM optimises the
 graph with its built-in Similarity3 factors.
 """
 
@@ -33,7 +33,8 @@ from vslam.map_kernels import refresh_landmarks
 
 
 def similarity(T_a_b: Matrix, scale: NDArray[np.float64] | float) -> Matrix:
-    """``(..., 4, 4)`` similarities from ``(..., 4, 4)`` rigid motions and ``(...,)`` scales."""
+    """``(..., 4, 4)`` similarities, composed of ``(..., 4, 4)`` rigid motions and ``(...,)``
+    scales."""
     S = T_a_b.copy()
     S[..., :3, :3] *= np.asarray(scale)[..., None, None]
     return S
@@ -45,15 +46,16 @@ def scale_of(S: Matrix) -> NDArray[np.float64]:
 
 
 def rigid(S: Matrix) -> Matrix:
-    """``(..., 4, 4)`` rigid motions: similarities with their scale set to 1."""
+    """``(..., 4, 4)`` rigid motions: the given similarities with their scale set to 1."""
     return similarity(S, 1.0 / scale_of(S))
 
 
 def optimise_similarities(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfig) -> Matrix:
-    """``(N, 4, 4)`` similarities that best agree with the edges, starting from ``S_wc``.
+    """``(N, 4, 4)`` similarities that agree best with the edges. The optimisation starts from
+    ``S_wc``.
 
-    Losses and optimiser are those of ``pose_graph.optimise``. Fixed keyframes keep their scale as
-    well as their pose.
+    The loss functions and the optimiser are those of ``pose_graph.optimise``. Fixed keyframes keep
+    their pose and their scale.
     """
     import gtsam
 
@@ -83,7 +85,7 @@ def optimise_similarities(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfi
 def sigmas(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
     """``(E, 7)`` standard deviations of rotation, translation and the logarithm of the scale.
 
-    The drift of the scale, like that of the pose, is modelled as a random walk along the path.
+    The drift of the scale is modelled as a random walk along the path, like the drift of the pose.
     """
     scale = graph.sigmas[:, 1] * (config.scale_drift / config.rotation_drift)
     scale[graph.kind == LOOP] = config.loop_scale
@@ -95,13 +97,14 @@ def sigmas(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
 def check_similarity_graph(
     graph: PoseGraph, S_wc_before: Matrix, S_wc: Matrix, config: PoseGraphConfig
 ) -> GraphCheck:
-    """``check_pose_graph`` for the similarities before and after the optimisation."""
+    """Like ``check_pose_graph``, for the similarities before and after the optimisation."""
     before, after = (edge_errors(graph, S, config) for S in (S_wc_before, S_wc))
     return check_edge_errors(graph, before, after, config)
 
 
 def edge_errors(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfig) -> NDArray[np.float64]:
-    """``(E,)`` chi-square of the rotation, translation and scale of the residual of each edge."""
+    """``(E,)`` chi-square of each edge, from the rotation, translation and scale of its
+    residual."""
     i, j = graph.edges.T
     S_i_j = np.linalg.inv(S_wc[i]) @ S_wc[j]
     residual = np.linalg.inv(similarity(graph.T_i_j, graph.scale)) @ S_i_j
@@ -113,15 +116,15 @@ def edge_errors(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfig) -> NDAr
 def move_keyframes_similarly(
     map_: Map, keyframes: NDArray[np.integer], S_wc: Matrix
 ) -> NDArray[np.float64]:
-    """Move keyframes by similarities, and move and scale each landmark with its anchor (ORB-SLAM,
+    """Move keyframes by similarities. Each landmark is moved and scaled with its anchor (ORB-SLAM,
     VII-C).
 
-    The poses of culled keyframes, which are stored relative to living ones, are scaled as well.
+    The poses of culled keyframes, which are stored relative to other keyframes, are scaled as well.
     ``map_.keyframes.unit_scale`` is multiplied by the scales.
 
     Args:
-        keyframes: ``(N,)`` ids of living keyframes.
-        S_wc: ``(N, 4, 4)`` new similarities of these keyframes.
+        keyframes: ``(N,)`` ids of keyframes that have not been culled.
+        S_wc: ``(N, 4, 4)`` new similarities of these keyframes (camera to world).
 
     Returns:
         ``(n_keyframes,)`` factor by which lengths around each keyframe were multiplied.
@@ -144,8 +147,8 @@ def move_keyframes_similarly(
 
 
 def loop_in_new_units(edge: LoopEdge, growth: NDArray[np.float64]) -> LoopEdge:
-    """Convert a loop edge after a correction that multiplied lengths around each keyframe by
-    ``growth``."""
+    """Convert a loop edge after a correction. ``growth`` is the factor by which the correction
+    multiplied lengths around each keyframe."""
     assert edge.T_query_match is not None
     T = edge.T_query_match.copy()
     T[:3, 3] *= growth[edge.match]

@@ -1,5 +1,4 @@
-"""Creates landmarks from the stereo features of a keyframe, and by triangulating features of two
-keyframes."""
+"""Creates new landmarks from stereo features of a keyframe, or from features of two keyframes."""
 
 from __future__ import annotations
 
@@ -24,10 +23,10 @@ def map_stereo_points(
     """Create landmarks from the close stereo features of a keyframe that observe no landmark yet.
 
     If fewer than ``mapping.min_stereo_points`` features are close, the nearest
-    ``min_stereo_points`` features are used (ORB-SLAM2, section III-E).
+    ``min_stereo_points`` stereo features are used instead (ORB-SLAM2, section III-E).
 
     Args:
-        far: whether to use far features as well.
+        far: whether far features are used as well.
 
     Returns:
         ``(N,)`` ids of the new landmarks.
@@ -50,9 +49,11 @@ def map_stereo_points(
 def triangulate_with_neighbours(
     map_: Map, keyframe: int, camera: Camera, config: Config
 ) -> NDArray[np.int32]:
-    """Match features of a keyframe with features of its covisible keyframes along epipolar lines,
-    and triangulate the matches (ORB-SLAM, VI-C). Only features that observe no landmark yet are
-    matched. Returns the ``(N,)`` ids of the new landmarks."""
+    """Create landmarks by triangulation between a keyframe and its covisible keyframes.
+
+    Features that observe no landmark yet are matched along epipolar lines, and the matches are
+    triangulated (ORB-SLAM, VI-C). Returns the ``(N,)`` ids of the new landmarks.
+    """
     neighbours, _ = map_.covisible(keyframe)
     created = [np.empty(0, np.int32)]
     limit, min_baseline = config.mapping.neighbours, camera.baseline
@@ -76,21 +77,22 @@ def triangulate_with_neighbours(
         ids = map_.add_landmarks(xyz, a.descriptor[rows_1], keyframe)
         link_many(map_.arrays, rows_1, ids)
         link_many(map_.arrays, rows_2, ids)
-        # The match was not aligned, so its position is no better than a keypoint's.
+        # The match was not aligned, so its position is no more accurate than that of a keypoint.
         map_.arrays.certainty[rows_2] = 1
         created.append(ids)
     return np.concatenate(created)
 
 
 def median_depth(map_: Map, keyframe: int) -> float:
-    """Median depth of the landmarks that a keyframe observes, a measure of the scene's scale."""
+    """Median depth of the landmarks that a keyframe observes, which measures the scale of the
+    scene."""
     points, T_cw = map_.arrays.xyz[map_.landmarks_of(keyframe)], map_.arrays.T_cw[keyframe]
     return float(np.median(points @ T_cw[2, :3] + T_cw[2, 3]))
 
 
 @inner_kernel
 def unmapped_rows(a, keyframe):
-    """``(N,)`` int64 rows of a keyframe that observe no landmark."""
+    """``(N,)`` int64 rows of a keyframe that do not observe a landmark."""
     first, last = a.first_row[keyframe], a.first_row[keyframe + 1]
     return first + np.flatnonzero(a.landmark[first:last] < 0)
 
@@ -106,11 +108,11 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
         scales: ``(levels,)`` pyramid scale factors.
         min_baseline: least distance between the cameras, in units of the map.
         max_distance: largest Hamming distance of a match, bits.
-        max_cosine: greatest cosine of the parallax angle of a match without stereo depth.
+        max_cosine: largest cosine of the parallax angle of a match without stereo depth.
 
     Returns:
-        ``(N, 3)`` positions in the world, and twice ``(N,)`` int64: the rows of the observations in
-        keyframe ``k1`` and in keyframe ``k2``.
+        ``(N, 3)`` positions in the world frame; ``(N,)`` int64 rows of the observations in keyframe
+        ``k1``; ``(N,)`` int64 rows of the observations in keyframe ``k2``.
     """
     fx, fy, cx, cy, bf, _ = intrinsics
     T1, T2 = a.T_cw[k1], a.T_cw[k2]
@@ -126,7 +128,7 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
     count = 0
     if dot3(gap, gap) < min_baseline**2 or dot3(gap, gap) == 0.0 or n2 == 0:
         return xyz[:0], out_1[:0], out_2[:0]
-    # t is the centre of camera 1 in the frame of camera 2; it projects to the epipole.
+    # t is the centre of camera 1 in the frame of camera 2. Its projection is the epipole.
     t, d, point = np.empty(3), np.empty(3), np.empty(3)
     ray_1, ray_2, from_1, from_2 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
@@ -142,7 +144,8 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
     for i in range(n1):
         row_1 = rows_1[i]
         world_ray(T1, a.xy[row_1], intrinsics, ray_1)
-        # d is the ray in the frame of camera 2; t x d is normal to the epipolar plane.
+        # d is the ray in the frame of camera 2. The cross product t x d is normal to the epipolar
+        # plane.
         for m in range(3):
             d[m] = T2[m, 0] * ray_1[0] + T2[m, 1] * ray_1[1] + T2[m, 2] * ray_1[2]
         n_x, n_y = t[1] * d[2] - t[2] * d[1], t[2] * d[0] - t[0] * d[2]
@@ -194,8 +197,8 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
                 T2, point, a.xy[row_2], a.u_right[row_2], scales[a.octave[row_2]], intrinsics
             )
         ):
-            # The ratio of the distances must agree with the ratio of the scales up to a factor of
-            # 1.5 times the scale of one level.
+            # The ratio of the distances must agree with the ratio of the scales. The tolerance is a
+            # factor of 1.5 times the scale factor of one level.
             for m in range(3):
                 from_1[m], from_2[m] = point[m] - centre_1[m], point[m] - centre_2[m]
             far = np.sqrt(dot3(from_1, from_1) / dot3(from_2, from_2))
@@ -232,8 +235,11 @@ def perpendicular(t):
 
 @kernel
 def direction(u, v):
-    """Direction of the line through the origin and (u, v), as a number in [0, 2) that grows with
-    the angle of the line from 0 to 180 degrees. It is computed without trigonometric functions."""
+    """Direction of the line through the origin and (u, v), as a number in [0, 2).
+
+    The number grows with the angle of the line from 0 to 180 degrees. It is computed without
+    trigonometric functions.
+    """
     if v < 0.0 or (v == 0.0 and u < 0.0):
         u, v = -u, -v
     if u > 0.0:
@@ -245,20 +251,21 @@ def direction(u, v):
 def sorted_about_epipole(x, y, gate, intrinsics, across):
     """Index features by the directions of the epipolar planes that they can match.
 
-    All epipolar planes contain the baseline, so in a view along the baseline each plane is a line
-    through the origin. A feature matches planes that cross a square around it, whose half side is
-    the square root of ``gate``. In the view along the baseline this square is a parallelogram. It
-    covers an interval of directions, or all directions if the epipole is inside.
+    All epipolar planes contain the baseline. In a view along the baseline, each plane is therefore
+    a line through the origin and has a direction. A feature matches planes that cross a square
+    around it. Half the side of this square is the square root of ``gate``. In the view along the
+    baseline, the square becomes a parallelogram, which covers an interval of directions. If the
+    epipole is inside the square, all directions are covered.
 
     Args:
         x, y: ``(n,)`` float32, pixels.
-        gate: ``(n,)`` float32, greatest squared distance from the epipolar line, pixels squared.
+        gate: ``(n,)`` float32, largest squared distance from the epipolar line, pixels squared.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         across: ``(2, 3)``, the two axes of the view along the baseline, see ``perpendicular``.
 
     Returns:
-        ``start`` ``(SECTIONS + 1,)`` and ``items`` int32: the features near a plane whose direction
-        is in bin s are among ``items[start[s]:start[s + 1]]``, ascending.
+        ``start`` ``(SECTIONS + 1,)``, and ``items`` int32. The features near a plane whose
+        direction is in bin s are among ``items[start[s]:start[s + 1]]``, in ascending order.
     """
     n = len(x)
     low, high = np.empty(n, np.int64), np.empty(n, np.int64)
@@ -266,14 +273,14 @@ def sorted_about_epipole(x, y, gate, intrinsics, across):
     for j in range(n):
         u, v = seen_along(x[j], y[j], intrinsics, across)
         middle = direction(u, v)
-        reach = 1.01 * np.sqrt(gate[j]) + 0.01  # a margin, so that rounding loses no feature
+        reach = 1.01 * np.sqrt(gate[j]) + 0.01  # a small margin, so that rounding loses no feature
         least, most = 0.0, 0.0
         for corner in range(4):
             x_k = x[j] + (reach if corner % 2 else -reach)
             y_k = y[j] + (reach if corner // 2 else -reach)
             u_k, v_k = seen_along(x_k, y_k, intrinsics, across)
             if u * u_k + v * v_k <= 0.0:
-                least, most = -1.0, 1.0  # at least 90 degrees, so the epipole may be inside
+                least, most = -1.0, 1.0  # 90 degrees or more: the epipole may be inside
                 break
             apart = direction(u_k, v_k) - middle
             apart += 2.0 * ((apart < -1.0) - (apart > 1.0))
@@ -311,8 +318,8 @@ def dot3(a, b):
 
 @inner_kernel
 def world_ray(T_cw, xy, intrinsics, ray):
-    """Write the viewing ray of a pixel in the world frame, with z = 1 in the camera frame, into
-    ``ray`` ``(3,)``."""
+    """Write the viewing ray of a pixel into ``ray`` ``(3,)``. The ray is in the world frame and is
+    scaled to z = 1 in the camera frame."""
     x = (xy[0] - intrinsics[2]) / intrinsics[0]
     y = (xy[1] - intrinsics[3]) / intrinsics[1]
     for i in range(3):
@@ -321,22 +328,23 @@ def world_ray(T_cw, xy, intrinsics, ray):
 
 @inner_kernel
 def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_cosine, point):
-    """Triangulate a landmark and write its position in the world into ``point`` ``(3,)``.
+    """Triangulate a landmark and write its position in the world frame into ``point`` ``(3,)``.
 
-    Usually the two rays are intersected. If the stereo pair of one keyframe sees the landmark with
-    more parallax than the two rays have, the stereo point of that keyframe is used instead.
+    Usually, the two rays are intersected. The stereo pair of one keyframe may see the landmark with
+    more parallax than the two rays have. In this case, the stereo point of that keyframe is used
+    instead.
 
     Args:
         depth_1, depth_2: stereo depths of the features; NaN for a feature without stereo depth.
         ray_1, ray_2: ``(3,)`` rays, see ``world_ray``.
-        centre_1, centre_2: ``(3,)`` positions of the cameras in the world.
+        centre_1, centre_2: ``(3,)`` positions of the cameras, in the world frame.
         baseline: baseline of the stereo pair.
-        max_cosine: greatest cosine of the angle between two rays if neither feature has a stereo
+        max_cosine: largest cosine of the angle between the two rays if neither feature has a stereo
             depth.
 
     Returns:
-        Whether the landmark was triangulated: False if there is neither enough parallax nor a
-        stereo depth, or the rays do not meet in front of both cameras.
+        True if the landmark was triangulated. False if there is neither enough parallax nor a
+        stereo depth, or if the rays do not meet in front of both cameras.
     """
     dot = dot3(ray_1, ray_2)
     square_1, square_2 = dot3(ray_1, ray_1), dot3(ray_2, ray_2)
@@ -347,7 +355,7 @@ def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_
     stereo_1, stereo_2 = depth_1 > 0.0, depth_2 > 0.0  # False for NaN
     stereo_cosine = min(np.cos(angle_1) if stereo_1 else 2.0, np.cos(angle_2) if stereo_2 else 2.0)
     if 0.0 < cosine < stereo_cosine and (stereo_1 or stereo_2 or cosine < max_cosine):
-        # Midpoint of the shortest segment between the rays; bundle adjustment will refine it.
+        # Midpoint of the shortest segment between the rays. Bundle adjustment refines it later.
         on_1, on_2 = 0.0, 0.0
         for i in range(3):
             on_1 += (centre_2[i] - centre_1[i]) * ray_1[i]
@@ -369,8 +377,8 @@ def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_
 
 @inner_kernel
 def agrees(T, p, xy, u_right, scale, intrinsics):
-    """Whether a point lies in front of the camera and passes the chi-square test of its
-    reprojection error."""
+    """Whether a point lies in front of the camera and its reprojection error passes the chi-square
+    test."""
     z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
     if z <= 0.0:
         return False

@@ -1,9 +1,9 @@
-"""Adjusts the first two views of a monocular map, and defines its unit of length.
+"""Adjusts the first two views of a monocular map, and defines the unit of length of the map.
 
-Two views determine the direction of a translation but not its length. So the unit of length is
-chosen such that the median depth of the landmarks is ``initialization.median_depth``. With the
-default of 15, a unit is roughly a metre in a street, so that thresholds that the configuration
-gives in metres have the right order of magnitude. The scale is still unknown.
+Two views determine the direction of a translation, but not its length. The unit of length is
+therefore chosen such that the median depth of the landmarks is ``initialization.median_depth``.
+With the default of 15, a unit is roughly a metre in a street. Thresholds that the configuration
+gives in metres then have the right order of magnitude. The true scale remains unknown.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ def adjust_two_views(
         points: ``(N, 3)`` initial points in the frame of camera 1.
         uv: ``(N, 2, 2)`` position of each point in view 1 and in view 2, pixels.
         sigma: ``(N,)`` standard deviation of these positions, pixels.
-        depth: median depth of the inliers in view 1 after scaling.
+        depth: median depth of the inliers in view 1 after scaling, in units of the map.
 
     Returns:
-        ``(4, 4)`` ``T_2_1``, ``(N, 3)`` points in the frame of camera 1, and ``(N,)`` bool, points
-        that are inliers in both views.
+        ``(4, 4)`` ``T_2_1``; ``(N, 3)`` points in the frame of camera 1; ``(N,)`` bool, True for
+        points that are inliers in both views.
     """
     n = len(points)
     problem = BundleProblem(

@@ -1,12 +1,14 @@
-"""Sub-pixel alignment of matches: a landmark's patch is registered to the image at its keypoint.
+"""Sub-pixel alignment of matches: each landmark's patch is registered to the image.
 
-FAST places a corner at a whole pixel of a pyramid level, so it is typically off by half a pixel.
-When the camera approaches the scene, this error is biased towards the focus of expansion
-(docs/research/motorway.md). So the patch of a keyframe that saw the landmark is warped into the
-view of the frame and shifted until it agrees with the image. This is the "feature alignment" of SVO
-(Forster et al., ICRA 2014, III-B), solved by inverse compositional Lucas-Kanade (Baker and
-Matthews, IJCV 2004, section 3.2). Changes of brightness and contrast are estimated together with
-the shift.
+FAST places a corner at a whole pixel of a pyramid level, so a corner is typically off by half a
+pixel. When the camera approaches the scene, this error is biased towards the focus of expansion
+(docs/research/motorway.md).
+
+To remove the error, the patch is taken from a keyframe that observed the landmark. The patch is
+warped into the view of the frame and shifted until it agrees with the image. This is the "feature
+alignment" of SVO (Forster et al., ICRA 2014, III-B), solved by inverse compositional Lucas-Kanade
+(Baker and Matthews, IJCV 2004, section 3.2). Changes of brightness and contrast are estimated
+together with the shift.
 """
 
 from __future__ import annotations
@@ -20,9 +22,9 @@ from vslam.frontend.frame import Frame
 from vslam.frontend.patches import patches_around
 from vslam.kernels import inner_kernel, kernel
 
-HALF = 4  # half width of the window that is compared, pixels
+HALF = 4  # half width of the compared window, pixels
 SIDE = 2 * HALF + 1
-WIDE = SIDE + 2  # one more pixel on each side, for the gradients
+WIDE = SIDE + 2  # one more pixel on each side, to compute the gradients
 MIN_VARIANCE = 1.0  # grey levels squared; a patch with a smaller variance has no texture
 MIN_CORNERNESS = 0.05  # least determinant of the 2x2 normal matrix over its diagonal product
 STILL = 0.03  # pixels; the iteration ends when a step is smaller
@@ -43,9 +45,9 @@ def align_frame(
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
 
     Returns:
-        ``(N, 2)`` float32 for ``Frame.shift``: full-resolution pixels from each feature to its
-        aligned position, NaN where a match was not aligned. None if the frame has no pyramid or no
-        landmark has a patch.
+        ``(N, 2)`` float32 for ``Frame.shift``: the offset from each feature to its aligned
+        position, in full-resolution pixels. NaN where a match was not aligned. None if the frame
+        has no pyramid or no landmark has a patch.
     """
     features = frame.features
     if frame.pyramid is None or not len(known.ids):
@@ -91,17 +93,17 @@ def find_patches(
         pyramid: the pyramid of the image.
         xy: ``(N, 2)`` expected positions, full-resolution pixels.
         octave: ``(N,)`` pyramid levels in which the patches are searched for.
-        T_cw: ``(4, 4)`` pose of the camera of the image.
-        xyz: ``(N, 3)`` positions of the landmarks in the world.
+        T_cw: ``(4, 4)`` pose of the camera that took the image (world to camera).
+        xyz: ``(N, 3)`` positions of the landmarks, in the world frame.
         known: patches of landmarks.
-        at: ``(N,)`` index into ``known`` of each landmark.
+        at: ``(N,)`` index of each landmark's patch in ``known``.
         scales: ``(levels,)`` full-resolution pixels per pixel of each octave.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
 
     Returns:
-        ``(N, 2)`` float32 shift of each patch, in pixels of its octave: the position where it was
-        found, minus the expected position. The expected position is first rounded to a whole pixel
-        of the octave. NaN if the patch was not found.
+        ``(N, 2)`` float32 shift of each patch, in pixels of its octave; NaN if the patch was not
+        found. The shift is the position where the patch was found, minus the expected position. The
+        expected position is first rounded to a whole pixel of the octave.
     """
     view, size = known.view[at], known.size[at]
     warp = warps(T_cw, xyz, known.T_cw, view, size, scales[octave], intrinsics)
@@ -121,21 +123,22 @@ def find_patches(
 def warps(T_cw, xyz, T_seen, view, size_seen, size, intrinsics):
     """Affine warps from the patches of a frame to the patches of keyframes.
 
-    The surface around a landmark is approximated by a plane that faces the keyframe (SVO, III-B).
+    The surface around a landmark is approximated by a plane perpendicular to the viewing direction
+    of the keyframe (SVO, III-B).
 
     Args:
-        T_cw: ``(4, 4)`` pose of the frame's camera.
+        T_cw: ``(4, 4)`` pose of the frame's camera (world to camera).
         xyz: ``(N, 3)`` landmarks in the world frame.
-        T_seen: ``(K, 4, 4)`` poses of the keyframes.
-        view: ``(N,)`` index into ``T_seen`` of the keyframe that saw each landmark.
-        size_seen, size: ``(N,)`` full-resolution pixels per pixel of the keyframe's patch and of
-            the frame's patch.
+        T_seen: ``(K, 4, 4)`` poses of the keyframes (world to camera).
+        view: ``(N,)`` index into ``T_seen`` of the keyframe that observed each landmark.
+        size_seen, size: ``(N,)`` scale of the keyframe's patch and of the frame's patch, in
+            full-resolution pixels per pixel of the patch.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
 
     Returns:
-        ``(N, 2, 2)`` float32 matrices that take an offset in the frame's patch to the offset in the
-        keyframe's patch, both in patch pixels; NaN where the landmark is behind one of the cameras
-        or the plane is seen from behind.
+        ``(N, 2, 2)`` float32 matrices. Each maps an offset in the frame's patch to the offset in
+        the keyframe's patch, both in pixels of the patch. NaN where the landmark is behind one of
+        the cameras or the frame views the plane from behind.
     """
     fx, fy = intrinsics[0], intrinsics[1]
     steps = np.full((len(xyz), 2, 2), np.nan, np.float32)
@@ -149,8 +152,8 @@ def warps(T_cw, xyz, T_seen, view, size_seen, size, intrinsics):
         if not (depth > 0.0 and p[2] > 0.0):
             continue
         for k in range(2):
-            # A step of one pixel along u or v in the keyframe, projected via the plane into the
-            # frame.
+            # A step of one pixel along u or v in the keyframe, projected onto the plane and from
+            # there into the frame.
             for r in range(3):
                 column[r] = 0.0
                 for m in range(3):
@@ -167,22 +170,23 @@ def warps(T_cw, xyz, T_seen, view, size_seen, size, intrinsics):
 
 @kernel
 def align(seen, reference, centre, which, warp, iterations, max_shift, min_correlation):
-    """Find the landmark of a reference patch in each of N patches.
+    """Locate landmarks with sub-pixel accuracy by registering a reference patch to each of N
+    patches.
 
     Args:
         seen: ``(N, PATCH_PIXELS)`` uint8 patches of the frame.
         reference: ``(P, PATCH_PIXELS)`` uint8 patches of keyframes.
-        centre: ``(P, 2)`` float32, position of the landmark in each reference patch, pixels from
+        centre: ``(P, 2)`` float32 position of the landmark in each reference patch, in pixels from
             the middle of the patch.
-        which: ``(N,)`` index of the reference patch that each seen patch is compared with.
+        which: ``(N,)`` index of the reference patch of each seen patch.
         warp: ``(N, 2, 2)`` float32, see ``warps``.
         iterations: maximum number of Gauss-Newton steps.
-        max_shift: largest shift in x and in y, pixels of the seen patch.
+        max_shift: largest accepted shift in x and in y, in pixels of the seen patch.
         min_correlation: least normalised cross-correlation of an accepted alignment.
 
     Returns:
-        ``(N, 2)`` float32 position of the landmark relative to the middle of the seen patch, in
-        pixels of this patch; NaN if the alignment failed.
+        ``(N, 2)`` float32 position of each landmark, in pixels from the middle of its seen patch;
+        NaN if the alignment failed.
     """
     n = len(seen)
     shift = np.full((n, 2), np.nan, np.float32)
@@ -217,8 +221,8 @@ def align(seen, reference, centre, which, warp, iterations, max_shift, min_corre
 
 @inner_kernel
 def draw(patch, centre, warp, out):
-    """Warp a patch around ``centre`` with bilinear interpolation. Returns False and leaves ``out``
-    unchanged if the warped window is not inside the patch.
+    """Warp a patch around ``centre`` with bilinear interpolation. Returns True on success. If the
+    warped window is not inside the patch, returns False and leaves ``out`` unchanged.
 
     Args:
         patch: ``(PATCH_PIXELS,)`` uint8.
@@ -232,8 +236,8 @@ def draw(patch, centre, warp, out):
     reach_y = far * (abs(yx) + abs(yy)) + abs(centre[1])
     if not max(reach_x, reach_y) <= np.float32(PATCH_RADIUS - 0.01):
         return False
-    # Coordinates are in fixed point (1 / 65536 pixel): a bit shift separates the whole and the
-    # fractional part much faster than floating-point arithmetic.
+    # Coordinates are in fixed point (1 / 65536 pixel). A bit shift separates the whole and the
+    # fractional part much faster than floating-point arithmetic does.
     one, part = np.float32(65536.0), np.float32(1.0 / 65536.0)
     x_first = np.int32((np.float32(PATCH_RADIUS) + centre[0] - far * (xx + xy)) * one)
     y_first = np.int32((np.float32(PATCH_RADIUS) + centre[1] - far * (yx + yy)) * one)
@@ -255,16 +259,17 @@ def draw(patch, centre, warp, out):
 
 @inner_kernel
 def prepare(wide, template, slope_x, slope_y):
-    """Compute the template and its gradients from a warped window. The mean of the template is
-    subtracted, and the gradients are made orthogonal to changes of brightness and contrast, so that
-    such changes do not affect the shift.
+    """Compute the template and its gradients from a warped window.
+
+    The mean of the template is subtracted. The gradients are made orthogonal to changes of
+    brightness and contrast, so that such changes do not affect the shift.
 
     Returns:
         Sum of squares of the template, and the entries xx, xy, yy of the 2x2 normal matrix.
     """
     half, zero, count = np.float32(0.5), np.float32(0.0), np.float32(SIDE * SIDE)
     # Sums of products of 1, the template t and its gradients x, y. Grey values are relative to the
-    # middle pixel, so that float32 sums lose few digits.
+    # middle pixel, because smaller numbers lose less precision in float32 sums.
     middle = wide[WIDE * WIDE // 2]
     t, x, y, tt, tx, ty, xx, xy, yy = zero, zero, zero, zero, zero, zero, zero, zero, zero
     for r in range(SIDE):
@@ -296,12 +301,12 @@ def prepare(wide, template, slope_x, slope_y):
 
 @inner_kernel
 def compare(image, x, y, template, slope_x, slope_y):
-    """Compare the template with the window of the image that is shifted by ``x, y`` from the middle
-    of the image.
+    """Compare the template with a window of the image. The window is shifted by ``x, y`` pixels
+    from the middle of the image.
 
     Returns:
-        Sum of squares of the window minus its mean, and the inner products of the window with the
-        template and with both gradients.
+        Sum of squares of the window minus its mean; inner product of the window with the template;
+        inner products of the window with both gradients.
     """
     one, zero = np.float32(1.0), np.float32(0.0)
     left, top = int(np.floor(x)), int(np.floor(y))

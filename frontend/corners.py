@@ -1,8 +1,9 @@
-"""FAST corners of one image: scores, non-maximum suppression, even distribution.
+"""FAST corners of one image: corner scores, non-maximum suppression, and even distribution.
 
-The FAST score of a pixel is the largest threshold at which it is still a corner. It is computed for
-every pixel without branches: compiled to vector minima and maxima of bytes, this takes 0.3 ms for a
-KITTI image, less than the usual test that rejects most pixels early.
+The FAST score of a pixel is the largest threshold at which the pixel is still a corner. It is
+computed for every pixel, without branches. The compiler turns the loop into vector minima and
+maxima of bytes, which take 0.3 ms for a KITTI image. This is faster than the usual test that
+rejects most pixels early.
 """
 
 from __future__ import annotations
@@ -18,10 +19,14 @@ def fast_scores(pixels, height, width):
 
     A pixel with value c is a corner at threshold t if 9 contiguous pixels of its circle are all
     brighter than c + t, or all darker than c - t. The score is the largest such t plus 1, or 0 if
-    there is none. For an arc of 9 bright pixels, this is the smallest value in the arc minus c; the
-    score is the maximum over all 16 arcs and both polarities. Minima over runs of 2, 4 and 8 pixels
-    are shared between arcs, which leaves 31 minima and maxima per polarity. Indices are unsigned,
-    so that the compiler needs no test for negative ones and vectorises the loop over bytes.
+    there is none.
+
+    For an arc of 9 bright pixels, this score is the smallest value in the arc minus c. The score of
+    the pixel is the maximum over all 16 arcs and both polarities. Arcs share the minima over runs
+    of 2, 4 and 8 pixels, which leaves 31 minima and maxima per polarity.
+
+    Indices are unsigned. The compiler then needs no test for negative indices and vectorises the
+    loop over bytes.
 
     Args:
         pixels: ``(height * width,)`` uint8.
@@ -51,8 +56,8 @@ def fast_scores(pixels, height, width):
             a9, a11, a13, a15 = min(p9, p10), min(p11, p12), min(p13, p14), min(p15, p0)
             b1, b3, b5, b7 = min(a1, a3), min(a3, a5), min(a5, a7), min(a7, a9)
             b9, b11, b13, b15 = min(a9, a11), min(a11, a13), min(a13, a15), min(a15, a1)
-            # A run of 8 pixels that starts at an odd pixel is part of two arcs of 9: with the pixel
-            # before it, and with the pixel after it.
+            # A run of 8 pixels that starts at an odd pixel is part of two arcs of 9: one includes
+            # the pixel before the run, the other the pixel after it.
             bright = max(
                 max(
                     max(min(min(b1, b5), max(p0, p9)), min(min(b3, b7), max(p2, p11))),
@@ -83,18 +88,19 @@ def fast_scores(pixels, height, width):
 
 @kernel
 def local_maxima(scores, margin, threshold, threshold_min, cell):
-    """Corners that no neighbour outscores (non-maximum suppression). Weak corners are kept only in
-    cells without a strong one.
+    """Non-maximum suppression: corners whose score no neighbour exceeds.
+
+    Weak corners are kept only in cells without a strong corner.
 
     Args:
         scores: ``(height, width)`` uint8, see ``fast_scores``.
         margin: width of the border without corners, pixels.
         threshold: corners with a higher score are strong, the others are weak.
-        threshold_min: pixels with this score or a lower one are no corners.
+        threshold_min: pixels with this score or a lower one are not corners.
         cell: side of the cells, pixels.
 
     Returns:
-        x, y: ``(n,)`` int32; score: ``(n,)`` uint8; in row order.
+        ``(n,)`` int32 x and y, in pixels, and ``(n,)`` uint8 scores, in row order.
     """
     height, width = scores.shape
     capacity = (height * width) // 4 + 1
@@ -102,10 +108,10 @@ def local_maxima(scores, margin, threshold, threshold_min, cell):
     score = np.empty(capacity, np.uint8)
     column_of = np.arange(width) // cell
     strong = np.zeros(width // cell + 1, np.bool_)  # cells of the current row with a strong corner
-    n = first = 0  # number of corners, and index of the first one in the current row of cells
+    n = first = 0  # number of corners; index of the first one in the current row of cells
     weakest = np.uint8(threshold_min)
     length = np.uintp(width - 2 * margin)
-    # One byte per pixel of a row, read eight at a time because most of them are 0.
+    # One byte per pixel of a row. Eight bytes are read at a time, because most of them are 0.
     is_corner = np.zeros((width + 7) // 8 * 8, np.uint8)
     words = is_corner.view(np.uint64)
     for y in range(margin, height - margin):
@@ -114,7 +120,7 @@ def local_maxima(scores, margin, threshold, threshold_min, cell):
         below = scores[y + 1, margin - 1 : width - margin + 1]
         for x in range(length):
             s = here[x + 1]
-            # Of neighbours with equal scores, the first in row order is kept.
+            # Of several neighbours with equal scores, the first one in row order is kept.
             before = max(max(above[x], above[x + 1]), max(above[x + 2], here[x]))
             after = max(max(below[x], below[x + 1]), max(below[x + 2], here[x + 2]))
             is_corner[x] = (s > max(before, weakest)) & (s >= after)
@@ -140,8 +146,9 @@ def local_maxima(scores, margin, threshold, threshold_min, cell):
 
 @kernel
 def spread(x, y, score, width, height, quota):
-    """Choose up to ``quota`` evenly spread corners: the best corner of each cell of a grid. The
-    cells are as large as possible while at least ``quota`` of them contain a corner.
+    """Choose up to ``quota`` evenly spread corners: the best corner of each cell of a grid.
+
+    The grid has the largest cells with which at least ``quota`` cells contain a corner.
 
     The cell size is found by bisection, as in Bailo et al. ("Efficient adaptive non-maximal
     suppression", PRL 2018).
@@ -149,6 +156,7 @@ def spread(x, y, score, width, height, quota):
     Args:
         x, y, score: ``(n,)`` corners in row order, see ``local_maxima``.
         width, height: size of the image, pixels.
+        quota: maximum number of corners.
 
     Returns:
         ``(m,)`` int64 indices of the chosen corners, ascending.
@@ -159,8 +167,9 @@ def spread(x, y, score, width, height, quota):
         for i in range(n):
             kept[i] = i
         return kept
-    # At first, cells of size ``low`` are small enough, because each corner has its own cell of size
-    # 1. Cells of size ``high`` are too large, because the image has fewer of them than the quota.
+    # Bisection: cells of size ``low`` are small enough, and cells of size ``high`` are too large.
+    # At size 1, each corner has its own cell. At the initial ``high``, the image has fewer cells
+    # than ``quota``.
     low, high = 1, int(np.sqrt(width * height / quota)) + 2
     is_occupied = np.empty(width * height, np.uint8)
     while high - low > 1:
@@ -181,7 +190,8 @@ def spread(x, y, score, width, height, quota):
             chosen[i] = True
             counts[score[i]] += 1
             surplus += 1
-    # Drop the weakest corners beyond the quota. Scores are bytes, so a histogram ranks them.
+    # Drop the weakest corners if there are more than ``quota``. Scores are bytes, so a histogram
+    # ranks them.
     weakest = 0
     while counts[weakest] <= surplus:
         surplus -= counts[weakest]
@@ -201,7 +211,7 @@ def spread(x, y, score, width, height, quota):
 @inline
 def cell_of(x, y, inverse, columns):
     """Index of the cell of a pixel. ``inverse`` is the inverse of the cell size, because
-    multiplication is many times faster than division."""
+    multiplication is much faster than division."""
     half = np.float32(0.5)
     return int((y + half) * inverse) * columns + int((x + half) * inverse)
 
@@ -226,7 +236,10 @@ def occupies(x, y, width, height, size, quota, is_occupied):
 @inner_kernel
 def occupy(x, y, score, width, size, best_of_cell):
     """Write the index of the best corner of each cell of ``size`` x ``size`` pixels into
-    ``best_of_cell``: the first one if several have equal scores, -1 for an empty cell."""
+    ``best_of_cell``.
+
+    The index is -1 for an empty cell. If several corners have equal scores, the first one is used.
+    """
     columns = (width + size - 1) // size
     best_of_cell[:] = -1
     inverse = np.float32(1.0 / size)

@@ -1,4 +1,4 @@
-"""Depth images as the right view of a virtual stereo pair (ORB-SLAM2, section III-A)."""
+"""Converts depth images to the right view of a virtual stereo pair (ORB-SLAM2, section III-A)."""
 
 from __future__ import annotations
 
@@ -17,21 +17,22 @@ def columns_of_depth(
     camera: Camera,
     config: DepthConfig,
 ) -> NDArray[np.float32]:
-    """Column that each keypoint would have in the right image of a virtual stereo pair.
+    """Column that each keypoint would have in the right image of a virtual stereo pair, in pixels.
 
-    A keypoint at column u whose nearest pixel has depth d gets ``u - fx b / d``. In this model, a
-    constant error in pixels corresponds to an error in depth that grows with the square of the
-    depth, as it does for structured light.
+    A keypoint at column u whose nearest pixel has depth d gets the column ``u - fx b / d``. In this
+    model, a constant error in pixels corresponds to a depth error that grows with the square of the
+    depth. This agrees with the errors of structured-light cameras.
 
     The depth of a corner at a depth discontinuity is ambiguous. Where the contour of a near object
-    crosses the background, the corner is not a point of the scene: it slides along the contour as
-    the camera moves. Stereo matching rejects most of these corners; here they get no column.
+    crosses the background, the corner is not a point of the scene. Instead, it slides along the
+    contour as the camera moves. Stereo matching rejects most of these corners. Here they get no
+    column.
 
     Args:
         xy: ``(N, 2)`` keypoints of the left image, pixels.
         scale: ``(N,)`` full-resolution pixels per pixel of the keypoint's octave.
-        depth: ``(H, W)`` metres along the z axis of the left camera, registered to its image;
-            0 where unknown.
+        depth: ``(H, W)`` metres along the z axis of the left camera, 0 where unknown. The depth
+            image is registered to the left image.
 
     Returns:
         ``(N,)`` float32, NaN where the depth is unknown, out of range, or discontinuous around the
@@ -47,7 +48,7 @@ def columns_of_depth(
 
 @kernel
 def depth_around(xy, radius, depth, max_ratio):
-    """Depth at the nearest pixel of each keypoint.
+    """Depth at the nearest pixel of each keypoint, in metres.
 
     Args:
         radius: ``(N,)`` int64, half width of the neighbourhood that is checked, pixels.
@@ -55,7 +56,7 @@ def depth_around(xy, radius, depth, max_ratio):
             neighbourhood.
 
     Returns:
-        ``(N,)`` float32 metres; 0 where the depth is unknown or the ratio is exceeded.
+        ``(N,)`` float32 depths; 0 where the depth is unknown or the ratio is exceeded.
     """
     height, width = depth.shape
     found = np.zeros(len(xy), np.float32)

@@ -1,4 +1,4 @@
-"""A frame: the features of an image, its pose, and the landmarks that it tracks."""
+"""A frame: the features of an image, the pose of the camera, and the tracked landmarks."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from vslam.geometry import Matrix, inverse
 
 
 class FeatureSource(Protocol):
-    """The images of a frame, whose features are extracted when they are first asked for.
+    """The images of a frame. Their features are extracted on first use.
 
     Attributes:
         extracted: the features.
         image: the ``(H, W)`` uint8 image that they are extracted from.
-        sides: the comparison of the left and the right image; None if there is no right image, or
-            it has not been read.
+        sides: the comparison of the left and the right image; None if there is no right image or it
+            has not been read.
         problem: why the right image could not be read; None if there was no such problem.
     """
 
@@ -33,7 +33,7 @@ class FeatureSource(Protocol):
     def extracted(self) -> Extracted: ...
 
     def extracted_with(self, keypoints: Keypoints) -> Extracted:
-        """The features, and additional features at given positions and levels of the left image."""
+        """The features, plus features at the given positions and levels of the left image."""
         ...
 
     @property
@@ -42,35 +42,37 @@ class FeatureSource(Protocol):
 
 @dataclass
 class Frame:
-    """A frame being tracked.
+    """A frame that is being tracked.
 
-    "The camera" is the one whose image the features come from: the left one, or the right one if
-    the left image is black. ``T_cw`` is the pose of the left camera in both cases.
+    "The camera" is the camera whose image the features come from. It is the left camera, or the
+    right camera if the left image is black. ``T_cw`` is the pose of the left camera in both cases.
 
     Attributes:
         index: number of the frame in the run, from 0.
         timestamp: seconds.
-        image: ``(H, W)`` uint8 image of the camera, for loop detectors that need it; None before
-            ``extract``, or if the frame has no image.
-        features, grid: the N features of the image, and a grid to search them by position.
+        image: ``(H, W)`` uint8 image of the camera, for loop detectors that need it. None before
+            ``extract`` is called, or if the frame has no image.
+        features, grid: the N features of the image, and a grid to search them by position. Before
+            features are extracted, ``features`` has one entry for each landmark that was found by
+            its patch.
         pyramid, row_offset, side: see ``Extracted``.
         T_camera_left: ``(4, 4)`` transform from the left camera to the camera: the identity, or
             ``Camera.T_right_left``.
         T_cw: ``(4, 4)`` estimated pose of the left camera (world to camera).
-        landmark: ``(N,)`` int32, id of the landmark that each feature tracks, or -1.
-        xyz: ``(N, 3)`` float64, position in the world of the point that each feature tracks,
-            metres; NaN if it tracks none.
+        landmark: ``(N,)`` int32, id of the landmark that each feature tracks, or -1 if it tracks
+            none.
+        xyz: ``(N, 3)`` float64 position of the landmark that each feature tracks, in the world
+            frame, in metres; NaN if the feature tracks none.
         disparity_offset: pixels that have been added to every disparity (``RigCalibration``).
         delay_removed: whether the columns in the right image have been corrected for its delay.
-        shift: ``(N, 2)`` float32, pixels from each feature to its aligned position, NaN where the
-            match was not aligned; None if no match was aligned.
-        twist: ``(6,)`` velocity per second when the frame was tracked: ``exp(twist dt)`` maps
-            points from the camera frame at one time to the camera frame dt seconds later. None if
-            unknown.
-        source: the images that ``extract`` takes the features from; None after extraction. Before
-            extraction, ``features`` has one entry for each landmark that was found by its patch.
-        coarse: ``coarse_levels`` of the image, to which the next frame is aligned; None if frames
-            are not aligned.
+        shift: ``(N, 2)`` float32 offset from each feature to its aligned position, in pixels; NaN
+            where the match was not aligned. None if no match was aligned.
+        twist: ``(6,)`` velocity when the frame was tracked, per second; None if unknown.
+            ``exp(twist dt)`` maps points from the camera frame at one time to the camera frame dt
+            seconds later.
+        source: the images from which ``extract`` takes the features; None after extraction.
+        coarse: the ``coarse_levels`` of the image, to which the next frame is aligned; None if
+            frames are not aligned.
         mask: the mask of the image; None if all pixels are used.
     """
 
@@ -103,7 +105,7 @@ class Frame:
         timestamp: float = 0.0,
         image: NDArray[np.uint8] | None = None,
     ) -> Frame:
-        """A new frame that is not tracked yet: its pose is the identity and it has no matches."""
+        """A new frame that is not tracked yet. Its pose is the identity, and it has no matches."""
         features, n = extracted.features, len(extracted.features)
         return cls(
             index=index,
@@ -127,9 +129,11 @@ class Frame:
         return T
 
     def extract(self, camera: Camera) -> None:
-        """Extract the features of the images, if that has not been done. The pose is kept, but the
-        new features track no landmarks yet. Where a landmark was found by its patch, a feature is
-        extracted even if the detector finds no corner there."""
+        """Extract the features of the images, unless this has already been done.
+
+        The pose is kept, but the new features do not track landmarks yet. Where a landmark was
+        found by its patch, a feature is extracted even if the detector finds no corner there.
+        """
         if self.source is None:
             return
         source, found = self.source, self.features
@@ -143,15 +147,15 @@ class Frame:
     def match(
         self, features: NDArray[np.integer], landmarks: NDArray[np.int32], xyz: Matrix
     ) -> None:
-        """Let ``(M,)`` features track landmarks with the given ids and ``(M, 3)`` positions."""
+        """Assign landmarks with the given ids and ``(M, 3)`` positions to ``(M,)`` features."""
         self.landmark[features], self.xyz[features] = landmarks, xyz
 
     def drop_matches(self, features: NDArray[np.integer] | slice = slice(None)) -> None:
-        """Remove the matches of some features; by default, of all."""
+        """Remove the matches of the given features; by default, of all features."""
         self.landmark[features], self.xyz[features] = -1, np.nan
 
     def snapshot(self) -> Frame:
-        """A copy that is independent of later changes of the frame's pose and matches."""
+        """A copy that later changes of the frame's pose and matches do not affect."""
         return replace(self, landmark=self.landmark.copy(), xyz=self.xyz.copy())
 
     def restore(self, snapshot: Frame) -> None:
@@ -164,12 +168,12 @@ class Frame:
 
     @property
     def can_become_keyframe(self) -> bool:
-        """Whether the frame can become a keyframe: all keyframes are left images."""
+        """Whether the frame can become a keyframe. All keyframes are left images."""
         return self.side == Side.LEFT
 
     @property
     def aligned(self) -> NDArray[np.bool_]:
-        """``(N,)`` bool, whether the match of each feature was aligned."""
+        """``(N,)`` bool: whether the match of each feature was aligned."""
         if self.shift is None:
             return np.zeros(len(self.features), np.bool_)
         return (self.landmark >= 0) & np.isfinite(self.shift[:, 0])
@@ -186,7 +190,7 @@ class Frame:
 
     @property
     def n_stereo(self) -> int:
-        """Number of features with a stereo match (or a depth)."""
+        """Number of features with a stereo match (or, in an RGB-D frame, with a depth)."""
         return int(np.count_nonzero(np.isfinite(self.features.u_right)))
 
 

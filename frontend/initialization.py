@@ -1,12 +1,13 @@
-"""The first two views of a monocular map: their motion and their points (ORB-SLAM, section IV).
+"""Initialises a monocular map from two views (ORB-SLAM, section IV).
 
-A planar scene or a pure rotation does not determine the fundamental matrix; in all other cases a
-homography does not explain the matches. So both models are fitted to the same random samples, and
-one is selected by their scores. A reconstruction is accepted only if one motion explains clearly
-more points than any other, because a map with a wrong start cannot be repaired later.
+The fundamental matrix is not determined if the scene is planar or the camera only rotates. In all
+other cases, a homography does not explain the matches. So both models are fitted to the same random
+samples, and the model is selected by their scores. A reconstruction is accepted only if one motion
+explains clearly more points than any other, because a map with a wrong start cannot be repaired
+later.
 
-All samples are fitted and scored in one batch: here NumPy is as fast as a Numba kernel, and needs
-no compilation.
+All samples are fitted and scored in one batch. Here NumPy is as fast as a Numba kernel and needs no
+compilation.
 """
 
 from __future__ import annotations
@@ -25,23 +26,24 @@ from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import Matrix
 from vslam.reprojection import CHI2_MONO, stack_uvr
 
-CHI2_LINE = 3.841  # 95 % quantile with 1 degree of freedom: distance of a point from a line
+CHI2_LINE = 3.841  # 95 % quantile of chi-square with 1 degree of freedom: distance from a line
 # Matches per sample. The eight-point algorithm needs all of them; a homography needs only four.
 SAMPLE = 8
-# Points whose parallax is less than this (0.36 degrees) are counted, but not mapped (ORB-SLAM).
+# Points with a smaller parallax than this (0.36 degrees) are counted, but not mapped (ORB-SLAM).
 MAX_COSINE = 0.99998
 
 
 @dataclass(frozen=True)
 class TwoViewModel:
-    """The model that explains N matches of two views.
+    """The model that explains the N matches of two views: a homography or a fundamental matrix.
 
     Attributes:
         kind: the model that was selected.
-        matrix: ``(3, 3)``; a homography maps pixels of view 1 to pixels of view 2, a fundamental
-            matrix maps them to epipolar lines in view 2.
+        matrix: ``(3, 3)``. A homography maps pixels of view 1 to pixels of view 2. A fundamental
+            matrix maps pixels of view 1 to epipolar lines in view 2.
         inlier: ``(N,)`` bool, matches that the model explains.
-        homography_share: ``S_H / (S_H + S_F)``, the ratio of scores that selected the model.
+        homography_share: ``S_H / (S_H + S_F)``, the ratio of the scores by which the model was
+            selected.
     """
 
     kind: Literal["homography", "fundamental"]
@@ -57,7 +59,7 @@ class TwoViews:
     Attributes:
         T_2_1: ``(4, 4)`` transform from camera 1 to camera 2; its translation has length 1.
         match: ``(M,)`` int64, indices of the matches that were triangulated.
-        points: ``(M, 3)`` in the frame of camera 1, in units of the baseline.
+        points: ``(M, 3)`` triangulated points, in the frame of camera 1; the unit is the baseline.
     """
 
     T_2_1: Matrix
@@ -71,7 +73,7 @@ def match_views(
     """Match two frames by descriptor, within a window around each feature's position in ``one``.
 
     Returns:
-        ``(N,)`` indices of the matched features in ``one``, and ``(N,)`` in ``two``.
+        ``(N,)`` indices of the matched features in ``one``, and ``(N,)`` indices in ``two``.
     """
     config, before, now = context.config.initialization, one.features, two.features
     n = len(before)
@@ -170,7 +172,7 @@ def select_model(
         scores, inlier = score_all(models, xy_1, xy_2, sigma)
         best = int(np.argmax(scores))
         M, score, explained = models[best], float(scores[best]), inlier[best]
-        # A model that is fitted to all inliers of the previous one usually has more inliers.
+        # Refitting a model to all its inliers usually gives a model with more inliers.
         while np.count_nonzero(explained) >= SAMPLE:
             refit = fit(np.flatnonzero(explained)[None])
             scores, inlier = score_all(refit, xy_1, xy_2, sigma)
@@ -187,8 +189,8 @@ def select_model(
 
 
 def normalised(xy: Matrix) -> tuple[Matrix, Matrix]:
-    """Normalise ``(N, 2)`` points, so that their mean is 0 and their mean distance from it is the
-    square root of 2 (Hartley, "In defense of the eight-point algorithm", PAMI 1997).
+    """Normalise ``(N, 2)`` points: their mean becomes 0, and their mean distance from it becomes
+    the square root of 2 (Hartley, "In defense of the eight-point algorithm", PAMI 1997).
 
     Returns:
         The ``(N, 2)`` normalised points, and the ``(3, 3)`` matrix that normalises them.
@@ -201,7 +203,8 @@ def normalised(xy: Matrix) -> tuple[Matrix, Matrix]:
 
 
 def fit_homographies(x_1: Matrix, x_2: Matrix) -> Matrix:
-    """``(B, 3, 3)`` homographies of B samples ``(B, M, 2)`` by DLT (Hartley and Zisserman, 4.1)."""
+    """``(B, 3, 3)`` homographies of B samples of shape ``(B, M, 2)``, by DLT (Hartley and
+    Zisserman, 4.1)."""
     x, y, u, v = x_1[..., 0], x_1[..., 1], x_2[..., 0], x_2[..., 1]
     zero, one = np.zeros_like(x), np.ones_like(x)
     above = np.stack([zero, zero, zero, -x, -y, -one, v * x, v * y, v], axis=-1)
@@ -210,8 +213,8 @@ def fit_homographies(x_1: Matrix, x_2: Matrix) -> Matrix:
 
 
 def fit_fundamentals(x_1: Matrix, x_2: Matrix) -> Matrix:
-    """``(B, 3, 3)`` fundamental matrices of B samples ``(B, M, 2)`` by the eight-point algorithm
-    (Hartley and Zisserman, 11.2). They have rank 2 and satisfy ``x_2' F x_1 = 0``."""
+    """``(B, 3, 3)`` fundamental matrices of B samples of shape ``(B, M, 2)``, by the eight-point
+    algorithm (Hartley and Zisserman, 11.2). They have rank 2 and satisfy ``x_2' F x_1 = 0``."""
     x, y, u, v = x_1[..., 0], x_1[..., 1], x_2[..., 0], x_2[..., 1]
     A = np.stack([u * x, u * y, u, v * x, v * y, v, x, y, np.ones_like(x)], axis=-1)
     U, d, Vt = np.linalg.svd(_null_vectors(A))
@@ -220,7 +223,7 @@ def fit_fundamentals(x_1: Matrix, x_2: Matrix) -> Matrix:
 
 
 def _null_vectors(A: Matrix) -> Matrix:
-    """The unit vectors h that minimise ``|A h|``, as ``(B, 3, 3)`` matrices."""
+    """The unit vectors h that minimise ``|A h|``, each reshaped to a 3x3 matrix: ``(B, 3, 3)``."""
     _, vectors = np.linalg.eigh(A.swapaxes(1, 2) @ A)
     return vectors[:, :, 0].reshape(-1, 3, 3)
 
@@ -228,7 +231,7 @@ def _null_vectors(A: Matrix) -> Matrix:
 def score_homographies(
     H: Matrix, xy_1: Matrix, xy_2: Matrix, sigma: Matrix
 ) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Scores ``(B,)`` and inliers ``(B, N)`` by the symmetric transfer error (ORB-SLAM, IV)."""
+    """``(B,)`` scores and ``(B, N)`` inliers by the symmetric transfer error (ORB-SLAM, IV)."""
     with np.errstate(all="ignore"):  # collinear samples give NaN errors, which score 0
         error_2 = _squared(_transferred(H, xy_1) - xy_2) / sigma**2
         error_1 = _squared(_transferred(_adjugates(H), xy_2) - xy_1) / sigma**2
@@ -238,12 +241,12 @@ def score_homographies(
 def score_fundamentals(
     F: Matrix, xy_1: Matrix, xy_2: Matrix, sigma: Matrix
 ) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Scores ``(B,)`` and inliers ``(B, N)`` by the distances from the epipolar lines in both
+    """``(B,)`` scores and ``(B, N)`` inliers by the distances from the epipolar lines in both
     views.
 
-    The distance from a line has one degree of freedom, so the limit is ``CHI2_LINE``. A perfect
-    match has the same score as with a homography, so that both models can be compared (ORB-SLAM,
-    IV).
+    The distance from a line has one degree of freedom, so the inlier threshold is ``CHI2_LINE``. A
+    perfect match scores as much as with a homography, so that the scores of both models can be
+    compared (ORB-SLAM, IV).
     """
     one = np.ones((len(xy_1), 1))
     p_1, p_2 = np.hstack([xy_1, one]), np.hstack([xy_2, one])
@@ -270,7 +273,8 @@ def _transferred(H: Matrix, xy: Matrix) -> Matrix:
 
 
 def _adjugates(H: Matrix) -> Matrix:
-    """Adjugates of ``(B, 3, 3)`` matrices: the inverses up to scale, also for singular matrices."""
+    """Adjugates of ``(B, 3, 3)`` matrices. They are the inverses up to scale, and exist even for
+    singular matrices."""
     a, b, c = H[:, 0], H[:, 1], H[:, 2]
     return np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
 
@@ -291,8 +295,8 @@ def motions_of_essential(E: Matrix) -> list[Matrix]:
 
 def motions_of_homography(A: Matrix) -> list[Matrix]:
     """The eight candidate motions ``T_2_1`` of a calibrated homography (Faugeras and Lustman,
-    "Motion and structure from motion in a piecewise planar environment", 1988). The list is empty
-    for a pure rotation."""
+    "Motion and structure from motion in a piecewise planar environment", 1988). Returns an empty
+    list for a pure rotation."""
     U, (d1, d2, d3), Vt = np.linalg.svd(A)
     if d1 / d2 < 1.00001 or d2 / d3 < 1.00001:
         return []
@@ -330,9 +334,8 @@ def _triangulate(
     """Triangulate N matches.
 
     Returns:
-        ``(N, 3)`` points in the frame of camera 1; ``(N,)`` bool, whether each point lies in front
-        of both cameras and has small reprojection errors; ``(N,)`` cosine of the parallax angle of
-        each point.
+        ``(N, 3)`` points in the frame of camera 1; ``(N,)`` bool, True for points in front of both
+        cameras with small reprojection errors; ``(N,)`` cosine of the parallax angle of each point.
     """
     R, t = T_2_1[:3, :3], T_2_1[:3, 3]
     ray_1 = camera.backproject(xy_1, np.ones(len(xy_1)))

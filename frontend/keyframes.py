@@ -1,4 +1,4 @@
-"""When a frame becomes a keyframe (ORB-SLAM2, section III-E; monocular: ORB-SLAM, V-E)."""
+"""Decides when a frame becomes a keyframe (ORB-SLAM2, section III-E; monocular: ORB-SLAM, V-E)."""
 
 from __future__ import annotations
 
@@ -20,17 +20,19 @@ class KeyframeEvidence:
 
     Attributes:
         seconds_since_keyframe: time since the last keyframe, seconds.
-        n_inliers: number of landmarks tracked in this frame.
-        n_reference: ``MapView.n_reference``, number of well-observed landmarks of the reference
+        n_inliers: number of landmarks that this frame tracks.
+        n_reference: ``MapView.n_reference``, the number of well-observed landmarks of the reference
             keyframe.
-        tracked_close: number of close stereo features of this frame that track a landmark.
-        untracked_close: number of close stereo features that track no landmark; None for a frame
-            that was tracked by patches and has no features. It is then assumed to be large enough.
+        tracked_close: number of close stereo features of this frame that track a landmark. A close
+            feature has a depth that stereo measures accurately.
+        untracked_close: number of close stereo features that track no landmark. None for a frame
+            that was tracked by patches and has no features; the number is then assumed to be large
+            enough.
         mapping_idle: whether local mapping of the last keyframe is finished and merged.
         gained_close: running mean, over the last keyframes, of the number of close points that the
-            first frame after a keyframe tracks; infinite if unknown.
+            first frame after a keyframe tracks. Infinite if unknown.
         first_close: number of close points that the first frame after the last keyframe tracks.
-        close_ratio: factor, at most 1, by which the number of tracked close points has fallen per
+        close_ratio: factor, at most 1, by which the number of tracked close points has changed per
             frame since the first frame after the last keyframe.
     """
 
@@ -45,8 +47,8 @@ class KeyframeEvidence:
     close_ratio: float = 1.0
 
     def ahead(self, frames: int) -> KeyframeEvidence:
-        """The evidence that is expected some frames later, if the number of tracked close points
-        continues to fall by ``close_ratio`` per frame."""
+        """The evidence that is expected some frames later. It is assumed that the number of tracked
+        close points continues to change by the factor ``close_ratio`` per frame."""
         close = round(self.tracked_close * self.close_ratio**frames)
         n_inliers = self.n_inliers + close - self.tracked_close
         return replace(self, tracked_close=close, n_inliers=n_inliers)
@@ -57,21 +59,25 @@ def needs_keyframe(
 ) -> bool:
     """Whether a stereo or RGB-D frame should become a keyframe.
 
-    A keyframe is due if the last one is old. It is also due if the view has changed enough or too
-    few close points are tracked, provided that local mapping is idle or the need is urgent.
+    A keyframe is needed if the last one is old. A keyframe is also needed if the view has changed
+    enough, or if too few close points are tracked. For these last two reasons, a keyframe is made
+    only if local mapping is idle or the need is urgent.
 
-    A lack of close points is a reason for a keyframe only if a keyframe would provide more. On a
-    motorway, close points are scarce and leave the view before they are seen twice, so that even
-    the first frame after a keyframe tracks too few of them. In that case a frame needs only a
-    fraction of the close points that such a first frame tracks on average (``gained_close``),
-    provided that enough far points constrain the pose: at least as many as the close points that
-    would otherwise be required. In fog there are no far points, so the full number of close points
-    is required.
+    A lack of close points is a reason for a keyframe only if a new keyframe would provide more of
+    them. On a motorway, close points are scarce and leave the view before they are seen twice. Even
+    the first frame after a keyframe then tracks too few of them. In that case, a lower threshold
+    applies: a fraction of the number of close points that such a first frame tracks on average
+    (``gained_close``).
+
+    The lower threshold applies only if enough far points constrain the pose. Their number must be
+    at least the usual threshold for close points. In fog there are no far points, so the usual
+    threshold remains.
 
     Args:
-        depth: whether the camera is RGB-D. Nearly all points that it sees are close and mapped at
-            once, so the counts alone would lead to too few keyframes for a hand-held camera, which
-            turns faster than a car.
+        depth: whether the camera is RGB-D. Such a camera maps nearly all points at once, because
+            they are close, so the counts alone would lead to too few keyframes. A hand-held camera
+            needs more keyframes, because it turns faster than a car. Therefore, the maximum time
+            between keyframes is shorter for RGB-D.
     """
     max_interval_s = config.depth_max_interval_s if depth else config.max_interval_s
     required: float = config.min_tracked_close
@@ -82,8 +88,8 @@ def needs_keyframe(
     lacks_close = evidence.tracked_close < required and gains
     moved_on = evidence.n_inliers < config.max_tracked_ratio * evidence.n_reference
     if evidence.untracked_close is None:
-        # Patches are tracked longer than features, so the number of inliers alone reveals a change
-        # of view too late.
+        # Patches are tracked longer than features. The number of inliers alone therefore reveals a
+        # change of view too late, so the number of close points is tested as well.
         moved_on |= evidence.tracked_close < config.patch_kept_close * evidence.first_close
     if evidence.seconds_since_keyframe >= max_interval_s:
         return True
@@ -94,17 +100,18 @@ def needs_keyframe(
 
 
 def needs_monocular_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig) -> bool:
-    """Whether a monocular frame should become a keyframe (ORB-SLAM, V-E). Keyframes are made early,
-    because a point is mapped only after two keyframes have seen it from different positions;
-    redundant keyframes are culled later.
+    """Whether a monocular frame should become a keyframe (ORB-SLAM, V-E).
 
-    The time since the last keyframe is no reason by itself: while the camera stands still, nothing
-    new can be triangulated.
+    Keyframes are made early, because a point is mapped only after two keyframes have seen it from
+    different positions. Redundant keyframes are culled later.
+
+    The time since the last keyframe is not a reason by itself. While the camera stands still,
+    nothing new can be triangulated.
     """
     tracked, reference = evidence.n_inliers, evidence.n_reference
     if tracked >= config.monocular_ratio * reference:
         return False
-    # In a sharp turn the view changes faster than it is mapped, so a keyframe cannot wait.
+    # In a sharp turn, the view changes faster than it is mapped, so the keyframe cannot wait.
     urgent = tracked < max(config.monocular_urgent_ratio * reference, config.monocular_min_tracked)
     late = evidence.seconds_since_keyframe >= config.max_interval_s
     return evidence.mapping_idle or urgent or late
@@ -113,11 +120,12 @@ def needs_monocular_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig)
 def count_close(
     state: PolicyState, tracked_close: int, frame: int, config: KeyframeConfig
 ) -> PolicyState:
-    """The state after a frame with index ``frame`` that tracks ``tracked_close`` close points. The
-    state changes only if this is the first frame after a keyframe.
+    """The state after the frame with index ``frame``, which tracks ``tracked_close`` close points.
+    The state changes only if this is the first frame after a keyframe.
 
-    A single frame may track few close points by chance; only several in a row show that close
-    points are scarce. So an exponential moving average is kept, and it starts at a high value.
+    A single frame may track few close points by chance. Close points are scarce only if several
+    frames in a row track few of them. So an exponential moving average is kept, which starts at a
+    high value.
     """
     if not state.gain_awaited:
         return state
@@ -126,8 +134,9 @@ def count_close(
 
 
 def close_ratio(state: PolicyState, tracked_close: int, frame: int) -> float:
-    """Factor by which the number of tracked close points has fallen per frame, from the first frame
-    after the last keyframe to ``frame``, which tracks ``tracked_close``; 1 if it has not fallen."""
+    """Factor by which the number of tracked close points has changed per frame, from the first
+    frame after the last keyframe to ``frame``, which tracks ``tracked_close``. Returns 1 if the
+    number has not fallen."""
     if not 0 < tracked_close < state.first_close:
         return 1.0
     share = tracked_close / state.first_close
@@ -151,7 +160,7 @@ class KeyframePolicy:
     def observe(
         self, frame: Frame, view: MapView, *, seconds_since_keyframe: float, mapping_idle: bool
     ) -> KeyframeEvidence:
-        """Update the state with a tracked frame; returns the evidence for ``wants_keyframe``."""
+        """Update the state with a tracked frame. Returns the evidence for ``wants_keyframe``."""
         tracked = frame.landmark >= 0
         if frame.source is None:
             depth = feature_depth(frame.features, self._context.camera)
@@ -176,25 +185,30 @@ class KeyframePolicy:
         )
 
     def wants_keyframe(self, evidence: KeyframeEvidence) -> bool:
-        """Whether the frame should become a keyframe, unless its place is known (``is_known``)."""
+        """Whether the frame should become a keyframe. This does not test whether the place is
+        already mapped; ``is_known`` does."""
         camera = self._context.camera
         if camera.monocular:
             return needs_monocular_keyframe(evidence, self._config)
         return needs_keyframe(evidence, self._config, depth=camera.depth)
 
     def is_known(self, *, n_inliers: int, n_shared: int, n_place: int) -> bool:
-        """Whether a keyframe here would repeat an old one: the frame tracks as many landmarks as a
-        frame next to the old keyframe should, and shares enough of them with the old keyframe.
+        """Whether the place is already mapped, so that a keyframe here would repeat an old one.
 
-        A lack of close points is no reason to map a known place again, because the old keyframe did
-        not provide more of them. A minimum number of inliers is required, because the last keyframe
-        of a map has few landmarks that three keyframes observe: beyond the end of the map, both
-        ratios would hold until the camera is lost.
+        The frame must track as many landmarks as a frame next to the old keyframe should. It must
+        also share enough of them with the old keyframe.
+
+        A lack of close points is not a reason to map a known place again, because the old keyframe
+        did not provide more of them.
+
+        A minimum number of inliers is required, because of the end of a map. The last keyframe of a
+        map has few landmarks that at least three keyframes observe. If the camera drives beyond the
+        end, both ratios would therefore hold until tracking is lost.
 
         Args:
             n_inliers: number of landmarks tracked in the frame.
-            n_shared: number of these landmarks that an old keyframe observes, namely the one that
-                observes the most of them.
+            n_shared: number of these landmarks that the old keyframe observes. The old keyframe is
+                the one that observes the most of them.
             n_place: number of landmarks of that keyframe that at least three keyframes observe.
         """
         return (
@@ -204,9 +218,11 @@ class KeyframePolicy:
         )
 
     def is_due(self, index: int, evidence: KeyframeEvidence) -> bool:
-        """Whether frame ``index``, which was tracked by patches, is to become a keyframe. A
-        keyframe that is expected to be needed soon is planned in advance, so that its features can
-        be extracted in the background."""
+        """Whether frame ``index``, which was tracked by patches, is to become a keyframe.
+
+        A keyframe is planned a few frames before it is expected to be needed. Its features can then
+        be extracted in the background.
+        """
         if self.due < 0:
             soon = range(self._config.patch_lead_frames + 1)
             planned = (index + k for k in soon if self.wants_keyframe(evidence.ahead(k)))
@@ -217,7 +233,7 @@ class KeyframePolicy:
         return True
 
     def keyframe_made(self) -> None:
-        """Note that a keyframe was made."""
+        """Update the state after a keyframe was made."""
         self._state = replace(self._state, gain_awaited=True, due=-1)
 
     def state(self) -> PolicyState:

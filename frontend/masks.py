@@ -1,4 +1,4 @@
-"""Masks: the pixels of an image that are not to be used, such as the hood of the car."""
+"""Image masks. They exclude pixels that are not to be used, such as the hood of the car."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from vslam.features import Pyramid
 from vslam.frontend.orb import build_pyramid
 
 # Least distance between a feature and a masked pixel, in pixels of the feature's level. Corner
-# detection and alignment read no pixels farther away (a patch is shifted by at most two pixels), so
-# neither is affected by the edge of the mask.
+# detection and alignment read no pixels that are farther from the feature, so the edge of the mask
+# does not affect them. (Alignment shifts a patch by at most two pixels.)
 REACH = 4
 _WINDOW = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
 
@@ -27,7 +27,7 @@ class Mask:
 
     Attributes:
         used: ``(H, W)`` bool, False where the image is not to be used.
-        levels: 1 for the pixels of each pyramid level where a feature may lie, 0 for the others.
+        levels: for each pixel of the pyramid, 1 if a feature may lie there, else 0.
     """
 
     used: NDArray[np.bool_]
@@ -35,7 +35,7 @@ class Mask:
 
     @classmethod
     def of(cls, mask: NDArray[np.uint8] | NDArray[np.bool_], config: OrbConfig) -> Self:
-        """A mask from an ``(H, W)`` array that is 0 where a pixel is not to be used."""
+        """A mask from an ``(H, W)`` array. Pixels whose value is 0 are not to be used."""
         used = mask > 0
         levels = build_pyramid(used * np.uint8(255), config)
         for index in range(config.n_levels):
@@ -44,8 +44,9 @@ class Mask:
         return cls(used, levels)
 
     def shows(self, xy: NDArray[np.floating], octave: NDArray[np.integer]) -> NDArray[np.bool_]:
-        """``(N,)`` bool: whether features may lie at ``(N, 2)`` positions (full-resolution pixels)
-        of ``(N,)`` octaves. Positions outside the image are clamped to its border."""
+        """``(N,)`` bool, True for features that the mask allows. Their positions are ``(N, 2)``
+        full-resolution pixels, and their octaves are ``(N,)``. Positions outside the image are
+        clamped to its border."""
         shapes = self.levels.shapes[octave]
         ratio = self.levels.shapes[0, ::-1] / shapes[:, ::-1]
         pixel = np.rint((np.nan_to_num(xy) + 0.5) / ratio - 0.5)
@@ -54,7 +55,7 @@ class Mask:
         return self.levels.pixels[at] > 0
 
     def filled(self, image: Image) -> Image:
-        """A copy of an ``(H, W)`` uint8 image in which masked pixels have the mean grey value of
-        the other pixels, for networks that read the whole image."""
+        """A copy of an ``(H, W)`` uint8 image for networks that read the whole image. Masked pixels
+        have the mean grey value of the other pixels."""
         mean = np.uint8(image[self.used].mean()) if self.used.any() else np.uint8(0)
         return np.where(self.used, image, mean)

@@ -1,6 +1,6 @@
-"""Stateless matching of landmarks and descriptors to the features of a frame.
+"""Matching of landmarks and descriptors to the features of a frame, without state.
 
-Search by projection follows ORB-SLAM (Mur-Artal et al., T-RO 2015, V-C and V-D): a landmark is
+Search by projection follows ORB-SLAM (Mur-Artal et al., T-RO 2015, V-C and V-D). A landmark is
 searched for only near its projection and near the pyramid level at which it should appear.
 """
 
@@ -20,20 +20,23 @@ ORIENTATION_BINS = 30
 
 @kernel
 def predict_view(T, xyz, normal, distance_range, intrinsics, width, height, scales, window):
-    """Predict where landmarks appear in an image (ORB-SLAM, V-D). A landmark is visible if it
-    projects into the image, its distance from the camera is in ``distance_range`` (with a tolerance
-    of 20 %), and the camera views it from at most 60 degrees off its mean viewing direction.
+    """Predict where landmarks appear in an image (ORB-SLAM, V-D).
+
+    A landmark is visible if it meets three conditions. It projects into the image. Its distance
+    from the camera is in ``distance_range``, with a tolerance of 20 %. The camera views it from at
+    most 60 degrees off its mean viewing direction.
 
     Args:
         T: ``(4, 4)`` pose of the camera (world to camera).
-        xyz, normal: ``(N, 3)`` positions, and mean viewing directions as unit vectors.
+        xyz, normal: ``(N, 3)`` positions and ``(N, 3)`` mean viewing directions (unit vectors) of
+            the landmarks, in the world frame.
         distance_range: ``(N, 2)`` least and greatest distance at which each landmark is detected.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         scales: ``(levels,)`` pyramid scale factors.
         window: search radius at octave 0, pixels.
 
     Returns:
-        ``uvr`` ``(N, 3)``, predicted u, v, u_right; ``(N,)`` search radius in pixels, 0 for
+        ``(N, 3)`` predicted u, v, u_right, in pixels; ``(N,)`` search radius in pixels, 0 for
         landmarks that are not visible; ``(N,)`` int64 predicted octave.
     """
     n = len(xyz)
@@ -73,14 +76,14 @@ def predict_view(T, xyz, normal, distance_range, intrinsics, width, height, scal
 
 
 class Projections(NamedTuple):
-    """The predicted appearance of M landmarks.
+    """The predicted image positions and the descriptors of M landmarks.
 
     Attributes:
-        uvr: ``(M, 3)`` predicted u, v, u_right.
+        uvr: ``(M, 3)`` predicted u, v, u_right, pixels.
         radius: ``(M,)`` half width of the search window, pixels; landmarks with a radius of 0 are
             skipped.
         octave_low, octave_high: ``(M,)`` lowest and highest accepted octave.
-        descriptor: ``(M, 4)`` the 32 bytes of each descriptor as four integers.
+        descriptor: ``(M, 4)``, the 32 bytes of each descriptor as four integers.
     """
 
     uvr: NDArray[np.float64]
@@ -95,9 +98,9 @@ class Searchable(NamedTuple):
 
     Attributes:
         xy: ``(N, 2)`` pixels.
-        octave: ``(N,)``.
+        octave: ``(N,)`` pyramid level.
         u_right: ``(N,)`` columns in the right image, NaN for features without a stereo match.
-        descriptor: ``(N, 4)`` the 32 bytes of each descriptor as four integers.
+        descriptor: ``(N, 4)``, the 32 bytes of each descriptor as four integers.
         grid: the features sorted by image cell.
     """
 
@@ -109,7 +112,7 @@ class Searchable(NamedTuple):
 
     @classmethod
     def of_features(cls, features: Features, grid: FeatureGrid) -> Searchable:
-        """The features of a frame; arrays are not copied."""
+        """The features of a frame. The arrays are not copied."""
         descriptor = features.descriptors.view(np.uint64)
         return cls(features.xy, features.octave, features.u_right, descriptor, grid)
 
@@ -121,14 +124,14 @@ def search_windows(projections, features, free, max_distance, ratio):
     Args:
         projections: ``Projections`` of the landmarks.
         features: ``Searchable`` of the image.
-        free: ``(N,)`` bool, features that may be matched.
+        free: ``(N,)`` bool, True for features that may be matched.
         max_distance: largest Hamming distance of a match, bits.
-        ratio: largest ratio of the best to the second best distance, tested only if both features
-            have the same octave; 1 disables the test.
+        ratio: largest ratio of the best to the second best distance. The ratio is tested only if
+            both features have the same octave; 1 disables the test.
 
     Returns:
-        ``(M,)`` int32 index of the feature or -1, and ``(M,)`` int32 distances. A feature is
-        matched at most once, to the landmark with the closest descriptor.
+        ``(M,)`` int32 index of the matched feature, or -1; and ``(M,)`` int32 distances. A feature
+        is matched at most once, to the landmark with the closest descriptor.
     """
     uvr, radius, octave_low, octave_high, descriptors = projections
     xy, octave, u_right, frame_descriptors, grid = features
@@ -184,16 +187,16 @@ def search_windows(projections, features, free, max_distance, ratio):
 
 @kernel
 def search_all(a, b, max_distance, ratio):
-    """Exhaustive matching of two sets of descriptors: mutual nearest neighbours that pass a ratio
-    test.
+    """Match two sets of descriptors exhaustively. A match is a pair of mutual nearest neighbours
+    that passes a ratio test.
 
     Args:
         a, b: ``(M, 4)`` and ``(N, 4)`` uint64 descriptors.
         max_distance: largest Hamming distance of a match, bits.
-        ratio: largest ratio of the best to the second best distance, for each descriptor in a.
+        ratio: largest ratio of the best to the second best distance, for each descriptor of a.
 
     Returns:
-        ``(M,)`` int32 index into b or -1.
+        ``(M,)`` int32 index of the match in b, or -1.
     """
     m, n = len(a), len(b)
     best_of_a = np.full(m, -1, np.int32)
@@ -220,9 +223,11 @@ def search_all(a, b, max_distance, ratio):
 
 @kernel
 def consistent_orientation(angle_a, angle_b):
-    """Whether the rotation of each match falls in one of the three fullest of 30 histogram bins
-    (ORB-SLAM, V-C). The second and the third bin are used only if each holds at least a tenth as
-    many matches as the first.
+    """Whether the rotation of each match agrees with most other matches (ORB-SLAM, V-C).
+
+    The rotations are counted in a histogram of 30 bins, and matches in the three fullest bins are
+    consistent. The second and the third bin count only if each holds at least a tenth as many
+    matches as the first.
 
     Args:
         angle_a, angle_b: ``(N,)`` float32 orientations of the matched features, radians.
@@ -250,13 +255,13 @@ def consistent_orientation(angle_a, angle_b):
 
 
 def count_elsewhere(u: NDArray[np.floating], width: int) -> int:
-    """Number of inliers outside a vertical strip that is a third of the image wide, placed so that
-    it contains the most inliers.
+    """Number of inliers outside a vertical strip of the image. The strip is a third of the image
+    wide and is placed so that it contains as many inliers as possible.
 
     Two different places may contain a similar object, for example a facade or a parked car. Such an
-    object can provide a hundred inliers and determine a pose to a centimetre, but all of them lie
-    close together, because the rest of the scene does not match. At a true revisit, inliers are
-    spread over the whole image.
+    object can provide a hundred inliers and determine a pose to a centimetre. However, all these
+    inliers lie close together, because the rest of the scene does not match. At a true revisit, the
+    inliers are spread over the whole image.
 
     Args:
         u: ``(N,)`` columns of the inliers, pixels.

@@ -1,7 +1,7 @@
-"""ORB features: FAST corners over a pyramid, evenly spread, with oriented BRIEF descriptors.
+"""ORB features: evenly spread FAST corners in an image pyramid, with oriented BRIEF descriptors.
 
-Follows Rublee et al. (ICCV 2011) with the even distribution of ORB-SLAM (Mur-Artal et al., T-RO
-2015, section V-A).
+Extraction follows Rublee et al. (ICCV 2011). The even distribution of corners follows ORB-SLAM
+(Mur-Artal et al., T-RO 2015, section V-A).
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ PATTERN: NDArray[np.int8] = np.load(Path(__file__).with_name("orb_pattern.npy"))
 
 @dataclass(frozen=True)
 class Extraction:
-    """Features of one image, sorted by octave: see ``vslam.features.Features`` for the fields.
+    """Features of one image, sorted by octave. ``vslam.features.Features`` describes the fields.
 
-    At every level, coordinate 0 is the centre of the first pixel: x in a level that is ``w`` times
-    narrower than the image corresponds to ``(x + 0.5) w - 0.5`` in the image.
+    At every level, coordinate 0 is the centre of the first pixel. If the image is ``w`` times wider
+    than a level, x in the level corresponds to ``(x + 0.5) w - 0.5`` in the image.
     """
 
     xy: NDArray[np.float32]
@@ -45,8 +45,13 @@ class Extraction:
     pyramid: Pyramid
 
     def joined(self, other: Extraction) -> tuple[Extraction, NDArray[np.int64]]:
-        """These features and those of another extraction from the same image, and the ``(N,)``
-        index of each feature among these features followed by the others."""
+        """Join these features with those of another extraction from the same image.
+
+        Returns:
+            The joined features, and the ``(N,)`` order in which they were sorted. Entry i of the
+            order is the index of the i-th joined feature in a list of these features followed by
+            the other ones.
+        """
         octave = np.concatenate([self.octave, other.octave])
         order = np.argsort(octave, kind="stable")
         both = Extraction(
@@ -67,7 +72,7 @@ def extract(
 ) -> Extraction:
     """Extract up to ``config.n_features`` ORB features from an ``(H, W)`` uint8 image.
 
-    A pure function, safe to call from several threads.
+    This is a pure function. It can be called from several threads at the same time.
 
     Args:
         allowed: 1 for pixels where a corner may lie, 0 for the others; None allows all pixels.
@@ -90,12 +95,13 @@ def extract(
 
 
 def extract_at(found: Extraction, xy: NDArray[np.float32], octave: NDArray[np.uint8]) -> Extraction:
-    """Extract a feature at each of N positions that has no other feature within
-    ``KEYPOINT_REACH``.
+    """Extract features at N given positions. Positions with another feature within
+    ``KEYPOINT_REACH`` are skipped.
 
     Args:
-        found: the other features of the image.
-        xy: ``(N, 2)`` full-resolution pixels; rounded to whole pixels of the levels.
+        found: the features that were already extracted from the image.
+        xy: ``(N, 2)`` positions in full-resolution pixels. They are rounded to whole pixels of the
+            levels.
         octave: ``(N,)`` pyramid levels.
     """
     shapes = found.pyramid.shapes
@@ -121,7 +127,7 @@ def extract_at(found: Extraction, xy: NDArray[np.float32], octave: NDArray[np.ui
 
 @kernel
 def _is_free(pixel, existing):
-    """``(N,)`` bool, whether each ``(N, 2)`` pixel is far from all ``(M, 2)`` existing features."""
+    """``(N,)`` bool: whether each ``(N, 2)`` pixel is far from all ``(M, 2)`` existing features."""
     free = np.ones(len(pixel), np.bool_)
     for i in range(len(pixel)):
         x, y = pixel[i, 0], pixel[i, 1]
@@ -134,18 +140,18 @@ def _is_free(pixel, existing):
 
 
 def scale_factors(config: OrbConfig) -> NDArray[np.float64]:
-    """``(L,)`` float64, scale of each level: full-resolution pixels per pixel; 1 for level 0."""
+    """``(L,)`` float64 scale of each level, in full-resolution pixels per pixel; 1 for level 0."""
     return config.scale_factor ** np.arange(config.n_levels, dtype=np.float64)
 
 
 @cache
 def features_per_level(config: OrbConfig) -> NDArray[np.int64]:
-    """``(L,)`` int64, ``n_features`` divided among the levels in proportion to 1 / scale (ORB-SLAM,
-    V-A)."""
+    """``(L,)`` int64 maximum number of features of each level. ``n_features`` is divided among the
+    levels in proportion to 1 / scale (ORB-SLAM, V-A)."""
     weights = 1.0 / scale_factors(config)
     share = config.n_features * weights / weights.sum()
     quota = np.floor(share).astype(np.int64)
-    # The features lost by rounding down go to the levels that lost the largest fractions.
+    # The features that are lost by rounding down go to the levels that lost the largest fractions.
     missing = config.n_features - quota.sum()
     quota[np.argsort(quota - share, kind="stable")[:missing]] += 1
     return quota
@@ -164,14 +170,14 @@ def _layout(
 
 
 def level_shapes(size: tuple[int, int], config: OrbConfig) -> NDArray[np.int64]:
-    """``(L, 2)`` heights and widths of the pyramid levels of an image with the given height and
-    width."""
+    """``(L, 2)`` heights and widths of the pyramid levels of an image. ``size`` is the height and
+    width of the image."""
     return _layout(*size, config)[2]
 
 
 def build_pyramid(image: NDArray[np.uint8], config: OrbConfig) -> Pyramid:
-    """Build the pyramid of an ``(H, W)`` uint8 image: each level is resized bilinearly from the
-    previous one."""
+    """Build the pyramid of an ``(H, W)`` uint8 image. Each level is resized bilinearly from the
+    previous level."""
     size, offsets, shapes, scales = _layout(*image.shape, config)
     pixels = np.empty(size + SPARE, np.uint8)
     pixels[-SPARE:] = 0
@@ -191,15 +197,17 @@ def extract_levels(
 ):
     """Extract the features of all levels.
 
-    This is a single kernel, so that the global interpreter lock is acquired only once per image.
+    All levels are processed in a single kernel, so that the global interpreter lock is acquired
+    only once per image.
 
     Args:
-        pixels, offsets, shapes: those of the ``Pyramid``.
+        pixels, offsets, shapes: fields of the ``Pyramid``.
         allowed: 1 for pixels where a corner may lie, 0 for the others; empty allows all pixels.
         quota: ``(L,)`` int64, greatest number of features per level.
         threshold, threshold_min, cell: see ``local_maxima``.
         inside: ``DISC``, the disc for ``orientations``.
-        pattern: ``PATTERN``, ``(256, 4)`` int8 test points xa, ya, xb, yb.
+        pattern: ``PATTERN``, ``(256, 4)`` int8 coordinates xa, ya, xb, yb of the two points of each
+            test.
 
     Returns:
         ``xy``, ``octave``, ``angle`` and ``descriptors``, see ``vslam.features.Features``.
@@ -218,7 +226,7 @@ def extract_levels(
             continue
         level_angles = orientations(image, corners, inside)
         level_descriptors = describe(smoothed(image), corners, level_angles, pattern)
-        # The sizes of levels are rounded to whole pixels, so their ratios differ from the scales.
+        # Level sizes are rounded to whole pixels, so their ratios differ slightly from the scales.
         ratio_x, ratio_y = shapes[0, 1] / width, shapes[0, 0] / height
         for i in range(len(corners)):
             x, y = corners[i, 0] + 0.5, corners[i, 1] + 0.5
@@ -232,8 +240,8 @@ def extract_levels(
 
 @kernel
 def detect_corners(pixels, allowed, quota, threshold, threshold_min, cell):
-    """Up to ``quota`` FAST-9 corners of one level, evenly spread over the ``allowed`` pixels:
-    ``(n, 2)`` float32 x, y in pixels of the level."""
+    """``(n, 2)`` float32 x, y of up to ``quota`` FAST-9 corners of one level, in pixels of the
+    level. The corners are evenly spread over the ``allowed`` pixels."""
     height, width = pixels.shape
     if min(height, width) <= 2 * MARGIN or quota == 0:
         return np.empty((0, 2), np.float32)
@@ -251,7 +259,8 @@ def detect_corners(pixels, allowed, quota, threshold, threshold_min, cell):
 
 
 def disc(radius: int) -> NDArray[np.int16]:
-    """``(2 radius + 1, LANES)`` mask, 1 inside a disc whose centre is in column ``radius``."""
+    """``(2 radius + 1, LANES)`` mask that is 1 inside a disc. The centre of the disc is in column
+    ``radius``."""
     x = np.arange(LANES) - radius
     y = np.arange(-radius, radius + 1)[:, None]
     return (abs(x) <= np.floor(np.sqrt(radius**2 - y**2 + 0.5))).astype(np.int16)
@@ -262,16 +271,16 @@ DISC = disc(PATCH_RADIUS)
 
 @kernel
 def orientations(pixels, corners, inside):
-    """``(n,)`` float32, direction of the intensity centroid of the disc around each corner, in
-    radians (Rublee et al., section 3.2)."""
+    """``(n,)`` float32 orientation of each corner, in radians: the direction of the intensity
+    centroid of the disc around the corner (Rublee et al., section 3.2)."""
     n = len(corners)
     angles = np.empty(n, np.float32)
     height, width = pixels.shape
     rows = len(inside)
     radius = rows // 2
     flat, weight = pixels.reshape(height * width), inside.reshape(rows * LANES)
-    # Sum and first moment of each column. They are at most 255 (1 + 2 + ... + 15) and fit into 16
-    # bits, so that a vector register holds many columns.
+    # Sum and first moment of each column. Both are at most 255 (1 + 2 + ... + 15), so 16 bits are
+    # enough, and a vector register holds many columns.
     total, moment = np.empty(LANES, np.int16), np.empty(LANES, np.int16)
     for i in range(n):
         corner = (int(corners[i, 1]) - radius) * width + int(corners[i, 0]) - radius
@@ -295,7 +304,7 @@ def orientations(pixels, corners, inside):
 
 @kernel
 def describe(smooth, corners, angles, pattern):
-    """``(n, 32)`` uint8, rotated BRIEF descriptor of each corner (Rublee et al., section 4). Bit 0
+    """``(n, 32)`` uint8 rotated BRIEF descriptor of each corner (Rublee et al., section 4). Bit 0
     of byte 0 is the result of the first test."""
     n = len(corners)
     height, width = smooth.shape
@@ -328,13 +337,18 @@ def describe(smooth, corners, angles, pattern):
 
 @kernel
 def smoothed(pixels):
-    """Blur an ``(H, W)`` uint8 image of at least 4x4 pixels before BRIEF, with mirrored borders.
-    The result is the same as that of ``cv2.GaussianBlur`` with a 7x7 kernel and a sigma of 2.
+    """Blur an image before BRIEF tests are evaluated.
 
-    OpenCV uses fixed-point weights in multiples of 1/256, first along rows, then along columns, and
-    rounds once at the end. Here row sums are split into whole grey levels and 256ths, and both
-    parts are summed along the columns. So every intermediate sum fits into 16 bits, and a vector
-    register holds twice as many pixels as with 32 bits.
+    The result is identical to that of ``cv2.GaussianBlur`` with a 7x7 kernel and a sigma of 2.
+    Borders are mirrored.
+
+    OpenCV uses fixed-point weights in multiples of 1/256. It blurs first along rows, then along
+    columns, and rounds once at the end. Here each row sum is split into whole grey levels and
+    256ths, and the two parts are summed separately along the columns. Every intermediate sum then
+    fits into 16 bits, so a vector register holds twice as many pixels as with 32 bits.
+
+    Args:
+        pixels: ``(H, W)`` uint8 image of at least 4x4 pixels.
     """
     height, width = pixels.shape
     taps = 2 * BLUR_REACH + 1
@@ -377,7 +391,10 @@ def smoothed(pixels):
 
 @inner_kernel
 def weigh(a, b, c, d, e, f, g, out):
-    """Weighted sum of seven rows, or of seven shifted copies of a row. The weights are those of a
-    Gaussian with a sigma of 2, in 256ths, rounded to a sum of 256 as in OpenCV."""
+    """Weighted sum of seven rows, or of seven shifted copies of one row.
+
+    The weights are those of a Gaussian with a sigma of 2, in 256ths. They are rounded to a sum of
+    256, as in OpenCV.
+    """
     for x in range(np.uintp(len(out))):
         out[x] = 18 * (a[x] + g[x]) + 34 * (b[x] + f[x]) + 48 * (c[x] + e[x]) + 56 * d[x]

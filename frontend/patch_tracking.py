@@ -1,8 +1,9 @@
-"""Tracking without features: the patches of the newest keyframes are searched for in the image.
+"""Tracks a frame without features: searches the image for patches of the newest keyframes.
 
-As in SVO (Forster et al., ICRA 2014, III, and T-RO 2017), sparse image alignment to the last frame
-first estimates the pose (``pose_alignment``). Then the patch of each landmark is aligned with the
-image separately, and the pose is optimised from the positions that were found.
+The method follows SVO (Forster et al., ICRA 2014, III, and T-RO 2017). First, sparse image
+alignment to the last frame estimates the pose (``pose_alignment``). Then the patch of each landmark
+is aligned with the image separately. Finally, the pose is optimised from the positions that were
+found.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ _MARGIN = PATCH_RADIUS + 2  # least distance of a patch centre from the border o
 
 
 class PatchTrack(NamedTuple):
-    """The pose of a frame, and the N inliers among the landmarks that were found by their patches.
+    """The pose of a frame that was tracked by patches, and the N landmarks that are inliers.
 
     Attributes:
-        T_cw: ``(4, 4)`` pose.
-        ids, xyz: ``(N,)`` ids and ``(N, 3)`` positions of the landmarks.
-        features: a feature for each landmark at the position where it was found, with the
-            descriptor of the landmark and without a column in a right image.
-        n_matches: number of landmarks that were found, outliers included.
+        T_cw: ``(4, 4)`` pose (world to camera).
+        ids, xyz: ``(N,)`` ids and ``(N, 3)`` world positions of the inliers.
+        features: a feature for each inlier, at the position where the patch was found. It has the
+            descriptor of the landmark and no column in the right image.
+        n_matches: number of landmarks whose patches were found, including outliers.
         visible: ``(M,)`` ids of the landmarks that the frame should see.
     """
 
@@ -44,7 +45,7 @@ class PatchTrack(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Share of inliers among the landmarks that were found."""
+        """Fraction of inliers among the landmarks whose patches were found."""
         return len(self.ids) / max(1, self.n_matches)
 
 
@@ -55,11 +56,12 @@ def track_patches(
     context: TrackingContext,
     mask: Mask | None = None,
 ) -> PatchTrack:
-    """Find the landmarks of the local map that have patches, and optimise the pose.
+    """Search the image for the patches of the landmarks of the local map, and optimise the pose.
 
     Args:
         pyramid: the pyramid of the image.
-        T_cw: ``(4, 4)`` initial pose. Landmarks projected with it may be off by about two pixels.
+        T_cw: ``(4, 4)`` initial pose (world to camera). Its error may shift projected landmarks by
+            about two pixels.
         mask: the mask of the image; None if all pixels are used.
     """
     known, local = view.patches, view.with_patches

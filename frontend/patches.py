@@ -1,7 +1,8 @@
 """Image patches around keypoints, to which matches are aligned, and a store of recent patches.
 
-Only the patches of the newest keyframes are kept: these keyframes observe nearly all landmarks that
-are being tracked, and a patch takes more memory than the rest of an observation.
+The patches of the newest keyframes are kept, and older patches are discarded. The newest keyframes
+observe nearly all landmarks that are being tracked, and a patch takes more memory than the rest of
+an observation.
 """
 
 from __future__ import annotations
@@ -27,14 +28,15 @@ from vslam.map import Map
 def patches_around(
     pyramid: Pyramid, xy: NDArray[np.float32], octave: NDArray[np.uint8]
 ) -> NDArray[np.uint8]:
-    """Cut a square patch around each keypoint out of the pyramid level of its octave.
+    """Cut out a square patch around each keypoint, from the pyramid level of its octave.
 
     Args:
-        xy: ``(N, 2)`` full-resolution pixels; the patches must lie inside their levels.
-        octave: ``(N,)``.
+        xy: ``(N, 2)`` positions in full-resolution pixels. The patches must lie inside their
+            levels.
+        octave: ``(N,)`` pyramid level of each keypoint.
 
     Returns:
-        ``(N, PATCH_PIXELS)`` uint8, row by row.
+        ``(N, PATCH_PIXELS)`` uint8 patches, row by row.
     """
     return _cut(pyramid.pixels, pyramid.offsets, pyramid.shapes, xy, octave)
 
@@ -86,7 +88,7 @@ class RecentPatches:
         self.add(KeyframePatches(keyframe, pixels, shift))
 
     def add(self, patches: KeyframePatches) -> None:
-        """Store the patches of another keyframe; if all slots are full, the patches of the oldest
+        """Store the patches of another keyframe. If all slots are full, the patches of the oldest
         keyframe are replaced."""
         slot, n = self._next, len(patches.pixels)
         if n > self._shift.shape[1]:
@@ -97,7 +99,7 @@ class RecentPatches:
         self._next = (slot + 1) % len(self._keyframes)
 
     def all(self) -> tuple[KeyframePatches, ...]:
-        """The stored patches of all keyframes, oldest first, for a checkpoint."""
+        """The stored patches of all keyframes, oldest keyframe first, for a checkpoint."""
         slots = np.roll(np.arange(len(self._keyframes)), -self._next)
         return tuple(
             KeyframePatches(
@@ -110,9 +112,14 @@ class RecentPatches:
         )
 
     def of(self, map_: Map, ids: NDArray[np.int32]) -> LandmarkPatches:
-        """The patches of ``(L,)`` landmarks with sorted ids. Each patch is from the newest stored
-        keyframe that observes the landmark; landmarks that no stored keyframe observes are omitted.
-        The result is valid until ``add`` is called."""
+        """The patches of landmarks in the map.
+
+        Each patch comes from the newest stored keyframe that observes the landmark. Landmarks that
+        no stored keyframe observes are omitted. The result is valid until ``add`` is called.
+
+        Args:
+            ids: ``(L,)`` ids of the landmarks, sorted.
+        """
         width, arrays = self._shift.shape[1], map_.arrays
         row, view = newest_rows(arrays, self._keyframes, ids)
         seen = np.flatnonzero(row >= 0)
@@ -137,13 +144,14 @@ def _widened(array: NDArray, n: int) -> NDArray:
 
 
 def certainty_of(frame: Frame, config: AlignmentConfig) -> NDArray[np.uint8] | int:
-    """``(N,)`` uint8, the factor by which the variance of each feature's position is smaller than
-    the variance of a keypoint's position (``Arrays.certainty``); 1 for all features of a frame
-    without a pyramid.
+    """``(N,)`` uint8 certainty of each feature's position (``Arrays.certainty``).
 
-    The position of an aligned match is accurate. The position of a feature without a match counts
-    as accurate, too, because a landmark that is created from the feature is defined by this
-    position. A match that was not aligned is off by about half a pixel.
+    The certainty is the variance of a keypoint's position, divided by the variance of this
+    position. It is 1 for all features of a frame without a pyramid.
+
+    The position of an aligned match is accurate. A feature without a match is also considered
+    accurate, because a landmark that is created from it is defined by its position. A match that
+    was not aligned is off by about half a pixel.
     """
     if frame.pyramid is None:
         return 1
@@ -153,14 +161,14 @@ def certainty_of(frame: Frame, config: AlignmentConfig) -> NDArray[np.uint8] | i
 
 @kernel
 def newest_rows(a, keyframes, ids):
-    """For each of ``(L,)`` landmarks, the row of its observation by the newest of ``keyframes``.
+    """For each of ``(L,)`` landmarks, find its observation by the newest of the given keyframes.
 
-    The observations of a landmark are linked roughly from the newest to the oldest keyframe, so the
-    search ends at the first observation that is older than all ``keyframes``.
+    The observations of a landmark are linked roughly from the newest to the oldest keyframe. The
+    search therefore ends at the first observation that is older than all ``keyframes``.
 
     Returns:
-        ``(L,)`` int64 row in the map's arrays and ``(L,)`` int64 index into ``keyframes``; -1 where
-        none of ``keyframes`` observes the landmark.
+        ``(L,)`` int64 row of the observation in the map's arrays, and ``(L,)`` int64 index of its
+        keyframe in ``keyframes``. Both are -1 where none of ``keyframes`` observes the landmark.
     """
     found, view = np.full(len(ids), -1, np.int64), np.full(len(ids), -1, np.int64)
     newest = keyframes.max()

@@ -1,4 +1,4 @@
-"""Pose of a camera from matched landmarks without an initial guess: P3P inside RANSAC.
+"""Estimates a camera pose from matched landmarks without an initial guess: P3P inside RANSAC.
 
 The P3P solver follows Persson and Nordberg, "Lambda Twist: An Accurate Fast Robust Perspective
 Three Point (P3P) Solver", ECCV 2018.
@@ -16,15 +16,15 @@ from vslam.reprojection import chi_square_ratio, unpacked
 
 @kernel
 def solve_p3p(points, rays, T_cw):
-    """Poses of a camera that sees three points along three rays.
+    """Find the poses of a camera that sees three points along three rays.
 
     Args:
-        points: ``(3, 3)`` float64, one point in the world per row.
+        points: ``(3, 3)`` float64, one point per row, in the world frame.
         rays: ``(3, 3)`` float64, unit directions in the camera frame.
-        T_cw: ``(4, 4, 4)`` float64, receives the poses.
+        T_cw: ``(4, 4, 4)`` float64, receives the poses (world to camera).
 
     Returns:
-        Number of poses, 0 to 4; 0 for collinear points.
+        Number of poses, 0 to 4; always 0 for collinear points.
     """
     a12, a13, a23 = _squared(points, 0, 1), _squared(points, 0, 2), _squared(points, 1, 2)
     b12, b13, b23 = _dot(rays, 0, 1), _dot(rays, 0, 2), _dot(rays, 1, 2)
@@ -34,8 +34,8 @@ def solve_p3p(points, rays, T_cw):
     area = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
     if area <= 1e-12 * longest * longest:
         return 0
-    # The depths l solve l' M_ij l = a_ij (paper, eq. 4-6). Two combinations of these equations are
-    # homogeneous: l' D1 l = 0 and l' D2 l = 0 (eq. 8).
+    # The depths l solve l' M_ij l = a_ij (paper, eq. 4-6). Two homogeneous combinations of these
+    # equations are l' D1 l = 0 and l' D2 l = 0 (eq. 8).
     D1, D2 = np.zeros((3, 3)), np.zeros((3, 3))
     D1[0, 0], D1[0, 1], D1[1, 1] = a23, -b12 * a23, a23 - a12
     D1[1, 2], D1[2, 2] = b23 * a12, -a12
@@ -44,7 +44,8 @@ def solve_p3p(points, rays, T_cw):
     for i in range(3):
         for j in range(i):
             D1[i, j], D2[i, j] = D1[j, i], D2[j, i]
-    # A combination D1 + g D2 whose determinant is zero describes a pair of planes (eq. 9-11).
+    # If the determinant of D1 + g D2 is zero, this combination describes a pair of planes (eq.
+    # 9-11).
     g = _real_root(
         _determinant(D2),
         _mixed(D2, D1),
@@ -75,8 +76,8 @@ def solve_p3p(points, rays, T_cw):
         if abs(n0) < 1e-14 * (abs(n1) + abs(n2)):
             continue
         w1, w2 = -n1 / n0, -n2 / n0  # l1 = w1 l2 + w2 l3
-        # Substituting l3 = t l2 into l' D l = 0, where D is D1 or D2, gives a quadratic in t. The
-        # quadratic is better conditioned for the matrix that contributes less to D0.
+        # Substituting l3 = t l2 into l' D l = 0, where D is D1 or D2, gives a quadratic equation in
+        # t. The equation is better conditioned for the matrix that contributes less to D0.
         D = D1 if abs(g) > 1.0 else D2
         A = D[0, 0] * w2 * w2 + 2.0 * D[0, 2] * w2 + D[2, 2]
         B = 2.0 * (D[0, 0] * w1 * w2 + D[0, 1] * w2 + D[0, 2] * w1 + D[1, 2])
@@ -126,8 +127,8 @@ def _dot(rays, i, j):
 
 @inner_kernel
 def _cross(points, out):
-    """Write the normal of the triangle of three points into ``out``. Its length is twice the area
-    of the triangle."""
+    """Write the normal of the triangle of three points into ``out``. The length of the normal is
+    twice the area of the triangle."""
     for k in range(3):
         m, n = (k + 1) % 3, (k + 2) % 3
         out[k] = (points[1, m] - points[0, m]) * (points[2, n] - points[0, n])
@@ -145,7 +146,8 @@ def _determinant(A):
 
 @inner_kernel
 def _mixed(A, B):
-    """Coefficient of g in det(A + g B): the sum of the cofactors of A times the entries of B."""
+    """Coefficient of g in det(A + g B): the sum of the products of A's cofactors and B's
+    entries."""
     total = 0.0
     for i in range(3):
         for j in range(3):
@@ -156,7 +158,8 @@ def _mixed(A, B):
 
 @inner_kernel
 def _real_root(c3, c2, c1, c0):
-    """A real root of ``c3 x^3 + c2 x^2 + c1 x + c0`` (closed form, then Newton)."""
+    """A real root of ``c3 x^3 + c2 x^2 + c1 x + c0``, in closed form and refined by Newton's
+    method."""
     b, c, d = c2 / c3, c1 / c3, c0 / c3
     shift = b / 3.0
     p = c - b * b / 3.0
@@ -164,7 +167,7 @@ def _real_root(c3, c2, c1, c0):
     discriminant = 0.25 * q * q + p * p * p / 27.0
     if discriminant >= 0.0:
         s = np.sqrt(discriminant)
-        # The larger of the two cube roots has no cancellation; the other follows from p.
+        # The larger of the two cube roots has no cancellation. The smaller one follows from p.
         u = np.cbrt(-0.5 * q - s) if q >= 0.0 else np.cbrt(-0.5 * q + s)
         x = u - (p / (3.0 * u) if u != 0.0 else 0.0)
     else:
@@ -185,7 +188,8 @@ def _real_root(c3, c2, c1, c0):
 
 @inner_kernel
 def _refine_depths(depth, a12, a13, a23, b12, b13, b23):
-    """Refine the depths by Newton's method on the three cosine laws (paper, section 3.6)."""
+    """Refine the depths by Newton's method on the three law-of-cosines equations (paper, section
+    3.6)."""
     for _ in range(5):
         l1, l2, l3 = depth[0], depth[1], depth[2]
         r1 = l1 * l1 + l2 * l2 - 2.0 * b12 * l1 * l2 - a12
@@ -211,8 +215,8 @@ def _refine_depths(depth, a12, a13, a23, b12, b13, b23):
 
 @inner_kernel
 def _pose_of_triangle(points, rays, depth, T):
-    """Write the pose that maps three points in the world to their positions on the rays into
-    ``T``."""
+    """Write a pose into ``T``. It maps three points in the world frame to their positions on the
+    rays."""
     placed = np.empty((3, 3))
     for i in range(3):
         for k in range(3):
@@ -235,8 +239,8 @@ def _pose_of_triangle(points, rays, depth, T):
 
 @inner_kernel
 def _triad(points, axes):
-    """Write an orthonormal frame of a triangle into the rows of ``axes``: the direction of the
-    first side, the normal, and their cross product."""
+    """Write an orthonormal frame of a triangle into the rows of ``axes``. The rows are the
+    direction of the first side, the normal, and their cross product."""
     _cross(points, axes[1])
     for k in range(3):
         axes[0, k] = points[1, k] - points[0, k]
@@ -251,8 +255,9 @@ def _triad(points, axes):
 
 @inner_kernel
 def _score_pose(T, points, uvr, inverse_sigma2, intrinsics, to_beat, inlier):
-    """MSAC score of a pose (Torr and Zisserman, CVIU 2000) and its number of inliers, which are
-    written into ``inlier``. Returns -1, 0 as soon as the score can no longer exceed ``to_beat``."""
+    """MSAC score of a pose (Torr and Zisserman, CVIU 2000) and its number of inliers. The inliers
+    are written into ``inlier``. Returns -1, 0 as soon as the score can no longer exceed
+    ``to_beat``."""
     pinhole = unpacked(intrinsics)
     n = len(points)
     score, count = 0.0, 0
@@ -278,25 +283,26 @@ def _score_pose(T, points, uvr, inverse_sigma2, intrinsics, to_beat, inlier):
 
 @kernel
 def ransac_pose(points, uvr, inverse_sigma2, intrinsics, seed, min_inliers, max_draws, confidence):
-    """Pose with the highest MSAC score among N matches.
+    """Find the pose with the highest MSAC score for N matches.
 
-    P3P uses only the left image, so samples may contain monocular features; the score of a pose
-    includes u_right where it is known.
+    P3P uses only the left image, so samples may contain monocular features. The score of a pose
+    also uses u_right where it is known.
 
     Args:
         points: ``(N, 3)`` float64 landmarks in the world frame.
-        uvr: ``(N, 3)`` float64 observed u, v, u_right; NaN u_right for a monocular feature.
-        inverse_sigma2: ``(N,)`` float64, inverse variance of a pixel coordinate.
+        uvr: ``(N, 3)`` float64 observed u, v, u_right, in pixels; u_right is NaN for a monocular
+            feature.
+        inverse_sigma2: ``(N,)`` float64, inverse variance of u and v.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         seed: uint64; the same seed gives the same result.
         min_inliers: least number of inliers of an acceptable pose.
         max_draws: maximum number of samples.
-        confidence: sampling ends when, with this probability, no better pose with at least
-            ``min_inliers`` inliers has been missed.
+        confidence: a probability. Sampling ends when, with this probability, no better pose with at
+            least ``min_inliers`` inliers has been missed.
 
     Returns:
-        ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers of the best pose. There may be fewer inliers
-        than ``min_inliers``.
+        ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers of the best pose. The number of inliers may be
+        smaller than ``min_inliers``.
     """
     fx, fy, cx, cy, _, _ = intrinsics
     n = len(points)

@@ -1,4 +1,5 @@
-"""Pose of one camera from matched landmarks ("motion-only bundle adjustment", ORB-SLAM2, III-C)."""
+"""Optimises a camera pose from matched landmarks (motion-only bundle adjustment, ORB-SLAM2,
+III-C)."""
 
 from __future__ import annotations
 
@@ -11,8 +12,9 @@ from vslam.reprojection import chi_square, chi_square_ratio, residual, unpacked
 
 ROUNDS = 4
 ITERATIONS = 10
-# Side of the cells of ``pose_covariance``, pixels: the width of the window that is aligned in the
-# coarsest octave. Larger cells give the same covariances (docs/research/uncertainty.md).
+# Side of the cells of ``pose_covariance``, pixels. It equals the width of the window that is
+# aligned in the coarsest octave. Larger cells give the same covariances
+# (docs/research/uncertainty.md).
 CELL = 32
 
 
@@ -24,24 +26,24 @@ def optimise_pose(
     intrinsics: NDArray[np.float64],
     disparity_weight: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Pose that minimises the robust reprojection error of fixed landmarks.
+    """Find the camera pose that minimises the robust reprojection error of fixed landmarks.
 
-    Runs four rounds of Gauss-Newton. After each round, the chi-square test classifies all
-    observations again, and the next round uses only inliers. The first two rounds use the Huber
-    loss.
+    Runs four rounds of Gauss-Newton. After each round, all observations are classified again by the
+    chi-square test, and the next round uses only inliers. The first two rounds use the Huber loss.
 
     Args:
-        T_cw: ``(4, 4)`` initial pose.
+        T_cw: ``(4, 4)`` initial pose (world to camera).
         points: ``(N, 3)`` float64 landmarks in the world frame.
-        uvr: ``(N, 3)`` float64 observed u, v, u_right; NaN u_right for a monocular observation.
-        inverse_sigma2: ``(N,)`` float64, inverse variance of a pixel coordinate.
+        uvr: ``(N, 3)`` float64 observed u, v, u_right, in pixels; u_right is NaN for a monocular
+            observation.
+        inverse_sigma2: ``(N,)`` float64, inverse variance of u and v.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         disparity_weight: ``(N,)`` float64, ratio of the standard deviation of u and v to the
             standard deviation of the disparity; None uses the ratio in ``intrinsics``.
 
     Returns:
-        ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers; no inliers if fewer than three observations
-        are left.
+        ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers. There are no inliers if fewer than three
+        observations are left.
     """
     if disparity_weight is None:
         disparity_weight = np.full(len(points), intrinsics[5])
@@ -59,20 +61,23 @@ def pose_covariance(
     """Covariance of an optimised pose relative to the landmarks.
 
     If the errors of all observations were independent and as large as their weights say, the
-    covariance would be the inverse of the normal matrix times a variance factor. They are not:
-    observations of near landmarks have larger errors, because errors of depth matter more there,
-    and one corner is often observed in several octaves. So the spread of the gradient is measured
-    instead of assumed (the sandwich estimator of White, Econometrica 1980), from sums over the
-    cells of a grid, within which errors may be correlated (Liang and Zeger, Biometrika 1986).
+    covariance would be the inverse of the normal matrix times a variance factor. In practice,
+    neither is true. Observations of near landmarks have larger errors than their weights say,
+    because depth errors matter more there. Errors are correlated, because one corner is often
+    observed in several octaves.
+
+    Therefore, the spread of the gradient is measured instead of assumed (the sandwich estimator of
+    White, Econometrica 1980). The gradients are summed over the cells of a grid, within which
+    errors may be correlated (Liang and Zeger, Biometrika 1986).
 
     Args:
         T_cw: ``(4, 4)`` optimised pose.
-        points, uvr, inverse_sigma2, intrinsics, disparity_weight: see ``optimise_pose``; inliers
-            only.
+        points, uvr, inverse_sigma2, intrinsics, disparity_weight: inliers only; see
+            ``optimise_pose``.
 
     Returns:
-        ``(6, 6)`` covariance of ``xi = [v, w]``, metres and radians, where ``exp(xi) T_cw`` is the
-        true pose; NaN if the observations do not determine the pose.
+        ``(6, 6)`` covariance of ``xi = [v, w]``, in metres and radians, where ``exp(xi) T_cw`` is
+        the true pose. NaN if the observations do not determine the pose.
     """
     if disparity_weight is None:
         disparity_weight = np.full(len(points), intrinsics[5])
@@ -90,8 +95,9 @@ def pose_covariance(
     )
     if n <= 6:
         return np.full((6, 6), np.nan)
-    # Few cells do not determine the spread of the gradient, so the spread that the weights of the
-    # observations imply counts like as many cells as there are unknowns.
+    # A few cells do not determine the spread of the gradient. The measured spread is therefore
+    # averaged with the spread that the weights of the observations imply. The implied spread counts
+    # like as many cells as there are unknowns.
     share = 6.0 / (6.0 + len(gradients))
     spread = (1.0 - share) * gradients.T @ gradients + share * chi2 / n * H
     try:
@@ -109,18 +115,19 @@ def offset_effect(
     inverse_sigma2: NDArray[np.float64],
     intrinsics: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """How an error of the disparity offset changes the motion of a stereo camera.
+    """Linear effect of an error in the disparity offset on the estimated motion of a stereo camera.
 
-    If all disparities are too large by one pixel, the point at depth z is too near by the share
-    ``z / bf`` and suggests a translation that is too short by this share.
+    Suppose that all disparities are too large by one pixel. A point at depth z then seems too near
+    by a fraction of ``z / bf``. The point suggests a translation that is too short by the same
+    fraction.
 
     Args:
         T_cw: ``(4, 4)`` optimised pose.
-        points, uvr, inverse_sigma2, intrinsics: see ``optimise_pose``; inliers only.
+        points, uvr, inverse_sigma2, intrinsics: inliers only; see ``optimise_pose``.
 
     Returns:
-        ``(6, 3)`` matrix that maps the translation of the motion to its error ``xi = [v, w]`` per
-        pixel; NaN if the observations do not determine the pose.
+        ``(6, 3)`` matrix that maps the translation of the motion to the error ``xi = [v, w]`` that
+        an offset of one pixel causes. NaN if the observations do not determine the pose.
     """
     seen = np.full((len(points), 3), np.nan)
     seen[:, :2] = uvr[:, :2]
@@ -138,12 +145,15 @@ def offset_effect(
 
 @kernel
 def _gradients(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics, first):
-    """Normal matrix; ``(C, 6)`` gradients of each cell's observations; sum of the chi-squares of
-    all observations; number of their coordinates.
+    """Normal equations of all observations, with gradients summed per cell.
 
     Args:
-        first: ``(C + 1,)`` index of the first observation of each cell, and the number of
-            observations.
+        first: ``(C + 1,)`` index of the first observation of each cell. The last entry is the
+            number of observations.
+
+    Returns:
+        The ``(6, 6)`` normal matrix; ``(C, 6)`` gradients of the cells; sum of the chi-squares of
+        all observations; number of coordinates of all observations.
     """
     n_cells = len(first) - 1
     H, gradients, chi2, n = np.zeros((6, 6)), np.empty((n_cells, 6)), 0.0, 0
@@ -196,12 +206,12 @@ def _optimise(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics):
 
 @inner_kernel
 def normal_equations(T, points, uvr, inverse_sigma2, disparity_weight, intrinsics, inlier, robust):
-    """Linearise the reprojection errors of all inliers at pose ``T``, with the Huber loss if
+    """Linearise the reprojection errors of all inliers at pose ``T``. Uses the Huber loss if
     ``robust``.
 
     Returns:
         Lower triangle of the normal matrix, right-hand side, sum of the chi-squares of the
-        observations, number of observations, and number of their coordinates.
+        observations, number of observations, and number of coordinates of the observations.
     """
     fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
     H = np.zeros((6, 6))

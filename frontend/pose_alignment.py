@@ -1,10 +1,13 @@
-"""Sparse image alignment: the motion between two frames from the grey values around landmarks.
+"""Sparse image alignment: estimates the motion between two frames from the grey values around
+landmarks.
 
 The motion of the camera is optimised until small windows around all landmarks of the last frame
-agree with the new image (SVO: Forster et al., ICRA 2014, III-A, and T-RO 2017, IV-A). Small images
-are used, the coarsest first, so that the prediction may be off by about twenty pixels, for example
-at the beginning of a turn. The light may change between two frames, so the mean of each window is
-subtracted, and a common factor of contrast is estimated.
+agree with the new image (SVO: Forster et al., ICRA 2014, III-A, and T-RO 2017, IV-A). The images
+are reduced in size, and the coarsest one is aligned first. Therefore, the prediction may be off by
+about twenty pixels, for example at the beginning of a turn.
+
+The light may change between two frames. So the mean of each window is subtracted, and one contrast
+factor for all windows is estimated.
 """
 
 from __future__ import annotations
@@ -29,16 +32,19 @@ WINDOW = 4  # pixels along each side
 PIXELS = WINDOW * WINDOW
 ITERATIONS = 10
 MIN_WINDOWS, MAX_WINDOWS = 20, 256
-MIN_CORRELATION = 0.6  # least correlation of all windows with the image; else the alignment failed
+MIN_CORRELATION = 0.6  # least correlation of all windows with the image, or the alignment failed
 # The iteration ends when a step rotates the image by less than STILL pixels of the level and moves
 # the camera by less than STILL_M units of the map.
 STILL, STILL_M = 0.02, 0.005
-ROBUST = 1.5  # Huber threshold of a window's error, as a multiple of the median error
+ROBUST = 1.5  # Huber threshold of a window's error, in multiples of the median error
 
 
 def coarse_levels(pyramid: Pyramid) -> Pyramid:
-    """The three images for the alignment of frames, coarsest first: the smallest level of a pyramid
-    reduced to half size, the smallest level itself, and the middle level."""
+    """The three small images of a frame that are used for its alignment, coarsest first.
+
+    They are the smallest level of the pyramid reduced to half size, the smallest level itself, and
+    the middle level.
+    """
     height, width = pyramid.shapes[0]
     last, middle = len(pyramid.shapes) - 1, len(pyramid.shapes) // 2
     smallest = pyramid.level(last)
@@ -86,18 +92,18 @@ def align_pose(
     intrinsics: NDArray[np.float64],
     size: tuple[int, int],
 ) -> Matrix:
-    """Pose of a frame by sparse image alignment to another frame.
+    """Estimate the pose of a frame by sparse image alignment to another frame.
 
     Args:
         now, before: ``coarse_levels`` of the frame and of the other frame.
-        xyz: ``(N, 3)`` landmarks that the other frame tracks, in the world.
+        xyz: ``(N, 3)`` landmarks that the other frame tracks, in the world frame.
         T_before: ``(4, 4)`` pose of the other frame (world to camera).
-        T_cw: ``(4, 4)`` predicted pose of the frame.
+        T_cw: ``(4, 4)`` predicted pose of the frame (world to camera).
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         size: height and width of the whole images, pixels.
 
     Returns:
-        ``(4, 4)`` pose ``T_cw``; the predicted pose if the alignment fails.
+        ``(4, 4)`` pose ``T_cw``. If the alignment fails, the predicted pose is returned.
     """
     stride = -(-len(xyz) // MAX_WINDOWS) or 1
     points = np.ascontiguousarray(transform(T_before, xyz[::stride]))
@@ -117,19 +123,20 @@ def align_pose(
 
 @kernel
 def _align(image, before, points, T_start, intrinsics, ratio_x, ratio_y):
-    """Align one level by inverse compositional Gauss-Newton: gradients and Jacobians are computed
-    once, in the image ``before``.
+    """Align one level by inverse compositional Gauss-Newton.
+
+    Gradients and Jacobians are computed only once, in the image ``before``.
 
     Args:
         image, before: ``(h, w)`` uint8.
         points: ``(N, 3)`` landmarks in the camera frame of ``before``.
-        T_start: ``(4, 4)`` initial motion, from the camera frame of ``before`` to that of
-            ``image``.
+        T_start: ``(4, 4)`` initial motion: the transform from the camera frame of ``before`` to the
+            camera frame of ``image``.
         ratio_x, ratio_y: full-resolution pixels per pixel of the level.
 
     Returns:
-        The ``(4, 4)`` motion, and the correlation between all windows and the image; ``T_start``
-        and 0 if the alignment fails.
+        The ``(4, 4)`` motion, and the correlation between all windows and the image. If the
+        alignment fails, ``T_start`` and 0 are returned.
     """
     n = len(points)
     template = np.empty((n, PIXELS), np.float32)
@@ -183,9 +190,12 @@ def _corner(point, intrinsics, ratio_x, ratio_y):
 
 @inner_kernel
 def _draw_template(before, point, intrinsics, ratio_x, ratio_y, template, jacobian):
-    """Write the grey values of the window around a point into ``template``, and their derivatives
-    with respect to the motion into ``jacobian``, each minus its mean over the window. Returns
-    whether the window lies inside the image."""
+    """Compute the template of the window around a point. Returns False if the window is not inside
+    the image.
+
+    Grey values are written into ``template``, and their derivatives with respect to the motion into
+    ``jacobian``. The mean over the window is subtracted from both.
+    """
     height, width = before.shape
     x, y, z = point[0], point[1], point[2]
     if not z > 0.1:
@@ -230,8 +240,8 @@ def _draw_template(before, point, intrinsics, ratio_x, ratio_y, template, jacobi
 
 @inner_kernel
 def _read_window(image, T, p, intrinsics, ratio_x, ratio_y, seen):
-    """Write the grey values of the window around a point that was moved by ``T``, minus their mean,
-    into ``seen``. Returns whether the window lies inside the image."""
+    """Write the grey values of the window around a point that was moved by ``T`` into ``seen``,
+    minus their mean. Returns False if the window is not inside the image."""
     height, width = image.shape
     x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
     y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
@@ -271,9 +281,11 @@ def _square(jacobian, hessian):
 
 @inner_kernel
 def _step(seen, template, jacobian, hessian, error, m, contrast):
-    """``(6,)`` Gauss-Newton step that reduces the differences between ``seen`` and the templates;
-    ``error`` must be negative for windows outside the image, and receives the norm of the
-    differences of the other windows."""
+    """``(6,)`` Gauss-Newton step that reduces the differences between ``seen`` and the templates.
+
+    On entry, ``error`` must be negative for windows outside the image. For the other windows, it
+    receives the norm of the differences.
+    """
     inside = 0
     scale = np.float32(1.0 / contrast)
     valid_errors = np.empty(m)

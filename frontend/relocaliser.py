@@ -1,5 +1,8 @@
 """Relocalisation: finds the pose of a lost or doubtful frame anywhere in the map (ORB-SLAM, T-RO
-2015, V-C)."""
+2015, V-C).
+
+A frame is doubtful if it has so few inliers that its matches may be wrong.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +29,8 @@ from vslam.map import Map
 from vslam.map_view import LocalMap, local_map
 
 Locate = Callable[[Image | None, Features, Map], list[LoopCandidate]]
-# Finds the pose of a frame near one of the candidates by other means than ORB descriptors; returns
-# None if it finds none.
+# Finds the pose of a frame near one of the candidates by other means than ORB descriptors. Returns
+# None if it finds no pose.
 Recognise = Callable[[Map, Image | None, Features, list[LoopCandidate]], Localisation | None]
 
 
@@ -46,13 +49,14 @@ class MapAccess(Protocol):
 
 
 class Relocaliser:
-    """Relocalises frames at the keyframes that they resemble."""
+    """Relocalises frames at keyframes that look similar."""
 
     def __init__(self, context: TrackingContext, locate: Locate, recognise: Recognise) -> None:
         """
         Args:
-            locate: returns the keyframes that a frame resembles, best first.
-            recognise: called if ORB descriptors match at none of these keyframes.
+            locate: returns the keyframes that look similar to a frame, best first.
+            recognise: called if a frame cannot be located at any of these keyframes by ORB
+                descriptors.
         """
         self._context = context
         self._locate = locate
@@ -61,9 +65,10 @@ class Relocaliser:
     def relocalise_if_needed(self, frame: Frame, found: Found, owner: MapAccess) -> Found:
         """Relocalise a frame that is lost or doubtful.
 
-        A lost frame is relocalised only while no keyframe is being mapped. A doubtful frame waits
-        until the keyframe is mapped. It keeps its tracked pose unless relocalisation finds more
-        than ``relocalization.better`` times as many inliers.
+        A lost frame is relocalised only if no keyframe is being mapped at the moment. For a
+        doubtful frame, the function waits until the keyframe is mapped. The doubtful frame keeps
+        its tracked pose unless relocalisation finds more than ``relocalization.better`` times as
+        many inliers.
 
         Args:
             found: the result of tracking the frame.
@@ -75,7 +80,7 @@ class Relocaliser:
             return self._find(frame, owner.merge()) if owner.is_merged else found
         if not found.is_doubtful:
             return found
-        map_ = owner.merge()  # worth the wait, because a doubtful frame soon becomes a keyframe
+        map_ = owner.merge()  # worth the wait: a doubtful frame soon becomes a keyframe
         before = frame.snapshot()
         relocalised = self._find(frame, map_)
         if relocalised.n_inliers > self._context.config.relocalization.better * found.n_inliers:
@@ -84,7 +89,7 @@ class Relocaliser:
         return found
 
     def _find(self, frame: Frame, map_: Map) -> Found:
-        """Relocalise a frame at the candidates, first by ORB descriptors, then by ``recognise``."""
+        """Relocalise a frame at the candidates: first by ORB descriptors, then by ``recognise``."""
         config = self._context.config.relocalization
         candidates = self._locate(frame.image, frame.features, map_)
         for candidate in candidates[: config.max_candidates]:
@@ -111,21 +116,23 @@ class Relocaliser:
 def relocalise(
     frame: Frame, place: LocalMap, surroundings: LocalMap, context: TrackingContext, seed: int
 ) -> int:
-    """Find the pose of a frame, without any prediction, at a place that it resembles.
+    """Find the pose of a frame at a place that looks similar, without a predicted pose.
 
-    The descriptors of the frame are matched with the landmarks of the place, and a pose is
-    estimated by P3P inside RANSAC, which needs no stereo. Then all landmarks of the surroundings
-    are searched for near their projections, first in wide windows, then in the usual windows.
+    The descriptors of the frame are matched with the landmarks of the place. A pose is estimated
+    from the matches by P3P inside RANSAC, which needs no stereo. Then all landmarks of the
+    surroundings are searched for near their projections, first in wide windows, then in windows of
+    the usual size.
 
     Args:
-        frame: receives the pose and the matches on success; otherwise both are reset.
+        frame: receives the pose and the matches. On failure, both are reset.
         place: the landmarks of a candidate keyframe.
         surroundings: the landmarks of the candidate and its covisible keyframes.
         seed: seed of the random samples; the same seed gives the same result.
 
     Returns:
-        Number of inliers, at least ``relocalization.min_inliers`` and not all on one object
-        (``count_elsewhere``); 0 if the frame was not found.
+        Number of inliers, or 0 if the pose was not found. A pose is accepted if it has at least
+        ``relocalization.min_inliers`` inliers and they do not all lie on one object
+        (``count_elsewhere``).
     """
     inliers = _locate(frame, place, surroundings, context, seed)
     config = context.config.relocalization

@@ -1,8 +1,9 @@
-"""Corrects frames for errors of a stereo rig that remain after rectification.
+"""Corrects the measurements of a stereo rig for errors that remain after rectification.
 
-Two errors are corrected: a common offset of all disparities, which is estimated while the map grows
-(``backend/disparity_offset.py``), and the delay of the right image given in the calibration file
-(``Camera.right_delay``). The delay is also measured, but the measurement is only reported.
+Two errors are corrected. The first is a common offset of all disparities, which is estimated while
+the map grows (``backend/disparity_offset.py``). The second is the delay of the right image, which
+is given in the calibration file (``Camera.right_delay``). The delay is also measured, but the
+measurement is only reported.
 """
 
 from __future__ import annotations
@@ -24,16 +25,18 @@ from vslam.states import RigState
 
 
 class RigCalibration:
-    """The corrections of a stereo pair. After stereo matching, only this class changes the
-    ``u_right`` of a frame.
+    """The corrections of a stereo pair.
+
+    After stereo matching, only this class changes the ``u_right`` of a frame.
 
     Attributes:
-        disparity_offset: pixels to be added to every measured disparity. The owner of the map sets
-            it to the map's disparity offset at each merge.
-        offset_sigma: standard deviation of the error of this estimate, in pixels, set likewise.
+        disparity_offset: pixels that are added to every measured disparity. At each merge, the
+            owner of the map sets it to the map's disparity offset.
+        offset_sigma: standard deviation of the disparity offset, in pixels. The owner of the map
+            sets it at each merge.
         delay: the measured delay of the right image.
         sides: a summary of the comparisons of left and right images.
-        problems: a sentence for each frame whose right image could not be read.
+        problems: one message for each frame whose right image could not be read.
     """
 
     def __init__(self, camera: Camera, config: StereoConfig, scales: NDArray[np.float64]) -> None:
@@ -49,8 +52,8 @@ class RigCalibration:
         self._scales = scales
 
     def extract(self, frame: Frame, twist: Matrix | None) -> None:
-        """Extract the features of a frame if that has not been done, record the comparison of its
-        two images, and ``prepare`` the frame."""
+        """Extract the features of a frame unless this has already been done. Also records the
+        comparison of its two images, and calls ``prepare``."""
         source = frame.source
         frame.extract(self._camera)
         if source is not None and source.sides is not None:
@@ -62,8 +65,10 @@ class RigCalibration:
         self.prepare(frame, twist)
 
     def prepare(self, frame: Frame, twist: Matrix | None) -> None:
-        """Correct ``u_right`` of a frame for the disparity offset and, if the motion is known, for
-        the delay of the right image. Calling this again has no effect.
+        """Correct ``u_right`` of a frame for the disparity offset and the delay of the right image.
+
+        The delay is corrected only if the motion is known. A second call does not apply a
+        correction again.
 
         Args:
             twist: ``(6,)`` velocity, see ``Frame.twist``; None if unknown.
@@ -78,8 +83,8 @@ class RigCalibration:
         frame.delay_removed = True
 
     def correct_offset(self, frame: Frame) -> None:
-        """Replace the disparity offset that the disparities of a frame contain by the current
-        offset."""
+        """Apply the current disparity offset to a frame, in place of the offset that was applied
+        before."""
         change = self.disparity_offset - frame.disparity_offset
         if change == 0.0:
             return
@@ -88,7 +93,7 @@ class RigCalibration:
         frame.disparity_offset = self.disparity_offset
 
     def mark_corrected(self, frame: Frame) -> None:
-        """Mark a frame that was restored from a checkpoint as corrected: it was prepared before it
+        """Mark a frame that was restored from a checkpoint as corrected. It was corrected before it
         was saved."""
         frame.disparity_offset, frame.delay_removed = self.disparity_offset, True
 
@@ -102,8 +107,8 @@ class RigCalibration:
         self.delay.add(frame.features, frame.row_offset, twist, self._scales)
 
     def state(self) -> RigState:
-        """The measurements so far, for a saved map or a checkpoint. They do not include the
-        disparity offset, which is part of the map."""
+        """The measurements so far, for a saved map or a checkpoint. The disparity offset is not
+        included, because it is part of the map."""
         return RigState(self.delay.state().numbers(), self.sides.numbers())
 
     def restore(self, state: RigState) -> None:

@@ -1,15 +1,20 @@
 """Measures the delay of the right image of a stereo pair from the rows of stereo matches.
 
 In a rectified pair, a point lies in the same row of both images. If the right image is taken later,
-the point's row in the right image is shifted by its image velocity times the delay. Its column is
-shifted as well, which distorts the map, because bundle adjustment explains much of a column shift
-by depth and motion. A row shift does not depend on depth, so bundle adjustment cannot absorb it,
-and no map is needed to measure it. A wrong calibration also shifts the rows, but by the same amount
-at every speed; a polynomial of the position in the image models this part.
+the point moves in the image during the delay. Its row in the right image is then shifted by its
+image velocity times the delay.
 
-The delay is measured and reported, but not corrected during the run: it is known only after some
-seconds, when the map is already distorted. To correct it in every frame whose motion is known, set
-``Camera.right_delay`` in the calibration.
+The column of the point is shifted as well. This distorts the map, because bundle adjustment
+explains much of a column shift by depth and motion. A row shift does not depend on depth, so bundle
+adjustment cannot absorb it. Therefore, the delay is measured from the row shifts, and no map is
+needed.
+
+A wrong calibration also shifts the rows, but by the same amount at every speed. A polynomial of the
+image position models this part.
+
+The delay is measured and reported, but not corrected during the run. The reason is that it is known
+only after some seconds, when the map is already distorted. To correct the delay in every frame
+whose motion is known, set ``Camera.right_delay`` in the calibration.
 """
 
 from __future__ import annotations
@@ -31,7 +36,7 @@ from vslam.kernels import inner_kernel, kernel
 EVERY = 8  # every 8th feature is measured, about a hundred per image
 ROUNDS = 3  # maximum number of Gauss-Newton steps
 STILL = 0.05  # pixels; the iteration ends when a step is smaller
-LARGEST = 3.0  # pixels of the feature's level; a match with a larger shift is wrong
+LARGEST = 3.0  # pixels of the feature's level; a match with a larger row shift is wrong
 HUBER_PX = 0.3
 FRAMES_OF_A_GROUP, FEWEST_GROUPS, MOST_GROUPS = 5, 5, 16
 _DEGREE = 3  # degree of the polynomial in the image coordinates
@@ -43,8 +48,9 @@ _SOLUTION, _TWIST, _WAITING, _GROUP = (1 + _P,), (6,), (7 + _P, 7 + _P), (2 + _P
 def row_offsets(
     left: Extraction, right: Extraction, u_right: NDArray[np.float32], config: StereoConfig
 ) -> NDArray[np.float32]:
-    """``(N,)`` float32, row of each feature in the right image minus row in the left image, in
-    full-resolution pixels. Only a subset of the features is measured; NaN for the others.
+    """``(N,)`` float32 row offset of each feature: its row in the right image minus its row in the
+    left image, in full-resolution pixels. Only a subset of the features is measured. The others are
+    NaN.
 
     Args:
         u_right: ``(N,)`` columns of the left features in the right image, NaN without a match.
@@ -82,10 +88,10 @@ def _row_offsets(xy, octave, u_right, pixels_l, pixels_r, offsets, shapes, half)
 @inner_kernel
 def _row_shift(image_l, image_r, x, y, dx, half):
     """Vertical shift of the patch around ``(x, y)`` from the left to the right image, in pixels of
-    the level; NaN if the patch has too little texture or is not found. The search starts at the
+    the level. NaN if the patch has too little texture or is not found. The search starts at the
     horizontal shift ``dx``.
 
-    Uses inverse compositional Lucas-Kanade (Baker and Matthews, IJCV 2004), so gradients are
+    Uses inverse compositional Lucas-Kanade (Baker and Matthews, IJCV 2004), so that gradients are
     computed only in the left patch.
     """
     height, width = image_l.shape
@@ -117,7 +123,7 @@ def _row_shift(image_l, image_r, x, y, dx, half):
                 gy = 0.5 * (float(image_l[y + j + 1, x + k]) - float(image_l[y + j - 1, x + k]))
                 r = _interpolated(image_r, x0 + k, y0 + j, a, b) - float(image_l[y + j, x + k])
                 rx, ry, total = rx + gx * r, ry + gy * r, total + r
-        # The mean difference is subtracted, because the images may differ in brightness.
+        # The mean difference is subtracted, because the brightness of the two images may differ.
         mean = total / (2 * half + 1) ** 2
         rx, ry = rx - mean * sum_x, ry - mean * sum_y
         step_x, step_y = (yy * rx - xy * ry) / determinant, (xx * ry - xy * rx) / determinant
@@ -139,15 +145,17 @@ def _interpolated(image, x, y, a, b):
 
 @dataclass(eq=False)
 class DelayState:
-    """The state of ``SideDelay``. "Moments" are weighted second moments, see ``_moments``.
+    """The state of ``SideDelay``. "Moments" are weighted second moments; see
+    ``SideDelay._moments``.
 
     Attributes:
         n_group: number of frames in the group that is being filled.
         length: number of frames in a full group.
-        solution: ``(1 + P,)`` the delay in seconds and the P coefficients of the polynomial,
-            estimated when the last group became full.
+        solution: ``(1 + P,)`` the delay in seconds, followed by the P coefficients of the
+            polynomial. It was estimated when the last group became full.
         twist: ``(6,)`` velocity before the last frame, see ``Frame.twist``.
-        waiting: ``(7 + P, 7 + P)`` moments of the last frame, which is not in a group yet.
+        waiting: ``(7 + P, 7 + P)`` moments of the last frame, which has not been added to a group
+            yet.
         group: ``(2 + P, 2 + P)`` moments of the group that is being filled.
         groups: ``(G, 2 + P, 2 + P)`` moments of the full groups.
     """
@@ -174,14 +182,14 @@ class DelayState:
         )
 
     def numbers(self) -> tuple[float, ...]:
-        """The state as stored in a map file; ``of_numbers`` is the inverse."""
+        """The state as numbers for a map file. ``of_numbers`` is the inverse."""
         arrays = (self.solution, self.twist, self.waiting, self.group, self.groups)
         flat = np.concatenate([array.ravel() for array in arrays])
         return (float(self.n_group), float(self.length), *flat.tolist())
 
     @classmethod
     def of_numbers(cls, numbers: tuple[float, ...]) -> DelayState:
-        """The state that ``numbers`` returned; an empty tuple gives the state before the first
+        """The state from the result of ``numbers``. An empty tuple gives the state before the first
         frame.
 
         Raises:
@@ -208,16 +216,15 @@ class DelayState:
 class SideDelay:
     """Least-squares estimate of the delay of the right image from all frames so far.
 
-    The velocity at a frame is the mean of the velocities before and after the frame, so a frame is
-    added only when the next frame is tracked. Until then the moments of the frame are kept. The
-    velocity can be applied to these moments later, because image velocities are linear in the
-    twist.
+    The velocity at a frame is the mean of the velocities before and after the frame. A frame is
+    therefore added only when the next frame is tracked. Until then, its moments are kept. The
+    velocity can be applied to the moments later, because image velocities are linear in the twist.
 
     Attributes:
-        seconds: time by which the right image is later than the left one.
-        sigma: standard deviation of ``seconds``, estimated from the disagreement between groups of
-            frames (cluster-robust: Liang and Zeger, Biometrika 1986); infinite until there are
-            enough groups.
+        seconds: the delay: the time by which the right image is taken later than the left image.
+        sigma: standard deviation of ``seconds``. It is estimated from the disagreement between
+            groups of frames (cluster-robust: Liang and Zeger, Biometrika 1986). Infinite until
+            there are enough groups.
     """
 
     def __init__(self, camera: Camera, config: StereoConfig) -> None:
@@ -272,9 +279,11 @@ class SideDelay:
         twist: Matrix,
         scales: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """``(7 + P, 7 + P)`` weighted second moments of the variables of the regression in a frame:
-        the six derivatives of the row velocity with respect to the twist, the P terms of the
-        polynomial, and the row offset. Outliers are down-weighted (Huber)."""
+        """``(7 + P, 7 + P)`` weighted second moments of the variables of the regression in a frame.
+
+        The variables are the six derivatives of the row velocity with respect to the twist, the P
+        terms of the polynomial, and the row offset. Outliers are down-weighted (Huber).
+        """
         chosen = np.flatnonzero(np.isfinite(row_offset) & np.isfinite(features.u_right))
         xy = features.xy[chosen]
         x, y = rays(xy, self._camera)

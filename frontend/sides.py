@@ -1,9 +1,9 @@
 """Compares the exposure of the two images of a stereo pair, and brightens the darker one.
 
 Stereo matching compares patches by the sum of absolute differences of their grey values. If one
-image is darker by one stop, disparities are biased; if it is darker by two stops, they are useless,
-although no frame is lost. Both cameras look at the same scene, so the gain between them can be
-estimated from the quantiles of all grey values.
+image is darker by one stop, disparities are biased. If it is darker by two stops, disparities are
+useless, although no frame is lost. Both cameras look at the same scene. The gain between the images
+can therefore be estimated from the quantiles of all grey values.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ Grey = NDArray[np.uint8]
 
 _STRIDE = 8  # a few thousand pixels determine the quantiles to within a grey level
 _LOW, _HIGH = 0.05, 0.95  # quantiles between which the images are compared
-_BELOW_CLIPPED = 0.98  # upper quantile, as a fraction of the share of unclipped pixels
-_MIN_SHARE = 0.25  # least share of the pixels from which a gain is estimated
+_BELOW_CLIPPED = 0.98  # upper quantile, in multiples of the share of unclipped pixels
+_MIN_SHARE = 0.25  # least share of the pixels that a gain is estimated from
 _MIN_RANGE = 4.0  # grey levels; over a smaller range, rounding dominates the gain
 _N_QUANTILES = 11  # number of quantiles that are compared between the two images
 # Largest difference between the quantiles of the two images, each scaled to a range of 1. If the
-# images differ by a gain, the difference is at most 0.07 for 95 % of the images of KITTI; if only
+# images differ by a gain, the difference is at most 0.07 for 95 % of the images of KITTI. If only
 # one image shows the sky, the difference is at least 0.22.
 _MAX_DEVIATION = 0.12
 _MIN_VISIBLE_RANGE = 16.0  # least range of the grey values of an image that is not black
@@ -34,12 +34,13 @@ _MIN_VISIBLE_RANGE = 16.0  # least range of the grey values of an image that is 
 
 @dataclass(frozen=True)
 class Sides:
-    """The difference in exposure between the two images of a pair.
+    """The difference in exposure between the left and the right image of a pair.
 
     Attributes:
-        darker_stops: by how many stops the right image is darker than the left one, negative if it
-            is brighter; 0 if the difference is below the threshold or is not a gain.
-        black: the side whose image is black while the other image is not; empty if there is no such
+        darker_stops: difference in exposure, in stops. It is positive if the right image is darker
+            than the left one. It is 0 if the difference is below the threshold, or if it is not a
+            gain.
+        black: the side whose image is black while the other image is not. Empty if there is no such
             side.
     """
 
@@ -49,11 +50,12 @@ class Sides:
 
 @dataclass
 class ComparedSides:
-    """A summary of the comparisons of a drive.
+    """A summary of the comparisons of all image pairs of a drive.
 
     Attributes:
         n: number of comparisons.
-        n_black_left, n_black_right: number of comparisons in which that side was black.
+        n_black_left, n_black_right: number of comparisons in which the image of this side was
+            black.
         darker_stops: all values of ``Sides.darker_stops`` that are not 0.
     """
 
@@ -71,7 +73,7 @@ class ComparedSides:
             self.darker_stops.append(sides.darker_stops)
 
     def numbers(self) -> tuple[float, ...]:
-        """The state as stored in a map file; ``of_numbers`` is the inverse."""
+        """The summary as numbers for a map file. ``of_numbers`` is the inverse."""
         return (self.n, self.n_black_left, self.n_black_right, *self.darker_stops)
 
     @classmethod
@@ -96,7 +98,7 @@ def compare_sides(left: Grey, right: Grey, config: StereoConfig) -> Sides:
 
 
 def balanced(left: Grey, right: Grey, sides: Sides) -> tuple[Grey, Grey]:
-    """The left and the right image, the darker one brightened by the gain that ``compare_sides``
+    """The left and the right image. The darker one is brightened by the gain that ``compare_sides``
     found."""
     stops = sides.darker_stops
     if stops > 0:
@@ -107,15 +109,15 @@ def balanced(left: Grey, right: Grey, sides: Sides) -> tuple[Grey, Grey]:
 
 
 def _shares(image: Grey) -> NDArray[np.float64]:
-    """``(256,)`` cumulative histogram: share of the pixels that are at most as bright as each grey
-    value."""
+    """``(256,)`` cumulative histogram: for each grey value, the share of pixels that are at most as
+    bright."""
     counts = np.bincount(image[::_STRIDE, ::_STRIDE].ravel(), minlength=256)
     return np.cumsum(counts) / counts.sum()
 
 
 def _quantiles(shares: NDArray[np.float64], *at: float) -> list[float]:
-    # Pixels with the same grey value are assumed to be spread evenly between it and the next one,
-    # so that quantiles vary smoothly even if the image has only few grey values.
+    # Pixels with the same grey value are assumed to be spread evenly between this value and the
+    # next one. Quantiles then vary smoothly even if the image has only a few grey values.
     values: list[float] = np.interp(at, shares, np.arange(256) + 0.5).tolist()
     return values
 
@@ -129,9 +131,12 @@ def _is_black(side: NDArray[np.float64], other: NDArray[np.float64], config: Ste
 
 
 def _stops(left: NDArray[np.float64], right: NDArray[np.float64], config: StereoConfig) -> float:
-    """Binary logarithm of the gain from the right to the left image, given the ``_shares`` of both.
-    It is 0 if the gain is below the threshold, or if dark and bright pixels have different gains.
-    Quantiles that are overexposed in either image are not compared."""
+    """Gain from the right to the left image, in stops. The arguments are the ``_shares`` of both
+    images.
+
+    The result is 0 if the gain is below the threshold, or if dark and bright pixels have different
+    gains. Quantiles that are overexposed in either image are not compared.
+    """
     below = config.clipped_from - 1
     top, unclipped = _HIGH, float(min(left[below], right[below]))
     if unclipped <= top:
@@ -150,7 +155,7 @@ def _stops(left: NDArray[np.float64], right: NDArray[np.float64], config: Stereo
         return 0.0
     if least >= _MIN_RANGE:  # over a smaller range, the gains of both halves differ by rounding
         low, high = log2(l_low / r_low), log2(l_high / r_high)
-        # More bright pixels in one image stretch only its upper half, which is not a gain.
+        # If one image has more bright pixels, only its upper half is stretched. This is not a gain.
         if min(low * np.sign(gain), high * np.sign(gain)) <= config.balance_from:
             return 0.0
         if abs(low - high) > config.max_gain_disagreement:
@@ -159,8 +164,9 @@ def _stops(left: NDArray[np.float64], right: NDArray[np.float64], config: Stereo
 
 
 def _proportional(left: NDArray[np.float64], right: NDArray[np.float64], top: float) -> bool:
-    """Whether the quantiles up to ``top`` are proportional, as they are if the images differ by a
-    gain. They are not if only one image shows, for example, the sky beside a bridge."""
+    """Whether the quantiles of both images up to ``top`` are proportional. They are if the images
+    differ only by a gain. They are not if, for example, only one image shows the sky beside a
+    bridge."""
     at = np.linspace(_LOW, top, _N_QUANTILES)
     a, b = (np.array(_quantiles(shares, *at)) for shares in (left, right))
     a, b = a - a[0], b - b[0]
@@ -168,8 +174,8 @@ def _proportional(left: NDArray[np.float64], right: NDArray[np.float64], top: fl
 
 
 def _brightened(dark: Grey, bright: Grey, stops: float) -> Grey:
-    """The dark image, multiplied by ``2 ** stops`` and shifted so that its lower quantile is that
-    of the bright image."""
+    """The dark image with its grey values multiplied by ``2 ** stops``. They are also shifted so
+    that both images have the same lower quantile."""
     (low,), (target,) = _quantiles(_shares(dark), _LOW), _quantiles(_shares(bright), _LOW)
     table = (np.arange(256) + 0.5 - low) * 2.0**stops + target - 0.5
     return np.clip(np.rint(table), 0, 255).astype(np.uint8)[dark]

@@ -14,19 +14,20 @@ from vslam.frontend.orb import Extraction
 from vslam.kernels import hamming, inline, inner_kernel, kernel
 
 LANES = 16  # shifts of the SAD window that are evaluated at once
-# Half width of the patch for sub-pixel refinement, pixels; a larger patch would more often include
+# Half width of the patch for sub-pixel refinement, pixels. A larger patch would more often include
 # a nearer object.
 REFINE_HALF = 4
 MEDIAN_FACTOR = 1.5 * 1.4826  # 1.5 standard deviations, as estimated from the median
 
 
 class StereoMatches(NamedTuple):
-    """Stereo matches of N left features, outliers included.
+    """Stereo matches of N left features, including outliers.
 
     Attributes:
         right: the features of the right image.
-        u_right: ``(N,)`` float32 column in the right image, NaN without a match.
-        sad: ``(N,)`` float32 sum of absolute differences (SAD), -1 without a match.
+        u_right: ``(N,)`` float32 column in the right image, pixels; NaN for features without a
+            match.
+        sad: ``(N,)`` float32 sum of absolute differences (SAD), -1 for features without a match.
     """
 
     right: Extraction
@@ -34,8 +35,8 @@ class StereoMatches(NamedTuple):
     sad: NDArray[np.float32]
 
     def joined(self, other: StereoMatches, order: NDArray[np.int64]) -> StereoMatches:
-        """The matches of these features followed by those of others, reordered by the index
-        ``order``."""
+        """These matches followed by other matches, reordered. ``order`` is the index of each match
+        in the joined list."""
         u_right = np.concatenate([self.u_right, other.u_right])[order]
         return StereoMatches(self.right, u_right, np.concatenate([self.sad, other.sad])[order])
 
@@ -45,10 +46,12 @@ def match_stereo(
 ) -> StereoMatches:
     """Match each left feature with a right feature, independently of the other left features.
 
-    Candidates lie in the same row (within 2 px at the scale of the right feature), at most one
-    octave apart, and at a disparity between 0 and that of a point one baseline away. The candidate
-    with the closest descriptor is chosen. Then a SAD window at the level of the left feature is
-    shifted along the row to locate the match to a fraction of a pixel.
+    A candidate must meet three conditions. It lies in the same row, within 2 px at the scale of the
+    right feature. Its octave differs by at most one. Its disparity is between 0 and the disparity
+    of a point at a distance of one baseline.
+
+    The candidate with the closest descriptor is chosen. Then a SAD window at the level of the left
+    feature is shifted along the row, to locate the match with sub-pixel accuracy.
     """
     u_right, sad = _match(
         _Side.of_extraction(left),
@@ -65,8 +68,12 @@ def match_stereo(
 
 
 class _Side(NamedTuple):
-    """One image: ``xy`` (N, 2), ``octave`` (N,) and ``descriptor`` (N, 4) of its features, and the
-    ``pixels`` of its pyramid."""
+    """One image of the pair.
+
+    Attributes:
+        xy, octave, descriptor: ``(N, 2)``, ``(N,)`` and ``(N, 4)``, its features.
+        pixels: the pixels of its pyramid.
+    """
 
     xy: NDArray[np.float32]
     octave: NDArray[np.uint8]
@@ -81,8 +88,12 @@ class _Side(NamedTuple):
 
 @kernel
 def rows_to_features(xy, octave, scales, height):
-    """Index features by the rows in which they may match: the features of row r are
-    ``items[start[r]:start[r + 1]]``, with ``start`` ``(height + 1,)`` int64."""
+    """Index the features by the rows in which they may match.
+
+    Returns:
+        ``start``, ``(height + 1,)`` int64, and ``items``, int32. The features of row r are
+        ``items[start[r]:start[r + 1]]``.
+    """
     start = np.zeros(height + 1, np.int64)
     n = len(xy)
     for fill in range(2):
@@ -106,8 +117,8 @@ def rows_to_features(xy, octave, scales, height):
 
 @kernel
 def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, half, reach):
-    """``u_right`` ``(N,)`` float32 and ``(N,)`` float32 SAD of each match; NaN and -1 for features
-    without a match."""
+    """``(N,)`` float32 ``u_right`` and ``(N,)`` float32 SAD of each match. They are NaN and -1 for
+    features without a match."""
     xy_l, octave_l, descriptors_l, pixels_l = left
     xy_r, octave_r, descriptors_r, pixels_r = right
     n = len(xy_l)
@@ -118,8 +129,8 @@ def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, ha
     for i in range(n):
         u, v = xy_l[i, 0], xy_l[i, 1]
         row = int(v)
-        # Candidates are listed without a branch, because a test whether each feature of the row is
-        # a candidate would often be mispredicted.
+        # Candidates are listed without a branch. A branch that tests whether each feature of the
+        # row is a candidate would often be mispredicted.
         n_candidates = 0
         for k in range(start[row], start[row + 1]):
             j = items[k]
@@ -147,7 +158,8 @@ def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, ha
         shift, score = slide(image_l, image_r, x_l, y_l, x_r, half, reach)
         if np.isnan(shift):
             continue
-        # The disparity is applied to the left feature's own column, not to the rounded ``x_l``.
+        # The disparity is applied to the column of the left feature itself, not to the rounded
+        # ``x_l``.
         disparity = (x_l - x_r - shift) * ratio_x
         if disparity < max_disparity and disparity > -1.0:
             u_right[i] = u - max(disparity, MIN_DISPARITY)
@@ -156,8 +168,8 @@ def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, ha
 
 
 def inliers_only(matches: StereoMatches, octave: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """The ``u_right`` of the matches, NaN for those whose SAD exceeds ``MEDIAN_FACTOR`` times the
-    median of their octave.
+    """The ``u_right`` of the matches, with NaN for outliers. An outlier is a match whose SAD
+    exceeds ``MEDIAN_FACTOR`` times the median of its octave.
 
     Args:
         octave: ``(N,)`` uint8 octave of each feature, sorted.
@@ -188,9 +200,12 @@ def _inliers_only(matched, sad, octave):
 
 @kernel
 def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
-    """Offset from ``x_r`` at which the patches agree best, in pixels of the level, and the SAD at
-    this offset. The offset is NaN if a patch would leave the image or the minimum is at an end of
-    the search range."""
+    """Shift of the right patch at which both patches agree best, in pixels of the level, and the
+    SAD at this shift.
+
+    The shift is relative to ``x_r``. It is NaN if a patch would leave the image, or if the minimum
+    is at an end of the search range.
+    """
     height, width = image_l.shape
     if (
         y_l < half
@@ -219,9 +234,9 @@ def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
 def add_differences(image_l, image_r, x_l, y_l, x_r, half, reach, costs):
     """Add the sum of absolute differences at each shift to ``costs``.
 
-    A vector register holds ``LANES`` shifts, and four columns of the patch are summed before the
-    register is stored. Lanes beyond the last shift may read from the next row; the caller ignores
-    them.
+    A vector register holds ``LANES`` shifts. Four columns of the patch are summed before the
+    register is stored. Lanes beyond the last shift may read from the next row. The caller ignores
+    these lanes.
     """
     width = image_l.shape[1]
     flat_l, flat_r = image_l.reshape(image_l.size), image_r.reshape(image_r.size)
@@ -259,16 +274,17 @@ def add_differences(image_l, image_r, x_l, y_l, x_r, half, reach, costs):
 
 @inline
 def difference(a, b):
-    """Absolute difference of two bytes, computed in bytes so that a register holds many of them."""
+    """Absolute difference of two bytes. It is computed in bytes, so that a register holds many of
+    them."""
     return np.uint16(np.uint8(max(a, b) - min(a, b)))
 
 
 @inner_kernel
 def refine_shift(image_l, image_r, x_l, y_l, x_r, shift, half):
-    """Shift in pixels that minimises the sum of squared differences, from a first estimate
-    ``shift`` in (-1, 1).
+    """Shift in pixels that minimises the sum of squared differences. ``shift`` is a first estimate
+    in (-1, 1).
 
-    The minimum of a parabola through three sums of absolute differences is biased towards whole
+    A parabola through three sums of absolute differences has a minimum that is biased towards whole
     pixels. Two Gauss-Newton steps on the interpolated patch remove this bias (Lucas and Kanade,
     IJCAI 1981). If they fail, ``shift`` is returned.
     """

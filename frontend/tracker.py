@@ -30,9 +30,9 @@ class TrackerStatus(Enum):
     """What the tracker knows about the position of the camera."""
 
     UNKNOWN = "unknown"
-    """No frame has been tracked in this map, and the camera may be anywhere in it."""
+    """No frame has been tracked in this map. The camera may be anywhere in it."""
     RESUMED = "resumed"
-    """No frame has been tracked yet, but the camera continues from the end of an earlier drive."""
+    """No frame has been tracked yet. The camera continues from the end of an earlier drive."""
     TRACKING = "tracking"
     """The last frame was tracked, was relocalised, or started a map."""
     LOST = "lost"
@@ -41,14 +41,16 @@ class TrackerStatus(Enum):
 
 @dataclass(frozen=True)
 class Found:
-    """The result of tracking or relocalising a frame; pose and matches are in the frame itself.
+    """The result of tracking or relocalising a frame. The pose and the matches are stored in the
+    frame.
 
     Attributes:
         state: OK, WEAK or LOST.
         n_matches, n_inliers: number of matched landmarks before and after the last pose
             optimisation.
         visible: ``(N,)`` int32 ids of the landmarks that the frame should see.
-        keyframe: id of the keyframe at which the frame was relocalised; -1 if it was not.
+        keyframe: id of the keyframe at which the frame was relocalised; -1 if it was not
+            relocalised.
         is_doubtful: whether the frame has so few inliers that its matches may be wrong.
     """
 
@@ -61,9 +63,11 @@ class Found:
 
     @classmethod
     def at_start(cls, frame: Frame, *, begun: bool) -> Found:
-        """The result for a frame before tracking starts. If the frame has started a map
-        (``begun``), the state is OK and all landmarks that the frame created are inliers; otherwise
-        the state is LOST."""
+        """The result for a frame before tracking starts.
+
+        If the frame has started a map (``begun``), the state is OK, and all landmarks that the
+        frame created are inliers. Otherwise the state is LOST.
+        """
         n_landmarks = int(np.count_nonzero(frame.landmark >= 0))
         state = TrackingState.OK if begun else TrackingState.LOST
         return cls(state, n_landmarks, n_landmarks)
@@ -80,9 +84,9 @@ class Found:
 
 
 def judge(n_matches: int, n_inliers: int, context: TrackingContext) -> TrackingState:
-    """The tracking state for a number of matches and a number of inliers among them."""
+    """The tracking state of a frame with the given number of matches, of which some are inliers."""
     config = context.config.tracking
-    # In the wide search windows of an RGB-D camera, even a wrong pose finds some inliers.
+    # The search windows of an RGB-D camera are wide, so that even a wrong pose has some inliers.
     share = config.depth_min_inlier_ratio if context.camera.depth else 0.0
     if n_inliers < config.min_inliers_lost or n_inliers < share * n_matches:
         return TrackingState.LOST
@@ -90,7 +94,7 @@ def judge(n_matches: int, n_inliers: int, context: TrackingContext) -> TrackingS
 
 
 class Tracker:
-    """Tracks one frame after the other. It accesses only a view of the map, not the map itself.
+    """Tracks one frame after another. It reads only a view of the map, not the map itself.
 
     Attributes:
         status: what is known about the position of the camera.
@@ -109,17 +113,23 @@ class Tracker:
 
     @property
     def twist(self) -> Matrix | None:
-        """``(6,)`` velocity when the camera was last tracked, see ``Frame.twist``; None if
+        """``(6,)`` velocity of the camera when it was last tracked, see ``Frame.twist``; None if
         unknown."""
         return self._resumed_twist if self.last is None else self.last.twist
 
     def predict(self, timestamp: float, frames: FramePoses, view: MapView) -> Matrix:
-        """Predict the ``(4, 4)`` pose ``T_cw`` at a time in seconds. The velocity is constant per
-        second, not per frame, so that dropped frames do not distort the prediction. Before the
-        first frame of a loaded map, the pose of the reference keyframe is predicted.
+        """Predict the pose of the camera at a given time.
+
+        The camera is assumed to keep its velocity. The velocity is measured per second, not per
+        frame, so that dropped frames do not distort the prediction. If no frame has been tracked
+        since the map was loaded, the pose of the reference keyframe is returned.
 
         Args:
-            frames: poses of all earlier frames, including lost ones.
+            timestamp: seconds.
+            frames: poses of all earlier frames, including lost frames.
+
+        Returns:
+        ``(4, 4)`` pose ``T_cw`` (world to camera).
         """
         if not len(frames):
             return view.T_reference
@@ -130,9 +140,12 @@ class Tracker:
         return orthonormalised(se3_exp(self.twist * elapsed) @ T_last)
 
     def track_patches(self, frame: Frame, T_cw: Matrix, view: MapView) -> Found:
-        """Track a frame that is expected at ``T_cw`` by the image patches of landmarks, without
-        extracting features. The result is LOST if too few patches are found, and also if the frame
-        cannot be tracked in this way, for example because the previous frame was not tracked."""
+        """Track a frame by the image patches of landmarks, without extracting features. ``T_cw`` is
+        the predicted ``(4, 4)`` pose.
+
+        The result is LOST if too few patches are found. It is also LOST if the frame cannot be
+        tracked in this way, for example because the previous frame was not tracked.
+        """
         last, config = self.last, self._config.tracking
         if frame.pyramid is None or frame.source is None or not len(view.patches.ids):
             return Found(TrackingState.LOST)
@@ -151,7 +164,7 @@ class Tracker:
             )
         track = track_patches(frame.pyramid, T_aligned, view, self._context, frame.mask)
         if track.share < config.patch_retry_ratio and T_aligned is not T_cw:
-            # The alignment of the image may have followed moving objects.
+            # Image alignment may have followed moving objects.
             again = track_patches(frame.pyramid, T_cw, view, self._context, frame.mask)
             track = max(track, again, key=lambda one: len(one.ids))
         n_inliers = len(track.ids)
@@ -164,18 +177,21 @@ class Tracker:
         return Found(TrackingState.OK, track.n_matches, n_inliers, track.visible)
 
     def match_features(self, frame: Frame, view: MapView) -> bool:
-        """Match the landmarks of the local map to the features of a frame whose pose is known;
-        returns whether the frame is still tracked."""
+        """Match the landmarks of the local map to the features of a frame whose pose is known.
+        Returns whether the frame is still tracked."""
         n_matches, n_inliers, _ = track_local_map(
             frame, view.local_landmarks, self._context, patches=view.patches
         )
         return judge(n_matches, n_inliers, self._context) != TrackingState.LOST
 
     def track(self, frame: Frame, T_cw: Matrix, view: MapView, frames: FramePoses) -> Found:
-        """Track a frame that is expected at ``T_cw``: first against the last frame or the reference
-        keyframe, then against all landmarks of the local map.
+        """Track a frame by its features.
+
+        The frame is tracked first against the last frame or the reference keyframe, then against
+        all landmarks of the local map.
 
         Args:
+            T_cw: ``(4, 4)`` predicted pose (world to camera).
             frames: poses of all earlier frames.
         """
         n_inliers = self._track_previous_frame(frame, T_cw, view)
@@ -189,9 +205,10 @@ class Tracker:
         return Found(state, n_matches, n_inliers, visible, is_doubtful=doubtful)
 
     def accept(self, frame: Frame, found: Found, frames: FramePoses) -> None:
-        """Continue from a frame that was tracked or relocalised, and compute its twist from the
-        motion since the last tracked frame. A relocalised frame gets no twist, because the jump to
-        its pose is not a motion of the camera.
+        """Continue from a frame that was tracked or relocalised.
+
+        The twist of the frame is computed from the motion since the last tracked frame. A
+        relocalised frame gets no twist, because the jump to its pose is not a motion of the camera.
 
         Args:
             frames: poses of all earlier frames.
@@ -208,7 +225,7 @@ class Tracker:
         self.last, self.lost_frames, self.status = frame, 0, TrackerStatus.TRACKING
 
     def lose(self) -> None:
-        """Note that a frame was not tracked."""
+        """Update the state after a frame that was not tracked."""
         self.lost_frames += 1
         self.status = TrackerStatus.LOST
 
@@ -221,7 +238,7 @@ class Tracker:
         self.status, self._resumed_twist = TrackerStatus.RESUMED, twist
 
     def state(self) -> TrackerState | None:
-        """The state between two frames, for a checkpoint; None before the first frame is
+        """The state between two frames, for a checkpoint. None before the first frame is
         tracked."""
         last = self.last
         if last is None:
@@ -239,11 +256,11 @@ class Tracker:
         )
 
     def restore(self, state: TrackerState, xyz: Matrix) -> Frame:
-        """Continue from a state that ``state`` returned; returns the last tracked frame.
+        """Continue from a state that ``state`` returned. Returns the last tracked frame.
 
         Args:
-            xyz: ``(N, 3)`` positions in the world of the landmarks that the last frame tracks, NaN
-                for features without a landmark.
+            xyz: ``(N, 3)`` positions of the landmarks that the last frame tracks, in the world
+                frame; NaN for features without a landmark.
         """
         extracted = Extracted(state.features)
         last = Frame.of(extracted, self._context.camera, state.index, state.timestamp)
@@ -261,9 +278,12 @@ class Tracker:
         return last
 
     def _track_previous_frame(self, frame: Frame, T_cw: Matrix, view: MapView) -> int:
-        """Track against the last frame with the predicted pose. If the motion is unknown or this
-        fails, track against the reference keyframe. If this fails too and the motion is known,
-        ``_track_predicted``. Returns the number of inliers."""
+        """Find a first pose and first matches of a frame. Returns the number of inliers.
+
+        The frame is tracked against the last frame, using the predicted pose. If the motion is
+        unknown or this fails, the frame is tracked against the reference keyframe. If this fails
+        too and the motion is known, ``_track_predicted`` is called.
+        """
         if self.last is None and self.status is not TrackerStatus.RESUMED:
             return 0
         if self.last is not None and self.last.twist is not None:
@@ -276,9 +296,12 @@ class Tracker:
         return self._track_predicted(frame, T_cw, view)
 
     def _track_predicted(self, frame: Frame, T_cw: Matrix, view: MapView) -> int:
-        """Match all landmarks of the local map near their predicted positions. After a sudden
-        change of brightness, landmarks that older frames saw may still match when those of the
-        previous frame do not. Returns the number of inliers, 0 if the prediction was wrong."""
+        """Match all landmarks of the local map near their predicted positions. Returns the number
+        of inliers, or 0 if the prediction was wrong.
+
+        This helps after a sudden change of brightness. Landmarks that older frames observed may
+        still match when those of the previous frame do not.
+        """
         frame.T_cw = T_cw
         frame.drop_matches()
         window = self._config.tracking.predicted_window
@@ -296,8 +319,12 @@ class Tracker:
 
     def _is_doubtful(self, frame: Frame, n_inliers: int, view: MapView, frames: FramePoses) -> bool:
         """Whether a frame has so few inliers that its matches may be wrong, and there is another
-        reason for doubt: a gap in time, an unknown motion (so that the pose was not predicted), or
-        a sudden drop in the number of inliers (for example after the camera was carried away)."""
+        reason for doubt.
+
+        There are three such reasons. The first is a gap in time. The second is an unknown motion,
+        because the pose was then not predicted. The third is a sudden drop in the number of
+        inliers, for example after the camera was carried away.
+        """
         if self.last is None:
             return False
         config = self._config.relocalization
@@ -317,8 +344,8 @@ def result_of(
     stage_ms: dict[str, float],
     odometry: Odometry,
 ) -> TrackResult:
-    """The ``TrackResult`` of a frame, which the library returns to its caller. ``stage_ms`` gives
-    the time of each stage in milliseconds."""
+    """The ``TrackResult`` of a frame, which the library returns to its caller. ``stage_ms`` is the
+    time that each stage took, in milliseconds."""
     return TrackResult(
         index=frame.index,
         timestamp=frame.timestamp,

@@ -1,6 +1,6 @@
 """Tracking of one frame against the map (ORB-SLAM2, section III; ORB-SLAM, section V).
 
-Everything here is a function of the frame, the previous frame and a ``LocalMap``. The map itself is
+All functions depend only on the frame, the previous frame and a ``LocalMap``. The map itself is
 never accessed, so local mapping can write to it at the same time.
 """
 
@@ -51,8 +51,8 @@ class TrackingContext:
 
     @property
     def tracks_patches(self) -> bool:
-        """Whether frames are tracked by patches if possible. For RGB-D cameras, tracking by patches
-        is less accurate and no faster (docs/research/performance.md)."""
+        """Whether frames are tracked by patches when possible. For RGB-D cameras, tracking by
+        patches is less accurate and not faster (docs/research/performance.md)."""
         method, camera = self.config.tracking.method, self.camera
         if method == "auto":
             return camera.sensor == "stereo"
@@ -65,7 +65,7 @@ class TrackingContext:
 
     @property
     def motion_window(self) -> float:
-        """Search radius at octave 0 around points that the previous frame saw, pixels."""
+        """Search radius at octave 0 around points that the previous frame observed, pixels."""
         config = self.config.tracking
         return config.depth_motion_window if self.camera.depth else config.motion_window
 
@@ -77,22 +77,25 @@ class TrackingContext:
 
 
 def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:
-    """``(N,)`` float64 depth from stereo, metres; NaN for features without a match."""
+    """``(N,)`` float64 depth from stereo, metres; NaN for features without a stereo match."""
     return camera.bf / (features.xy[:, 0].astype(np.float64) - features.u_right)
 
 
 def track_motion(
     frame: Frame, previous: Frame, T_cw: NDArray[np.float64], context: TrackingContext
 ) -> tuple[int, int]:
-    """Use the predicted pose to project the points that the previous frame saw, match these points
-    near their projections, and optimise the pose.
+    """Track a frame against the points of the previous frame.
 
-    In addition to landmarks, close stereo points of the previous frame that are not in the map are
-    used (the visual-odometry points of ORB-SLAM2). They stabilise the pose and are then discarded.
+    The points are projected with the predicted pose and matched near their projections. Then the
+    pose is optimised.
+
+    The points are the landmarks of the previous frame and its close stereo points that are not in
+    the map (the visual-odometry points of ORB-SLAM2). The stereo points stabilise the pose and are
+    then discarded.
 
     Args:
         frame: receives the pose and the matches.
-        T_cw: ``(4, 4)`` predicted pose of the left camera.
+        T_cw: ``(4, 4)`` predicted pose of the left camera (world to camera).
 
     Returns:
         Number of matches, and number of inliers of the pose optimisation.
@@ -105,8 +108,9 @@ def track_motion(
     ahead = in_camera[:, 2] > 0.1
     uvr = camera.project(np.where(ahead[:, None], in_camera, 1.0))
     advance = compose(previous.T_cw, inverse(T_cw))[2, 3]
-    # After a motion of more than the baseline forwards (or backwards), the octave of a feature can
-    # only rise (or fall). A monocular camera has no baseline to compare the motion with.
+    # If the camera has moved forwards by more than the baseline, the octave of a feature can only
+    # rise. If it has moved backwards, the octave can only fall. A monocular camera has no baseline
+    # to compare the motion with.
     low, high = octave - 1, octave + 1
     if advance > camera.baseline > 0.0:
         low, high = octave, np.full_like(octave, len(context.scales))
@@ -138,10 +142,10 @@ def track_motion(
 def trackable_points(
     previous: Frame, context: TrackingContext
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points that a frame saw: its landmarks and its other close stereo points.
+    """Points that a frame observed: its landmarks and its other close stereo points.
 
     Returns:
-        ``(M, 3)`` points in the world frame, and ``(M,)`` indices of the features that saw them.
+        ``(M, 3)`` points in the world frame, and ``(M,)`` indices of their features in the frame.
     """
     points = previous.xyz.copy()
     known = np.isfinite(points[:, 0])
@@ -179,7 +183,7 @@ def track_descriptors(
     Args:
         frame: receives the pose and the matches.
         reference: the landmarks of the reference keyframe.
-        T_cw: ``(4, 4)`` initial pose of the left camera for the optimisation.
+        T_cw: ``(4, 4)`` initial pose of the left camera for the optimisation (world to camera).
 
     Returns:
         Number of inliers of the pose optimisation.
@@ -202,8 +206,8 @@ def track_local_map(
     window: float | None = None,
     patches: LandmarkPatches = NO_PATCHES,
 ) -> tuple[int, int, NDArray[np.int32]]:
-    """Match all landmarks of the local map that should be visible, align the matches to a fraction
-    of a pixel, and optimise the pose.
+    """Match all landmarks of the local map that should be visible, and optimise the pose. The
+    matches are first aligned to the image with sub-pixel accuracy.
 
     Args:
         frame: receives the pose and the matches.
@@ -243,8 +247,8 @@ def predict_landmarks(
     mask: Mask | None,
     context: TrackingContext,
 ) -> tuple[Matrix, Matrix, NDArray[np.int64]]:
-    """Predict where the landmarks of a local map appear (``predict_view``). Landmarks on masked
-    pixels are not visible."""
+    """Predict where the landmarks of a local map appear in the image (``predict_view``). Landmarks
+    on masked pixels are marked as not visible."""
     camera = context.camera
     uvr, radius, octave = predict_view(
         T_camera_w,
@@ -269,8 +273,8 @@ def _search(
     context: TrackingContext,
     ratio: float,
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """``search_windows`` in a frame; returns the ``(M,)`` indices of the matched features, and the
-    ``(M,)`` indices of their projections."""
+    """Run ``search_windows`` in a frame. Returns the ``(M,)`` indices of the matched features and
+    the ``(M,)`` indices of their projections."""
     features = Searchable.of_features(frame.features, frame.grid)
     max_distance = context.config.tracking.match_distance
     found, _ = search_windows(projections, features, free, max_distance, ratio)
@@ -287,7 +291,7 @@ def refine(
     """Optimise the pose from all matches, drop the outliers, and return the number of inliers.
 
     Args:
-        T_cw: ``(4, 4)`` initial pose of the left camera.
+        T_cw: ``(4, 4)`` initial pose of the left camera (world to camera).
         shift: the new ``Frame.shift``; None if no match is aligned.
     """
     frame.shift = shift
@@ -303,15 +307,15 @@ def refine(
 def uncertainty_of(
     frame: Frame, offset_sigma: float, context: TrackingContext
 ) -> tuple[Matrix, Matrix | None]:
-    """The uncertainty of a tracked frame.
+    """The uncertainty of the pose and the motion of a tracked frame.
 
     Args:
         offset_sigma: standard deviation of the disparity offset, pixels; 0 for cameras without one.
 
     Returns:
         ``(6, 6)`` covariance of the pose ``T_cw`` relative to the points that the frame tracks
-        (``pose_covariance``), and ``(6, 3)`` effect on the motion if the disparity offset is wrong
-        by ``offset_sigma`` (``offset_effect``); None if that is 0.
+        (``pose_covariance``). ``(6, 3)`` effect on the motion if the disparity offset is wrong by
+        ``offset_sigma`` (``offset_effect``); None if ``offset_sigma`` is 0.
     """
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
     observed = _observed_points(frame, matched, context)
@@ -321,14 +325,14 @@ def uncertainty_of(
     if frame.side == Side.LEFT:
         return covariance, effect
     A = adjoint(inverse(frame.T_camera_left))
-    # The cameras are parallel, so their translations are nearly the same.
+    # The cameras are parallel and rigidly connected, so their translations are nearly the same.
     return A @ covariance @ A.T, None if effect is None else A @ effect
 
 
 def _observed_points(
     frame: Frame, matched: NDArray[np.integer], context: TrackingContext
 ) -> tuple[NDArray[np.float64], ...]:
-    """The arguments of ``optimise_pose`` after the pose, for the points that the ``matched``
+    """The arguments of ``optimise_pose`` that follow the pose, for the points that the ``matched``
     features track. Aligned matches have their aligned positions."""
     uvr, weight = observations(frame, matched, context)
     certainty = np.ones(len(matched))
@@ -345,8 +349,8 @@ def _observed_points(
 def observations(
     frame: Frame, feature: NDArray[np.integer], context: TrackingContext
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """``(N, 3)`` float64 u, v, u_right of ``(N,)`` features of a frame, and ``(N,)`` float64
-    inverse variances of these coordinates."""
+    """``(N, 3)`` float64 u, v, u_right of ``(N,)`` features of a frame, in pixels, and ``(N,)``
+    float64 inverse variances of u and v."""
     features = frame.features
     uvr = stack_uvr(features.xy[feature], features.u_right[feature])
     return uvr, context.scales[features.octave[feature]] ** -2.0

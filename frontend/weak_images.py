@@ -1,10 +1,12 @@
-"""Features of noisy or faint images: noise is filtered and contrast is raised before extraction.
+"""Extracts features from images that are noisy or have low contrast.
 
-The thresholds of FAST are grey levels, chosen for images of normal contrast. At night, in fog or
-with a wrong exposure, a corner differs from its surroundings by only one or two grey levels; in
-heavy noise, every pixel is a corner. Averaging neighbouring pixels recovers differences of less
-than a grey level, so that a scene can be recognised in an image of only five grey levels. Images
-with normal contrast and noise are left unchanged.
+The thresholds of FAST are grey levels that suit images of normal contrast. At night, in fog or with
+a wrong exposure, a corner differs from its surroundings by only one or two grey levels. In heavy
+noise, every pixel is a corner.
+
+Therefore, noise is filtered and contrast is raised before extraction. Averaging neighbouring pixels
+recovers differences of less than a grey level. In this way, a scene can be recognised in an image
+of only five grey levels. Images with normal contrast and noise are left unchanged.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ Grey = NDArray[np.uint8]
 ROW_STRIDE = 32  # noise is measured in every 32nd row: 15,000 pixels of a KITTI image
 # For Gaussian noise, median abs(I[x-1] - 2 I[x] + I[x+1]) = 0.6745 sqrt(6) sigma.
 _SECOND_DIFFERENCE = 0.6745 * 6.0**0.5
-_SPIKE_DEVIATIONS, LEAST_SPIKE = 4.0, 32.0  # least height of a spike, in sigma and in grey levels
+_SPIKE_DEVIATIONS, LEAST_SPIKE = 4.0, 32.0  # least height of a spike: in sigmas, in grey levels
 _MEDIAN = 5  # side of the median filter that removes spikes, pixels
 _GAUSSIAN = 2.0 * np.pi**0.5  # a Gaussian blur of s pixels divides the noise by 2 sqrt(pi) s
 _BLOCK = 16  # side of the blocks in which contrast is measured, pixels
@@ -40,12 +42,14 @@ def extract_in_any_light(
     allowed: Pyramid | None = None,
     pyramid: Pyramid | None = None,
 ) -> list[Extraction]:
-    """Extract the ORB features of ``(H, W)`` uint8 images that were taken at the same time. Noisy
-    images are filtered first, and the contrast of faint ones is raised. All images are processed in
-    the same way, because stereo matching compares their patches.
+    """Extract the ORB features of ``(H, W)`` uint8 images that were taken at the same time.
+
+    Noisy images are filtered first. The contrast of faint images, which have low contrast and few
+    corners, is raised. If one image needs this, all images are processed in the same way, because
+    stereo matching compares their patches.
 
     Args:
-        image_map: applies a function to all images, one after the other or in parallel; the result
+        image_map: applies a function to all images, either sequentially or in parallel. The result
             is the same.
         allowed: where the first image may have corners, see ``extract``.
         pyramid: the pyramid of the first image, if it has already been built.
@@ -65,9 +69,11 @@ def extract_in_any_light(
 
 
 def without_noise(images: Sequence[Grey], config: WeakImageConfig) -> Sequence[Grey]:
-    """Filter the noise of ``(H, W)`` uint8 images: a median filter removes spikes (single bright or
-    dark pixels), and a Gaussian blur reduces the other noise to ``noise_left``. Images with normal
-    noise are returned unchanged."""
+    """Filter the noise of ``(H, W)`` uint8 images. Images with normal noise are returned unchanged.
+
+    A median filter removes spikes (single bright or dark pixels). A Gaussian blur reduces the other
+    noise to ``noise_left``.
+    """
     measured = [grain(image, ROW_STRIDE, LEAST_SPIKE) for image in images]
     if max(spikes for _, spikes in measured) > config.spikes_from:
         images = [np.asarray(cv2.medianBlur(image, _MEDIAN), np.uint8) for image in images]
@@ -84,12 +90,12 @@ def grain(image, stride, least):
     """Estimate the noise and the spikes of an ``(H, W)`` uint8 image from every ``stride``-th row.
 
     Noise is estimated from the median of absolute second differences along a row. The median is
-    robust against edges; the mean (Immerkaer, CVIU 1996) is not.
+    robust to edges. The mean (Immerkaer, CVIU 1996) is not.
 
     Returns:
-        Standard deviation of the noise, grey levels; share of the pixels that are spikes, that is,
-        brighter than both neighbours or darker than both by more than ``least`` grey levels and
-        more than four standard deviations.
+        Standard deviation of the noise, in grey levels; share of the pixels that are spikes. A
+        spike is brighter than both neighbours, or darker than both. The difference must exceed
+        ``least`` grey levels and four standard deviations.
     """
     height, width = image.shape
     counts = np.zeros(1021, np.int64)
@@ -119,9 +125,10 @@ def grain(image, stride, least):
 
 
 def is_faint(images: Sequence[Grey], counts: Sequence[int], config: Config) -> bool:
-    """Whether any of the images has few corners because of low contrast. An image that is out of
-    focus also has few corners, but raising its contrast would only amplify rounding errors. An
-    image that shows nothing at all is ignored.
+    """Whether any of the images has few corners because of low contrast.
+
+    An image that is out of focus also has few corners. It is not counted as faint, because raising
+    its contrast would only amplify rounding errors. An image that shows nothing at all is ignored.
 
     Args:
         counts: number of features of each image.
@@ -139,12 +146,12 @@ def _is_faint(image: Grey, config: WeakImageConfig) -> bool:
 
 
 def detail(image: Grey) -> float:
-    """Mean absolute second difference along the rows, grey levels."""
+    """Mean absolute second difference of the grey values along the rows, grey levels."""
     return float(np.abs(np.diff(image[::2].astype(np.int16), 2, axis=1)).mean())
 
 
 def contrast(image: Grey) -> float:
-    """Median over blocks of the standard deviation of their grey values, grey levels."""
+    """Median, over blocks of the image, of the standard deviation of the grey values in a block."""
     rows, columns = (side // _BLOCK * _BLOCK for side in image.shape)
     if not rows or not columns:
         return 0.0
@@ -153,10 +160,12 @@ def contrast(image: Grey) -> float:
 
 
 def with_contrast(image: Grey, config: WeakImageConfig) -> Grey:
-    """Normalise the local contrast of an ``(H, W)`` uint8 image: after a blur of one pixel, grey
-    values are scaled so that their standard deviation is the same in a window
-    (``contrast_window``) around every pixel. Flat regions, which contain only noise, are amplified
-    less."""
+    """Normalise the local contrast of an ``(H, W)`` uint8 image.
+
+    After a blur of one pixel, grey values are scaled. Their standard deviation is then the same in
+    a window (``contrast_window``) around every pixel. Flat regions, which contain only noise, are
+    amplified less.
+    """
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.0)
     window = (config.contrast_window, config.contrast_window)
     mean = cv2.boxFilter(smooth, -1, window)

@@ -1,7 +1,7 @@
 """Loop detection by bag of words.
 
 Candidates are chosen as in ORB-SLAM (Mur-Artal et al., T-RO 2015, sections III-E and VII-A). A
-candidate shares many words with the query and belongs to one of the groups of covisible keyframes
+candidate shares many words with the query. It belongs to one of the groups of covisible keyframes
 with the highest total scores. Its score is at least the lowest score among the keyframes that are
 covisible with the query. One pass over the inverted index gives the scores of all keyframes.
 """
@@ -26,7 +26,7 @@ from vslam.map_kernels import count_shared
 
 
 class BowDetector:
-    """A ``LoopDetector`` by visual words. Keyframes must be added in ascending order."""
+    """A ``LoopDetector`` that uses visual words. Keyframes must be added in ascending order."""
 
     name = "bow"
 
@@ -34,14 +34,14 @@ class BowDetector:
         self.vocabulary = vocabulary
         self.config = config or BowConfig()
         self._index = InvertedIndex(vocabulary.n_words)
-        # CSR layout: the words of keyframe k are word[start[k]:start[k + 1]]. Ids that were never
-        # added have no words.
+        # CSR layout: the words of keyframe k are word[start[k]:start[k + 1]]. For ids that were
+        # never added, this range is empty.
         self._start = np.zeros(65, np.int64)
         self._word = np.empty(65536, np.int32)
         self._n_keyframes = 0  # newest id + 1
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
-        """Store the words of a keyframe; the image is ignored.
+        """Store the words of a keyframe. The image is ignored.
 
         Raises:
             ValueError: the id is not greater than the ids of all earlier keyframes.
@@ -55,11 +55,11 @@ class BowDetector:
         self._index.add(keyframe, bow_vector(self.vocabulary, words))
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
-        """Candidates for a keyframe that was added.
+        """Find candidates for a keyframe that has been added.
 
         Candidates are keyframes in the map that are neither recent nor covisible with the query.
         Their scores are at least the lowest score among the keyframes that are covisible with the
-        query; if there are none, any score suffices.
+        query. If no keyframe is covisible with the query, there is no lower limit.
         """
         config = self.config
         entries = self._entries(keyframe)
@@ -77,14 +77,14 @@ class BowDetector:
     def locate(
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
-        """Keyframes in the map that look similar to a frame outside the map, best first."""
+        """Keyframes in the map that look similar to a frame outside the map, most similar first."""
         words = self.vocabulary.words(features.descriptors)
         likeness = self._index.compare(bow_vector(self.vocabulary, words))
         eligible = map_.arrays.keyframe_alive[: len(likeness.score)].copy()
         return self._candidates(-1, likeness, eligible, 0.0, map_)
 
     def memory(self) -> DetectorMemory:
-        """See :class:`LoopDetector`; the memory consists of the words of all keyframes."""
+        """See :class:`LoopDetector`. The memory consists of the words of all keyframes."""
         first = self._start[: self._n_keyframes + 1]
         words = PerKeyframe(first, self._word[: first[-1]])
         return DetectorMemory(self.name, self._fingerprint, {"words": words})
@@ -150,10 +150,11 @@ class BowDetector:
 
 @inner_kernel
 def most_covisible(counts, minimum, keyframes, strength):
-    """Select up to G keyframes with the highest counts, which must be at least ``minimum``.
+    """Select the keyframes with the highest counts. Counts below ``minimum`` are ignored.
 
-    Writes their ids into ``keyframes`` and their counts into ``strength``, both ``(G,)`` int64,
-    sorted by descending count and then by ascending id. Returns the number of keyframes.
+    Up to G keyframes are selected. Their ids are written into ``keyframes`` and their counts into
+    ``strength``, both ``(G,)`` int64. They are sorted by descending count and then by ascending id.
+    Returns the number of selected keyframes.
     """
     n = 0
     for k in range(len(counts)):
@@ -183,25 +184,25 @@ def choose_candidates(
     group_score_ratio,
     max_groups,
 ):
-    """Choose candidates by shared words, scores and groups of covisible keyframes.
+    """Choose candidates by shared words, scores, and groups of covisible keyframes.
 
-    1. A keyframe passes if it shares at least ``common_words_ratio`` times as many words as the
-       keyframe that shares most. Among the keyframes that pass and score at least ``least_score``,
-       the ``max_groups`` keyframes with the highest scores are selected.
-    2. Each selected keyframe forms a group with those of its ``group_size`` most covisible
-       keyframes that pass. The score of a group is the sum of its members' scores, and its
-       representative is the member with the highest score.
-    3. The representatives of the groups with at least ``group_score_ratio`` times the highest group
-       score are returned.
+    1. A keyframe passes if it shares enough words with the query: at least ``common_words_ratio``
+       times as many as the keyframe that shares the most. Of the keyframes that pass and score at
+       least ``least_score``, the ``max_groups`` keyframes with the highest scores are selected.
+    2. Each selected keyframe forms a group with its ``group_size`` most covisible keyframes, if
+       these pass. The score of a group is the sum of the scores of its members. The representative
+       of a group is the member with the highest score.
+    3. The representatives of the best groups are returned. The score of such a group is at least
+       ``group_score_ratio`` times the highest score of a group.
 
     Args:
-        a, n_keyframes: arrays and number of keyframes of the map.
+        a, n_keyframes: arrays of the map, and number of keyframes in the map.
         shared: ``(K,)`` number of shared words; K is at most ``n_keyframes``.
-        score: ``(K,)`` score.
-        eligible: ``(K,)`` bool, keyframes that may be candidates.
+        score: ``(K,)`` score of each keyframe.
+        eligible: ``(K,)`` bool, True for keyframes that may be candidates.
 
     Returns:
-        ``(n,)`` int64 ids of the keyframes without duplicates, best group first.
+        ``(n,)`` int64 ids of the chosen keyframes, without duplicates, best group first.
     """
     n = len(shared)
     most = 0

@@ -1,8 +1,8 @@
-"""The inverted index from words to keyframes of Galvez-Lopez and Tardos (T-RO 2012, IV).
+"""Inverted index from visual words to keyframes (Galvez-Lopez and Tardos, T-RO 2012, IV).
 
 The L1 score of two bags of words is the sum, over their shared words, of the smaller of the two
-weights (vocabulary.py). Each posting therefore stores the weight of its word in the keyframe, and
-one pass over the postings of a query's words gives the number of shared words and the score of
+weights (vocabulary.py). Each posting therefore stores the weight of its word in the keyframe. One
+pass over the postings of a query's words then gives the number of shared words and the score of
 every keyframe.
 """
 
@@ -17,13 +17,13 @@ from vslam.kernels import kernel
 from vslam.loopclosure.vocabulary import BowVector
 
 FIRST_BLOCK = 8  # postings in the smallest block: one cache line
-UNIT = 2**31 - 1  # weights are integer multiples of 1 / UNIT, so sums do not depend on the order
-SHARED = 1 << 40  # added for each shared word; it lies above all bits of a sum of weights
+UNIT = 2**31 - 1  # weights are multiples of 1 / UNIT, so that the order of sums does not matter
+SHARED = 1 << 40  # added for each shared word; larger than any sum of weights
 
 
 def grown(array: NDArray, needed: int) -> NDArray:
-    """The array itself if it has room for ``needed`` items, else a copy of at least 1.5 times its
-    length."""
+    """An array with room for at least ``needed`` items. This is the array itself if it is long
+    enough, or else a copy of at least 1.5 times its length."""
     if needed <= len(array):
         return array
     bigger = np.empty((max(needed, len(array) * 3 // 2), *array.shape[1:]), array.dtype)
@@ -47,14 +47,15 @@ class Postings(NamedTuple):
     """Inverted index of W words. The postings of a word are contiguous, in one block.
 
     The size of a block is 8, 16, 32 or another power of two. When the block of a word is full, its
-    postings move to a block of twice the size, and the old block becomes free for other words.
+    postings are moved to a block of twice the size. The old block can then be reused for other
+    words.
 
     Attributes:
         start: ``(W,)`` index of the first posting of each word.
         size: ``(W,)`` number of postings of each word.
-        free: ``(40,)`` head of a linked list of the free blocks of each size, -1 if it is empty;
-            the first entry of a free block is the index of the next free block.
-        pool: ``(P,)`` postings, ``keyframe << 32 | weight``.
+        free: ``(40,)`` head of a linked list of the free blocks of each size, or -1 if the list is
+            empty. The first entry of a free block is the index of the next free block.
+        pool: ``(P,)`` postings. Each posting is ``keyframe << 32 | weight``.
     """
 
     start: NDArray[np.int64]
@@ -64,7 +65,7 @@ class Postings(NamedTuple):
 
 
 class InvertedIndex:
-    """The keyframes that contain each word, and the weight of the word in each of them."""
+    """The keyframes that contain each word, and the weight of the word in each keyframe."""
 
     def __init__(self, n_words: int) -> None:
         self.n_keyframes = 0  # newest id + 1
@@ -86,19 +87,19 @@ class InvertedIndex:
         self.n_keyframes = max(self.n_keyframes, keyframe + 1)
 
     def compare(self, bag: BowVector) -> Likeness:
-        """Compare the bag of words of an image with all keyframes, from id 0 to the newest."""
+        """Compare the bag of words of an image with all keyframes, from id 0 to the newest id."""
         sums = compare_with_all(self._postings, self.n_keyframes, bag.words, fixed(bag.weights))
         return Likeness((sums // SHARED).astype(np.int32), sums % SHARED / UNIT)
 
 
 def fixed(weights: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Weights in [0, 1] as multiples of 1 / ``UNIT``."""
+    """Weights in [0, 1], as integer multiples of 1 / ``UNIT``."""
     return np.rint(weights.astype(np.float64) * UNIT).astype(np.int64)
 
 
 def is_full(size):
-    """Whether the block of a word with ``size`` postings is full, by the same condition as in
-    ``post``; ``size`` may be an array."""
+    """Whether the block of a word with ``size`` postings is full. ``size`` may be an array. The
+    condition must be the same as in ``post``."""
     return (size & (size - 1) == 0) & ((size == 0) | (size >= FIRST_BLOCK))
 
 
@@ -106,10 +107,10 @@ def is_full(size):
 def post(postings, used, keyframe, words, weights):
     """Add the bag of words of a keyframe to the inverted index.
 
-    The pool must have room for a new block for each word whose block is full.
+    The pool must have room for one new block for each word whose block is full.
 
     Args:
-        used: number of entries of the pool that are in blocks.
+        used: number of entries of the pool that belong to blocks.
 
     Returns:
         The new value of ``used``.
@@ -143,8 +144,10 @@ def post(postings, used, keyframe, words, weights):
 @kernel
 def compare_with_all(postings, n_keyframes, words, weights):
     """``(K,)`` int64: for each keyframe, ``SHARED`` times the number of shared words plus the sum
-    of the smaller weights. Because both are in one integer, each posting needs only one
-    addition."""
+    of the smaller weights.
+
+    Both quantities are stored in one integer, so that each posting needs only one addition.
+    """
     start, sizes, _, pool = postings
     sums = np.zeros(n_keyframes, np.int64)
     for i in range(len(words)):

@@ -1,4 +1,4 @@
-"""A loop detector that merges the candidates of several others."""
+"""A loop detector that merges the candidates of several loop detectors."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class CombinedDetector:
     """Implements :class:`vslam.loopclosure.detector.LoopDetector`.
 
     The scores of different detectors are not comparable, so the candidates of all detectors are
-    interleaved: first the best one of each, then the second best, and so on. Candidates for the
-    same keyframe are joined. Different keyframes of one place all stay candidates, because a change
-    of the light may leave only one of them recognisable.
+    interleaved. The best candidate of each detector comes first, then the second best of each, and
+    so on. Candidates for the same keyframe are joined. Different keyframes of one place all remain
+    candidates, because after a change of the light, only one of them may be recognisable.
     """
 
     def __init__(self, name: str, detectors: list[LoopDetector]) -> None:
@@ -40,7 +40,7 @@ class CombinedDetector:
         return _interleaved([one.locate(image, features, map_) for one in self._detectors])
 
     def memory(self) -> DetectorMemory:
-        """See :class:`LoopDetector`; contains the memory of each detector under its name."""
+        """See :class:`LoopDetector`. It contains the memory of each detector under its name."""
         memories = [one.memory() for one in self._detectors]
         tables = {
             f"{memory.name}/{name}": table
@@ -59,8 +59,8 @@ class CombinedDetector:
 
 
 def _interleaved(found: list[list[LoopCandidate]]) -> list[LoopCandidate]:
-    """The first candidate of each detector, then the second one of each, and so on, with the
-    candidates for the same keyframe joined into one."""
+    """Interleave the candidates of several detectors: the first candidate of each detector, then
+    the second of each, and so on. Candidates for the same keyframe are joined into one."""
     by_match: dict[int, LoopCandidate] = {}
     for candidate in chain.from_iterable(zip_longest(*found)):
         if candidate is not None:
@@ -70,9 +70,11 @@ def _interleaved(found: list[list[LoopCandidate]]) -> list[LoopCandidate]:
 
 
 def _joined(first: LoopCandidate, second: LoopCandidate) -> LoopCandidate:
-    """Join the candidates of two detectors for the same keyframe. The result is the first candidate
-    with the names of both detectors. If the first candidate has no ``similarity``, that of the
-    second candidate is used."""
+    """Join the candidates of two detectors for the same keyframe.
+
+    The result is the first candidate, with the names of both detectors. If the first candidate has
+    no ``similarity``, the similarity of the second candidate is used.
+    """
     similarity = second.similarity if first.similarity is None else first.similarity
     names = f"{first.proposed_by}+{second.proposed_by}"
     return replace(first, similarity=similarity, proposed_by=names)

@@ -1,10 +1,12 @@
-"""Temporal consistency of loops: several keyframes must propose the place, and their verified loops
-must agree.
+"""Temporal consistency of loops.
 
-ORB-SLAM (T-RO 2015, VII-A) requires that consecutive keyframes resemble overlapping places, which
-is evidence from appearance. Geometry gives stronger evidence: each verified loop implies how much
-the map has drifted, and the loops of neighbouring keyframes must imply the same drift. ORB-SLAM3
-(T-RO 2021, section VI) also verifies a loop first and then confirms it with other keyframes.
+Several keyframes must propose the same place, and their verified loops must agree.
+
+ORB-SLAM (T-RO 2015, VII-A) requires that the candidates of consecutive keyframes belong to
+overlapping places. This is evidence from appearance. Geometry gives stronger evidence: each
+verified loop implies how much the map has drifted, and the loops of neighbouring keyframes must
+imply the same drift. ORB-SLAM3 (T-RO 2021, section VI) also verifies a loop first and then confirms
+it with other keyframes.
 """
 
 from __future__ import annotations
@@ -25,16 +27,16 @@ from vslam.states import ConsistencyState
 
 
 class LoopConsistency:
-    """Remembers which places recent keyframes resembled, and which loops were verified for them.
+    """Stores which places recent keyframes resembled, and which loops were verified for them.
 
-    Call ``update`` once for every keyframe, with or without candidates, ``confirm`` for every
-    verified edge, and ``reset`` after a loop has been closed.
+    Call ``update`` once for every keyframe, with or without candidates. Call ``confirm`` for every
+    verified edge. Call ``reset`` after a loop has been closed.
     """
 
     def __init__(self, config: ConsistencyConfig) -> None:
         self.config = config
         self._series: list[ResembledPlace] = []
-        self._verified: list[tuple[int, LoopEdge]] = []  # verified edges, each with its turn
+        self._verified: list[tuple[int, LoopEdge]] = []  # verified edges and their turns
         self._turn = 0  # number of updates so far
 
     def update(
@@ -42,14 +44,14 @@ class LoopConsistency:
     ) -> tuple[list[LoopCandidate], list[LoopEdge]]:
         """Check whether enough consecutive keyframes resembled the place of each candidate.
 
-        The place of a candidate is the set of its match and the keyframes covisible with the match.
-        The candidate continues the longest series of keyframes that resembled an overlapping place.
-        Candidates at the same place share one series, so there are never more new series than
-        candidates.
+        The place of a candidate consists of its match and the keyframes that are covisible with the
+        match. The candidate continues the longest series of keyframes that resembled an overlapping
+        place. Candidates at the same place share one series, so there are never more new series
+        than candidates.
 
         Returns:
-            The candidates whose place enough consecutive keyframes resembled, and a rejected edge
-            for each other candidate.
+            The candidates whose place was resembled by enough consecutive keyframes, and a rejected
+            edge for each other candidate.
         """
         self._turn += 1
         series: dict[frozenset[int], ResembledPlace] = {}
@@ -81,12 +83,12 @@ class LoopConsistency:
     def confirm(self, edge: LoopEdge, map_: Map) -> LoopEdge:
         """Accept a verified edge only if the loops of enough recent keyframes imply the same drift.
 
-        The drift implied by an edge is the motion of the world that would move the query to where
+        The drift that an edge implies is a motion of the world: it would move the query to where
         the edge places it. Odometry between neighbouring keyframes is accurate compared with the
-        tolerances, so true loops imply the same drift and false ones do not.
+        tolerances. True loops therefore imply the same drift, and false loops do not.
 
         Returns:
-            The edge; it is marked as not accepted if too few keyframes agree so far. A keyframe
+            The edge. It is marked as not accepted if too few keyframes agree so far. A keyframe
             counts once, even if several of its edges agree.
         """
         if not edge.accepted:
@@ -108,11 +110,11 @@ class LoopConsistency:
     def confirmed_by_earlier(
         self, map_: Map, camera: Camera, config: VerificationConfig
     ) -> Iterator[LoopEdge]:
-        """Yield the verified loops that still wait for agreement and that an earlier keyframe
-        confirms, newest first.
+        """Yield verified loops that still lack agreement, but that an earlier keyframe confirms.
+        The newest loop comes first.
 
-        An earlier keyframe confirms a loop if it is covisible with the query, can be verified at
-        the same place, and implies the same drift. ORB-SLAM3 (section VI) also tries covisible
+        An earlier keyframe confirms a loop if it is covisible with the query, is verified at the
+        same place, and implies the same drift. ORB-SLAM3 (section VI) also tries covisible
         keyframes before it waits for later keyframes.
         """
         oldest = self._turn + 1 - self.config.verified_memory
@@ -126,8 +128,8 @@ class LoopConsistency:
     def _is_confirmed(
         self, edge: LoopEdge, map_: Map, camera: Camera, config: VerificationConfig
     ) -> bool:
-        """Whether verification succeeds with the same drift for a keyframe that is covisible with
-        the query of an edge and at least ``min_moved`` away from it."""
+        """Whether another keyframe is verified at the same place with the same drift. The keyframe
+        must be covisible with the query of the edge and at least ``min_moved`` away from it."""
         assert edge.T_query_match is not None
         T_w_query = inverse(map_.keyframe_pose(edge.query))
         for keyframe in map_.covisible(edge.query)[0].tolist():
@@ -164,14 +166,14 @@ class LoopConsistency:
         self._turn = state.turn
 
     def reset(self) -> None:
-        """Forget all series and verified loops, because closing a loop has moved the map."""
+        """Discard all series and verified loops, because the map moved when a loop was closed."""
         self._series.clear()
         self._verified.clear()
 
 
 def implied_drift(edge: LoopEdge, map_: Map) -> NDArray[np.float64]:
     """``(4, 4)`` motion of the world that moves the query to where an edge places it. If the edge
-    has a scale, this is a similarity with the scale in its upper left 3x3 block.
+    has a scale, the motion is a similarity with the scale in its upper left 3x3 block.
 
     Raises:
         ValueError: the edge has no pose.
@@ -184,7 +186,7 @@ def implied_drift(edge: LoopEdge, map_: Map) -> NDArray[np.float64]:
 
 
 def _rigid(S: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A similarity with its scale set to 1; a rigid motion is returned unchanged."""
+    """A similarity with its scale set to 1. A rigid motion is returned unchanged."""
     T, scale_cubed = S.copy(), np.linalg.det(S[:3, :3])
     if abs(scale_cubed - 1.0) > 1e-9:
         T[:3, :3] /= np.cbrt(scale_cubed)

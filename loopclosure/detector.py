@@ -13,47 +13,52 @@ from vslam.map import Map
 
 
 class LoopDetector(Protocol):
-    """Remembers the appearance of keyframes and finds keyframes that look similar.
+    """Stores the appearance of keyframes and finds keyframes that look similar.
 
-    Methods are called in the order of the keyframes, by one thread at a time.
+    The methods are called in the order of the keyframes, by one thread at a time.
 
-    The later stages are the same for all detectors: rating and verification of candidates,
-    consistency, and correction. The setting ``verification.descriptors`` selects the descriptors
-    for verification, and its default depends on the detector. For ``bow``, ``capsule-paper`` and
-    plug-ins, candidates are verified by ORB descriptors alone. For ``both`` and the other networks,
-    candidates that ORB rejects are verified again by learned local descriptors; these detectors
-    also use the local descriptors to rank the 20 most similar keyframes. The local descriptors
-    always come from the feature extractor of the capsule network, whichever network proposed the
-    candidates. To compare detectors in isolation, set ``verification.descriptors`` to ``orb`` or
-    ``both`` for all of them.
+    All detectors share the later stages: rating and verification of candidates, consistency, and
+    correction. However, detectors differ in the descriptors that verify their candidates. The
+    setting ``verification.descriptors`` selects these descriptors, and its default depends on the
+    detector.
+
+    For ``bow``, ``capsule-paper`` and plug-ins, candidates are verified only by ORB descriptors.
+    For ``both`` and the other networks, candidates that ORB rejects are verified again by learned
+    local descriptors. These detectors also use the local descriptors to rank the 20 most similar
+    keyframes. The local descriptors always come from the feature extractor of the capsule network,
+    regardless of the network that proposed the candidates.
+
+    To compare detectors in isolation, set ``verification.descriptors`` to ``orb`` or ``both`` for
+    all of them.
     """
 
     name: str
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
-        """Remember a keyframe. ``image`` is its ``(H, W)`` uint8 left image, or None if it was not
-        stored."""
+        """Store the appearance of a keyframe. ``image`` is its ``(H, W)`` uint8 left image, or None
+        if it was not stored."""
         ...
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
-        """Candidates for a keyframe that was added, best first: similar keyframes in the map that
-        are neither recent nor covisible with it."""
+        """Find candidates for a keyframe that has been added, best first. Candidates are similar
+        keyframes in the map that are neither recent nor covisible with the keyframe."""
         ...
 
     def locate(
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
-        """Keyframes in the map that look similar to a frame outside the map, best first.
-        ``LoopCandidate.query`` is -1, because the frame is no keyframe."""
+        """Keyframes in the map that look similar to a frame outside the map, most similar first.
+        ``LoopCandidate.query`` is -1, because the frame is not a keyframe."""
         ...
 
     def memory(self) -> DetectorMemory:
-        """What the detector remembers of all keyframes, for a map file. Do not write to its arrays,
-        because the detector still uses them."""
+        """The data that the detector has stored for all keyframes, to be saved in a map file. Do
+        not write to its arrays, because the detector still uses them."""
         ...
 
     def restore(self, memory: DetectorMemory) -> None:
-        """Load the memory of an identical detector, instead of calling ``add`` for each keyframe.
+        """Load the memory of an identical detector. This replaces calling ``add`` for each
+        keyframe.
 
         Raises:
             ValueError: the memory is damaged or comes from another detector.
@@ -62,14 +67,14 @@ class LoopDetector(Protocol):
 
 
 def require_same(detector: DetectorMemory, memory: DetectorMemory) -> None:
-    """Check that a memory belongs to a detector.
+    """Check that a memory was made by the same detector.
 
     Args:
         detector: the detector's own memory.
         memory: the memory to be restored.
 
     Raises:
-        ValueError: the memory comes from another detector, or from the same one with another
+        ValueError: the memory comes from another detector, or from the same detector with another
             vocabulary or other weights.
     """
     if memory.name != detector.name:
@@ -79,7 +84,7 @@ def require_same(detector: DetectorMemory, memory: DetectorMemory) -> None:
 
 
 class NoDetector:
-    """A detector that never finds a loop, for odometry only."""
+    """A detector that never finds a loop. It is used for pure odometry."""
 
     name = "none"
 

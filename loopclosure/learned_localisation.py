@@ -1,8 +1,8 @@
 """Estimates the pose of an image at a place in the map by learned local descriptors.
 
-Landmarks of the place are searched for anywhere in the image, not only at its keypoints, because at
-night or in the other lane the corner detector responds at other points. If one keyframe of the
-place does not give enough matches, the matches of further keyframes are added.
+Landmarks of the place are searched for anywhere in the image, not only at its keypoints. The reason
+is that the corner detector responds at other points at night or in the other lane. If one keyframe
+of the place does not give enough matches, the matches of further keyframes are added.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from vslam.reprojection import stack_uvr
 
 
 class View(NamedTuple):
-    """The descriptors and landmarks of a keyframe of the place.
+    """The local descriptors and the landmarks of one keyframe of the place.
 
     Attributes:
         maps: local descriptors of the keyframe's image.
         landmarks: ``(N,)`` ids of the landmarks that the keyframe observes.
-        xy: ``(N, 2)`` pixels of these landmarks in the keyframe's image.
+        xy: ``(N, 2)`` positions of these landmarks in the keyframe's image, pixels.
     """
 
     maps: DescriptorMaps
@@ -44,15 +44,15 @@ class View(NamedTuple):
 
 
 class PoseEstimate(NamedTuple):
-    """A camera pose, the landmarks of a place that should be visible from it, and which of them are
-    found in the image.
+    """A camera pose, and the landmarks of a place that should be visible from it.
 
     Attributes:
         landmarks: ``(M,)`` int32 ids of the landmarks that should be visible.
-        uv: ``(M, 2)`` float64, their predicted pixels.
-        seen: ``(M,)`` bool, landmarks found at their predicted pixels (inliers).
+        uv: ``(M, 2)`` float64 predicted positions of these landmarks in the image, pixels.
+        seen: ``(M,)`` bool, True for inliers: landmarks that were found at their predicted
+            positions.
         n_matches: number of matches near the predictions, including outliers.
-        T_cw: ``(4, 4)`` pose of the camera in the world frame of the landmarks.
+        T_cw: ``(4, 4)`` pose of the camera (world to camera), in the world frame of the landmarks.
     """
 
     landmarks: NDArray[np.int32]
@@ -75,11 +75,11 @@ def localise(
 
     Args:
         query: local descriptors of the image.
-        keyframes: ids of keyframes of the place that have images, best first.
+        keyframes: ids of keyframes of the place that have images, most similar first.
         seed: seed of the random samples; the same seed gives the same result.
 
     Returns:
-        The pose with the landmarks, or a short reason why no pose was found.
+        The pose and the landmarks, or a short explanation of why no pose was found.
     """
     views: list[View] = []
     xyz, uv = np.empty((0, 3)), np.empty((0, 2))
@@ -115,7 +115,7 @@ def localise(
 
 
 def view_of(map_: Map, keyframe: int, images: KeyframeImages) -> View:
-    """The ``View`` of a keyframe with an image."""
+    """The ``View`` of a keyframe that has an image."""
     a, rows = map_.arrays, map_.rows(keyframe)
     landmark = a.landmark[rows]
     observing = np.flatnonzero(landmark >= 0)
@@ -130,8 +130,8 @@ def guided_search(
     camera: Camera,
     config: LearnedMatchingConfig,
 ) -> PoseEstimate:
-    """Search for all landmarks of the views near their projections and refine the pose with all
-    matches; then repeat both steps."""
+    """Refine a pose. All landmarks of the views are searched for near their projections, and the
+    pose is optimised with all matches. Both steps are done twice."""
     _, first = np.unique(np.concatenate([view.landmarks for view in views]), return_index=True)
     landmarks = np.concatenate([view.landmarks for view in views])[first]
     xyz = map_.arrays.xyz[landmarks]
@@ -157,7 +157,7 @@ def guided_search(
 
 
 def project(xyz: Matrix, T_cw: Matrix, camera: Camera) -> Matrix:
-    """``(N, 2)`` pixels of ``(N, 3)`` world points, NaN for points outside the image."""
+    """``(N, 2)`` pixels of ``(N, 3)`` world points; NaN for points outside the image."""
     p = transform(T_cw, xyz)
     uv = np.full((len(p), 2), np.nan)
     ahead = p[:, 2] > 0.1
@@ -171,6 +171,6 @@ def _observed(
     uv: Matrix, query: DescriptorMaps, config: LearnedMatchingConfig
 ) -> tuple[Matrix, Matrix]:
     """Monocular observations at ``(N, 2)`` pixels: ``(N, 3)`` u, v, u_right (NaN), and ``(N,)``
-    inverse variances."""
+    inverse variances of u and v."""
     sigma = config.sigma / query.scale
     return stack_uvr(uv, np.full(len(uv), np.nan)), np.full(len(uv), sigma**-2.0)

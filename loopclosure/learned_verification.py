@@ -1,8 +1,10 @@
-"""Verifies loop candidates and relocalises by learned local descriptors, which still match when the
-appearance has changed too much for ORB descriptors.
+"""Verifies loop candidates and relocalises by learned local descriptors.
 
-The steps are those of :mod:`vslam.loopclosure.verification`: an initial pose, guided matching with
-all landmarks of the place, refinement, and the same tests against similar-looking places.
+Learned descriptors still match when the appearance has changed too much for ORB descriptors.
+
+The steps are those of :mod:`vslam.loopclosure.verification`. First, an initial pose is estimated.
+Then, guided matching uses all landmarks of the place, and the pose is refined. Finally, the same
+tests reject places that only look similar.
 """
 
 from __future__ import annotations
@@ -35,12 +37,15 @@ _DEPTHS_AGREE = 0.15  # largest relative difference in depth between two landmar
 
 
 class LearnedTrials:
-    """Chooses the candidates for learned verification, which takes forty times as long as
-    verification by ORB.
+    """Chooses the candidates for learned verification.
 
-    The chosen candidates are those with the most similar images by local descriptors, if they are
-    similar enough. After a failed attempt, only candidates that are clearly more similar than the
-    failed one are chosen for the next ``learned.retry_interval`` keyframes.
+    Learned verification takes forty times as long as verification by ORB descriptors, so only a few
+    candidates are tried.
+
+    The candidates whose images are most similar by local descriptors are chosen, if they are
+    similar enough. After a failed attempt, the limit is higher for the next
+    ``learned.retry_interval`` keyframes. Only candidates that are clearly more similar than the
+    failed one are then chosen.
 
     Attributes:
         state: the outcome of the last attempt.
@@ -51,8 +56,8 @@ class LearnedTrials:
         self.state = VerifierState()
 
     def choose(self, keyframe: int, candidates: Collection[LoopCandidate]) -> set[int]:
-        """The keyframe ids ``match`` of the candidates to try. Candidates without a rating are
-        never chosen."""
+        """The ids ``match`` of the candidates that should be tried. Candidates without a similarity
+        are never chosen."""
         config = self._config
         min_similarity = config.min_similarity
         if keyframe < self.state.resting_until:
@@ -62,7 +67,7 @@ class LearnedTrials:
         return {match for similarity, match in best if similarity >= min_similarity}
 
     def record(self, candidate: LoopCandidate, *, located: bool) -> None:
-        """Remember the result of an attempt.
+        """Record the result of an attempt.
 
         Args:
             located: whether the attempt found a pose, even if the loop was rejected afterwards.
@@ -81,14 +86,14 @@ def with_similarities(
     config: LearnedMatchingConfig,
     beyond: NDArray[np.float64] | None = None,
 ) -> list[LoopCandidate]:
-    """Set ``similarity`` for candidates whose images the detector has not compared by local
-    descriptors.
+    """Set the ``similarity`` of candidates that the detector has not compared by local descriptors.
 
     Args:
-        candidates: best first; at most ``config.max_compared`` of them are compared.
-        glance: returns the coarse descriptors of the query image; called only if there is a
-            candidate to rate.
-        beyond: result of :func:`vslam.loopclosure.reach.beyond_reach`; keyframes out of reach are
+        candidates: the candidates, best first. At most ``config.max_compared`` of them are
+            compared.
+        glance: returns the coarse descriptors of the query image. It is called only if there is a
+            candidate to compare.
+        beyond: result of :func:`vslam.loopclosure.reach.beyond_reach`. Keyframes out of reach are
             not compared. None if the camera may be anywhere.
 
     Returns:
@@ -115,9 +120,9 @@ def is_image_redundant(
     """Whether the image of a keyframe need not be stored, because another image shows nearly the
     same view.
 
-    This is the case if the previous keyframe has an image, because every second image is enough
-    even if keyframes are far apart. It is also the case if any keyframe with an image shares most
-    landmarks with this keyframe, as in slow motion, in turns, and on revisits of mapped places.
+    There are two such cases. First, the previous keyframe has an image; every second image is
+    enough even if keyframes are far apart. Second, any keyframe with an image shares most landmarks
+    with this keyframe. This happens in slow motion, in turns, and on revisits of mapped places.
     """
     if keyframe - 1 in images:
         return True
@@ -134,11 +139,11 @@ def verify_learned(
     config: LearnedMatchingConfig,
     gates: VerificationConfig,
 ) -> LoopEdge:
-    """Verify a candidate as :func:`verification.verify` does, but by learned local descriptors.
+    """Verify a candidate by learned local descriptors, as :func:`verification.verify` does by ORB.
 
     Returns:
-        The edge, accepted or with the reason for its rejection. Its features and landmarks are
-        those inliers that coincide with a keypoint of the query.
+        The edge. It is either accepted, or it has the reason for its rejection. Its features and
+        landmarks are the inliers that coincide with a keypoint of the query.
     """
     query, match = candidate.query, candidate.match
     edge = LoopEdge.of(candidate, matched_by="learned")
@@ -151,8 +156,8 @@ def verify_learned(
     if isinstance(estimate, str):
         return replace(edge, reason=estimate)
     feature, landmark = observed_features(map_, query, estimate, camera, config)
-    # Now that the pose is known, ORB features may match. If enough do, their matches are preferred,
-    # because their positions are more precise (about a tenth of a pixel).
+    # Now that the pose is known, ORB features may match. If enough of them do, their matches are
+    # preferred, because their positions are more precise (about a tenth of a pixel).
     place = collect_landmarks(map_.arrays, np.array(keyframes, np.int64), map_.n_landmarks)
     guided = guided_match(map_, query, place, estimate.T_cw, camera, gates)
     if np.count_nonzero(guided.seen) >= gates.min_inliers:
@@ -195,8 +200,8 @@ def recognise(
         match: id of the keyframe.
 
     Returns:
-        The pose and the observed landmarks, or None if the frame fails the tests of a loop or if
-        too few of its keypoints coincide with landmarks to continue tracking.
+        The pose and the observed landmarks. None if the frame fails the tests of a loop, or if too
+        few of its keypoints coincide with landmarks to continue tracking.
     """
     gates = config.verification
     around = [match, *map_.covisible(match)[0].tolist()]
@@ -216,10 +221,10 @@ def recognise(
 def observed_features(
     map_: Map, query: int, estimate: PoseEstimate, camera: Camera, config: LearnedMatchingConfig
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Pair features of the query with landmarks of the place that coincide in the image.
+    """Pair features of the query with landmarks of the place that are at the same image position.
 
-    If a feature already observes a landmark, the depths of both landmarks must agree, because a
-    corner of a car in front of a facade is not a corner of the facade.
+    If a feature already observes a landmark, the depths of both landmarks must agree. Otherwise, a
+    corner of a car could be paired with a corner of the facade behind it.
 
     Returns:
         ``(N,)`` indices of features and ``(N,)`` ids of landmarks, without duplicates.
@@ -241,8 +246,8 @@ def joined(
     first: tuple[NDArray[np.int32], NDArray[np.int32]],
     second: tuple[NDArray[np.int32], NDArray[np.int32]],
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """All pairs of features and landmarks of the first list, followed by the pairs of the second
-    list whose feature and landmark are both absent from the first."""
+    """Join two lists of pairs of features and landmarks. A pair of the second list is added only if
+    neither its feature nor its landmark is in the first list."""
     new = ~(np.isin(second[0], first[0]) | np.isin(second[1], first[1]))
     return np.r_[first[0], second[0][new]], np.r_[first[1], second[1][new]]
 
@@ -254,22 +259,22 @@ def nearest_features(
     scales: NDArray[np.float64],
     config: LearnedMatchingConfig,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Match pixels to the nearest features within ``config.fuse_pixels``, measured in pixels of the
-    feature's octave.
+    """Match pixels to the nearest features. The distance is at most ``config.fuse_pixels``,
+    measured in pixels of the feature's octave.
 
     Args:
-        uv: ``(N, 2)`` pixels.
-        xy, octave: features of the image.
+        uv: ``(N, 2)`` positions in the image, pixels.
+        xy, octave: positions and octaves of the features of the image.
 
     Returns:
-        ``(K,)`` indices of features, without duplicates, and ``(K,)`` indices of the pixels; the
+        ``(K,)`` indices of features, without duplicates, and ``(K,)`` indices of their pixels. The
         nearest pairs come first.
     """
     if not len(uv) or not len(xy):
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    # Brute force takes 3 ms. SciPy's k-d tree is faster, but its import takes 27 MB and 0.2 s, and
-    # it returns an arbitrary one of several features at the same pixel, whereas argmin returns the
-    # first one, which has the finest octave.
+    # Brute force takes 3 ms. SciPy's k-d tree is faster, but its import takes 27 MB and 0.2 s. If
+    # several features lie at the same pixel, the k-d tree returns an arbitrary one. ``argmin``
+    # returns the first one, which has the finest octave.
     x, y = xy.T.astype(np.float64)
     feature = np.array([np.argmin((x - u) ** 2 + (y - v) ** 2) for u, v in uv.tolist()])
     distance = np.sqrt((x[feature] - uv[:, 0]) ** 2 + (y[feature] - uv[:, 1]) ** 2)
@@ -288,10 +293,10 @@ def _rejection_reason(
     config: LearnedMatchingConfig,
     gates: VerificationConfig,
 ) -> str:
-    """The reason to reject a refined loop, or "" if it passes all tests.
+    """The reason to reject a refined loop, or "" if the loop passes all tests.
 
     Args:
-        query_seen: result of ``_seen_of_query``.
+        query_seen: the result of ``_seen_of_query``.
     """
     assert edge.T_query_match is not None
     distance = float(np.linalg.norm(inverse(edge.T_query_match)[:3, 3]))
@@ -308,7 +313,8 @@ def _rejection_reason(
 def _visibility_reason(
     estimate: PoseEstimate, camera: Camera, config: LearnedMatchingConfig, gates: VerificationConfig
 ) -> str:
-    """The reason to reject a pose because too little of the place is seen, or "" if enough is."""
+    """The reason to reject a pose because too little of the place is seen, or "" if enough is
+    seen."""
     seen, total = int(np.count_nonzero(estimate.seen)), len(estimate.seen)
     if seen < config.min_inliers:
         return f"only {seen} learned matches fit"
@@ -329,9 +335,12 @@ def _seen_of_query(
     camera: Camera,
     config: LearnedMatchingConfig,
 ) -> tuple[int, int]:
-    """Number of landmarks of the query that are found at their projections in the image of a
-    keyframe of the place, and number of landmarks of the query that should be visible in this
-    image."""
+    """Count the landmarks of the query that are visible in the image of a keyframe of the place.
+
+    Returns:
+        Number of landmarks of the query that are found at their projections in this image, and
+        number of landmarks of the query that should be visible in it.
+    """
     assert edge.T_query_match is not None
     T_match_query = inverse(edge.T_query_match)
     T_match_query[:3, 3] *= edge.scale  # in the unit around the query, like the landmarks
@@ -346,13 +355,13 @@ def _seen_of_query(
     least, reach = config.min_fine_similarity, config.guided_reach
     found = locate_near(view.xy, expected, view.maps, match, reach, least)
     error = np.linalg.norm(found.xy - expected, axis=1) * match.scale
-    # 95 % of the distances of a two-dimensional normal distribution are below 2.45 sigma.
+    # For a two-dimensional normal distribution, 95 % of the distances are below 2.45 sigma.
     seen = np.count_nonzero(error < 2.45 * config.sigma)
     return int(seen), int(np.isfinite(expected[:, 0]).sum())
 
 
 class LearnedRelocalisation:
-    """Implements ``Recognise`` with the images of keyframes; without images, it finds nothing."""
+    """Implements ``Recognise`` with the images of keyframes. Without images, it finds nothing."""
 
     def __init__(self, images: KeyframeImages | None, camera: Camera, config: Config) -> None:
         self._images = images
@@ -362,7 +371,7 @@ class LearnedRelocalisation:
     def __call__(
         self, map_: Map, image: Image | None, features: Features, candidates: list[LoopCandidate]
     ) -> Localisation | None:
-        """Search for a frame at the candidates whose images are most similar to it; returns None if
+        """Search for a frame at the candidates whose images are most similar to it. Returns None if
         no candidate succeeds."""
         images, config = self._images, self._config
         if images is None or image is None:

@@ -1,9 +1,9 @@
 """Coarse-to-fine matching of learned local descriptors (after LoFTR, Sun et al., CVPR 2021).
 
-Coarse matches are cells of two images that are mutual nearest neighbours. Fine matching searches
-for each keypoint of one image in the other image, in windows around the positions that nearby
-coarse matches predict. The other image needs no keypoints. The position is refined to a fraction of
-a cell and accepted only if the reverse search returns to the keypoint.
+Coarse matches are pairs of cells in two images that are mutual nearest neighbours. Fine matching
+searches the other image for each keypoint of one image. It searches in windows around the positions
+that nearby coarse matches predict. The other image needs no keypoints. The position is refined to a
+fraction of a cell. It is accepted only if the reverse search returns to the keypoint.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ class DescriptorMaps(NamedTuple):
     """Local descriptors of an image, normalised to length 1.
 
     Attributes:
-        coarse: ``(h, w, C)`` float32, or float16 from ``coarse_alone``; cell (i, j) lies at pixel
+        coarse: ``(h, w, C)`` float32, or float16 from ``coarse_alone``. Cell (i, j) lies at pixel
             (16 j, 16 i) of the network's input.
-        fine: ``(H, W, D)`` float32; cell (i, j) lies at pixel (4 j, 4 i) of the network's input.
+        fine: ``(H, W, D)`` float32. Cell (i, j) lies at pixel (4 j, 4 i) of the network's input.
         scale: pixels of the network's input per pixel of the camera image.
     """
 
@@ -35,8 +35,8 @@ class DescriptorMaps(NamedTuple):
     scale: float
 
     def coarse_alone(self) -> DescriptorMaps:
-        """Only the coarse descriptors, in half precision, because they stay in memory for all
-        keyframes."""
+        """Only the coarse descriptors, in half precision. Half precision saves memory, because
+        these descriptors stay in memory for all keyframes."""
         none = np.empty((0, *self.fine.shape[1:]), np.float32)
         return self._replace(coarse=self.coarse.astype(np.float16), fine=none)
 
@@ -58,19 +58,20 @@ class Located(NamedTuple):
     """Positions of keypoints of one image in another image.
 
     Attributes:
-        xy: ``(N, 2)`` float64 pixels of the camera image, NaN where not found.
+        xy: ``(N, 2)`` float64 pixels of the camera image; NaN for keypoints that were not found.
     """
 
     xy: NDArray[np.float64]
 
     @property
     def found(self) -> NDArray[np.bool_]:
-        """``(N,)`` bool, keypoints that were found."""
+        """``(N,)`` bool, True for keypoints that were found."""
         return np.asarray(np.isfinite(self.xy[:, 0]))
 
 
 def match_coarse(a: DescriptorMaps, b: DescriptorMaps, least: float) -> CoarseMatches:
-    """Mutual nearest neighbours of the coarse descriptors whose cosine is at least ``least``."""
+    """Mutual nearest neighbours of the coarse descriptors whose cosine similarity is at least
+    ``least``."""
     cells = [one.coarse.reshape(-1, one.coarse.shape[2]).astype(np.float32) for one in (a, b)]
     best_a, best_b, similarity = _nearest(cells[0], np.ascontiguousarray(cells[1].T))
     mutual = (best_b[best_a] == np.arange(len(best_a))) & (similarity >= least)
@@ -79,7 +80,7 @@ def match_coarse(a: DescriptorMaps, b: DescriptorMaps, least: float) -> CoarseMa
 
 
 def positions(cells: NDArray[np.int64], maps: DescriptorMaps) -> NDArray[np.float64]:
-    """``(N, 2)`` positions of ``(N,)`` coarse cells, pixels of the camera image."""
+    """``(N, 2)`` positions of ``(N,)`` coarse cells, in pixels of the camera image."""
     columns = maps.coarse.shape[1]
     return COARSE_STRIDE * np.stack([cells % columns, cells // columns], 1) / maps.scale
 
@@ -92,14 +93,14 @@ def locate(
     reach: int,
     least: float,
 ) -> Located:
-    """Search for keypoints of image a in image b, in windows around the positions that nearby
-    coarse matches predict.
+    """Search image b for keypoints of image a. The search windows lie around the positions that
+    nearby coarse matches predict.
 
     Args:
-        xy: ``(N, 2)`` keypoints, pixels of camera image a.
+        xy: ``(N, 2)`` keypoints, in pixels of camera image a.
         coarse: coarse matches from a to b.
         reach: half width of a window, in fine cells.
-        least: least cosine of a match.
+        least: least cosine similarity of a match.
     """
     rows, columns, _ = a.coarse.shape
     cell_in_b = np.full(rows * columns, -1, np.int64)
@@ -119,12 +120,13 @@ def locate_near(
     reach: int,
     least: float,
 ) -> Located:
-    """Search for keypoints of image a in image b, in windows around predicted positions.
+    """Search image b for keypoints of image a, in windows around predicted positions.
 
     Args:
-        xy: ``(N, 2)`` keypoints, pixels of camera image a.
-        expected: ``(N, 2)`` predicted positions, pixels of camera image b; NaN skips a keypoint.
-        reach, least: as in ``locate``.
+        xy: ``(N, 2)`` keypoints, in pixels of camera image a.
+        expected: ``(N, 2)`` predicted positions, in pixels of camera image b. A keypoint with NaN
+            is skipped.
+        reach, least: see ``locate``.
     """
     found = _locate_near(
         xy.astype(np.float64) * (a.scale / FINE_STRIDE),
@@ -135,24 +137,26 @@ def locate_near(
 
 
 def likeness(a: DescriptorMaps, b: DescriptorMaps, least: float) -> float:
-    """Similarity of two images: the sum of the cosines of their coarse matches, divided by the
-    number of cells of the smaller image; 1 for identical images.
+    """Similarity of two images by their coarse descriptors; 1 for identical images.
+
+    The similarity is the sum of the cosine similarities of the coarse matches, divided by the
+    number of cells of the smaller image.
 
     Args:
-        least: least cosine of a match.
+        least: least cosine similarity of a match.
     """
     return float(match_coarse(a, b, least).similarity.sum() / _fewest_cells(a, b))
 
 
 def homography_share(coarse: CoarseMatches, a: DescriptorMaps, b: DescriptorMaps) -> float:
-    """``homography_inliers`` as a share of the cells of the smaller image."""
+    """``homography_inliers``, divided by the number of cells of the smaller image."""
     return homography_inliers(coarse, a, b) / _fewest_cells(a, b)
 
 
 def homography_inliers(coarse: CoarseMatches, a: DescriptorMaps, b: DescriptorMaps) -> int:
     """Number of coarse matches that fit a single homography.
 
-    A homography is not an exact model of a street, but distant points fit it, and near points
+    A homography is not an exact model of a street. However, distant points fit it, and near points
     deviate from it by only a cell or two. In images of different places, far fewer matches fit any
     homography.
     """
@@ -174,11 +178,11 @@ def _fewest_cells(a: DescriptorMaps, b: DescriptorMaps) -> int:
 
 @kernel
 def _nearest(a, b):
-    """Nearest neighbours by cosine of descriptors a ``(N, C)`` and b ``(C, M)``.
+    """Nearest neighbours by cosine similarity, of descriptors a ``(N, C)`` and b ``(C, M)``.
 
     Returns:
-        ``(N,)`` int64 nearest b of each a, ``(M,)`` int64 nearest a of each b, and ``(N,)`` float32
-        cosine of each a with its nearest b.
+        ``(N,)`` int64 nearest b of each a; ``(M,)`` int64 nearest a of each b; ``(N,)`` float32
+        cosine similarity of each a and its nearest b.
     """
     n, channels = a.shape
     m = b.shape[1]
@@ -201,8 +205,10 @@ def _nearest(a, b):
 
 @inner_kernel
 def _interpolate(fine, x, y, out):
-    """Write the descriptor at (x, y), in cells, interpolated bilinearly and normalised to length 1,
-    into ``out``; returns False outside the image."""
+    """Write the interpolated descriptor at (x, y) into ``out``. Returns False outside the image.
+
+    The position is in cells. The descriptor is interpolated bilinearly and normalised to length 1.
+    """
     rows, columns, channels = fine.shape
     if not (x >= 0.0 and y >= 0.0 and x <= columns - 1 and y <= rows - 1):
         return False
@@ -225,7 +231,7 @@ def _interpolate(fine, x, y, out):
 
 @inner_kernel
 def _cosine(fine, i, j, descriptor):
-    # Four partial sums, because each addition to a single sum would wait for the previous one.
+    # Four partial sums are used. With a single sum, each addition would wait for the previous one.
     s0, s1, s2, s3 = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
     for c in range(0, len(descriptor), 4):
         s0 += fine[i, j, c] * descriptor[c]
@@ -237,8 +243,8 @@ def _cosine(fine, i, j, descriptor):
 
 @inner_kernel
 def _search(fine, descriptor, x, y, reach):
-    """Find the most similar cell within ``reach`` of (x, y); returns its column, row and cosine (-2
-    if the window is outside the image)."""
+    """Find the most similar cell within ``reach`` of (x, y). Returns its column, row and cosine
+    similarity. The similarity is -2 if the window is outside the image."""
     rows, columns, _ = fine.shape
     best_i, best_j, best = -1, -1, np.float32(-2.0)
     middle_j, middle_i = int(np.rint(x)), int(np.rint(y))
@@ -252,8 +258,8 @@ def _search(fine, descriptor, x, y, reach):
 
 @inner_kernel
 def _peak(fine, descriptor, j, i, best):
-    """Position of the best match at sub-cell precision: in x and in y, the maximum of the parabola
-    through the cosines of the best cell and its two neighbours."""
+    """Position of the best match at sub-cell precision. In x and in y, it is the maximum of the
+    parabola through the cosine similarities of the best cell and its two neighbours."""
     rows, columns, _ = fine.shape
     x, y = float(j), float(i)
     if 0 < j < columns - 1:
@@ -271,8 +277,9 @@ def _peak(fine, descriptor, j, i, best):
 
 @inner_kernel
 def _accept_if_mutual(fine_a, fine_b, descriptor, x, y, j, i, best, reach, other, found):
-    """Set ``found`` to the peak around the best cell of b if the reverse search from that peak ends
-    within 1.5 cells of the keypoint (x, y) in a; ``other`` is a workspace."""
+    """Set ``found`` to the peak around the best cell of b, if the reverse search confirms it. The
+    reverse search from the peak must end within 1.5 cells of the keypoint (x, y) in a. ``other`` is
+    a workspace."""
     peak_x, peak_y = _peak(fine_b, descriptor, j, i, best)
     if _interpolate(fine_b, peak_x, peak_y, other):
         back_j, back_i, _ = _search(fine_a, other, x, y, reach)
@@ -282,8 +289,8 @@ def _accept_if_mutual(fine_a, fine_b, descriptor, x, y, j, i, best, reach, other
 
 @kernel
 def _locate(xy, fine_a, fine_b, cell_in_b, columns_b, reach, least):
-    """``locate`` in units of fine cells; ``cell_in_b`` is the coarse match of each cell of a, or
-    -1."""
+    """Like ``locate``, in units of fine cells. ``cell_in_b`` is the coarse match of each cell of a,
+    or -1."""
     n, channels = len(xy), fine_a.shape[2]
     rows_a, columns_a = cell_in_b.shape
     found = np.full((n, 2), np.nan)
@@ -323,7 +330,7 @@ def _locate(xy, fine_a, fine_b, cell_in_b, columns_b, reach, least):
 
 @kernel
 def _locate_near(xy, expected, fine_a, fine_b, reach, least):
-    """``locate_near`` in units of fine cells."""
+    """Like ``locate_near``, in units of fine cells."""
     n, channels = len(xy), fine_a.shape[2]
     found = np.full((n, 2), np.nan)
     descriptor, other = np.empty(channels, np.float32), np.empty(channels, np.float32)

@@ -1,4 +1,4 @@
-"""Wraps a loop detector of another package and checks its results before they are used."""
+"""Wraps a loop detector from another package, and checks its results before they are used."""
 
 from __future__ import annotations
 
@@ -23,12 +23,13 @@ _METHODS = ("add", "query", "locate")
 
 
 class PlugInDetector:
-    """A ``LoopDetector`` that forwards all calls to the detector of a package. After its first
-    failure, that detector is not called again.
+    """A ``LoopDetector`` that forwards all calls to the detector of another package.
+
+    After its first failure, the detector of the package is not called again.
 
     Attributes:
-        problem: one sentence about the failure; None if there was none. A run ends after a failure
-            and keeps its results so far.
+        problem: one sentence about the failure; None if there was no failure. A run ends after a
+            failure and keeps the results that it has so far.
     """
 
     def __init__(self, plugin: PlugIn, detector: LoopDetector) -> None:
@@ -49,7 +50,8 @@ class PlugInDetector:
         return self._candidates(-1, map_, self._detector.locate, _read_only(image), features, map_)
 
     def memory(self) -> DetectorMemory:
-        """The memory of the package's detector, or only its name if it has no method ``memory``."""
+        """The memory of the package's detector. If that detector has no method ``memory``, it is
+        only its name."""
         empty = DetectorMemory(self.name)
         if not callable(getattr(self._detector, "memory", None)):
             return empty
@@ -69,7 +71,7 @@ class PlugInDetector:
 
         Raises:
             ValueError: the memory comes from another detector, or the package's detector has no
-                method ``restore`` or fails in it.
+                method ``restore``, or this method fails.
         """
         if memory.name != self.name:
             raise ValueError(f"made with the detector {memory.name}, not {self.name}")
@@ -82,7 +84,8 @@ class PlugInDetector:
             raise ValueError(self.problem)
 
     def _call(self, method: Callable[..., Any], *arguments: object) -> Any:
-        """Call a method; returns its result, or None if the detector fails or has failed before."""
+        """Call a method and return its result. Returns None if the detector fails or has failed
+        before."""
         if self.problem is not None:
             return None
         try:
@@ -120,9 +123,9 @@ def open_plugin(plugin: PlugIn, config: Config, weights: Path | None) -> PlugInD
 
 
 def _fault(candidates: object, query: int, map_: Map) -> str:
-    """What is wrong with the candidates for a query, or "" if they are valid.
+    """Describe what is wrong with the candidates for a query. Returns "" if they are valid.
 
-    The check is needed because kernels use the ids as indices without bounds checks.
+    The check is needed because compiled kernels use the ids as indices without bounds checks.
     """
     if not isinstance(candidates, (list, tuple)):
         return f"returned {type(candidates).__name__}, not a list"

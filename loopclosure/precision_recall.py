@@ -1,6 +1,6 @@
-"""Evaluates the scores of a loop detector by precision, recall and measures derived from them.
+"""Precision, recall and derived measures for the scores of a loop detector.
 
-The definitions are those of published benchmarks, for example recall at 100 % precision (Cummins
+The definitions are those of published benchmarks. An example is recall at 100 % precision (Cummins
 and Newman, IJRR 2008). Tests check that the curves are identical to those of scikit-learn.
 """
 
@@ -16,13 +16,14 @@ from vslam.errors import InputError
 
 @dataclass(frozen=True)
 class PrecisionRecall:
-    """A precision-recall curve of K + 1 points: one for each threshold, and the end point with
-    precision 1 and recall 0.
+    """A precision-recall curve of K + 1 points.
+
+    There is one point for each of K thresholds. The last point has precision 1 and recall 0.
 
     Attributes:
         precision, recall: ``(K + 1,)`` float64.
-        thresholds: ``(K,)`` the distinct scores, ascending; a pair is accepted if its score is at
-            least the threshold.
+        thresholds: ``(K,)`` distinct scores, ascending. A pair is accepted if its score is at least
+            the threshold.
     """
 
     precision: NDArray[np.float64]
@@ -31,10 +32,10 @@ class PrecisionRecall:
 
 
 def precision_recall(same: NDArray, score: NDArray) -> PrecisionRecall:
-    """Precision and recall at each distinct score.
+    """Compute precision and recall at each distinct score.
 
     Args:
-        same: ``(N,)`` bool, whether the two images of each pair show the same place.
+        same: ``(N,)`` bool, True for pairs of images that show the same place.
         score: ``(N,)`` similarity of each pair.
 
     Raises:
@@ -42,9 +43,12 @@ def precision_recall(same: NDArray, score: NDArray) -> PrecisionRecall:
     """
     same, score = np.asarray(same, bool), np.asarray(score, np.float64)
     if same.shape != score.shape or same.ndim != 1:
-        raise InputError(f"precision-recall: {same.shape} labels do not fit {score.shape} scores.")
+        raise InputError(
+            f"precision-recall: the labels have the shape {same.shape}, but the scores have the "
+            f"shape {score.shape}."
+        )
     if not same.any():
-        raise InputError("precision-recall: empty ground truth, no pair shows the same place.")
+        raise InputError("precision-recall: empty ground truth; no pair shows the same place.")
     if np.isnan(score).any():
         raise InputError("precision-recall: a score is NaN; check the weights of the detector.")
     return curve_of(same, score, int(same.sum()))
@@ -54,9 +58,9 @@ def curve_of(right: NDArray[np.bool_], score: NDArray[np.float64], total: int) -
     """The precision-recall curve of N scored items.
 
     Args:
-        right: ``(N,)`` bool, items that are correct to accept.
-        score: ``(N,)`` float64.
-        total: number of correct items, the denominator of recall.
+        right: ``(N,)`` bool, True for items that should be accepted.
+        score: ``(N,)`` float64 score of each item.
+        total: number of items that should be accepted, which is the denominator of recall.
     """
     order = np.argsort(-score, kind="stable")
     ranked = score[order]
@@ -70,28 +74,30 @@ def curve_of(right: NDArray[np.bool_], score: NDArray[np.float64], total: int) -
 
 
 def average_precision(curve: PrecisionRecall) -> float:
-    """Average precision: the precisions weighted by the steps in recall, without interpolation."""
+    """Average precision: the sum of precisions weighted by the steps in recall, without
+    interpolation."""
     return float(-np.sum(np.diff(curve.recall) * curve.precision[:-1]))
 
 
 def recall_at_full_precision(curve: PrecisionRecall) -> float:
-    """The highest recall at which no accepted pair is wrong."""
+    """The highest recall at which all accepted pairs are correct."""
     return float(curve.recall[curve.precision == 1.0].max())
 
 
 def precision_at_recall(curve: PrecisionRecall, recall: float) -> float:
-    """The highest precision among the thresholds with at least this recall."""
+    """The highest precision among all thresholds with at least the given recall."""
     return float(curve.precision[curve.recall >= recall].max())
 
 
 def accepted_at(curve: PrecisionRecall, threshold: float) -> tuple[float, float]:
-    """Precision and recall at a threshold; 1 and 0 if no pair is accepted."""
+    """Precision and recall at a threshold. They are 1 and 0 if no pair is accepted."""
     k = int(np.searchsorted(curve.thresholds, threshold))
     return float(curve.precision[k]), float(curve.recall[k])
 
 
 def max_f1(curve: PrecisionRecall) -> tuple[float, float]:
-    """The highest F1 score (harmonic mean of precision and recall), and its threshold."""
+    """The highest F1 score (harmonic mean of precision and recall), and the threshold that gives
+    it."""
     p, r = curve.precision[:-1], curve.recall[:-1]
     f1 = np.divide(2 * p * r, p + r, out=np.zeros_like(p), where=p + r > 0)
     best = int(np.argmax(f1))
@@ -99,15 +105,16 @@ def max_f1(curve: PrecisionRecall) -> tuple[float, float]:
 
 
 def balanced_accuracy(same: NDArray, score: NDArray, threshold: float) -> float:
-    """Mean of the true positive rate and the true negative rate at a threshold. It equals the
-    accuracy on a set with as many positive as negative pairs.
+    """Mean of the true positive rate and the true negative rate at a threshold.
+
+    This equals the accuracy on a set with as many positive as negative pairs.
 
     Args:
-        same: ``(N,)`` bool, whether the two images of each pair show the same place.
+        same: ``(N,)`` bool, True for pairs of images that show the same place.
         score: ``(N,)`` similarity of each pair.
 
     Raises:
-        InputError: all pairs show the same place, or none does.
+        InputError: all pairs show the same place, or no pair does.
     """
     same, accepted = np.asarray(same, bool), np.asarray(score) >= threshold
     if same.all() or not same.any():
@@ -119,7 +126,8 @@ def balanced_accuracy(same: NDArray, score: NDArray, threshold: float) -> float:
 
 
 def summary(same: NDArray, score: NDArray) -> dict[str, float]:
-    """All measures that a report shows for the scores of a detector on a set of pairs."""
+    """All measures that a report shows for a detector, computed from its scores on a set of
+    pairs."""
     curve = precision_recall(same, score)
     f1, threshold = max_f1(curve)
     return {

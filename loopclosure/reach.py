@@ -1,4 +1,4 @@
-"""Limits loop detection to keyframes that the camera may be revisiting, according to odometry."""
+"""Uses odometry to limit loop detection to the keyframes that the camera may be revisiting."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ from vslam.map import Map
 
 
 def beyond_reach(map_: Map, keyframe: int, config: SiameseConfig) -> NDArray[np.float64]:
-    """By how much the distance to each keyframe exceeds the possible error of odometry.
+    """Test which keyframes the camera may be revisiting, given the possible error of odometry.
 
-    The error of a position is bounded by a constant plus a share of the distance driven. In a
-    monocular map, which has no metric scale and whose scale drifts, the bound is a larger share
-    without a constant. Keyframes of other sub-maps are always within reach: the camera was lost
-    between the sub-maps, so their relative pose is unknown, and so is their relative scale if the
-    map is monocular.
+    The result is the distance between the camera and each keyframe, minus a bound on the position
+    error of odometry. The bound is a constant plus a fraction of the distance driven since the
+    keyframe. A monocular map has no metric scale, and its scale drifts. There, the bound is a
+    larger fraction of the distance driven, with no constant term.
 
-    Within a sub-map, keyframes that face another direction than the camera are out of reach at any
-    distance, because the heading from odometry is accurate to a few degrees, and the detectors do
-    not recognise a place from behind or from the side.
+    Keyframes of other sub-maps are always within reach. The camera was lost between the sub-maps,
+    so their relative pose is unknown. In a monocular map, their relative scale is unknown as well.
+
+    Within a sub-map, a keyframe whose viewing direction differs too much from that of the camera is
+    out of reach at any distance. There are two reasons. The heading from odometry is accurate to a
+    few degrees. In addition, the detectors do not recognise a place from behind or from the side.
 
     Args:
         keyframe: id of the current keyframe.
 
     Returns:
-        ``(n_keyframes,)`` float64 in the unit of the map: at most 0 for keyframes within reach,
-        infinite for those that face another direction.
+        ``(n_keyframes,)`` float64, in the unit of the map. The value is at most 0 for keyframes
+        within reach, and infinite for keyframes with a different viewing direction.
     """
     n, a = map_.n_keyframes, map_.arrays
     T = a.T_cw[:n]
@@ -42,7 +44,7 @@ def beyond_reach(map_: Map, keyframe: int, config: SiameseConfig) -> NDArray[np.
         beyond = distance - config.reach - config.reach_share * driven
     else:
         beyond = distance - config.monocular_reach_share * driven
-    direction = T[:, 2, :3]  # viewing direction of each keyframe in the world
+    direction = T[:, 2, :3]  # viewing direction of each keyframe in the world frame
     beyond[direction @ direction[keyframe] < np.cos(np.radians(config.reach_angle))] = np.inf
     if map_.restarts:
         submap = map_.submaps()

@@ -1,4 +1,4 @@
-"""Creates the loop detectors of vslam and of other packages by name (docs/howto/plugins.md)."""
+"""Creates loop detectors by name: those of vslam and of other packages (docs/howto/plugins.md)."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ _ABOUT = {
     "capsule-pruned": "the Siamese capsule network, pruned",
     "capsule-paper": "the Siamese capsule network as the paper describes it",
 }
-# Detectors whose candidates are also verified by learned descriptors, unless the configuration says
-# otherwise.
+# Detectors whose candidates are also verified by learned descriptors. The configuration can
+# override this.
 LEARNED_VERIFICATION = ("both", *(name for name in NETWORKS if name != TO_THE_LETTER))
 
 
@@ -37,16 +37,17 @@ def about(name: str) -> str:
 
 
 def require_detector(name: str, weights: Path | None = None, option: str = "--detector") -> None:
-    """Check that a detector can be created, before anything expensive is imported or compiled.
+    """Check that a detector can be created. This is done before anything expensive is imported or
+    compiled.
 
     Args:
         name: name of the detector.
-        weights: its weights or vocabulary; None uses those that vslam ships.
-        option: the command-line option that an error message names.
+        weights: weights or vocabulary of the detector; None uses the files that vslam ships.
+        option: the command-line option that error messages refer to.
 
     Raises:
         InputError: the detector is unknown, its weights are missing, or weights are given for a
-            detector without weights.
+            detector that has none.
     """
     if name not in DETECTORS:
         others = plugins.find_plugins(plugins.DETECTORS)
@@ -62,11 +63,13 @@ def require_detector(name: str, weights: Path | None = None, option: str = "--de
     elif weights is not None and name == "none":
         raise InputError("--weights: the detector 'none' has no weights; leave the option out.")
     elif weights is not None and not weights.is_file():
-        raise InputError(f"--weights {weights}: no such file; name a vocabulary, .npz or .txt.")
+        raise InputError(
+            f"--weights {weights}: no such file; name a vocabulary file (.npz or .txt)."
+        )
 
 
 def problem_of(detector: LoopDetector) -> str | None:
-    """One sentence about the failure of a plug-in detector; None if there was none."""
+    """One sentence about the failure of a plug-in detector; None if there was no failure."""
     return detector.problem if isinstance(detector, PlugInDetector) else None
 
 
@@ -78,19 +81,19 @@ def detector_with_images(
     local_weights: Path | None = None,
     late: bool = True,
 ) -> tuple[LoopDetector, KeyframeImages | None]:
-    """Create a detector without any keyframes, and the store of keyframe images for learned
-    verification; :class:`vslam.slam.Slam` takes both.
+    """Create a detector, and the store of keyframe images for learned verification. Neither
+    contains any keyframes yet. :class:`vslam.slam.Slam` takes both.
 
     Args:
-        weights, late: as in :func:`create_detector`.
-        local_weights: weights of the local descriptors; None uses those that vslam ships.
+        weights, late: see :func:`create_detector`.
+        local_weights: weights of the local descriptors; None uses the weights that vslam ships.
 
     Returns:
-        The detector, and the store of images; the store is None if candidates are verified by ORB
-        alone.
+        The detector, and the store of images. The store is None if candidates are verified only by
+        ORB descriptors.
 
     Raises:
-        InputError, ValueError: as in :func:`create_detector`.
+        InputError, ValueError: see :func:`create_detector`.
     """
     images = create_images(name, config, local_weights)
     return create_detector(name, config, weights, images, late=late), images
@@ -104,14 +107,15 @@ def create_detector(
     *,
     late: bool = False,
 ) -> LoopDetector:
-    """Create a detector without any keyframes. Its dependencies are imported only here.
+    """Create a detector without any keyframes. The dependencies of the detector are imported only
+    here.
 
     Args:
-        weights: weights of a learned detector, or the vocabulary of ``bow``; None uses those that
-            vslam ships.
-        images: the store of keyframe images from :func:`create_images`; pass the same store to
+        weights: weights of a learned detector, or the vocabulary of ``bow``; None uses the file
+            that vslam ships.
+        images: the store of keyframe images from :func:`create_images`. Pass the same store to
             ``verifier_for``.
-        late: whether to postpone loading the shipped network until its first image.
+        late: whether loading of the shipped network is postponed until the first image.
 
     Raises:
         InputError: the vocabulary or weights cannot be read, or the package of a plug-in is broken.
@@ -147,8 +151,8 @@ def create_detector(
 
 
 def create_images(name: str, config: Config, weights: Path | None = None) -> KeyframeImages | None:
-    """Create the store of keyframe images that learned rating and verification of candidates need;
-    None if ``verification.descriptors`` selects ORB alone.
+    """Create the store of keyframe images, which learned rating and verification of candidates
+    need. Returns None if ``verification.descriptors`` selects only ORB descriptors.
 
     Raises:
         InputError: the network of the local descriptors cannot be read.
@@ -168,12 +172,12 @@ def create_images(name: str, config: Config, weights: Path | None = None) -> Key
 
 
 def _network_of(name: str) -> str:
-    """The network that a learned detector uses; ``both`` uses ``capsule``."""
+    """Name of the network that a learned detector uses. The detector ``both`` uses ``capsule``."""
     return "capsule" if name == "both" else name
 
 
 def parse_weights(given: Collection[str], detectors: Collection[str]) -> dict[str, Path]:
-    """Parse items ``NAME=FILE`` into the files of weights by detector name.
+    """Parse items of the form ``NAME=FILE``. Returns the file of weights for each detector name.
 
     Raises:
         InputError: an item has another form or names an unknown detector.
@@ -183,7 +187,7 @@ def parse_weights(given: Collection[str], detectors: Collection[str]) -> dict[st
         name, equals, file = item.partition("=")
         if not equals or name not in detectors:
             raise InputError(
-                f"--weights {item}: must be NAME=FILE with a name of --detectors"
+                f"--weights {item}: must be NAME=FILE, where NAME is one of --detectors"
                 f"{did_you_mean(name, detectors)}: {', '.join(detectors)}."
             )
         files[name] = Path(file).expanduser().absolute()

@@ -1,8 +1,8 @@
-"""Motion between two cameras from matched 3D landmarks, by RANSAC.
+"""Estimates the motion between two cameras from matched 3D landmarks, by RANSAC.
 
-Both sides of a loop have triangulated the same points, so three matches determine the motion in
-closed form (Horn, JOSA A 1987; the scale as in Umeyama, PAMI 1991). As in ORB-SLAM (T-RO 2015,
-VII-B), RANSAC scores a motion by the reprojection errors in *both* keyframes.
+Both sides of a loop have triangulated the same points. Three matches therefore determine the motion
+in closed form (Horn, JOSA A 1987; the scale is computed as in Umeyama, PAMI 1991). As in ORB-SLAM
+(T-RO 2015, VII-B), RANSAC scores a motion by the reprojection errors in *both* keyframes.
 """
 
 from __future__ import annotations
@@ -19,18 +19,19 @@ from vslam.reprojection import chi_square, chi_square_ratio, residual, unpacked
 
 REFITS = 4
 SAMPLE_ITERATIONS, REFIT_ITERATIONS = 3, 5
-# Least height of a triangle over its longest side; flatter triangles hardly constrain the rotation
+# Least height of a triangle over its longest side. Flatter triangles hardly constrain the rotation
 # about the longest side.
 MIN_FLATNESS = 0.03
 
 
 class ObservedPoints(NamedTuple):
-    """The landmarks of N matches on one side of a loop, and their observations there.
+    """The landmarks of N matches on one side of a loop, and their observations on this side.
 
     Attributes:
-        points: ``(N, 3)`` landmarks in the camera frame, unit of the map.
-        uvr: ``(N, 3)`` observed u, v, u_right, pixels; NaN u_right for a monocular observation.
-        inverse_sigma2: ``(N,)`` inverse variance of a pixel coordinate.
+        points: ``(N, 3)`` landmarks in the camera frame, in the unit of the map.
+        uvr: ``(N, 3)`` observed u, v, u_right, in pixels; u_right is NaN for a monocular
+            observation.
+        inverse_sigma2: ``(N,)`` inverse variance of u and v.
     """
 
     points: NDArray[np.float64]
@@ -39,12 +40,12 @@ class ObservedPoints(NamedTuple):
 
 
 class Alignment(NamedTuple):
-    """The similarity ``p_a = scale * R p_b + t`` between two cameras.
+    """A similarity transform between two cameras: ``p_a = scale * R p_b + t``.
 
     Attributes:
-        T_a_b: ``(4, 4)`` with R and t.
-        scale: factor from lengths in b to lengths in a.
-        inlier: ``(N,)`` bool, matches that agree with the similarity.
+        T_a_b: ``(4, 4)`` rigid motion with R and t.
+        scale: factor that converts lengths in b to lengths in a.
+        inlier: ``(N,)`` bool, True for matches that agree with the similarity.
     """
 
     T_a_b: NDArray[np.float64]
@@ -63,17 +64,19 @@ def align(
     confidence: float,
     fix_scale: bool = True,
 ) -> Alignment | None:
-    """Rigid motion or similarity with the highest MSAC score; None if it has fewer than
-    ``min_inliers`` inliers.
+    """Find the rigid motion or similarity with the highest MSAC score. Returns None if it has fewer
+    than ``min_inliers`` inliers.
 
     Args:
-        a, b: the same N matches as seen by each camera.
+        a, b: the same N matches, as observed by each camera.
         intrinsics: ``(6,)`` of both cameras, see ``Camera.intrinsics``.
         seed: seed of the random samples; the same seed gives the same result.
         min_inliers: least number of inliers.
         max_draws: maximum number of samples.
-        confidence: sampling stops once a better motion would have been found with this probability.
-        fix_scale: True for metric maps (stereo, RGB-D), False for monocular ones.
+        confidence: a probability. Sampling ends once a better motion would have been found with
+            this probability.
+        fix_scale: whether the scale is fixed to 1. True for metric maps (stereo, RGB-D), False for
+            monocular maps.
     """
     if len(a.points) < max(3, min_inliers):
         return None
@@ -92,15 +95,15 @@ def align(
 
 @kernel
 def fit_motion(p_a, p_b, weights, fix_scale):
-    """Weighted least-squares motion ``p_a = scale * R p_b + t`` between point sets (Horn 1987).
+    """Weighted least-squares motion ``p_a = scale * R p_b + t`` between two point sets (Horn 1987).
 
     Args:
-        p_a, p_b: ``(N, 3)`` float64; at least three points that are not collinear (see
-            ``is_degenerate``).
+        p_a, p_b: ``(N, 3)`` float64 points. There must be at least three points that are not
+            collinear (see ``is_degenerate``).
         weights: ``(N,)`` float64; a point with weight 0 is ignored.
 
     Returns:
-        ``(4, 4)`` with R and t, and the scale (1 if ``fix_scale``).
+        The ``(4, 4)`` motion with R and t, and the scale, which is 1 if ``fix_scale`` is True.
     """
     n = len(p_a)
     total = 0.0
@@ -169,7 +172,8 @@ def fit_motion(p_a, p_b, weights, fix_scale):
 
 @kernel
 def is_degenerate(p):
-    """Whether three points, the rows of a ``(3, 3)`` array, are nearly collinear or coincide."""
+    """Whether three points are nearly collinear or coincide. The points are the rows of ``p``,
+    ``(3, 3)``."""
     longest = 0.0
     for i in range(3):
         side = 0.0
@@ -187,11 +191,12 @@ def is_degenerate(p):
 
 @inner_kernel
 def _same_sides(p_a, p_b, bf):
-    """Whether the side lengths of two triangles agree within the stereo error. This cheap test
-    rejects most samples that contain a wrong match.
+    """Whether the side lengths of two triangles agree within the stereo error.
 
-    A disparity error of one pixel moves a point by z^2 / bf. Each end of a side may have this error
-    in each camera.
+    This fast test rejects most samples that contain a wrong match.
+
+    A disparity error of one pixel moves a point by z^2 / bf. Both ends of a side may have this
+    error, in both cameras.
     """
     for i in range(3):
         j = (i + 1) % 3
@@ -211,8 +216,8 @@ def _add_residual(p, motion, uvr, inverse_sigma2, intrinsics, H, b):
 
     Args:
         p: ``(3,)`` point in the camera frame.
-        motion: ``(3, 7)`` derivative of the point with respect to the similarity.
-        H, b: ``(7, 7)`` and ``(7,)`` normal equations.
+        motion: ``(3, 7)`` derivative of the point with respect to the parameters of the similarity.
+        H, b: ``(7, 7)`` and ``(7,)`` normal equations, which are updated in place.
     """
     if p[2] <= 0.1:
         return
@@ -239,12 +244,12 @@ def refine_motion(T, scale, a, b, chosen, intrinsics, iterations, fix_scale):
     """Refine a motion by Gauss-Newton on the reprojection errors in both cameras, with the Huber
     loss.
 
-    This is needed because stereo points are ten times less certain along the line of sight than
-    across it, and ``fit_motion`` ignores the difference.
+    The refinement is needed because stereo points are ten times less certain along the line of
+    sight than across it. ``fit_motion`` ignores this difference.
 
     Args:
-        T, scale: initial motion.
-        chosen: ``(M,)`` indices of the matches to use.
+        T, scale: initial ``(4, 4)`` motion and scale.
+        chosen: ``(M,)`` indices of the matches that are used.
 
     Returns:
         The refined ``(4, 4)`` motion and scale.
@@ -263,7 +268,7 @@ def refine_motion(T, scale, a, b, chosen, intrinsics, iterations, fix_scale):
                     p[row] += scale * T[row, k] * points_b[i, k]
             _derivative(p, fix_scale, derivative_a)
             _add_residual(p, derivative_a, uvr_a[i], weight_a[i], intrinsics, H, g)
-            # Camera b observes R' (p_a - t) / scale, the inverse of the same motion.
+            # Camera b observes R' (p_a - t) / scale, which is the inverse of the same motion.
             _derivative(points_a[i], fix_scale, derivative_a)
             for row in range(3):
                 p[row] = 0.0
@@ -292,8 +297,8 @@ def refine_motion(T, scale, a, b, chosen, intrinsics, iterations, fix_scale):
 
 @inner_kernel
 def _derivative(p, fix_scale, out):
-    """Write the derivative ``[I, -[p]x, p]`` of a moved point with respect to translation, rotation
-    and log scale into ``out``, ``(3, 7)``."""
+    """Write the derivative ``[I, -[p]x, p]`` of a moved point into ``out``, ``(3, 7)``. The
+    derivative is with respect to translation, rotation and the logarithm of the scale."""
     for row in range(3):
         for column in range(3):
             out[row, column] = 1.0 if row == column else 0.0
@@ -317,7 +322,8 @@ def _error(x, y, z, uvr, inverse_sigma2, intrinsics):
 def _score_motion(T, scale, a, b, intrinsics, to_beat, inlier):
     """MSAC score of a motion and its number of inliers (Torr and Zisserman, CVIU 2000).
 
-    Sets ``inlier``. Stops and returns (-1, 0) when the score can no longer exceed ``to_beat``.
+    The inliers are written into ``inlier``. Returns (-1, 0) as soon as the score can no longer
+    exceed ``to_beat``.
     """
     points_a, uvr_a, weight_a = a
     points_b, uvr_b, weight_b = b
@@ -350,7 +356,7 @@ def _score_motion(T, scale, a, b, intrinsics, to_beat, inlier):
 @kernel
 def _ransac(a, b, intrinsics, seed, min_inliers, max_draws, confidence, fix_scale):
     """RANSAC on samples of three matches. Each motion with a new best score is refitted to its
-    inliers. Returns T, scale, inliers and their number."""
+    inliers. Returns T, the scale, the inliers, and the number of inliers."""
     points_a, points_b = a.points, b.points
     n = len(points_a)
     state = np.empty(1, np.uint64)
@@ -359,7 +365,7 @@ def _ransac(a, b, intrinsics, seed, min_inliers, max_draws, confidence, fix_scal
     best_inlier, inlier = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
     sample = np.empty(3, np.int64)
     three_a, three_b, ones = np.empty((3, 3)), np.empty((3, 3)), np.ones(3)
-    # This many samples suffice if at least min_inliers of the matches are correct.
+    # This number of samples suffices if at least min_inliers of the matches are correct.
     draws = draws_needed(min_inliers / n, confidence, max_draws)
     turn = 0
     while turn < draws:

@@ -1,11 +1,15 @@
-"""Geometric verification of loop candidates: is it the same place, and what is the relative pose?
+"""Geometric verification of loop candidates.
 
-The steps are those of ORB-SLAM (T-RO 2015, VII-B; for stereo T-RO 2017, III-D): match the
-descriptors of two keyframes, estimate a motion by RANSAC, match all landmarks of the place near
-their projections, and refine the pose. ORB-SLAM then only counts inliers, but a facade or a car
-that looks like another one has many inliers, too. The tests here therefore also look for evidence
-against the loop: the inliers must be spread over the image, and in each keyframe most of the other
-side's landmarks that should be visible must be found.
+Verification tests whether two keyframes show the same place, and estimates their relative pose.
+
+The first steps are those of ORB-SLAM (T-RO 2015, VII-B; for stereo T-RO 2017, III-D). The
+descriptors of two keyframes are matched, and a motion is estimated by RANSAC. Then all landmarks of
+the place are matched near their projections, and the pose is refined.
+
+ORB-SLAM then only counts inliers. However, a facade or a car that looks like another one has many
+inliers, too. The tests here therefore also look for evidence against the loop. The inliers must be
+spread over the image. In addition, each keyframe must show most of the other side's landmarks that
+should be visible in it.
 """
 
 from __future__ import annotations
@@ -45,10 +49,11 @@ class GuidedMatches(NamedTuple):
 
     Attributes:
         landmarks: ``(M,)`` int32 ids of the landmarks that should be visible.
-        feature: ``(M,)`` int32, inlier feature of each landmark (index within the keyframe), or -1.
-        uv: ``(M, 2)`` float64, predicted pixels of the landmarks.
+        feature: ``(M,)`` int32 inlier feature of each landmark, as its index within the keyframe;
+            -1 if there is none.
+        uv: ``(M, 2)`` float64 predicted positions of the landmarks in the image, pixels.
         n_matches: number of matches near the predictions, including outliers.
-        T_cw: ``(4, 4)`` pose of the camera in the world frame of the landmarks.
+        T_cw: ``(4, 4)`` pose of the camera (world to camera), in the world frame of the landmarks.
     """
 
     landmarks: NDArray[np.int32]
@@ -59,7 +64,7 @@ class GuidedMatches(NamedTuple):
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """``(M,)`` bool, landmarks with an inlier feature."""
+        """``(M,)`` bool, True for landmarks with an inlier feature."""
         return self.feature >= 0
 
 
@@ -69,10 +74,11 @@ def verify(
     camera: Camera,
     config: VerificationConfig,
 ) -> LoopEdge:
-    """Decide whether the query keyframe shows the place of the match. The map is not changed.
+    """Decide whether the query keyframe shows the place of the match keyframe. The map is not
+    changed.
 
     Returns:
-        An edge that is accepted with the reason "verified", or rejected with another reason. The
+        An edge. It is accepted with the reason "verified", or rejected with another reason. The
         pose and the numbers of matches come from the last step that was completed. The inliers are
         features of the query and landmarks of the place, without duplicates.
     """
@@ -93,8 +99,8 @@ def verify(
 
 
 def verify_near(map_: Map, edge: LoopEdge, camera: Camera, config: VerificationConfig) -> LoopEdge:
-    """Verify as ``verify`` does, but start from the pose of an edge instead of matching
-    descriptors.
+    """Verify an edge that already has a pose. This does the same as ``verify``, but starts from the
+    pose of the edge instead of matching descriptors.
 
     Raises:
         ValueError: the edge has no pose.
@@ -124,10 +130,10 @@ def verify_near(map_: Map, edge: LoopEdge, camera: Camera, config: VerificationC
 def match_keyframes(
     map_: Map, query: int, match: int, config: VerificationConfig
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Match the descriptors of those features of two keyframes that observe landmarks.
+    """Match the descriptors of two keyframes. Only features that observe landmarks are used.
 
     Returns:
-        ``(N,)`` rows of the matched features in the map's arrays, for each keyframe.
+        ``(N,)`` rows of the matched features of each keyframe in the map's arrays.
     """
     a = map_.arrays
     rows_q, rows_m = (
@@ -151,8 +157,8 @@ def _consensus(
     camera: Camera,
     config: VerificationConfig,
 ) -> tuple[Matrix | None, float, int]:
-    """``T_query_match`` and scale from RANSAC, with the number of inliers. The pose is None if it
-    has too few inliers."""
+    """``T_query_match`` and the scale from RANSAC, with the number of inliers. The pose is None if
+    no motion has enough inliers."""
     found = align(
         _observed_points(map_, query, rows_q),
         _observed_points(map_, match, rows_m),
@@ -171,15 +177,15 @@ def _consensus(
 
 
 def relative_scale(map_: Map, edge: LoopEdge, T_cw: Matrix, *, default: float) -> float:
-    """Scale of a monocular loop: the factor from lengths around the match to lengths around the
-    query.
+    """Scale of a monocular loop. It is the factor that converts lengths around the match to lengths
+    around the query.
 
-    An inlier feature of the query may also observe a landmark of its own. The ratio of the depths
-    of that landmark and of the landmark of the place is one estimate of the scale; the median is
-    returned.
+    An inlier feature of the query may also observe a landmark of its own. The depth of this
+    landmark, divided by the depth of the matched landmark of the place, is one estimate of the
+    scale. The median of these estimates is returned.
 
     Args:
-        T_cw: ``(4, 4)`` pose of the query in the world frame of the place.
+        T_cw: ``(4, 4)`` pose of the query (world to camera), in the world frame of the place.
         default: the result if there are too few such features.
     """
     a = map_.arrays
@@ -201,15 +207,16 @@ def _observed_points(map_: Map, keyframe: int, rows: NDArray[np.int64]) -> Obser
 
 
 def _observations(map_: Map, rows: NDArray[np.int64]) -> tuple[Matrix, Matrix]:
-    """``(N, 3)`` u, v, u_right of ``(N,)`` rows, and ``(N,)`` inverse variances."""
+    """``(N, 3)`` u, v, u_right of ``(N,)`` rows of the map's arrays, and their ``(N,)`` inverse
+    variances."""
     a = map_.arrays
     uvr = stack_uvr(a.xy[rows], a.u_right[rows])
     return uvr, map_.scales[a.octave[rows]] ** -2.0
 
 
 def place_of(map_: Map, match: int, query: int, config: VerificationConfig) -> NDArray[np.int64]:
-    """Ids of the match and its most covisible keyframes, except keyframes that are covisible with
-    the query."""
+    """Ids of the match and its most covisible keyframes. Keyframes that are covisible with the
+    query are excluded."""
     near_query = {query, *map_.covisible(query)[0].tolist()}
     around = [k for k in map_.covisible(match)[0].tolist() if k not in near_query]
     return np.array([match, *around[: config.place_keyframes]], np.int64)
@@ -223,12 +230,14 @@ def guided_match(
     camera: Camera,
     config: VerificationConfig,
 ) -> GuidedMatches:
-    """Search for ``(N,)`` landmarks near their projections and refine the pose with all matches;
-    then repeat both steps with narrower windows.
+    """Match ``(N,)`` landmarks to the features of a keyframe and refine its pose.
+
+    The landmarks are searched for near their projections, and the pose is refined with all matches.
+    Both steps are then repeated with narrower windows.
 
     Args:
-        T_cw: ``(4, 4)`` estimated pose of the keyframe in the world frame of the landmarks. If the
-            map has drifted, it differs from the keyframe's pose in the map.
+        T_cw: ``(4, 4)`` estimated pose of the keyframe (world to camera), in the world frame of the
+            landmarks. If the map has drifted, it differs from the pose of the keyframe in the map.
     """
     a, rows = map_.arrays, map_.rows(keyframe)
     grid = FeatureGrid.of_positions(a.xy[rows], camera.width, camera.height)
@@ -274,7 +283,7 @@ def _rejection_reason(
     camera: Camera,
     config: VerificationConfig,
 ) -> str:
-    """The reason to reject a refined loop, or "" if it passes all tests."""
+    """The reason to reject a refined loop, or "" if the loop passes all tests."""
     if edge.n_inliers < config.min_inliers:
         return f"only {edge.n_inliers} landmarks of the place fit"
     if edge.n_inliers < config.min_inlier_ratio * edge.n_matches:
@@ -302,13 +311,13 @@ def spread_reason(
     config: VerificationConfig,
     min_elsewhere: int,
 ) -> str:
-    """The reason to reject inliers that are not spread over the image, or "" if they are.
+    """The reason to reject inliers that are not spread over the image, or "" if they are spread.
 
     Args:
-        uv: ``(M, 2)`` predicted pixels of the landmarks that should be visible.
-        seen: ``(M,)`` bool, the inliers.
-        min_elsewhere: least number of inliers outside the vertical strip, a third of the image
-            wide, that contains most of them.
+        uv: ``(M, 2)`` predicted positions, in pixels, of the landmarks that should be visible.
+        seen: ``(M,)`` bool, True for inliers.
+        min_elsewhere: least number of inliers outside a vertical strip of the image. The strip is a
+            third of the image wide, and is placed so that it contains as many inliers as possible.
     """
     expected, occupied = occupied_cells(uv, camera), occupied_cells(uv[seen], camera)
     if occupied < max(config.min_cells, config.min_cell_ratio * expected):
@@ -328,7 +337,7 @@ def reverse_match(
 ) -> GuidedMatches:
     """Search for the landmarks of the query in the image of the match."""
     T_match_query = inverse(T_query_match)
-    T_match_query[:3, 3] *= edge.scale  # in the unit around the query, like the landmarks
+    T_match_query[:3, 3] *= edge.scale  # lengths in the unit around the query, like the landmarks
     T_mw = T_match_query @ map_.keyframe_pose(edge.query)
     return guided_match(map_, edge.match, map_.landmarks_of(edge.query), T_mw, camera, config)
 
@@ -341,7 +350,7 @@ def seen_of(map_: Map, keyframe: int, guided: GuidedMatches) -> tuple[int, int]:
 
 
 def occupied_cells(uv: Matrix, camera: Camera) -> int:
-    """Number of grid cells of the image that contain at least one of ``(N, 2)`` pixels."""
+    """Number of cells of a grid over the image that contain at least one of ``(N, 2)`` pixels."""
     column = (uv[:, 0] * GRID_COLUMNS / camera.width).astype(np.int64)
     row = (uv[:, 1] * GRID_ROWS / camera.height).astype(np.int64)
     return len(np.unique(row * GRID_COLUMNS + column))

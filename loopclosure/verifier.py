@@ -1,7 +1,10 @@
-"""Verifiers of loop candidates: by ORB descriptors, by learned descriptors, or by ORB first and by
-learned descriptors if ORB fails.
+"""Verifiers of loop candidates.
 
-Loop closing uses only the interface of :class:`Verifier` and is the same for all of them.
+There are three: a verifier that uses ORB descriptors, one that uses learned descriptors, and one
+that uses ORB first and learned descriptors if ORB fails.
+
+Loop closing uses only the interface of :class:`Verifier`. It is therefore the same for all
+verifiers.
 """
 
 from __future__ import annotations
@@ -29,14 +32,14 @@ from vslam.states import VerifierState
 
 class Verifier:
     """Decides by geometry whether a keyframe shows the place that a detector proposes. This class
-    uses ORB descriptors alone.
+    uses only ORB descriptors.
 
-    Methods are called in the order of the keyframes, by one thread at a time.
+    The methods are called in the order of the keyframes, by one thread at a time.
 
     Attributes:
-        images: the keyframe images that verification needs; None if it needs none.
-        verified_memory: number of keyframes for which a verified loop waits for other loops that
-            agree with it.
+        images: the keyframe images that verification needs; None if it needs no images.
+        verified_memory: number of keyframes for which a verified loop is kept while it waits for
+            other loops that agree with it.
     """
 
     images: KeyframeImages | None = None
@@ -47,12 +50,12 @@ class Verifier:
         self._camera = camera
 
     def is_image_redundant(self, map_: Map, keyframe: int) -> bool:
-        """Whether the image of a keyframe is not needed because other images show nearly the same
+        """Whether the image of a keyframe is not needed, because other images show nearly the same
         view."""
         return False
 
     def add(self, map_: Map, keyframe: int, image: NDArray[np.uint8] | None) -> None:
-        """Store the image of a new keyframe if verification needs images.
+        """Store the image of a new keyframe, if verification needs images.
 
         Args:
             image: ``(H, W)`` uint8 left image; None if it is missing or not needed.
@@ -61,8 +64,8 @@ class Verifier:
     def rate(
         self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
     ) -> list[LoopCandidate]:
-        """Set ``similarity`` and ``promising`` (see ``LoopCandidate``) of a keyframe's candidates
-        if this verifier uses them. The order of the candidates stays the same."""
+        """Set ``similarity`` and ``promising`` of a keyframe's candidates, if this verifier uses
+        them (see ``LoopCandidate``). The order of the candidates is not changed."""
         return candidates
 
     def verify(
@@ -71,8 +74,8 @@ class Verifier:
         """Decide whether a candidate is a loop. The map is not changed.
 
         Args:
-            refusal: the rejected edge if the candidate has failed an earlier test, else None.
-                Verification by ORB skips such a candidate.
+            refusal: the rejected edge if the candidate has failed an earlier test, or else None.
+                Verification by ORB skips candidates that have failed an earlier test.
 
         Returns:
             An accepted edge with a pose, or a rejected edge with the reason.
@@ -82,7 +85,7 @@ class Verifier:
         return verification.verify(map_, candidate, self._camera, self._config.verification)
 
     def state(self) -> VerifierState:
-        """The state without the images, for a saved map or a checkpoint."""
+        """The state of the verifier, without the images, for a saved map or a checkpoint."""
         return VerifierState()
 
     def restore(self, state: VerifierState) -> None:
@@ -94,8 +97,8 @@ def verifier_for(config: Config, camera: Camera, images: KeyframeImages | None =
 
     Args:
         images: the store of keyframe images for learned verification, from
-            ``vslam.loopclosure.registry.create_images``; None selects ORB alone, whatever the
-            configuration says.
+            ``vslam.loopclosure.registry.create_images``. None selects verification only by ORB,
+            regardless of the configuration.
     """
     if images is None:
         return Verifier(config, camera)
@@ -105,11 +108,12 @@ def verifier_for(config: Config, camera: Camera, images: KeyframeImages | None =
 
 
 class LearnedVerifier(Verifier):
-    """A verifier that uses learned local descriptors alone.
+    """A verifier that uses only learned local descriptors.
 
     It takes forty times as long as verification by ORB, so :class:`LearnedTrials` selects the
-    promising candidates. They are tried even if only one keyframe resembled the place, because at
-    night a camera that crosses a place may get only one good view of it.
+    promising candidates. A promising candidate is tried even if only one keyframe resembled the
+    place. The reason is that a camera that crosses a place at night may get only one good view of
+    it.
     """
 
     images: KeyframeImages
@@ -124,7 +128,7 @@ class LearnedVerifier(Verifier):
         return is_image_redundant(map_, keyframe, self.images, self._config.learned)
 
     def add(self, map_: Map, keyframe: int, image: NDArray[np.uint8] | None) -> None:
-        """Store the image, and drop the images of keyframes that were culled."""
+        """Store the image of a keyframe, and remove the images of keyframes that were culled."""
         if image is not None:
             self.images.add(keyframe, image)
             self.images.keep(map_.arrays.keyframe_alive)
@@ -132,8 +136,8 @@ class LearnedVerifier(Verifier):
     def rate(
         self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
     ) -> list[LoopCandidate]:
-        """See :class:`Verifier`. Images of candidates that the detector has not compared are
-        compared, and the promising candidates are marked."""
+        """See :class:`Verifier`. Candidates whose images the detector has not compared are compared
+        here. Promising candidates are then marked."""
         images, config = self.images, self._config
         if keyframe in images and any(one.similarity is None for one in candidates):
             beyond = beyond_reach(map_, keyframe, config.siamese)
@@ -148,7 +152,7 @@ class LearnedVerifier(Verifier):
         self, map_: Map, candidate: LoopCandidate, refusal: LoopEdge | None = None
     ) -> LoopEdge:
         """See :class:`Verifier`. Promising candidates are tried even if they have failed an earlier
-        test, other candidates never."""
+        test. Other candidates are never tried."""
         if not candidate.promising:
             reason = "images not similar enough for learned verification"
             return refusal or LoopEdge.of(candidate, reason, matched_by="learned")
@@ -170,12 +174,12 @@ class LearnedVerifier(Verifier):
 
 
 class OrbThenLearnedVerifier(LearnedVerifier):
-    """A verifier that uses ORB descriptors and, if they fail, learned descriptors."""
+    """A verifier that uses ORB descriptors first, and learned descriptors if ORB fails."""
 
     def verify(
         self, map_: Map, candidate: LoopCandidate, refusal: LoopEdge | None = None
     ) -> LoopEdge:
-        """See :class:`Verifier`. A promising candidate that ORB rejects is tried again by learned
-        descriptors."""
+        """See :class:`Verifier`. A promising candidate that ORB rejects is verified again by
+        learned descriptors."""
         edge = Verifier.verify(self, map_, candidate, refusal)
         return edge if edge.accepted else super().verify(map_, candidate, edge)

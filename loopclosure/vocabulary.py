@@ -1,10 +1,12 @@
 """Visual words: a vocabulary tree of binary descriptors, and the bag of words of an image.
 
-The tree is the hierarchical vocabulary of Nister and Stewenius (CVPR 2006) for binary descriptors
-(Galvez-Lopez and Tardos, T-RO 2012, section III): each node splits its descriptors into k clusters
-by Hamming distance, the centre of a cluster is the bitwise majority of its descriptors, and the
-leaves are the words. Nodes are numbered breadth first, so that the children of a node are adjacent
-in memory and each step of a descent reads one block of k descriptors.
+The tree is the hierarchical vocabulary of Nister and Stewenius (CVPR 2006), in the form for binary
+descriptors (Galvez-Lopez and Tardos, T-RO 2012, section III). Each node splits its descriptors into
+k clusters by Hamming distance. The centre of a cluster is the bitwise majority of its descriptors.
+The leaves of the tree are the words.
+
+Nodes are numbered breadth first, so that the children of a node are adjacent in memory. Each step
+down the tree then reads one block of k descriptors.
 """
 
 from __future__ import annotations
@@ -33,14 +35,16 @@ class Vocabulary:
     Attributes:
         branching: maximum number of children of a node (k in the literature).
         levels: maximum depth of a leaf (L in the literature).
-        descriptors: ``(N, 4)`` uint64, centre of each node; zero for the root.
+        descriptors: ``(N, 4)`` uint64 centre of each node; zero for the root.
         first_child: ``(N,)`` int32; the children of node i are
             ``first_child[i] ... first_child[i] + n_children[i] - 1``.
-        n_children: ``(N,)`` uint8, 0 for a leaf.
-        parent: ``(N,)`` int32, -1 for the root.
-        level: ``(N,)`` uint8, depth of each node; 0 for the root.
-        word: ``(N,)`` int32, word of each leaf, in the order of the nodes; -1 for inner nodes.
-        weight: ``(W,)`` float32, inverse document frequency ln(images / images with the word).
+        n_children: ``(N,)`` uint8 number of children of each node; 0 for a leaf.
+        parent: ``(N,)`` int32 parent of each node; -1 for the root.
+        level: ``(N,)`` uint8 depth of each node; 0 for the root.
+        word: ``(N,)`` int32 word of each leaf, numbered in the order of the nodes; -1 for inner
+            nodes.
+        weight: ``(W,)`` float32 inverse document frequency of each word: ln(images / images with
+            the word).
     """
 
     branching: int
@@ -58,7 +62,7 @@ class Vocabulary:
         return len(self.weight)
 
     def words(self, descriptors: NDArray[np.uint8]) -> NDArray[np.int32]:
-        """``(M,)`` int32, the word of each of ``(M, 32)`` uint8 descriptors."""
+        """``(M,)`` int32 word of each of ``(M, 32)`` uint8 descriptors."""
         return descend(
             np.ascontiguousarray(descriptors).view(np.uint64),
             self.descriptors,
@@ -68,8 +72,8 @@ class Vocabulary:
         )
 
     def ancestors(self, level: int) -> NDArray[np.int32]:
-        """``(W,)`` int32, node of the ancestor of each word at a level (0 is the root). A word
-        above that level is its own ancestor."""
+        """``(W,)`` int32 node that is the ancestor of each word at a level. The root is at level 0.
+        A word above the level is its own ancestor."""
         nodes = np.flatnonzero(self.word >= 0).astype(np.int32)
         while (deep := self.level[nodes] > level).any():
             nodes[deep] = self.parent[nodes[deep]]
@@ -77,18 +81,23 @@ class Vocabulary:
 
 
 class BowVector(NamedTuple):
-    """Bag of words of an image: ``(N,)`` int32 words in ascending order, and ``(N,)`` float32
-    weights that sum to 1."""
+    """Bag of words of an image.
+
+    Attributes:
+        words: ``(N,)`` int32 words, in ascending order.
+        weights: ``(N,)`` float32 weights of the words, which sum to 1.
+    """
 
     words: NDArray[np.int32]
     weights: NDArray[np.float32]
 
 
 def bow_vector(vocabulary: Vocabulary, words: NDArray[np.int32]) -> BowVector:
-    """Bag of words of an image from its ``(M,)`` words, with tf-idf weights normalised to an L1
-    norm of 1 (Nister and Stewenius, section 4).
+    """Bag of words of an image, from the ``(M,)`` words of its features. The tf-idf weights are
+    normalised to an L1 norm of 1 (Nister and Stewenius, section 4).
 
-    Words of weight 0, which occur in every training image, carry no information and are left out.
+    Words that occur in every training image have weight 0. They carry no information and are left
+    out.
     """
     unique, count = np.unique(words, return_counts=True)
     weights = count * vocabulary.weight[unique].astype(np.float64)
@@ -100,8 +109,9 @@ def bow_vector(vocabulary: Vocabulary, words: NDArray[np.int32]) -> BowVector:
 def score(a: BowVector, b: BowVector) -> float:
     """L1 score of two images in [0, 1]: 1 - |a - b| / 2 (T-RO 2012, equation 2).
 
-    Since the weights are positive and sum to 1, this equals the sum, over the shared words, of the
-    smaller weight (Nister and Stewenius, section 4, equation 5, rearranged).
+    The weights are positive and sum to 1. The score therefore equals the sum, over the shared
+    words, of the smaller of the two weights (Nister and Stewenius, section 4, equation 5,
+    rearranged).
     """
     _, in_a, in_b = np.intersect1d(a.words, b.words, assume_unique=True, return_indices=True)
     return float(np.minimum(a.weights[in_a], b.weights[in_b]).sum(dtype=np.float64))
@@ -109,11 +119,12 @@ def score(a: BowVector, b: BowVector) -> float:
 
 @kernel
 def descend(queries, descriptors, first_child, n_children, word):
-    """Descend from the root to a leaf for each query, always to the nearest child; among equally
-    near children, to the first one.
+    """Find the word of each query by descending the tree from the root to a leaf.
+
+    Each step goes to the nearest child. Of equally near children, the first one is chosen.
 
     Args:
-        queries: ``(M, 4)`` uint64 descriptors; the other arrays are those of ``Vocabulary``.
+        queries: ``(M, 4)`` uint64 descriptors. The other arrays are attributes of ``Vocabulary``.
 
     Returns:
         ``(M,)`` int32 words.
@@ -141,7 +152,7 @@ def from_children(
     n_children: NDArray[np.uint8],
     weight: NDArray[np.float32],
 ) -> Vocabulary:
-    """Build a vocabulary from its nodes in breadth-first order; see ``Vocabulary`` for the
+    """Build a vocabulary from its nodes in breadth-first order. ``Vocabulary`` describes the
     arguments.
 
     Raises:
@@ -190,8 +201,10 @@ def from_children(
 
 
 def save(vocabulary: Vocabulary, path: Path) -> None:
-    """Write a vocabulary as an npz file. The file is not compressed, because the nearly random bits
-    of descriptors hardly compress and an uncompressed file loads faster.
+    """Write a vocabulary as an npz file.
+
+    The file is not compressed. The bits of descriptors are nearly random and hardly compress, and
+    an uncompressed file loads faster.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -210,11 +223,11 @@ def save(vocabulary: Vocabulary, path: Path) -> None:
 
 
 def load(path: Path = SHIPPED) -> Vocabulary:
-    """Read a vocabulary that ``save`` wrote; by default, the one that vslam ships.
+    """Read a vocabulary that ``save`` wrote. The default is the vocabulary that vslam ships.
 
     Raises:
-        InputError: the file is missing, damaged, not a vocabulary, or written by a version of vslam
-            with another schema.
+        InputError: the file is missing, damaged or not a vocabulary, or it was written by a version
+            of vslam with another schema.
     """
     fix = "write it again with 'vslam vocabulary train' or 'convert'"
     parts = read_npz(path, "a vocabulary", fix)

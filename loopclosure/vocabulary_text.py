@@ -1,10 +1,12 @@
-"""DBoW2's text format for vocabularies, for example ORB-SLAM's ``ORBvoc.txt``.
+"""Reads and writes vocabularies in DBoW2's text format, for example ORB-SLAM's ``ORBvoc.txt``.
 
-The first line is ``k L scoring weighting``. Each further line describes a node: the number of its
-parent, whether it is a leaf (0 or 1), the 32 bytes of its descriptor, and its weight (for a leaf,
-the inverse document frequency). Nodes are numbered from 1 in the order of their lines; node 0 is
-the root and has no line. The reader accepts any order in which parents precede their children; the
-writer uses breadth-first order.
+The first line is ``k L scoring weighting``. Each further line describes a node by numbers. They are
+the number of its parent, whether it is a leaf (0 or 1), the 32 bytes of its descriptor, and its
+weight. The weight of a leaf is the inverse document frequency. Nodes are numbered from 1, in the
+order of their lines. Node 0 is the root and has no line.
+
+The reader accepts any order in which parents precede their children. The writer uses breadth-first
+order.
 """
 
 from __future__ import annotations
@@ -25,11 +27,12 @@ from vslam.loopclosure.vocabulary import (
 )
 
 NUMBERS = 35  # numbers per line of a node: parent, leaf, 32 bytes, weight
-L1_NORM, TF_IDF = 0, 0  # DBoW2's codes for the scoring and weighting that vslam uses
+L1_NORM, TF_IDF = 0, 0  # DBoW2's codes for the scoring and the weighting of vslam
 
 
 def read_vocabulary(path: Path) -> Vocabulary:
-    """Read a vocabulary from an npz file or, if the name ends in .txt, from DBoW2's text format.
+    """Read a vocabulary from a file. A name that ends in .txt selects DBoW2's text format, .npz the
+    format of vslam.
 
     Raises:
         InputError: the name has another ending, or the file cannot be read (see ``load`` and
@@ -39,7 +42,8 @@ def read_vocabulary(path: Path) -> Vocabulary:
 
 
 def write_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
-    """Write a vocabulary as an npz file or, if the name ends in .txt, in DBoW2's text format.
+    """Write a vocabulary to a file. A name that ends in .txt selects DBoW2's text format, .npz the
+    format of vslam.
 
     Raises:
         InputError: the name has another ending.
@@ -49,7 +53,7 @@ def write_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
 
 
 def is_text(path: Path) -> bool:
-    """Whether a file name selects DBoW2's text format (.txt) rather than npz.
+    """Whether a file name selects DBoW2's text format (.txt). Otherwise it selects npz.
 
     Raises:
         InputError: the name has neither ending.
@@ -65,7 +69,7 @@ def read_text(path: Path) -> Vocabulary:
     """Read a vocabulary in DBoW2's text format.
 
     Raises:
-        InputError: the file is missing or damaged; the message names the line and the error.
+        InputError: the file is missing or damaged. The message gives the line and the error.
     """
     try:
         text = path.read_bytes().rstrip()
@@ -100,7 +104,7 @@ def read_text(path: Path) -> Vocabulary:
 
 
 def write_text(vocabulary: Vocabulary, path: Path) -> None:
-    """Write a vocabulary in DBoW2's text format, for DBoW2 and ORB-SLAM.
+    """Write a vocabulary in DBoW2's text format, which DBoW2 and ORB-SLAM can read.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -109,7 +113,7 @@ def write_text(vocabulary: Vocabulary, path: Path) -> None:
     weight = np.zeros(len(v.word), np.float32)
     weight[v.word >= 0] = v.weight
     byte_text = [f" {value}" for value in range(256)]
-    # No newline at the end, because ORB-SLAM's reader expects another node after each newline.
+    # There is no newline at the end, because ORB-SLAM's reader expects a node after each newline.
     lines = [f"{v.branching} {v.levels} {L1_NORM} {TF_IDF}"]
     rows = zip(
         v.parent[1:].tolist(),
@@ -146,7 +150,8 @@ def _read_header(path: Path, header: bytes) -> tuple[int, int]:
 
 
 def _read_nodes(path: Path, lines: list[bytes]) -> NDArray[np.float64]:
-    """Parse the lines of nodes 1 to n as ``(n, 35)`` numbers and check their ranges."""
+    """Parse the lines of nodes 1 to n as ``(n, 35)`` numbers, and check the ranges of the
+    numbers."""
 
     def refused(node: int, fault: str) -> InputError:
         return InputError(f"{path}: line {node + 1} {fault}; fetch or export it again.")
@@ -180,7 +185,7 @@ def _read_nodes(path: Path, lines: list[bytes]) -> NDArray[np.float64]:
 def _check_children(
     path: Path, parent: NDArray[np.int64], leaf: NDArray[np.bool_], branching: int
 ) -> None:
-    """Check that leaves have no children, and that other nodes have 1 to ``branching`` of them."""
+    """Check that leaves have no children and that other nodes have 1 to ``branching`` children."""
     n_children = np.bincount(parent[1:], minlength=len(parent))
     for wrong, fault in (
         (leaf & (n_children > 0), "is a leaf but has children"),
@@ -194,8 +199,8 @@ def _check_children(
 
 
 def _breadth_first(parent: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Nodes in breadth-first order, siblings in the order of their lines, and the level of each
-    node."""
+    """Nodes in breadth-first order, and the level of each node. Siblings are in the order of their
+    lines."""
     by_parent = np.argsort(parent, kind="stable")
     n_children = np.bincount(parent[1:], minlength=len(parent))
     first = 1 + np.cumsum(n_children) - n_children  # position of each first child in by_parent

@@ -1,10 +1,12 @@
-"""Training of a vocabulary tree by k-majority clustering, level by level.
+"""Trains a vocabulary tree by k-majority clustering, level by level.
 
 This is the method of Galvez-Lopez and Tardos (T-RO 2012, section III) for binary descriptors, after
-Nister and Stewenius (CVPR 2006). In each node, descriptors are assigned to the nearest of k
-centres, and each centre becomes the bitwise majority of its descriptors, until nothing changes. All
-arithmetic is on integers and the random numbers are generated here, so that a seed gives the same
-tree on every machine.
+Nister and Stewenius (CVPR 2006). In each node, every descriptor is assigned to the nearest of k
+centres. Each centre then becomes the bitwise majority of its descriptors. Both steps are repeated
+until nothing changes.
+
+All arithmetic is on integers, and the random numbers are generated here. A seed therefore gives the
+same tree on every machine.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 from vslam.kernels import hamming, inner_kernel, kernel
 from vslam.loopclosure.vocabulary import MAX_BRANCHING, MAX_LEVELS, Vocabulary, from_children
 
-TRIALS = 4  # candidates per centre in greedy k-means++, about 2 + ln k
+TRIALS = 4  # candidates per centre in greedy k-means++: about 2 + ln k
 ITERATIONS = 12  # maximum number of majority votes in a node; most nodes converge earlier
 
 
@@ -28,13 +30,13 @@ def train(
     seed: int = 0,
     on_level: Callable[[int, int], None] | None = None,
 ) -> Vocabulary:
-    """Train a vocabulary; the same input and seed give the same tree.
+    """Train a vocabulary. The same input and seed give the same tree.
 
     Args:
         descriptors_of_images: ``(n, 32)`` uint8 descriptors of each image.
         branching: maximum number of children of a node.
         levels: maximum depth of a leaf.
-        on_level: called after each level with the numbers of levels and nodes so far.
+        on_level: called after each level, with the number of levels and the number of nodes so far.
 
     Raises:
         ValueError: branching or levels is out of range, or there are fewer than two different
@@ -68,14 +70,15 @@ def train(
     seen_in = np.zeros(n_leaves, np.int64)
     for one in descriptors_of_images:
         seen_in[np.unique(tree.words(one))] += 1
-    # Each leaf should be the word of a training descriptor; np.maximum only guards the division.
+    # Every leaf should be the word of some training descriptor. np.maximum only prevents a division
+    # by 0.
     weight = np.log(len(counts) / np.maximum(seen_in, 1)).astype(np.float32)
     return from_children(branching, levels, nodes, children, weight)
 
 
 @inner_kernel
 def uniform(state):
-    """The next random number in [0, 1) and the next state of splitmix64 (Steele et al., OOPSLA
+    """The next random number in [0, 1), and the next state of splitmix64 (Steele et al., OOPSLA
     2014)."""
     state = state + np.uint64(0x9E3779B97F4A7C15)
     z = state
@@ -87,12 +90,12 @@ def uniform(state):
 
 @inner_kernel
 def seed_centres(data, members, branching, state, nearest, centres):
-    """Choose up to ``branching`` different members that are far from each other as initial centres.
+    """Choose initial centres: up to ``branching`` different members that are far from each other.
 
     k-means++ (Arthur and Vassilvitskii, SODA 2007) draws a member with a probability proportional
-    to its squared distance from the nearest centre so far; for bit vectors, this is the Hamming
-    distance. The greedy variant (their section 7) draws ``TRIALS`` members and chooses the one that
-    minimises the sum of these distances over all members.
+    to its squared distance from the nearest centre so far. For bit vectors, this squared distance
+    is the Hamming distance. The greedy variant (their section 7) draws ``TRIALS`` members. It
+    chooses the one that minimises the sum of these distances over all members.
 
     Args:
         members: ``(n,)`` indices into data.
@@ -100,7 +103,7 @@ def seed_centres(data, members, branching, state, nearest, centres):
         centres: ``(branching, 4)`` uint64, receives the centres.
 
     Returns:
-        Number of centres; it is below ``branching`` only if there are fewer different descriptors.
+        Number of centres. It is below ``branching`` only if there are fewer different descriptors.
     """
     n = len(members)
     draw, state = uniform(state)
@@ -136,8 +139,8 @@ def seed_centres(data, members, branching, state, nearest, centres):
 
 @inner_kernel
 def assign(data, members, centres, n_centres, label):
-    """Assign each member to the nearest centre, or to the first of several equally near ones;
-    returns the number of changed labels."""
+    """Assign each member to the nearest centre. Of equally near centres, the first one is chosen.
+    Returns the number of labels that changed."""
     changed = 0
     for i in range(len(members)):
         nearest, least = 0, 257
@@ -153,8 +156,8 @@ def assign(data, members, centres, n_centres, label):
 
 @inner_kernel
 def vote(data, members, label, n_centres, ones, size, centres):
-    """Set each centre to the bitwise majority of its members. A centre without members keeps its
-    value.
+    """Set each centre to the bitwise majority of its members. A centre without members is not
+    changed.
 
     Args:
         ones: ``(branching, 256)`` int64 workspace.
@@ -188,15 +191,16 @@ def split_level(data, order, starts, branching, stream, iterations):
 
     Args:
         data: ``(M, 4)`` uint64 descriptors.
-        order: ``(M,)`` int64 indices into ``data``, grouped by node; overwritten.
-        starts: ``(n + 1,)`` int64, start of the group of each node in ``order``. Descriptors in
-            leaves of upper levels are outside these groups.
+        order: ``(M,)`` int64 indices into ``data``, grouped by node. They are overwritten.
+        starts: ``(n + 1,)`` int64 start of the group of each node in ``order``. Descriptors in
+            leaves of upper levels do not belong to these groups.
         stream: uint64 seed of the random numbers of this level.
 
     Returns:
-        centres: ``(c, 4)`` uint64, centres of all children, node by node.
-        n_children: ``(n,)`` uint8; 0 for a node whose descriptors are all the same.
-        child_starts: ``(c + 1,)`` int64, start of the group of each child in ``order``.
+        centres: ``(c, 4)`` uint64 centres of all children, node by node.
+        n_children: ``(n,)`` uint8 number of children of each node; 0 if all its descriptors are the
+            same.
+        child_starts: ``(c + 1,)`` int64 start of the group of each child in ``order``.
     """
     n_nodes = len(starts) - 1
     centres = np.zeros((n_nodes * branching, 4), np.uint64)
@@ -214,7 +218,8 @@ def split_level(data, order, starts, branching, stream, iterations):
     for node in range(n_nodes):
         members = order[starts[node] : starts[node + 1]]
         n = len(members)
-        # The states of different nodes are far apart, so their random sequences do not overlap.
+        # The states of different nodes are far apart, so that their random sequences do not
+        # overlap.
         state = stream * np.uint64(0xD1342543DE82EF95) + np.uint64(node) * np.uint64(1 << 40)
         n_centres = seed_centres(data, members, branching, state, nearest, own)
         if n_centres == 1:
@@ -223,7 +228,7 @@ def split_level(data, order, starts, branching, stream, iterations):
             label[i] = -1
         changed = assign(data, members, own, n_centres, label)
         iteration = 0
-        # The last step is an assignment, so that descending the tree leads to the same clusters.
+        # The last step is an assignment, so that a descent of the tree leads to the same clusters.
         while changed > 0 and iteration < iterations:
             vote(data, members, label, n_centres, ones, size, own)
             changed = assign(data, members, own, n_centres, label)
@@ -239,8 +244,8 @@ def split_level(data, order, starts, branching, stream, iterations):
         for i in range(n):
             sorted_members[cursor[label[i]]] = members[i]
             cursor[label[i]] += 1
-        # Nodes that became leaves are skipped, so the groups of the other nodes are moved to the
-        # left.
+        # Nodes that became leaves are skipped. The groups of the other nodes are therefore moved to
+        # the left.
         for i in range(n):
             order[filled + i] = sorted_members[i]
         for k in range(n_centres):

@@ -66,7 +66,7 @@ def test_bad_figures_are_refused():
         precision_recall(np.zeros(3, bool), np.zeros(3))
     with pytest.raises(InputError, match="NaN"):
         precision_recall(np.ones(2, bool), np.array([0.1, np.nan]))
-    with pytest.raises(InputError, match="do not fit"):
+    with pytest.raises(InputError, match="the labels have the shape"):
         precision_recall(np.ones(2, bool), np.zeros(3))
     with pytest.raises(InputError, match="same place and of different places"):
         balanced_accuracy(np.ones(2, bool), np.zeros(2), 0.5)

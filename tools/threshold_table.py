@@ -25,11 +25,30 @@ DESCRIPTION = re.compile(
 )
 HEAD = """# Thresholds
 
-Written by `python tools/threshold_table.py` from `vslam/config.py`; `tests/test_threshold_table.py` compares the two. `vslam run --config FILE` reads them from a JSON file, `{"orb": {"n_features": 1500}}` or `{"orb.n_features": 1500}`, and `--config orb.n_features=1500,tracking.method=patches` sets them on the command line. In Python they are `Slam(camera, config={"orb.n_features": 1500})`. [design.md](../explanation/design.md) describes the methods.
+This page lists all thresholds of vslam. `python tools/threshold_table.py` generates it from `vslam/config.py`, and `tests/test_threshold_table.py` checks that the two agree. [The design](../explanation/design.md) describes the methods in which the thresholds are used. There are three ways to change a threshold:
 
-The source names the paper and section of the rule and says what the value is: *printed* in that section, *customary* in the programs and KITTI configurations of the ORB-SLAM family, or our *own*. OS1: Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2: Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017. ZS: Zhou and Sun, Sci Rep 15, 7644 (2025). Descriptor distances and ratios of best over second-best distance are upper bounds; a descriptor has 256 bits. A search radius at octave 0 grows with the scale of the pyramid level.
+- In a JSON file: `vslam run --config FILE`, with `{"orb": {"n_features": 1500}}` or `{"orb.n_features": 1500}` in the file.
+- On the command line: `vslam run --config orb.n_features=1500,tracking.method=patches`.
+- In Python: `Slam(camera, config={"orb.n_features": 1500})`.
 
-The other numbers of the method are constants in the code: mathematics, numerical tolerances, sizes of arrays and kernels, and numbers that belong to another constant or to trained weights. The most important ones are the chi-square quantiles, the viewing angle of 60 degrees and the search radius 1.6 times as wide for landmarks seen obliquely (OS1 V-D), the distance range of a landmark with 20 % slack, the 30 bins of the orientation check, 3 keyframes of probation for a landmark (OS1 VI-B).
+The column *source* names the paper and the section of the rule in which the threshold is used. It also states where the value comes from:
+
+- *printed*: the value is printed in this section of the paper.
+- *customary*: the programs of the ORB-SLAM family use the value, or their configurations for KITTI.
+- *own*: we chose the value.
+
+OS1 is Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2 is Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017. ZS is Zhou and Sun, Sci Rep 15, 7644 (2025).
+
+Descriptor distances are upper bounds. A descriptor has 256 bits. Ratios of the best to the second-best distance are upper bounds, too. A search radius at octave 0 grows with the scale of the pyramid level.
+
+The other numbers of the method are constants in the code. They are mathematical constants, numerical tolerances, sizes of arrays and kernels, and numbers that belong to another constant or to trained weights. The most important ones are:
+
+- the chi-square quantiles,
+- the limit of 60 degrees for the viewing angle of a landmark (OS1 V-D),
+- the search radius, which is 1.6 times as wide for landmarks that are seen obliquely (OS1 V-D),
+- the distance range of a landmark, with a tolerance of 20 %,
+- the 30 bins of the orientation check,
+- the first 3 keyframes of a landmark, during which it can be culled as a recent landmark (OS1 VI-B).
 """  # noqa: E501
 
 

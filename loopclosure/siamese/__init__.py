@@ -1,4 +1,4 @@
-"""Siamese networks that decide whether two images show the same place: inference without torch.
+"""Inference, without torch, of Siamese networks that decide whether two images show the same place.
 
-Training is in :mod:`vslam.loopclosure.training`.
+Training code is in :mod:`vslam.loopclosure.training`.
 """

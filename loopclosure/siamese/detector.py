@@ -1,4 +1,4 @@
-"""The loop detector that compares image descriptors of a Siamese network."""
+"""The loop detector that compares the image descriptors of a Siamese network."""
 
 from __future__ import annotations
 
@@ -22,14 +22,16 @@ from vslam.map import Map
 
 
 class SiameseDetector:
-    """A :class:`vslam.loopclosure.detector.LoopDetector` by the image descriptors of a network.
+    """A :class:`vslam.loopclosure.detector.LoopDetector` that uses the image descriptors of a
+    network.
 
-    If the images of keyframes are stored (``images``), the network computes the descriptor of a
-    keyframe only when the camera comes within reach of the keyframe (:func:`beyond_reach`) or is
-    lost. On a drive that never returns to a place, the network does not run at all.
+    If the images of keyframes are stored (``images``), descriptors are computed on demand. The
+    network computes the descriptor of a keyframe only when the camera comes within reach of the
+    keyframe (:func:`beyond_reach`) or is lost. On a drive that never returns to a place, the
+    network does not run at all.
 
-    Descriptors are rows of a matrix that grows by half when it is full. The matrix has no columns
-    until the network has computed the first descriptor.
+    Descriptors are the rows of a matrix that grows by half when it is full. The matrix has no
+    columns until the network has computed the first descriptor.
     """
 
     def __init__(
@@ -39,15 +41,15 @@ class SiameseDetector:
         learned: LearnedMatchingConfig | None = None,
         images: KeyframeImages | None = None,
     ) -> None:
-        """The detector has the name of the network.
+        """Create a detector without any keyframes. It has the name of the network.
 
         Args:
             learned: thresholds for local descriptors; None uses the defaults.
             images: the store of keyframe images. With a store, candidates must reach the similarity
-                ``config.offered``, and the most similar keyframes are ranked again by local
-                descriptors, because at night the correct place is often among these keyframes but
-                not the first. Without a store (None), candidates must reach ``config.threshold``
-                and are ranked by similarity.
+                ``config.offered``. The most similar keyframes are then ranked again by local
+                descriptors, because at night the correct place is often among them but not the
+                first. Without a store (None), candidates must reach ``config.threshold`` and are
+                ranked by similarity.
         """
         self.name = network.name
         self._network = network
@@ -56,10 +58,10 @@ class SiameseDetector:
         self._config = config
         self._descriptors = np.zeros((64, 0), np.float32)
         self._n_rows = 0  # number of rows in use
-        self._row = np.full(64, -1, np.int64)  # row of each keyframe, -1 without a descriptor
+        self._row = np.full(64, -1, np.int64)  # row of each keyframe; -1 if it has no descriptor
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
-        """Remember a keyframe. A keyframe without an image is never a query and never a match."""
+        """Add a keyframe. A keyframe without an image can never be a query or a match."""
         if keyframe >= len(self._row):
             more = max(keyframe + 1 - len(self._row), len(self._row) // 2)
             self._row = np.pad(self._row, (0, more), constant_values=-1)
@@ -67,8 +69,8 @@ class SiameseDetector:
             self._store_descriptor(keyframe, image)
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
-        """See :class:`LoopDetector`. The similarity of a candidate is at least the threshold (see
-        ``images``)."""
+        """See :class:`LoopDetector`. The similarity of a candidate is at least the threshold, which
+        depends on ``images`` (see ``__init__``)."""
         if keyframe >= len(self._row) or not (self._described[keyframe] or self._stored(keyframe)):
             return []
         eligible = self._searchable(map_)
@@ -97,7 +99,7 @@ class SiameseDetector:
     ) -> list[LoopCandidate]:
         """The keyframes in the map that are most similar to a frame outside the map, best first.
 
-        There is no threshold, because relocalisation verifies candidates by geometry anyway.
+        No threshold is applied, because relocalisation verifies all candidates by geometry.
         """
         if image is None:
             return []
@@ -111,7 +113,8 @@ class SiameseDetector:
         return self._best(-1, p, rating, map_)
 
     def memory(self) -> DetectorMemory:
-        """See :class:`LoopDetector`. The memory contains the descriptors computed so far."""
+        """See :class:`LoopDetector`. The memory contains the descriptors that have been computed so
+        far."""
         first = np.concatenate([[0], np.cumsum(self._described)]).astype(np.int64)
         table = PerKeyframe(first, self._descriptors[self._row[self._described]])
         return DetectorMemory(self.name, self._network.fingerprint, {"descriptors": table})
@@ -130,12 +133,12 @@ class SiameseDetector:
 
     @property
     def _described(self) -> NDArray[np.bool_]:
-        """``(K,)`` bool, keyframes with a descriptor."""
+        """``(K,)`` bool, True for keyframes with a descriptor."""
         return self._row >= 0
 
     def _searchable(self, map_: Map) -> NDArray[np.bool_]:
-        """``(n,)`` bool, keyframes in the map that have a descriptor or an image to compute it
-        from."""
+        """``(n,)`` bool, True for keyframes in the map that have a descriptor, or an image from
+        which it can be computed."""
         n = min(map_.n_keyframes, len(self._row))
         able = self._described[:n].copy()
         able[[k for k in np.flatnonzero(~able).tolist() if self._stored(k)]] = True
@@ -146,11 +149,11 @@ class SiameseDetector:
         return self._images is not None and keyframe in self._images
 
     def _without_descriptor(self, keyframes: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Ids of the keyframes in a ``(n,)`` bool mask that have no descriptor yet."""
+        """Ids of the keyframes in an ``(n,)`` bool mask that have no descriptor yet."""
         return np.flatnonzero(keyframes & ~self._described[: len(keyframes)])
 
     def _describe(self, keyframes: Iterable[int]) -> None:
-        """Compute the descriptors of keyframes that have none yet."""
+        """Compute the descriptors of the given keyframes, unless they already exist."""
         assert self._images is not None
         for keyframe in keyframes:
             if not self._described[keyframe]:
@@ -171,21 +174,21 @@ class SiameseDetector:
     def _similarities(
         self, descriptor: NDArray[np.float32], eligible: NDArray[np.bool_]
     ) -> NDArray[np.float32]:
-        """``(N,)`` similarity of each keyframe, -1 for keyframes that are not eligible."""
+        """``(N,)`` similarity of each keyframe; -1 for keyframes that are not eligible."""
         p = np.full(len(eligible), -1.0, np.float32)
         rows = self._row[: len(eligible)][eligible]
         if len(rows):
-            # Rows are passed in the order of the keyframes instead of the order in which they were
-            # computed, because the last bits of a matrix product may depend on a row's position.
-            # Consecutive rows are passed as a view, without a copy.
+            # Rows are passed in the order of the keyframes, not in the order in which they were
+            # computed. The reason is that the last bits of a matrix product may depend on the
+            # position of a row. Consecutive rows are passed as a view, without a copy.
             consecutive = (np.diff(rows) == 1).all()
             chosen = slice(rows[0], rows[-1] + 1) if consecutive else rows
             p[eligible] = self._network.compare(descriptor, self._descriptors[chosen])
         return p
 
     def _local_ratings(self, p: NDArray[np.float32], query: DescriptorMaps) -> NDArray[np.float32]:
-        """``(N,)`` similarity by local descriptors of the keyframes that are most similar according
-        to ``p``, -1 for the other keyframes."""
+        """``(N,)`` similarity by local descriptors, for the keyframes that are most similar
+        according to ``p``. It is -1 for the other keyframes."""
         assert self._images is not None
         rating = np.full(len(p), -1.0, np.float32)
         for keyframe in np.argsort(-p, kind="stable")[: self._config.reranked].tolist():
@@ -201,9 +204,12 @@ class SiameseDetector:
         rating: NDArray[np.float32],
         map_: Map,
     ) -> list[LoopCandidate]:
-        """The candidates with the highest ``rating`` ``(N,)``, which is -1 for keyframes that are
-        not candidates. Of several covisible keyframes, only the best becomes a candidate, because
-        further keyframes of one place would displace candidates at other places."""
+        """The candidates with the highest ratings. ``rating`` is ``(N,)``, and -1 for keyframes
+        that cannot be candidates.
+
+        Of several covisible keyframes, only the best one becomes a candidate. Further keyframes of
+        the same place would displace candidates at other places.
+        """
         rating = rating.copy()
         found: list[LoopCandidate] = []
         most = self._config.max_candidates
@@ -235,8 +241,8 @@ def open_detector(
     Args:
         name: one of ``NETWORKS``.
         weights: ONNX file; None uses the weights that vslam ships.
-        config, learned, images: as in :class:`SiameseDetector`.
-        late: whether to postpone loading the shipped weights until the first image.
+        config, learned, images: see :class:`SiameseDetector`.
+        late: whether loading of the shipped weights is postponed until the first image.
 
     Raises:
         InputError: the name is unknown, or the weights are missing or belong to another network.

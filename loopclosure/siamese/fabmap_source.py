@@ -1,4 +1,4 @@
-"""Reads the FAB-MAP image collections with their ground-truth matrices."""
+"""Reads the FAB-MAP image collections and their ground-truth matrices."""
 
 from __future__ import annotations
 
@@ -22,20 +22,21 @@ _UNDISTORT_COLUMNS = (8, 9)
 
 
 def read_fabmap(folder: Path, truth: str = "", side: str = "left") -> list[ImageSource]:
-    """Read a FAB-MAP collection: a folder of images and a ground-truth matrix.
+    """Read a FAB-MAP collection, which is a folder of images and a ground-truth matrix.
 
-    The matrix has a row for each image, or a row for each pair of a left image (odd number) and a
-    right image (even number); with pairs, only the images of one camera are used. If the folder has
-    a ``calibration.txt`` (fx fy cx cy k1 k2 p1 p2 [k3] on one line), the images are undistorted.
+    The matrix has one row for each image, or one row for each pair of images. In a pair, the left
+    image has an odd number and the right image has an even number. Of such pairs, the images of
+    only one camera are used. If the folder has a file ``calibration.txt`` (fx fy cx cy k1 k2 p1 p2
+    [k3] on one line), the images are undistorted.
 
     Args:
         folder: folder of the images.
-        truth: ``.mat`` file of the matrix; by default, the first one in the folder.
-        side: "left" or "right", the camera to use if the matrix has a row for each pair.
+        truth: ``.mat`` file of the matrix. The default is the first ``.mat`` file in the folder.
+        side: "left" or "right": the camera that is used if the matrix has one row for each pair.
 
     Raises:
-        InputError: there are no images or no matrix, or the number of rows of the matrix does not
-            fit the images.
+        InputError: there are no images or no matrix, or the number of rows does not match the
+            number of images.
     """
     files = images_in(folder)
     if not files:
@@ -43,7 +44,9 @@ def read_fabmap(folder: Path, truth: str = "", side: str = "left") -> list[Image
     named = Path(truth).expanduser() if truth else None
     path = named or next(iter(sorted(folder.glob("*.mat"))), None)
     if path is None:
-        raise InputError(f"{folder}: no ground-truth matrix; name it: fabmap:DIR[truth=FILE.mat].")
+        raise InputError(
+            f"{folder}: no ground-truth matrix; name one with fabmap:DIR[truth=FILE.mat]."
+        )
     loops = read_loop_matrix(path)
     n = len(loops)
     if 2 * n == len(files):
@@ -55,7 +58,8 @@ def read_fabmap(folder: Path, truth: str = "", side: str = "left") -> list[Image
         )
     relation = np.where(loops | loops.T, SAME, DIFFERENT).astype(np.int8)
     index = np.arange(n)
-    # The matrices do not mark an image's predecessors and successors, although their views overlap.
+    # The matrices do not mark the images just before and after an image, although the views
+    # overlap.
     near_in_time = np.abs(index[:, None] - index[None]) <= 20
     relation[near_in_time & (relation == DIFFERENT)] = UNKNOWN
     np.fill_diagonal(relation, SAME)

@@ -1,4 +1,4 @@
-"""The type of image source that all readers return, and functions that several readers share."""
+"""The type of image source that all readers return, and functions that the readers share."""
 
 from __future__ import annotations
 
@@ -22,21 +22,22 @@ _NO_TRUTH = (
 
 @dataclass(frozen=True)
 class ImageSource:
-    """A source of N images with known relations between them.
+    """A source of N images with a known relation between each pair of images.
 
     Attributes:
         name: name of the source.
-        family: sources of the same family may show the same places.
-        names: names of the N images, ``folder/file``.
-        images: the N files, or their encoded bytes as ``(B,)`` uint8.
-        relation: ``(N, N)`` int8, symmetric: 1 same place, -1 different places, 0 unknown. The
-            diagonal is 1, because an image shows the same place as its augmentations.
-        unit: ``(N,)`` int32; images of the same unit (a folder, a stretch of road) are not split
-            between training and validation.
-        calibration: ``(8,)`` or ``(9,)`` fx fy cx cy k1 k2 p1 p2 [k3]; None if the images are
-            rectified.
-        is_query: ``(N,)`` bool, images that a benchmark compares with all other images; None for a
-            drive, where each image is compared with much earlier images.
+        family: name of a group of sources; sources of the same family may show the same places.
+        names: names of the N images, as ``folder/file``.
+        images: the N image files, or their encoded bytes as ``(B,)`` uint8.
+        relation: ``(N, N)`` int8, symmetric. 1: both images show the same place; -1: they show
+            different places; 0: unknown. The diagonal is 1, because an image shows the same place
+            as its augmented copies.
+        unit: ``(N,)`` int32 label of the folder or stretch of road that an image belongs to. Images
+            of the same unit are not split between training and validation.
+        calibration: ``(8,)`` or ``(9,)`` camera model fx fy cx cy k1 k2 p1 p2 [k3]. None if the
+            images are rectified.
+        is_query: ``(N,)`` bool, True for images that a benchmark compares with all other images.
+            None for a drive, where each image is compared with much earlier images.
         times: ``(N,)`` capture times, seconds; None if unknown.
     """
 
@@ -54,7 +55,7 @@ class ImageSource:
         return len(self.images)
 
     def read(self, index: int, size: Size, fit: Fit) -> NDArray[np.uint8]:
-        """Read an image as uint8, undistorted and resized to ``size``.
+        """Read an image as uint8. It is undistorted and resized to ``size``.
 
         Raises:
             UnreadableImageError: the image is missing or damaged.
@@ -62,7 +63,7 @@ class ImageSource:
         return to_size(self.grey(index), size, fit)
 
     def grey(self, index: int) -> NDArray[np.uint8]:
-        """Read an image as ``(H, W)`` uint8, undistorted.
+        """Read an image as ``(H, W)`` uint8. It is undistorted, but not resized.
 
         Raises:
             UnreadableImageError: the image is missing or damaged.
@@ -71,7 +72,8 @@ class ImageSource:
         return image if self.calibration is None else undistorted(image, self.calibration)
 
     def select(self, chosen: NDArray[np.int64]) -> ImageSource:
-        """A source with only the images whose indices are in ``chosen`` ``(M,)``, in this order."""
+        """A source that contains only the images with the ``(M,)`` indices ``chosen``, in this
+        order."""
         return replace(
             self,
             names=tuple(self.names[i] for i in chosen),
@@ -84,8 +86,8 @@ class ImageSource:
 
 
 def undistorted(image: NDArray[np.uint8], calibration: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Remove radial and tangential distortion (Brown's model); the size and the camera matrix stay
-    the same."""
+    """Remove radial and tangential distortion (Brown's model). The image size and the camera matrix
+    stay the same."""
     import cv2
 
     fx, fy, cx, cy = calibration[:4]
@@ -94,27 +96,27 @@ def undistorted(image: NDArray[np.uint8], calibration: NDArray[np.float64]) -> N
 
 
 def images_in(folder: Path) -> list[Path]:
-    """The image files of a folder, sorted by name; empty if there is no such folder."""
+    """The image files of a folder, sorted by name. The list is empty if there is no such folder."""
     if not folder.is_dir():
         return []
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
 
 
 def names_of(files: Iterable[Path]) -> tuple[str, ...]:
-    """The names ``folder/file`` of images in a source."""
+    """The names of images in a source: ``folder/file``."""
     return tuple(f"{file.parent.name}/{file.name}" for file in files)
 
 
 def read_loop_matrix(path: Path) -> NDArray[np.bool_]:
-    """Read a loop matrix: the largest square matrix of a ``.mat`` file, as ``(N, N)`` bool, True
-    where two images close a loop.
+    """Read a loop matrix as ``(N, N)`` bool. It is True where two images close a loop.
 
-    The matrix may be dense or sparse, and may have any name (``truth`` in the files of Oxford and
-    Lip6, the name of the sequence in those for KITTI). Most matrices mark each pair once, in the
-    row of the later image.
+    The loop matrix is the largest square matrix of a ``.mat`` file. It may be dense or sparse, and
+    may have any name. In the files of Oxford and Lip6, its name is ``truth``. In the files for
+    KITTI, it is the name of the sequence. Most matrices mark each pair once, in the row of the
+    later image.
 
     Raises:
-        InputError: there is no such file, or it contains no such matrix.
+        InputError: there is no such file, or the file contains no loop matrix.
     """
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vslam.errors import InputError, UnreadableImageError
 
-_FIELD_OF_VIEW = 80.0  # horizontal field of view assumed by turn_homography, degrees
+_FIELD_OF_VIEW = 80.0  # horizontal field of view that turn_homography assumes, degrees
 
 Fit = Literal["squash", "crop"]
 Size = tuple[int, int]
@@ -18,7 +18,7 @@ Size = tuple[int, int]
 
 
 def parse_size(text: str) -> Size:
-    """Parse ``129`` (a square) or ``81x145`` (height and width).
+    """Parse an image size: ``129`` (a square) or ``81x145`` (height and width).
 
     Raises:
         InputError: the text has another form, or a side is below 32 pixels.
@@ -39,8 +39,8 @@ def parse_size(text: str) -> Size:
 def to_size(image: NDArray[np.uint8], size: Size, fit: Fit = "squash") -> NDArray[np.uint8]:
     """Resize an ``(H, W)`` uint8 image to ``size``.
 
-    ``squash`` keeps the whole view but changes the aspect ratio. ``crop`` preserves the aspect
-    ratio by cutting out the largest central rectangle with the aspect ratio of ``size``.
+    ``squash`` keeps the whole view but changes the aspect ratio. ``crop`` keeps the aspect ratio:
+    it cuts out the largest central rectangle with the aspect ratio of ``size``.
     """
     import cv2
 
@@ -57,11 +57,11 @@ def to_size(image: NDArray[np.uint8], size: Size, fit: Fit = "squash") -> NDArra
 
 
 def read_grey(source: Path | NDArray[np.uint8], name: str = "") -> NDArray[np.uint8]:
-    """Decode an image as ``(H, W)`` uint8.
+    """Read and decode an image as ``(H, W)`` uint8.
 
     Args:
-        source: the file, or its ``(B,)`` encoded bytes.
-        name: name of an image that is given as bytes, for the error message.
+        source: the image file, or its encoded bytes as ``(B,)`` uint8.
+        name: name of the image for error messages, if the image is given as bytes.
 
     Raises:
         UnreadableImageError: the image is missing, empty or damaged.
@@ -80,11 +80,13 @@ def read_grey(source: Path | NDArray[np.uint8], name: str = "") -> NDArray[np.ui
 
 
 def turn_homography(width: int, height: int, degrees: float) -> NDArray[np.float64]:
-    """``(3, 3)`` homography from the pixels of an image to the pixels of the image that the camera
-    would take after a turn by ``degrees`` to the right, without any translation.
+    """``(3, 3)`` homography for a rotation of the camera to the right, without any translation.
 
-    The horizontal field of view is assumed to be 80 degrees, as is common on cars. The homography
-    only scales vertical coordinates, so it also holds for squashed images.
+    It maps pixels of an image to pixels of the image that the camera would take after a rotation by
+    ``degrees``.
+
+    The horizontal field of view is assumed to be 80 degrees, which is common on cars. A homography
+    of this kind only scales vertical coordinates, so it also holds for squashed images.
     """
     focal = width / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])

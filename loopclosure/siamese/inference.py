@@ -1,4 +1,4 @@
-"""Runs trained networks in ONNX Runtime on one thread, without torch."""
+"""Runs trained networks in ONNX Runtime on a single thread, without torch."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vslam.errors import InputError
 from vslam.loopclosure.siamese.images import Size
 from vslam.loopclosure.siamese.weights import SHIPPED, find_weights
 
-# Keys of the metadata.
+# Keys of the metadata of an ONNX file.
 FORMAT, NAME, ABOUT, COMPARISON = "vslam", "name", "about", "comparison"
 VERSION = "1"  # value of FORMAT
 _NO_RUNTIME = "learned loop detectors need ONNX Runtime: pip install onnxruntime."
@@ -26,15 +26,18 @@ _FIX = "write one with 'vslam export onnx', or name another file"
 
 
 class OnnxNetwork:
-    """A network that ``vslam export onnx`` wrote: a graph from images to descriptors, and a graph
-    that compares descriptors.
+    """A network from a file that ``vslam export onnx`` wrote.
+
+    The file contains two graphs: one computes descriptors from images, and the other compares
+    descriptors.
 
     Attributes:
         name: one of ``NETWORKS``.
         size: height and width of its input images.
         dimensions: length D of its descriptors.
-        fingerprint: hash of the file, see ``fingerprint_of``.
-        about: how the weights were trained; ``parameters`` is the number of learned parameters.
+        fingerprint: hash of the file; see ``fingerprint_of``.
+        about: description of the training of the weights. Its entry ``parameters`` is the number of
+            learned parameters.
     """
 
     def __init__(self, path: Path) -> None:
@@ -68,16 +71,20 @@ class OnnxNetwork:
             raise InputError(f"{path}: {_FOREIGN}; {_FIX}.") from error
 
     def embed(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """``(D,)`` float32 descriptor of norm 1 of a uint8 image with the height and width
-        ``size``."""
+        """Compute the ``(D,)`` float32 descriptor of a uint8 image with the height and width
+        ``size``. The descriptor has norm 1."""
         (descriptor,) = self._embedding.run(None, {"image": image})
         return np.asarray(descriptor, np.float32)
 
     def compare(
         self, query: NDArray[np.float32], gallery: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """``(N,)`` probabilities in (0, 1) that the images of a query descriptor ``(D,)`` and of
-        each gallery descriptor ``(N, D)`` show the same place."""
+        """Compare a query image with N gallery images by their descriptors ``(D,)`` and ``(N, D)``.
+
+        Returns:
+            ``(N,)`` probabilities in (0, 1) that the query and each gallery image show the same
+            place.
+        """
         views = gallery.reshape(-1, *self._views)
         # NumPy computes the lengths four times as fast as onnxruntime does.
         lengths = np.sqrt(np.einsum("nvd,nvd->nv", views, views))
@@ -87,10 +94,11 @@ class OnnxNetwork:
 
 
 class LateNetwork:
-    """A shipped network that is loaded with the first image, because many drives never need it.
+    """A shipped network that is loaded only when the first image arrives. Many drives never need
+    it.
 
     Attributes:
-        name, fingerprint: as in :class:`OnnxNetwork`.
+        name, fingerprint: see :class:`OnnxNetwork`.
     """
 
     def __init__(self, name: str) -> None:
@@ -129,7 +137,7 @@ class LateNetwork:
 
 
 def fingerprint_of(path: Path) -> str:
-    """A hash of the contents of a file: the first 16 hexadecimal digits of SHA-256."""
+    """Hash of the contents of a file: the first 16 hexadecimal digits of its SHA-256."""
     return sha256(path.read_bytes()).hexdigest()[:16]
 
 
@@ -138,7 +146,7 @@ def open_network(name: str, weights: Path | None = None) -> OnnxNetwork:
 
     Args:
         name: one of ``NETWORKS``.
-        weights: ONNX file; None uses the one that vslam ships.
+        weights: ONNX file; None uses the file that vslam ships.
 
     Raises:
         InputError: the name is unknown, or the weights are missing or belong to another network.
@@ -151,17 +159,17 @@ def open_network(name: str, weights: Path | None = None) -> OnnxNetwork:
 
 
 def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
-    """Open an ``onnxruntime.InferenceSession`` on one thread, so that its results are bit-identical
-    on any number of cores.
+    """Open an ``onnxruntime.InferenceSession`` that uses one thread. With one thread, the results
+    are bit-identical on any number of cores.
 
     Args:
         path: path of the file, for error messages.
         model: the file, or its bytes.
-        first_input: expected name of the first input; other graphs are refused.
+        first_input: expected name of the first input. Graphs with another name are refused.
 
     Raises:
-        InputError: the file cannot be read, is not such a graph, or needs too much time or memory;
-            or ONNX Runtime is not installed.
+        InputError: the file cannot be read, is not such a graph, or needs too much time or memory.
+            The error is also raised if ONNX Runtime is not installed.
     """
     try:
         import onnxruntime
@@ -190,7 +198,8 @@ def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
 
 
 def _check_limits(path: Path, file: bytes) -> None:
-    """Refuse a file that is not shipped with vslam if it exceeds the limits of ``onnx_limits``."""
+    """Refuse a file that exceeds the limits of ``onnx_limits``. This is called for files that vslam
+    does not ship."""
     try:
         from vslam.loopclosure.siamese.onnx_limits import check_graph
     except ImportError as error:

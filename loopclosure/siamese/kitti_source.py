@@ -1,5 +1,7 @@
-"""Reads the images of a KITTI sequence. Its poses or a loop matrix determine which images show the
-same place."""
+"""Reads the images of a KITTI sequence.
+
+The poses of the sequence, or a loop matrix, determine which images show the same place.
+"""
 
 from __future__ import annotations
 
@@ -34,22 +36,23 @@ def read_kitti(
     truth: str = "",
     near: str = "5",
 ) -> list[ImageSource]:
-    """Read left grey images of a KITTI sequence.
+    """Read the left grey images of a KITTI sequence.
 
     Args:
-        root: KITTI root.
+        root: root folder of the KITTI dataset.
         seq: name of the sequence.
         first, last: numbers of the first and the last image, both included.
-        every: step between images; 2 takes every second image.
-        frames: ranges of numbers, ``0-249+1500-1699``, instead of ``first`` and ``last``.
-        truth: ``.mat`` file with a loop matrix of the whole sequence, which marks the pairs of the
-            same place. Unmarked pairs show different places if they are more than 25 m apart;
-            otherwise their relation is unknown.
+        every: step between images. With 2, every second image is used.
+        frames: ranges of image numbers, such as ``0-249+1500-1699``. They replace ``first`` and
+            ``last``.
+        truth: ``.mat`` file with a loop matrix of the whole sequence. It marks the pairs of images
+            that show the same place. The images of an unmarked pair show different places if they
+            are more than 25 m apart. Otherwise, their relation is unknown.
         near: distance in metres, below 25, within which two images show the same place. Published
             loop matrices also mark images that are 20 m or more apart.
 
     Raises:
-        InputError: the range has no images, poses are missing for them, the matrix or the times do
+        InputError: the range contains no images, images have no poses, the matrix or the times do
             not belong to the sequence, or ``near`` is out of range.
     """
     base = root if (root / "sequences").is_dir() else root / "dataset"
@@ -70,7 +73,7 @@ def read_kitti(
         )
     T_wc = poses[number]
     steps = np.linalg.norm(np.diff(T_wc[:, :3, 3], axis=0), axis=1)
-    # Stretches of 100 m are not split between training and validation.
+    # Images of one 100 m stretch of road are not split between training and validation.
     stretch = (np.concatenate([[0.0], np.cumsum(steps)]) // 100.0).astype(np.int32)
     if not 0.0 < float(near) < _FAR:
         raise InputError(f"near={near}: must be above 0 and below {_FAR:g} m.")
@@ -93,7 +96,8 @@ def read_kitti(
 
 
 def _times(path: Path, number: NDArray[np.int64]) -> NDArray[np.float64] | None:
-    """Capture times of the images with these numbers, seconds; None if there is no such file."""
+    """Capture times of the images with the given numbers, in seconds; None if there is no such
+    file."""
     if not path.exists():
         return None
     times = read_table(path, (1,), "a time")[:, 0]
@@ -106,10 +110,11 @@ def _times(path: Path, number: NDArray[np.int64]) -> NDArray[np.float64] | None:
 
 
 def relation_of_poses(T_wc: NDArray[np.float64], near: float = 5.0) -> NDArray[np.int8]:
-    """``(N, N)`` int8 relation of images by their ``(N, 4, 4)`` poses.
+    """``(N, N)`` int8 relation of images, from their ``(N, 4, 4)`` poses.
 
-    Two images show the same place if they are less than ``near`` metres and 30 degrees apart, and
-    different places if they are more than 25 m apart. Otherwise the relation is unknown.
+    Two images show the same place if they are less than ``near`` metres apart and their viewing
+    directions differ by less than 30 degrees. They show different places if they are more than 25 m
+    apart. Otherwise, the relation is unknown.
     """
     centre, forward = T_wc[:, :3, 3], T_wc[:, :3, 2]
     distance = np.linalg.norm(centre[:, None] - centre[None], axis=2)

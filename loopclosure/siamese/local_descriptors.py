@@ -18,15 +18,15 @@ from vslam.loopclosure.siamese.weights import SHIPPED
 from vslam.loops import PerKeyframe
 
 SHIPPED_LOCAL = SHIPPED / "local.onnx"
-WIDTH = 640  # width of the network's input, pixels; docs/research/loops.md compares widths
-GLANCE_WIDTH = 320  # width of the input for a quick comparison ("glance"), pixels
+WIDTH = 640  # width of the network's input, pixels (compared in docs/research/loops.md)
+GLANCE_WIDTH = 320  # input width for a quick comparison ("glance"), pixels
 _QUALITY = 90  # JPEG quality of the keyframe images in memory
 _JPEG = b"\xff\xd8"  # the first bytes of a JPEG file
 _CACHED = 4  # number of descriptor maps in the least-recently-used cache
 
 
 class LocalDescriptors:
-    """The network of local descriptors, which is loaded with the first image."""
+    """The network that computes local descriptors. It is loaded when the first image arrives."""
 
     def __init__(self, path: Path = SHIPPED_LOCAL) -> None:
         """
@@ -56,7 +56,8 @@ class LocalDescriptors:
         """Resize an ``(H, W)`` uint8 image to ``width`` pixels and compute its local descriptors.
 
         Raises:
-            InputError: the file is damaged or not such a network, or ONNX Runtime is not installed.
+            InputError: the file is damaged or not a network of local descriptors, or ONNX Runtime
+                is not installed.
         """
         scale = width / image.shape[1]
         coarse, fine = self._session.run(None, {"image": resized(image, width)})
@@ -64,7 +65,8 @@ class LocalDescriptors:
 
 
 def resized(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
-    """An image resized to a width in pixels, with the same aspect ratio but at least 64 rows."""
+    """Resize an image to a width in pixels. The aspect ratio is kept, but the result has at least
+    64 rows."""
     scale = width / image.shape[1]
     size = width, max(64, round(image.shape[0] * scale))
     if size == image.shape[::-1]:
@@ -74,8 +76,11 @@ def resized(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
 
 
 class KeyframeImages:
-    """Images of keyframes as JPEG files in memory, about 40 kB each. Local descriptors take thirty
-    times as much memory and are computed on demand, because most of them are never needed."""
+    """Stores the images of keyframes as JPEG files in memory, about 40 kB each.
+
+    Local descriptors would take thirty times as much memory. They are computed on demand, because
+    most of them are never needed.
+    """
 
     def __init__(self, network: LocalDescriptors) -> None:
         self.network = network
@@ -90,13 +95,14 @@ class KeyframeImages:
         self._files[keyframe] = file.tobytes(), WIDTH / image.shape[1]
 
     def files(self, n_keyframes: int) -> PerKeyframe:
-        """The JPEG files of the first ``n_keyframes`` keyframes as uint8, for a map file."""
+        """The JPEG files of the first ``n_keyframes`` keyframes, as uint8, to be saved in a map
+        file."""
         files = [self._files[k][0] if k in self._files else b"" for k in range(n_keyframes)]
         first = np.cumsum([0, *map(len, files)]).astype(np.int64)
         return PerKeyframe(first, np.frombuffer(b"".join(files), np.uint8))
 
     def restore(self, files: PerKeyframe, width: int) -> None:
-        """Store the files that ``files`` returned.
+        """Store the JPEG files of a loaded map. ``files`` is the result of the method ``files``.
 
         Args:
             width: width of the camera images, pixels.
@@ -115,7 +121,8 @@ class KeyframeImages:
         """Remove the images of keyframes that were culled from the map.
 
         Args:
-            alive: ``(K,)`` bool for all keyframes up to the last one added.
+            alive: ``(K,)`` bool for all keyframes up to the last one added; False for culled
+                keyframes.
         """
         for keyframe in [one for one in self._files if not alive[one]]:
             for kept in (self._files, self._maps, self._glances):
@@ -125,7 +132,7 @@ class KeyframeImages:
         return keyframe in self._files
 
     def maps(self, keyframe: int) -> DescriptorMaps:
-        """Local descriptors of the image of a keyframe that was added."""
+        """Local descriptors of the image of a stored keyframe."""
         if keyframe not in self._maps:
             self._maps[keyframe] = self._described(keyframe, WIDTH)
             while len(self._maps) > _CACHED:
@@ -134,19 +141,22 @@ class KeyframeImages:
         return self._maps[keyframe]
 
     def glance(self, keyframe: int) -> DescriptorMaps:
-        """Coarse descriptors of the image of a keyframe at half the width. They take a quarter of
-        the time and stay in memory."""
+        """Coarse descriptors of the image of a stored keyframe, computed at half the width.
+
+        They take a quarter of the time, and stay in memory.
+        """
         if keyframe not in self._glances:
             maps = self._described(keyframe, GLANCE_WIDTH)
             self._glances[keyframe] = maps.coarse_alone()
         return self._glances[keyframe]
 
     def glance_at(self, image: NDArray[np.uint8]) -> DescriptorMaps:
-        """Descriptors of an image that is not stored, at the width of a ``glance``."""
+        """Descriptors of an image that is not stored, computed at the same width as in
+        ``glance``."""
         return self.network.describe(image, GLANCE_WIDTH)
 
     def image(self, keyframe: int) -> NDArray[np.uint8]:
-        """The image of a keyframe that was added, as uint8, ``WIDTH`` pixels wide.
+        """The image of a stored keyframe, as uint8, with a width of ``WIDTH`` pixels.
 
         Raises:
             InputError: the file comes from a loaded map and is damaged.

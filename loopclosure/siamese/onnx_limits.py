@@ -1,8 +1,8 @@
-"""Checks that an ONNX file from an untrusted source needs limited time and memory.
+"""Checks that an ONNX file from an untrusted source needs only limited time and memory.
 
 A graph of a few hundred bytes can loop forever or create tensors of any size, and ONNX Runtime sets
-no limits. The graphs of vslam use only a few dozen operators, and the sizes of all tensors follow
-from the sizes of the inputs. Any other graph is refused before it is run.
+no limits. The graphs of vslam use only a few dozen operators. In these graphs, the sizes of all
+tensors follow from the sizes of the inputs. Any other graph is refused before it is run.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ from onnx import GraphProto, ModelProto, NodeProto, TensorProto, numpy_helper, s
 from onnx.reference import ReferenceEvaluator
 
 MOST_NUMBERS = 2**27
-"""Most numbers that a graph may compute in all its tensors; VGG-16 computes 104 million."""
+"""Maximum total number of elements in all tensors that a graph computes. For VGG-16, the number is
+104 million."""
 MOST_PRODUCTS = 2**38
-"""Most multiplications in all convolutions and matrix products of a graph."""
+"""Maximum total number of multiplications in all convolutions and matrix products of a graph."""
 _MOST_NODES = 10_000
 _SMALL = 64  # tensors with more numbers cannot be shapes
 _SIDE = 512  # assumed size of each input dimension that the graph leaves open
@@ -46,8 +47,8 @@ def check_graph(file: bytes) -> None:
         file: contents of the ONNX file.
 
     Raises:
-        ValueError: the file is not an ONNX file, or its graph is refused for the reason in the
-            message.
+        ValueError: the file is not an ONNX file, or its graph is refused. The message gives the
+            reason.
     """
     try:
         model = onnx.load_model_from_string(file)
@@ -59,7 +60,7 @@ def check_graph(file: bytes) -> None:
         if math.prod(tensor.dims) > tensor.ByteSize():
             raise ValueError("it does not contain its weights")
         is_weight = tensor.data_type in (TensorProto.FLOAT, TensorProto.FLOAT16)
-        if is_weight and math.prod(tensor.dims) > _SMALL:  # only the shape matters from here on
+        if is_weight and math.prod(tensor.dims) > _SMALL:  # from here on, only the shape matters
             tensor.CopyFrom(
                 TensorProto(name=tensor.name, data_type=tensor.data_type, dims=tensor.dims)
             )
@@ -87,7 +88,7 @@ def _check_nodes(model: ModelProto) -> None:
 
 
 def _shapes(model: ModelProto) -> dict[str, tuple[int, ...]]:
-    """Shapes of all tensors, inferred from the shapes of the inputs. Shapes that the file states
+    """Infer the shapes of all tensors from the shapes of the inputs. Shapes that the file states
     for other tensors are ignored.
 
     Raises:
@@ -118,8 +119,8 @@ def _shapes(model: ModelProto) -> dict[str, tuple[int, ...]]:
 
 
 def _compute_shapes(graph: GraphProto) -> None:
-    """Replace the nodes that compute shapes by their results, because onnx's shape inference does
-    not evaluate divisions."""
+    """Replace the nodes that compute shapes by their results. This is needed because the shape
+    inference of onnx does not evaluate divisions."""
     known = {
         tensor.name: numpy_helper.to_array(tensor)
         for tensor in graph.initializer
@@ -144,8 +145,11 @@ def _compute_shapes(graph: GraphProto) -> None:
 
 
 def _products(node: NodeProto, shapes: dict[str, Any]) -> int:
-    """Number of multiplications of a convolution or a matrix product; 0 for other nodes, which need
-    only a few operations for each number of their result."""
+    """Number of multiplications of a convolution or a matrix product.
+
+    For other nodes the result is 0. They need only a few operations for each element of their
+    output.
+    """
     if node.op_type == "Conv":
         return math.prod(shapes[node.output[0]]) * math.prod(shapes[node.input[1]][1:])
     if node.op_type == "MatMul":

@@ -1,5 +1,5 @@
-"""Writes and reads image sources as one small file, for machines without space for the original
-images."""
+"""Writes and reads image sources as one small file. Such a file is meant for machines without space
+for the original images."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ from vslam.untrusted import read_npz
 
 
 def write_pack(sources: list[ImageSource], path: Path, size: Size, fit: Fit) -> None:
-    """Write sources as one npz file: their relations, and their images as JPEG files at the input
-    size of a network (docs/howto/training.md).
+    """Write sources as one npz file (docs/howto/training.md).
+
+    The file contains their relations and their images. The images are stored as JPEG files at the
+    input size of a network.
 
     Raises:
         UnreadableImageError: an image is missing or damaged.

@@ -1,5 +1,7 @@
-"""Reads pairs of images that ``vslam synth --pairs`` rendered. The camera poses determine whether
-images of different pairs show the same place."""
+"""Reads pairs of images that ``vslam synth --pairs`` rendered.
+
+The camera poses determine whether images of different pairs show the same place.
+"""
 
 from __future__ import annotations
 
@@ -13,20 +15,21 @@ from vslam.errors import InputError
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, ImageSource, names_of
 
 _VIEW = ("x_a", "z_a", "yaw_a", "x_b", "z_b", "yaw_b")
-# Rendered towns are divided into square cells with this side in metres; the images of one cell are
+# Side of the square cells that a rendered town is divided into, metres. The images of one cell are
 # not split between training and validation.
 _CELL = 80.0
 
 
 def read_pairs(folder: Path) -> list[ImageSource]:
-    """Read rendered pairs from a folder with a file ``pairs.csv``.
+    """Read rendered pairs of images from a folder that contains a file ``pairs.csv``.
 
-    The file must have the columns a, b (image files) and same (1 or 0), and may have others. With
-    the columns x_a, z_a, yaw_a, x_b, z_b, yaw_b (metres, degrees), images of different pairs are
-    related by ``relation_of_views``; without them, these relations are unknown.
+    The file must have the columns a and b (image files) and same (1 or 0). It may have further
+    columns. If it has the columns x_a, z_a, yaw_a, x_b, z_b, yaw_b (metres, degrees), images of
+    different pairs are related by ``relation_of_views``. Without these columns, the relations
+    between different pairs are unknown.
 
     Raises:
-        InputError: the list is missing, malformed or empty.
+        InputError: the file is missing, malformed or empty.
     """
     path = folder / "pairs.csv"
     try:
@@ -70,16 +73,18 @@ def read_pairs(folder: Path) -> list[ImageSource]:
 
 
 def relation_of_views(views: NDArray[np.float64]) -> NDArray[np.int8]:
-    """``(N, N)`` int8 relation of images by their poses.
+    """``(N, N)`` int8 relation of images, from their poses.
 
-    Two images show the same place if they are less than 5 m and 35 degrees apart. They show
-    different places if they are more than 40 m apart and do not look along the same street; two
-    images look along the same street if their directions are similar or opposite, they are less
-    than 160 m apart, and one is less than 25 m beside the line of sight of the other. Otherwise the
-    relation is unknown.
+    Two images show the same place if they are less than 5 m apart and their directions differ by
+    less than 35 degrees. They show different places if they are more than 40 m apart and do not
+    look along the same street. Otherwise, the relation is unknown.
+
+    Two images look along the same street if three conditions are met. Their directions are similar
+    or opposite. They are less than 160 m apart. One camera is less than 25 m to the side of the
+    line of sight of the other.
 
     Args:
-        views: ``(N, 3)`` x and z in metres, yaw in degrees from z towards x.
+        views: ``(N, 3)`` x and z in metres, and yaw in degrees from z towards x.
     """
     xz, yaw = views[:, :2], np.radians(views[:, 2])
     direction = np.stack([np.sin(yaw), np.cos(yaw)], 1)

@@ -1,4 +1,5 @@
-"""Reads sets of photographs. Their folders and a NOTES.txt determine which show the same place."""
+"""Reads sets of photographs. Their folders and a file NOTES.txt determine which show the same
+place."""
 
 from __future__ import annotations
 
@@ -25,13 +26,13 @@ _UNLIMITED = 1_000_000
 
 @dataclass(frozen=True)
 class _SpecialSet:
-    """Properties of a set of photographs that do not follow from its kind; they were copied from
-    its notes.
+    """Properties of a set of photographs that do not follow from the kind of the set. They were
+    copied from its notes.
 
     Attributes:
         reach: photographs of a folder show the same place if their positions in the sorted folder
-            differ by at most this number; None if all photographs of a folder show the same place.
-        region: maps the name of a folder to a region; relations between folders of the same region
+            differ by at most this number. None if all photographs of a folder show the same place.
+        region: maps the name of a folder to a region. Relations between folders of the same region
             are unknown.
         family: family of the set, see ``ImageSource``.
         singles: folders whose photographs are unrelated to each other.
@@ -44,15 +45,15 @@ class _SpecialSet:
 
 
 _SPECIAL_SETS = {
-    # The camera rotates on the spot, so photographs far apart in the sorted folder do not overlap.
+    # The camera rotates on the spot. Photographs far apart in the sorted folder do not overlap.
     "pano_rotation": _SpecialSet(reach=1, family="landmarks"),
     # Photographs of one folder show opposite walls of a yard.
     "strecha": _SpecialSet(reach=3, family="landmarks"),
-    # Each folder has the views of one walk in one direction; the walks overlap at their ends.
+    # Each folder contains the views of one walk in one direction. The walks overlap at their ends.
     "pano360": _SpecialSet(reach=2, region=lambda folder: folder.split("_")[0]),
-    # Folders are several passes along the same floor.
+    # The folders are several passes along the same floor of a building.
     "ie_tower": _SpecialSet(reach=1, region=lambda folder: folder.split("__")[0]),
-    # Folders are views cut from one panorama.
+    # The views in each folder were cut from one panorama.
     "webcams": _SpecialSet(region=lambda folder: folder.split("_")[0]),
     "multiview": _SpecialSet(reach=4, family="landmarks"),
     "wxbs_evd": _SpecialSet(family="landmarks"),
@@ -70,14 +71,14 @@ _SPECIAL_SETS = {
 
 
 def read_photos(folder: Path) -> list[ImageSource]:
-    """Read sets of photographs, ``folder/SET/SUBFOLDER/*`` with ``folder/SET/NOTES.txt``.
+    """Read sets of photographs: ``folder/SET/SUBFOLDER/*`` with the notes ``folder/SET/NOTES.txt``.
 
-    The first line of the notes states the kind of the set: (a) each subfolder shows one place; (b)
-    each subfolder is a video, in which consecutive frames overlap; (c) the photographs are
-    unrelated. ``_SPECIAL_SETS`` has further properties of some sets.
+    The first line of the notes states the kind of the set. In a set of kind (a), each subfolder
+    shows one place. In kind (b), each subfolder is a video, in which consecutive frames overlap. In
+    kind (c), the photographs are unrelated. ``_SPECIAL_SETS`` has further properties of some sets.
 
     Raises:
-        InputError: there is no such set, or the notes state no kind.
+        InputError: there is no set of photographs, or the notes do not state the kind.
     """
     notes = sorted(folder.glob("*/NOTES.txt")) or sorted(folder.glob("NOTES.txt"))
     if not notes:

@@ -1,27 +1,31 @@
-"""Opens sources of images by name, for training networks and comparing detectors.
+"""Opens sources of images by name. They are used to train networks and to compare detectors.
 
-A source is a set of images with a matrix that states for each pair whether the images show the same
-place (1) or different places (-1) or whether this is unknown (0). Unknown pairs are never used.
-Images of different sources show different places, unless the sources belong to the same family (for
-example two sets of photographs of one region); then their relation is unknown.
+A source is a set of images with a matrix. For each pair of images, the matrix states whether they
+show the same place (1) or different places (-1), or whether this is unknown (0). Unknown pairs are
+never used.
+
+Images of different sources show different places, unless the sources belong to the same family.
+Between sources of the same family, the relation is unknown. An example of a family is two sets of
+photographs of the same region.
 
 On the command line, a source is named ``KIND:PATH`` or ``KIND:PATH[option=value,...]``. The kinds
 and their options are:
 
 ``kitti:DIR``: left grey images of a KITTI sequence with ground-truth poses (``kitti_source``).
-    ``seq``: the sequence; default 00.
-    ``first``, ``last``: numbers of the first and the last image; default all images.
-    ``every``: step between images; 2 takes every second one.
-    ``frames``: ranges of numbers instead of first and last, as in ``frames=0-249+1500-1699``.
-    ``near``: distance in metres within which two images show the same place; default 5.
-    ``truth``: ``.mat`` file with a loop matrix that marks the pairs of the same place.
+    ``seq``: the sequence; the default is 00.
+    ``first``, ``last``: numbers of the first and the last image; the default is all images.
+    ``every``: step between images; with 2, every second image is used.
+    ``frames``: ranges of image numbers that replace first and last: ``frames=0-249+1500-1699``.
+    ``near``: distance in metres within which two images show the same place; the default is 5.
+    ``truth``: ``.mat`` file with a loop matrix, which marks the pairs that show the same place.
 ``fabmap:DIR``: Oxford CityCentre or NewCollege (Cummins and Newman 2008), or another ordered set of
-    images with a loop matrix, for example those of Lip6 (``fabmap_source``).
-    ``truth``: ``.mat`` file with the loop matrix; default the first one in the folder.
-    ``side``: ``left`` or ``right`` camera, if the matrix has one row for each pair; default left.
-``pairs:DIR``: output of ``vslam synth --pairs`` (``pairs_source``); no options.
-``photos:DIR``: folders of photographs with a NOTES.txt (``photo_source``); no options.
-``pack:FILE.npz``: output of ``vslam export places`` (``pack``); no options.
+    images with a loop matrix, for example the sets of Lip6 (``fabmap_source``).
+    ``truth``: ``.mat`` file with the loop matrix; the default is the first one in the folder.
+    ``side``: ``left`` or ``right``. This camera is used if the matrix has one row for each pair;
+    the default is left.
+``pairs:DIR``: output of ``vslam synth --pairs`` (``pairs_source``). It has no options.
+``photos:DIR``: folders of photographs with a NOTES.txt (``photo_source``). It has no options.
+``pack:FILE.npz``: output of ``vslam export places`` (``pack``). It has no options.
 """
 
 from __future__ import annotations
@@ -49,8 +53,8 @@ _READERS: dict[str, tuple[Callable[..., list[ImageSource]], tuple[str, ...]]] = 
 
 
 def split_spec(spec: str) -> tuple[str, str, dict[str, str]]:
-    """Split ``kind:path[key=value,...]`` into its kind, path and options. The path is empty if the
-    text has another form."""
+    """Split a specification ``kind:path[key=value,...]`` into kind, path and options. The path is
+    empty if the text does not have this form."""
     kind, _, rest = spec.partition(":")
     found = re.fullmatch(r"(.+?)(?:\[(.*)\])?", rest)
     if found is None:
@@ -60,7 +64,7 @@ def split_spec(spec: str) -> tuple[str, str, dict[str, str]]:
 
 
 def open_source(spec: str) -> list[ImageSource]:
-    """Open the source ``kind:path[options]``; see the kinds above.
+    """Open the source ``kind:path[options]``. The docstring of this module lists the kinds.
 
     Raises:
         InputError: the kind or an option is unknown, or data is missing or malformed.

@@ -1,4 +1,4 @@
-"""The names of the networks and the files of their weights."""
+"""The names of the networks, and the files that contain their weights."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ from vslam.errors import InputError
 
 NETWORKS = ("capsule", "capsule-pruned", "capsule-paper")
 PRUNED = ("capsule-pruned", "capsule-paper")
-"""Networks made from trained weights of ``capsule`` by removing primary capsules."""
+"""Networks that were made from trained weights of ``capsule`` by removing primary capsules."""
 TO_THE_LETTER = "capsule-paper"
-"""The method of the paper without additions. No keyframe images are stored for it, so neither
-odometry nor learned local descriptors influence which loops it finds."""
+"""The network that implements the method of the paper without additions.
+
+No keyframe images are stored for this network. Therefore, neither odometry nor learned local
+descriptors influence which loops it finds.
+"""
 SHIPPED = Path(__file__).parent / "weights"
 
 
@@ -20,7 +23,7 @@ def find_weights(name: str, weights: Path | None = None) -> Path:
 
     Args:
         name: one of ``NETWORKS``.
-        weights: the file that the user named; None uses the one that vslam ships.
+        weights: the file that the user gave; None uses the file that vslam ships.
 
     Raises:
         InputError: the name is unknown, or there is no such file.

@@ -1,4 +1,5 @@
-"""Training of the Siamese networks in torch, their pruning and their export to ONNX.
+"""Trains the Siamese networks in torch, prunes them, and exports them to ONNX.
 
-Only ``vslam train`` and ``vslam export`` import this package. It needs the extra ``train``.
+Only ``vslam train`` and ``vslam export`` import this package. It needs the optional dependencies
+``train`` of vslam.
 """

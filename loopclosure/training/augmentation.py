@@ -1,4 +1,5 @@
-"""Random changes of an image that preserve its place: viewpoint, light, occlusion, sensor."""
+"""Random changes of an image that still shows the same place: viewpoint, light, occlusion,
+sensor."""
 
 from __future__ import annotations
 
@@ -8,26 +9,36 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from vslam.loopclosure.siamese.images import turn_homography
 
-_TURNED, _ZOOMED = 0.5, 0.5  # shares of the images that are turned and zoomed, if enabled
+_TURNED, _ZOOMED = 0.5, 0.5  # shares of images that are rotated and zoomed, if enabled
 
 
 class Augmentation(BaseModel):
-    """Strengths of the changes; 0 disables a change. The paper changes perspective and luminance
-    and masks parts of the image."""
+    """Strengths of the random changes. A strength of 0 disables a change.
+
+    The paper changes perspective and luminance, and masks parts of the image.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     homography: float = Field(
-        0.10, ge=0, le=0.4, description="Largest shift of a corner, relative to each side."
+        0.10,
+        ge=0,
+        le=0.4,
+        description="Largest shift of a corner of the image, relative to each side.",
     )
-    shift: float = Field(0.10, ge=0, le=0.5, description="Largest shift, relative to the width.")
-    turn: float = Field(0.0, ge=0, le=45, description="Largest turn of the camera, degrees.")
+    shift: float = Field(
+        0.10, ge=0, le=0.5, description="Largest horizontal shift, relative to the width."
+    )
+    turn: float = Field(0.0, ge=0, le=45, description="Largest rotation of the camera, degrees.")
     zoom: float = Field(
-        0.0, ge=0, le=1, description="Largest log of the zoom, which imitates driving on."
+        0.0,
+        ge=0,
+        le=1,
+        description="Largest log of the zoom factor. A zoom imitates driving forwards.",
     )
-    log_gain: float = Field(0.35, ge=0, description="Standard deviation of the log gain.")
+    log_gain: float = Field(0.35, ge=0, description="Standard deviation of the log of the gain.")
     bias: float = Field(20.0, ge=0, description="Standard deviation of the bias, grey levels.")
-    log_gamma: float = Field(0.25, ge=0, description="Standard deviation of log gamma.")
+    log_gamma: float = Field(0.25, ge=0, description="Standard deviation of the log of gamma.")
     masks: int = Field(3, ge=0, description="Largest number of masks.")
     mask_area: float = Field(
         0.10, ge=0, le=0.5, description="Largest share of the image that one mask covers."
@@ -37,8 +48,8 @@ class Augmentation(BaseModel):
     mirror: bool = Field(True, description="Mirror both images of every second pair.")
 
 
-# Only changes of light and occlusion are stronger: rendered pairs already differ in viewpoint, and
-# the noise and blur of a camera average out at the network's resolution.
+# Only changes of light and occlusion are stronger. Rendered pairs already differ in viewpoint. The
+# noise and blur of a camera average out at the resolution of the network.
 STRONG = Augmentation(
     homography=0.08, shift=0.12, log_gain=0.5, bias=30.0, log_gamma=0.5, masks=3, mask_area=0.15,
 )  # fmt: skip
@@ -47,10 +58,10 @@ STRONG = Augmentation(
 def augment(
     image: NDArray[np.uint8], strength: Augmentation, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Change an ``(H, W)`` image at random.
+    """Apply random changes to an ``(H, W)`` image.
 
-    The changes are applied in the order of image formation: viewpoint, occlusion, light, lens,
-    sensor, quantisation to 8 bits.
+    The changes are applied in the order in which an image is formed: viewpoint, occlusion, light,
+    lens, sensor, quantisation to 8 bits.
     """
     import cv2
 
@@ -63,10 +74,10 @@ def augment(
     border = cv2.BORDER_REFLECT_101
     if strength.turn > 0 and rng.random() < _TURNED:
         H = H @ turn_homography(width, height, rng.uniform(-1, 1) * strength.turn)
-        # The scene beyond the border is unknown; it becomes black or a mirror image.
+        # The scene beyond the border is unknown, so it becomes black or a mirror image.
         border = cv2.BORDER_CONSTANT if rng.random() < 0.5 else border
     if strength.zoom > 0 and rng.random() < _ZOOMED:
-        # Enlarging the image around its centre approximates driving on.
+        # Enlarging the image around its centre approximates driving forwards.
         factor = np.exp(rng.uniform(0, strength.zoom))
         x, y = (1.0 - factor) * width / 2, (1.0 - factor) * height / 2
         H = H @ np.array([[factor, 0, x], [0, factor, y], [0, 0, 1.0]])
@@ -78,7 +89,8 @@ def augment(
     curve = np.exp(strength.log_gain * rng.standard_normal()) * curve
     curve += strength.bias * rng.standard_normal()
     out = np.asarray(cv2.LUT(out, np.clip(np.rint(curve), 0, 255).astype(np.uint8)), np.uint8)
-    # Negative draws have no effect, so that half of the images stay sharp or free of noise.
+    # Negative draws have no effect. Half of the images therefore stay sharp, and half free of
+    # noise.
     blur, noise = rng.uniform(-1, 1, 2) * (strength.blur, strength.noise)
     if blur > 0.2:
         out = np.asarray(cv2.GaussianBlur(out, (0, 0), float(blur)), np.uint8)

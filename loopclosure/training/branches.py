@@ -1,4 +1,4 @@
-"""The layout in which a network reads an image, and the branch that computes its descriptor."""
+"""Defines how a network reads an image, and the branch that computes the image's descriptor."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from vslam.loopclosure.training.lite import (
 )
 from vslam.loopclosure.training.preprocessing import Unrolling, standardised, textured
 
-_LEAST_SHARE = 0.02  # least weight of a view, so that no descriptor is 0 without texture
+_LEAST_SHARE = 0.02  # least weight of a view, so that an image without texture has a descriptor
 
 
 class Layout(NamedTuple):
@@ -39,9 +39,10 @@ class Layout(NamedTuple):
 
     Attributes:
         size: height and width of the image.
-        views: number of parts, evenly spaced from left to right; each gets its own descriptor.
-        view_width: columns of a part; None if the whole image is the only part.
-        half_angle, middle: see :class:`preprocessing.Unrolling`; with half_angle 0, the image is
+        views: number of views. A view is a part of the image with its own descriptor. Views are
+            evenly spaced from left to right.
+        view_width: number of columns of a view. None if the whole image is the only view.
+        half_angle, middle: see :class:`preprocessing.Unrolling`. If half_angle is 0, the image is
             not unrolled.
     """
 
@@ -53,32 +54,35 @@ class Layout(NamedTuple):
 
 
 class CapsuleShape(BaseModel):
-    """The structure of a capsule branch. It is stored beside the weights."""
+    """The structure of a capsule branch. It is stored together with the weights."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     extractor: Literal["light", "lite0"] = "light"
     pixels: int = Field(227, ge=32, description="Height of the input.")
-    width: int | None = Field(None, ge=32, description="Width of the input; None: a square.")
+    width: int | None = Field(None, ge=32, description="Width of the input; None for a square.")
     views: int = Field(
-        1, ge=1, le=16, description="Number of parts of the image, from left to right."
+        1, ge=1, le=16, description="Number of views (parts of the image), from left to right."
     )
-    view_width: int | None = Field(None, ge=32, description="Columns of a part; None: all.")
+    view_width: int | None = Field(None, ge=32, description="Columns of a view; None for all.")
     half_angle: float = Field(
-        0.0, ge=0, le=60, description="Degrees from middle to side for unrolling; 0: no unrolling."
+        0.0,
+        ge=0,
+        le=60,
+        description="Degrees from the middle to a side for unrolling; 0 disables it.",
     )
     middle: float = Field(
         1.0, gt=0, le=1, description="Share of the height that the middle column keeps."
     )
     blocks: tuple[tuple[int, int, int], ...] = LIGHT_BLOCKS
-    types: int = Field(32, ge=1, description="Types of primary capsules.")
+    types: int = Field(32, ge=1, description="Number of types of primary capsules.")
     size: int = Field(8, ge=1, description="Dimension of a primary capsule.")
-    outputs: int = Field(64, ge=1, description="Output capsules.")
+    outputs: int = Field(64, ge=1, description="Number of output capsules.")
     depth: int = Field(16, ge=1, description="Dimension of an output capsule.")
-    iterations: int = Field(3, ge=1, description="Iterations of the routing.")
+    iterations: int = Field(3, ge=1, description="Number of routing iterations.")
     over: Literal["primary", "output"] = "primary"
     kept: int | None = Field(
-        None, description="Number of places kept per type; None before pruning."
+        None, description="Number of places that are kept per type; None before pruning."
     )
 
     @model_validator(mode="after")
@@ -114,33 +118,33 @@ class CapsuleShape(BaseModel):
 
     @property
     def layout(self) -> Layout:
-        """The layout in which the branch reads an image."""
+        """How the branch reads an image."""
         return Layout(self.input, self.views, self.view_width, self.half_angle, self.middle)
 
     @property
     def view(self) -> Size:
-        """Height and width of a view. An image is cut into ``views`` of them."""
+        """Height and width of a view. An image is cut into a number of ``views``."""
         return self.pixels, self.view_width or self.input[1]
 
     @property
     def cut_stride(self) -> int:
         """Stride, in pixels, of the array from which the views are cut.
 
-        For lite0, views are cut from the early features, which are computed once for all views; for
-        other extractors, from the pixels.
+        For lite0, views are cut from the early features, which are computed once for all views. For
+        other extractors, views are cut from the pixels.
         """
         return EARLY_STRIDE if self.extractor == "lite0" else 1
 
     @property
     def cuts(self) -> list[slice]:
-        """Columns of the views in the array with :attr:`cut_stride`."""
+        """Columns of each view in the array with the stride :attr:`cut_stride`."""
         width, view = self.input[1], self.view[1]
         step = (width - view) // self.cut_stride // max(1, self.views - 1)
         columns = (view - 1) // self.cut_stride + 1
         return [slice(k * step, k * step + columns) for k in range(self.views)]
 
     def for_images_of(self, size: Size) -> CapsuleShape:
-        """The shape for images of another height and width. The views keep approximately their
+        """The shape for images with another height and width. Each view keeps approximately its
         share of the width.
 
         Raises:
@@ -155,7 +159,7 @@ class CapsuleShape(BaseModel):
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Rows and columns of the feature grid of a view; a cell of the grid is called a place."""
+        """Rows and columns of the feature grid of a view. A cell of the grid is called a place."""
         height, width = self.view
         if self.extractor == "lite0":
             return lite_grid_side(height), lite_grid_side(width)
@@ -168,7 +172,7 @@ class CapsuleShape(BaseModel):
         return rows * columns
 
     def with_layout(self, layout: Layout) -> CapsuleShape:
-        """The shape with another layout.
+        """The same shape with another layout.
 
         Raises:
             InputError: the views do not fit the image.
@@ -189,13 +193,16 @@ class CapsuleShape(BaseModel):
 
 
 class CapsuleBranch(nn.Module):
-    """Extractor, primary capsules and routing; the flattened output capsules are the descriptor.
+    """The part of a network that computes descriptors: extractor, primary capsules and routing.
 
-    With several views, the descriptor is the concatenation of the views' descriptors from left to
-    right. Each is scaled by the share of its view that shows texture, because fog or a covered lens
-    does not distinguish places. For lite0, the views are cut from the early features of the whole
-    image. These features are computed only once, and at the border of a view they depend on the
-    neighbouring pixels of the image instead of padding.
+    The descriptor consists of the flattened output capsules. With several views, it is the
+    concatenation of the descriptors of the views, from left to right. The descriptor of each view
+    is scaled by the share of the view that shows texture. The reason is that fog or a covered lens
+    does not distinguish places.
+
+    For lite0, the views are cut from the early features of the whole image. These features are
+    computed only once. At the border of a view, they depend on the neighbouring pixels of the image
+    instead of padding.
     """
 
     def __init__(self, shape: CapsuleShape) -> None:
@@ -207,8 +214,8 @@ class CapsuleBranch(nn.Module):
         lite = shape.extractor == "lite0"
         self.extractor = LiteExtractor() if lite else LightExtractor(shape.blocks)
         self.primary = PrimaryCapsules(self.extractor.out_channels, shape.types, shape.size)
-        # With channels last, depthwise convolutions take a third less time forward and a quarter
-        # less backward.
+        # With the memory format channels-last, depthwise convolutions take a third less time
+        # forwards and a quarter less backwards.
         for module in (self.extractor, self.primary):
             module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.capsules = CapsuleLayer(
@@ -217,7 +224,8 @@ class CapsuleBranch(nn.Module):
         )  # fmt: skip
 
     def forward(self, images: Tensor) -> Tensor:
-        """``(N, 3, H, W)`` float32 images in [0, 1] to ``(N, D)`` descriptors, not normalised."""
+        """Compute ``(N, D)`` descriptors of ``(N, 3, H, W)`` float32 images in [0, 1]. The
+        descriptors are not normalised."""
         grey = self._unrolled(images)
         texture = textured(grey)
         v = self.capsules(self._primary_capsules(grey, texture)).flatten(1)
@@ -225,19 +233,19 @@ class CapsuleBranch(nn.Module):
         return (views * self._textured_share(texture)[:, :, None]).flatten(1)
 
     def routed(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Output capsules ``(V N, J, D)`` and couplings ``(V N, J, I)``; the leftmost views of all
-        images come first."""
+        """Compute output capsules ``(V N, J, D)`` and couplings ``(V N, J, I)``. The leftmost views
+        of all images come first."""
         grey = self._unrolled(images)
         return self.capsules.routed(self._primary_capsules(grey, textured(grey)))
 
     def _unrolled(self, images: Tensor) -> Tensor:
-        """``(N, 3, H, W)`` images to ``(N, 1, H, W)`` unrolled grey images."""
+        """Convert ``(N, 3, H, W)`` images to unrolled grey images, ``(N, 1, H, W)``."""
         grey: Tensor = self.unrolling(images.mean(1, keepdim=True))
         return grey
 
     def _primary_capsules(self, grey: Tensor, texture: Tensor) -> Tensor:
-        """Primary capsules ``(V N, T, P, A)`` of ``(N, 1, H, W)`` images with :func:`textured`
-        masks."""
+        """Primary capsules ``(V N, T, P, A)`` of ``(N, 1, H, W)`` images. ``texture`` contains
+        their masks from :func:`textured`."""
         if isinstance(self.extractor, LiteExtractor):
             x = standardised(grey, texture).contiguous(memory_format=torch.channels_last)
             x = self.extractor.late(self._views(self.extractor.early(x)))
@@ -261,6 +269,6 @@ class CapsuleBranch(nn.Module):
 
 
 def _first_fault(error: ValidationError) -> str:
-    """The first fault of a validation, as a clause."""
+    """The first error of a validation, as a clause."""
     first = error.errors()[0]
     return ": ".join([*map(str, first["loc"]), plain_reason(first["msg"])])

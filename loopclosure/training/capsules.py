@@ -1,11 +1,13 @@
 """Capsules and dynamic routing.
 
-Zhou and Sun, Sci Rep 15, 7644 (2025), equations 4 to 9, after Sabour et al., NIPS 2017. There are N
-images, I primary capsules of dimension A, and J output capsules of dimension D. Primary capsules
-have T types (channel groups of the extractor) at P places (cells of the feature grid): i = t P + p.
+The equations are 4 to 9 of Zhou and Sun, Sci Rep 15, 7644 (2025), after Sabour et al., NIPS 2017.
+There are N images, I primary capsules of dimension A, and J output capsules of dimension D. Primary
+capsules have T types at P places. A type is a group of channels of the extractor, and a place is a
+cell of the feature grid. The index of a primary capsule is i = t P + p.
 
-All places of a type share their matrices, so ``route`` sums over the places first and never forms
-the prediction vectors. ``tests/reference_routing.py`` implements the paper's equations literally.
+All places of a type share their matrices. ``route`` therefore sums over the places first, and never
+computes the prediction vectors. ``tests/reference_routing.py`` implements the equations of the
+paper literally.
 """
 
 from __future__ import annotations
@@ -16,12 +18,13 @@ import torch
 from torch import Tensor, nn
 
 Over = Literal["primary", "output"]
-_DEVIATION = 0.12  # initial standard deviation of prediction vectors over sqrt(number of capsules)
+_DEVIATION = 0.12  # initial deviation of prediction vectors over sqrt(number of capsules)
 TINY = 1e-12  # added so that the square root is differentiable at 0
 
 
 def squash(s: Tensor) -> Tensor:
-    """Eq. 8: ``|s|² / (1 + |s|²) · s / |s|`` along the last axis; the length is below 1."""
+    """Eq. 8: ``|s|² / (1 + |s|²) · s / |s|`` along the last axis. The length of the result is below
+    1."""
     squared = (s * s).sum(-1, keepdim=True)
     return s * (torch.sqrt(squared + TINY) / (1.0 + squared))
 
@@ -34,26 +37,27 @@ def length(v: Tensor) -> Tensor:
 def route(
     u: Tensor, W: Tensor, iterations: int = 3, over: Over = "primary", alive: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Dynamic routing; gradients flow through the last iteration only.
+    """Dynamic routing. Gradients flow only through the last iteration.
 
-    With ``s_j = Σ_t W_tj (Σ_p c_tpj u_tp)`` and ``û_j|i · v_j = u_tp · (W_tjᵀ v_j)``, sums of
-    vectors of size A over the places replace the ``I J D`` numbers of the prediction vectors, which
-    would be written once and read five times.
+    The sums are rearranged as ``s_j = Σ_t W_tj (Σ_p c_tpj u_tp)`` and
+    ``û_j|i · v_j = u_tp · (W_tjᵀ v_j)``. In this form, sums over the places replace the prediction
+    vectors. The sums are vectors of size A, whereas the prediction vectors have ``I J D`` numbers,
+    which would have to be written once and read five times.
 
     Args:
         u: ``(N, T, P, A)`` primary capsules.
-        W: ``(J, T, A, D)``, shared by the places of a type.
-        iterations: at least 1.
+        W: ``(J, T, A, D)`` matrices, shared by the places of a type.
+        iterations: number of iterations, at least 1.
         over: axis of the softmax. With ``primary``, the coupling coefficients sum to 1 over i, as
-            in the paper; with ``output``, over j, as in Sabour et al.
-        alive: ``(I,)`` bool; capsules where it is False are ignored, as if they were removed. None
-            keeps all.
+            in the paper. With ``output``, they sum to 1 over j, as in Sabour et al.
+        alive: ``(I,)`` bool. Capsules where it is False are ignored, as if they were removed. None
+            uses all capsules.
 
     Returns:
         Output capsules ``v`` ``(N, J, D)``, and the coupling coefficients as numerators ``e``
-        ``(N, T, J, P)`` and denominators ``total`` ``(N, 1, J, 1)`` or ``(1,)``; see
-        :func:`couplings`. They are returned undivided, because dividing the sums over P instead of
-        ``e`` takes a sixth of the divisions.
+        ``(N, T, J, P)`` and denominators ``total`` ``(N, 1, J, 1)`` or ``(1,)``. :func:`couplings`
+        divides the numerators by the denominators. They are returned undivided, because ``route``
+        itself divides only the sums over P, which takes a sixth of the divisions.
     """
     n, types, places, size = u.shape
     outputs, _, _, depth = W.shape
@@ -62,7 +66,7 @@ def route(
     present = None if alive is None else alive.view(types, 1, places)
 
     def weighted_sums(e: Tensor, total: Tensor) -> Tensor:
-        """``s`` ``(N, J, D)`` with the coupling coefficients ``e / total``."""
+        """The sums ``s`` ``(N, J, D)`` for the coupling coefficients ``e / total``."""
         pooled = torch.bmm(e.view(n * types, outputs, places), rows)
         pooled = pooled.view(n, types, outputs, size) / total
         pooled = pooled.permute(2, 0, 1, 3).reshape(outputs, n, types * size)
@@ -75,14 +79,16 @@ def route(
         return torch.bmm(back, rows.transpose(1, 2)).view(n, types, outputs, places)
 
     def softmax_parts(b: Tensor) -> tuple[Tensor, Tensor]:
-        """Numerators and denominator of Eq. 6 for logits ``(N, T, J, P)``, which it overwrites."""
+        """Numerators and denominator of Eq. 6 for logits ``(N, T, J, P)``. The logits are
+        overwritten."""
         if over == "output":
             c = torch.softmax(b, dim=2)
             return c if present is None else c * present, b.new_ones(1)
         if present is not None:
             b.masked_fill_(~present, -torch.inf)
-        # Subtracting the maximum avoids overflow and does not change a softmax. Reducing one axis
-        # at a time is several times faster than reducing two axes that are not adjacent.
+        # Subtracting the maximum avoids overflow and does not change a softmax. Two reductions of
+        # one axis each are several times faster than one reduction of two axes that are not
+        # adjacent.
         b -= b.amax(3, keepdim=True).amax(1, keepdim=True)
         e = torch.exp(b)
         return e, e.sum(3, keepdim=True).sum(1, keepdim=True)
@@ -113,19 +119,20 @@ def couplings(e: Tensor, total: Tensor) -> Tensor:
 
 
 class CapsuleLayer(nn.Module):
-    """The layer from primary to output capsules.
+    """The layer that computes output capsules from primary capsules.
 
-    The transforms are ``W_ij = W_t(i)j diag(g_i)``: a matrix for each type and output, and a gain
-    vector of size A for each primary capsule, which distinguishes the places. (A matrix for each i
-    and j would need tens of millions of parameters.) A pruned capsule has no row in ``gains`` and
-    ``place`` and takes no part in any product or softmax.
+    The transforms are ``W_ij = W_t(i)j diag(g_i)``. There is a matrix for each type and output, and
+    a gain vector of size A for each primary capsule. The gain vectors distinguish the places. (A
+    matrix for each i and j would need tens of millions of parameters.) A pruned capsule has no
+    entry in ``gains`` and ``place``, and takes no part in any product or softmax.
 
     Attributes:
         W: ``(J, T, A, D)`` matrices.
-        gains: ``(T, K, A)`` for the K kept places of each type (all places before pruning).
-        place: ``(T, K)`` int64 buffer, indices of the kept places.
-        alive: ``(T K,)`` bool buffer, capsules that are not masked. Tests compare removal with
-            masking.
+        gains: ``(T, K, A)`` gain vectors of the K kept places of each type. Before pruning, all
+            places are kept.
+        place: ``(T, K)`` int64 buffer with the indices of the kept places.
+        alive: ``(T K,)`` bool buffer, True for capsules that are not masked. Tests use it to
+            compare removal with masking.
     """
 
     place: Tensor
@@ -146,7 +153,7 @@ class CapsuleLayer(nn.Module):
         kept = places if kept is None else kept
         self.iterations, self.over, self.places = iterations, over, places
         # A mean over thousands of capsules is a short vector, and short outputs give no agreement.
-        # With half of this deviation, the couplings stay equal; with twice this deviation, a few
+        # With half of this deviation, the couplings stay equal. With twice this deviation, a few
         # capsules get nearly all of the coupling.
         deviation = _DEVIATION * (types * places / size) ** 0.5 if over == "primary" else 1.0
         self.W = nn.Parameter(torch.randn(outputs, types, size, depth) * deviation)
@@ -156,11 +163,11 @@ class CapsuleLayer(nn.Module):
         self.masked = False
 
     def forward(self, u: Tensor) -> Tensor:
-        """``(N, T, P, A)`` primary capsules to ``(N, J, D)`` output capsules."""
+        """Compute ``(N, J, D)`` output capsules from ``(N, T, P, A)`` primary capsules."""
         return self._route(u)[0]
 
     def routed(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Output capsules and the couplings ``(N, J, T K)`` that led to them."""
+        """Output capsules, and the couplings ``(N, J, T K)`` that led to them."""
         v, e, total = self._route(u)
         return v, couplings(e, total)
 
@@ -171,7 +178,7 @@ class CapsuleLayer(nn.Module):
             rows = u.flatten(1, 2).index_select(1, (first + self.place).flatten())
             u = rows.unflatten(1, (types, kept))  # torch.gather takes five times as long
         alive = self.alive if self.masked else None
-        # Routing sums thousands of products and therefore never runs in half precision.
+        # Routing sums thousands of products. It therefore never runs in half precision.
         with torch.autocast(u.device.type, enabled=False):
             u = u.float() * self.gains
             return route(u, self.W, self.iterations, self.over, alive)

@@ -1,4 +1,4 @@
-"""Checkpoints of a training."""
+"""Checkpoints of a training run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ CHECKPOINT = "checkpoint.pt"
 
 @dataclass
 class TrainingProgress:
-    """The progress of a training. Checkpoints contain it beside the weights and Adam's moments."""
+    """The progress of a training run. A checkpoint contains the progress, the weights and Adam's
+    moments."""
 
     epoch: int = 0
     step: int = 0
@@ -39,13 +40,13 @@ def save_checkpoint(
     progress: TrainingProgress,
     pairs: Pairs | None,
 ) -> None:
-    """Write everything that resuming a killed training needs.
+    """Write everything that is needed to resume an interrupted training run.
 
     Args:
         pairs: the pairs of the current epoch; None between epochs.
 
     Raises:
-        ResultsError: the file cannot be written; an older file stays as it is.
+        ResultsError: the file cannot be written. In this case, an older file is not changed.
     """
     content = {
         "settings": settings.model_dump_json(),
@@ -65,11 +66,14 @@ def load_checkpoint(
     network: SiameseNetwork,
     optimiser: torch.optim.Optimizer,
 ) -> tuple[TrainingProgress, Pairs | None]:
-    """Load a checkpoint into the network and the optimiser; returns the progress, and the pairs of
-    the current epoch or None between epochs.
+    """Load a checkpoint into the network and the optimiser.
+
+    Returns:
+        The progress, and the pairs of the current epoch. The pairs are None between epochs.
 
     Raises:
-        InputError: the file is damaged, or comes from another version of vslam or other settings.
+        InputError: the file is damaged, or comes from another version of vslam, or was written with
+            other settings.
     """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
@@ -79,9 +83,9 @@ def load_checkpoint(
             f"{path}: written by another version of vslam; use another --out."
         ) from error
     except Exception as error:  # torch raises many types
-        raise InputError(f"{path}: not a readable checkpoint; remove it to start anew.") from error
-    # The learning rate may change, so that a diverged training can be resumed. Settings that are
-    # used only at the end may change, too.
+        raise InputError(f"{path}: not a readable checkpoint; remove it to start again.") from error
+    # The learning rate may change, so that a training run that has diverged can be resumed.
+    # Settings that are used only at the end may change as well.
     free = {key: getattr(settings, key) for key in ("learning_rate", "patience", "learned_share")}
     if written.model_copy(update=free) != settings:
         raise InputError(

@@ -1,4 +1,4 @@
-"""Training data: loads the images of all sources, divides them, and draws pairs."""
+"""Training data: loads the images of all sources, splits them, and draws pairs of images."""
 
 from __future__ import annotations
 
@@ -17,22 +17,25 @@ from vslam.errors import InputError, write_file
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN, ImageSource
 from vslam.loopclosure.siamese.images import Fit, Size
 
-# First and last frame of each sequence that training may use; detectors are tested on the others.
+# First and last frame of each sequence that training may use. Detectors are tested on the others.
 TRAINING_FRAMES = {"kitti00": (250, 1499)}
-# Collections of which training may use only one, because the test needs the other.
+# Groups of collections. Training may use only one collection of a group, because tests need the
+# other.
 _EITHER = ({"citycentre", "newcollege"},)
 
 
 @dataclass(frozen=True)
 class Collection:
-    """All images of all sources.
+    """All images of all sources of training data.
 
     Attributes:
-        names: ``source/folder/file`` of each of N images.
-        images: ``(N, H, W)`` uint8.
-        relation: ``(N, N)`` int8: 1 same place, -1 different places, 0 unknown.
-        unit: ``(N,)`` int64; images of one unit are not split between training and validation.
-        sources: name and number of images of each source.
+        names: names of the N images, as ``source/folder/file``.
+        images: ``(N, H, W)`` uint8 grey images.
+        relation: ``(N, N)`` int8 relation of each pair. 1: same place; -1: different places; 0:
+            unknown.
+        unit: ``(N,)`` int64 label. Images with the same label are not split between training and
+            validation.
+        sources: name of each source, and its number of images.
     """
 
     names: tuple[str, ...]
@@ -47,11 +50,11 @@ class Collection:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Pairs of images with labels.
+    """Pairs of images, and whether they show the same place.
 
     Attributes:
         a, b: ``(M,)`` int64 indices of the images in the collection.
-        same: ``(M,)`` bool, whether both show the same place.
+        same: ``(M,)`` bool, True for pairs that show the same place.
     """
 
     a: NDArray[np.int64]
@@ -63,7 +66,7 @@ class Pairs:
 
 
 def refuse_test_data(sources: list[ImageSource]) -> None:
-    """Check that training on the sources leaves the test data unused.
+    """Check that the sources of training data do not contain the test data.
 
     Raises:
         InputError: the sources include test frames of KITTI, or both FAB-MAP collections.
@@ -86,7 +89,7 @@ def refuse_test_data(sources: list[ImageSource]) -> None:
 
 
 def load(sources: list[ImageSource], size: Size, fit: Fit, threads: int = 2) -> Collection:
-    """Decode all images of all sources into memory (51 kB per image at 227 pixels).
+    """Decode all images of all sources into memory. An image of 227x227 pixels takes 51 kB.
 
     Raises:
         InputError: there are no sources, or two sources have the same name.
@@ -122,10 +125,10 @@ def load(sources: list[ImageSource], size: Size, fit: Fit, threads: int = 2) -> 
 def divide(
     collection: Collection, seed: int, share: float = 0.15
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Divide the images by whole units into training and validation images.
+    """Split the images into training and validation images. Units are not split.
 
-    The other images that show the same place as a validation image, for example at the ends of a
-    stretch of road, belong to neither part.
+    Other images may show the same place as a validation image, for example at the ends of a stretch
+    of road. These images are used neither for training nor for validation.
 
     Raises:
         InputError: there are too few images.
@@ -139,13 +142,13 @@ def divide(
     for part in (train, validation):
         relation = collection.relation[np.ix_(part, part)]
         if not len(part) or not (relation == DIFFERENT).any():
-            raise InputError("--data: too few places to divide; add a source of images.")
+            raise InputError("--data: too few places to split; add a source of images.")
     return train, validation
 
 
 def validation_images(validation: NDArray[np.int64], most: int, seed: int) -> NDArray[np.int64]:
-    """Choose at most ``most`` of the ``(M,)`` validation images; a seed gives the same choice for
-    every training."""
+    """Choose at most ``most`` of the ``(M,)`` validation images. The same seed gives the same
+    choice in every training run."""
     if len(validation) <= most:
         return validation
     picked = np.random.default_rng([seed, 2]).choice(len(validation), most, replace=False)
@@ -153,7 +156,7 @@ def validation_images(validation: NDArray[np.int64], most: int, seed: int) -> ND
 
 
 def check_emphasis(collection: Collection, emphasis: Mapping[str, float]) -> None:
-    """Check that the collection has the sources that ``emphasis`` names.
+    """Check that the collection contains the sources that ``emphasis`` names.
 
     Raises:
         InputError: a source does not exist.
@@ -177,18 +180,19 @@ def draw_pairs(
     together: int = 1,
     emphasis: Mapping[str, float] | None = None,
 ) -> Pairs:
-    """Draw pairs for training.
+    """Draw pairs of images for training.
 
     Args:
-        chosen: ``(M,)`` images to draw from.
+        chosen: ``(M,)`` indices of the images from which pairs are drawn.
         count: number of pairs.
-        hard: ``(M, K)`` similar images of other places, filled up with -1; see :func:`mine`.
-        hard_share: share of the pairs of different places that are drawn from ``hard``.
-        same_share: share of the pairs that show the same place; these pairs are spread evenly over
+        hard: ``(M, K)`` similar images of other places, padded with -1; see :func:`mine`.
+        hard_share: share of the pairs of different places for which the second image is drawn from
+            ``hard``.
+        same_share: share of the pairs that show the same place. These pairs are spread evenly over
             the list.
         together: number of consecutive pairs whose first images come from the same source.
-        emphasis: relative frequency, by source, with which an image is drawn as the first of a
-            pair; default 1.
+        emphasis: relative frequency, for each source, with which an image is drawn as the first of
+            a pair. The default is 1.
     """
     relation = collection.relation[np.ix_(chosen, chosen)]
     sizes = [size for _, size in collection.sources]
@@ -221,14 +225,14 @@ def draw_pairs(
 def mine(
     collection: Collection, chosen: NDArray[np.int64], alike: NDArray[np.float32], k: int = 10
 ) -> NDArray[np.int64]:
-    """Find the ``k`` most similar images of other places for each image.
+    """Find, for each image, the ``k`` most similar images of other places (hard negatives).
 
     Args:
-        chosen: ``(M,)`` images.
-        alike: ``(M, M)`` similarities.
+        chosen: ``(M,)`` indices of the images.
+        alike: ``(M, M)`` similarities of these images.
 
     Returns:
-        ``(M, k)`` int64 images, most similar first, -1 where there are fewer.
+        ``(M, k)`` int64 indices of images, most similar first, padded with -1.
     """
     out = np.full((len(chosen), k), -1, np.int64)
     for row, image in enumerate(chosen):
@@ -239,7 +243,8 @@ def mine(
 
 
 def write_pairs(path: Path, collection: Collection, pairs: Pairs, seed: int) -> None:
-    """Write a list of pairs as CSV (a, b, same); the first line states the seed.
+    """Write a list of pairs as a CSV file with the columns a, b, same. The first line states the
+    seed.
 
     Raises:
         ResultsError: the file cannot be written.

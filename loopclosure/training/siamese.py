@@ -19,22 +19,25 @@ from vslam.loopclosure.training.branches import CapsuleBranch, CapsuleShape
 from vslam.loopclosure.training.capsules import TINY
 from vslam.loopclosure.training.extractors import fold_batch_norms
 
-_SOFTNESS = 0.04  # temperature of the soft maximum over alignments, in cosines
+_SOFTNESS = 0.04  # temperature of the soft maximum over alignments, in units of cosine similarity
 
 
 def aligned(alike: Tensor, most: Tensor) -> Tensor:
-    """Cosine of two images under the best alignment of their views.
+    """Cosine similarity of two images under the best horizontal alignment of their views.
 
-    After a turn of the camera, the same objects appear in another view. Therefore, the views of one
-    image are shifted to the left or right by up to half of their number, and each of these
-    alignments has a cosine over the views that overlap. The result is the soft maximum of these
-    cosines, because two alignments fit about equally well if the camera has turned by half the
-    spacing of the views or has driven on. The result can slightly exceed 1. (Not in the paper,
-    which compares whole images only.)
+    The descriptor of an image consists of the descriptors of its views, which are parts of the
+    image from left to right. After a rotation of the camera, an object appears in a different view.
+    Therefore, the views of one image are shifted to the left or right, by up to half the number of
+    views. For each shift, a cosine similarity is computed from the views that overlap.
+
+    The result is the soft maximum of these similarities. A soft maximum is used because two shifts
+    may fit about equally well. This happens if the camera has rotated by half the spacing of the
+    views, or has driven forwards. The result can slightly exceed 1. The paper compares only whole
+    images.
 
     Args:
-        alike: ``(..., V, V)`` scalar products of the views' descriptors.
-        most: ``(..., V, V)`` products of the lengths of the views' descriptors.
+        alike: ``(..., V, V)`` scalar products of the descriptors of the views.
+        most: ``(..., V, V)`` products of the lengths of these descriptors.
     """
     views = alike.shape[-1]
     v = torch.arange(views, device=alike.device)
@@ -45,19 +48,19 @@ def aligned(alike: Tensor, most: Tensor) -> Tensor:
 
 
 def cosines(a: Tensor, b: Tensor, views: int = 1) -> Tensor:
-    """Cosines ``(N, M)`` of descriptors ``(N, D)`` and ``(M, D)``, :func:`aligned` if they have
-    several views."""
+    """Cosine similarities ``(N, M)`` of descriptors ``(N, D)`` and ``(M, D)``. If the descriptors
+    have several views, these are :func:`aligned`."""
     if views == 1:
         return a @ b.T
     a, b = _by_view(a, views), _by_view(b, views)
-    # b comes first because it may have the thousands of keyframes of a map.
+    # b comes first, because it may contain the thousands of keyframes of a map.
     alike = (b.flatten(0, 1) @ a.flatten(0, 1).T).view(len(b), views, len(a), views)
     most = _lengths(a)[:, None, :, None] * _lengths(b)[None, :, None, :]
     return aligned(alike.permute(2, 0, 3, 1), most)
 
 
 def _by_view(descriptors: Tensor, views: int) -> Tensor:
-    """Split descriptors ``(N, V D)`` into those of their views, ``(N, V, D)``."""
+    """Split descriptors ``(N, V D)`` into the descriptors of their views, ``(N, V, D)``."""
     return descriptors.view(len(descriptors), views, descriptors.shape[1] // views)
 
 
@@ -67,39 +70,42 @@ def _lengths(views: Tensor) -> Tensor:
 
 
 class DistanceHead(nn.Module):
-    """``p = sigmoid(a - b d)`` (Eq. 2) with the distance d of two descriptors (Eq. 10), a, b > 0.
+    """Computes ``p = sigmoid(a - b d)`` (Eq. 2) from the distance d of two descriptors (Eq. 10),
+    with a, b > 0.
 
-    With several views, d is computed from their :func:`aligned` cosine.
+    With several views, d is computed from their :func:`aligned` cosine similarity.
     """
 
     def __init__(self, views: int = 1) -> None:
         super().__init__()
         self.views = views
-        # p = 0.5 at d = 1.1, which separates the same from different places with random weights.
+        # At d = 1.1, p is 0.5. With random weights, this separates the same place from different
+        # places.
         self.log_a = nn.Parameter(torch.tensor(1.5))
         self.log_b = nn.Parameter(torch.tensor(1.4))
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
-        """Logits ``(N,)`` of N pairs of unit descriptors, ``(N, D)`` each."""
+        """Logits ``(N,)`` of N pairs of descriptors of norm 1. Both arguments are ``(N, D)``."""
         a, b = _by_view(a, self.views), _by_view(b, self.views)
         most = _lengths(a)[:, :, None] * _lengths(b)[:, None]
         return self.of_cosine(aligned(a @ b.transpose(1, 2), most))
 
     def of_cosine(self, cosine: Tensor) -> Tensor:
-        """Logits from the cosines of unit descriptors, whose distance is ``sqrt(2 - 2 cos)``."""
+        """Logits from the cosine similarities of descriptors of norm 1. Their distance is
+        ``sqrt(2 - 2 cos)``."""
         d = torch.sqrt((2.0 - 2.0 * cosine).clamp_min(0.0) + TINY)
         return self.log_a.exp() - self.log_b.exp() * d
 
     def compare(self, query: Tensor, gallery: Tensor, lengths: Tensor) -> Tensor:
-        """Compare an image with a gallery by one matrix product.
+        """Compare an image with a gallery of images by one matrix product.
 
         Args:
             query: ``(V, d)`` descriptors of the views of the image.
             gallery: ``(M, V, d)`` descriptors of the views of M images.
-            lengths: ``(M, V)`` lengths of the gallery's descriptors.
+            lengths: ``(M, V)`` lengths of the descriptors of the gallery.
 
         Returns:
-            ``(M,)`` logits.
+            ``(M,)`` logits of the similarities.
         """
         alike = (gallery @ query.T).transpose(1, 2)
         most = _lengths(query[None])[:, :, None] * lengths[:, None]
@@ -107,7 +113,7 @@ class DistanceHead(nn.Module):
 
 
 class SiameseNetwork(nn.Module):
-    """A capsule branch, which computes descriptors, and a head, which compares them.
+    """A capsule branch that computes descriptors, and a head that compares them.
 
     Attributes:
         name: one of ``NETWORKS``.
@@ -121,24 +127,26 @@ class SiameseNetwork(nn.Module):
         self.size, self.dimensions = branch.size, branch.dimensions
 
     def embed(self, images: Tensor) -> Tensor:
-        """``(N, 3, H, W)`` float32 images in [0, 1] to ``(N, D)`` float32 descriptors of norm 1."""
+        """Compute ``(N, D)`` float32 descriptors of norm 1 from ``(N, 3, H, W)`` float32 images in
+        [0, 1]."""
         return functional.normalize(self.branch(images).float(), dim=1)
 
     def cosines(self, a: Tensor, b: Tensor) -> Tensor:
-        """``(N, M)`` aligned cosines of descriptors ``(N, D)`` and ``(M, D)``."""
+        """``(N, M)`` aligned cosine similarities of descriptors ``(N, D)`` and ``(M, D)``."""
         return cosines(a, b, self.branch.views)
 
     def logits(self, a: Tensor, b: Tensor) -> Tensor:
-        """Logits ``(N,)`` of ``similarity``, which the loss needs."""
+        """Logits ``(N,)`` of the probabilities that ``similarity`` returns. The loss needs the
+        logits."""
         return self.head(a, b)
 
     def similarity(self, a: Tensor, b: Tensor) -> Tensor:
-        """Probabilities ``(N,)`` in (0, 1) that the images of N pairs of descriptors, ``(N, D)``
-        each, show the same place."""
+        """Probabilities ``(N,)`` in (0, 1) that two images show the same place, for N pairs of
+        descriptors. Both arguments are ``(N, D)``."""
         return torch.sigmoid(self.head(a, b))
 
     def compare(self, query: Tensor, gallery: Tensor) -> Tensor:
-        """Similarities ``(M,)`` of a descriptor ``(D,)`` with the descriptors ``(M, D)``."""
+        """Similarities ``(M,)`` of a descriptor ``(D,)`` and each of the descriptors ``(M, D)``."""
         by_view = _by_view(gallery, self.branch.views)
         query = _by_view(query[None], self.branch.views)[0]
         return torch.sigmoid(self.head.compare(query, by_view, _lengths(by_view)))
@@ -153,7 +161,7 @@ class SiameseNetwork(nn.Module):
 
 
 def build_network(name: str, shape: CapsuleShape | None = None) -> SiameseNetwork:
-    """Create a network with random weights from torch's global generator.
+    """Create a network with random weights, which are drawn from the global generator of torch.
 
     Args:
         name: one of ``NETWORKS``.
@@ -171,10 +179,11 @@ def build_network(name: str, shape: CapsuleShape | None = None) -> SiameseNetwor
 def save_network(
     network: SiameseNetwork, path: Path, about: dict[str, Any], *, half: bool = False
 ) -> None:
-    """Write weights as safetensors with metadata: the structure of the network and ``about``.
+    """Write the weights of a network as safetensors. The metadata contains the structure of the
+    network and ``about``.
 
     Args:
-        half: whether to store the weights in half precision, for shipping.
+        half: whether the weights are stored in half precision, as for the weights that vslam ships.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -194,7 +203,7 @@ def save_network(
 
 
 def load_network(path: Path) -> tuple[SiameseNetwork, dict[str, Any]]:
-    """Read a file that :func:`save_network` wrote; returns the network in eval mode and ``about``.
+    """Read a file that :func:`save_network` wrote. Returns the network in eval mode, and ``about``.
 
     Raises:
         InputError: the file is missing, damaged or not from this version of vslam.
@@ -217,7 +226,8 @@ def load_network(path: Path) -> tuple[SiameseNetwork, dict[str, Any]]:
 
 
 def for_inference(network: SiameseNetwork) -> SiameseNetwork:
-    """Prepare a network for inference in place: eval mode, no gradients, folded normalisations."""
+    """Prepare a network for inference, in place. It is set to eval mode, its weights need no
+    gradients, and its batch normalisations are folded into the convolutions."""
     network.eval().requires_grad_(False)
     fold_batch_norms(network)
     return network

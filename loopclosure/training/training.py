@@ -1,8 +1,9 @@
-"""Trains a network in epochs of pairs, with checkpoints from which a killed training can resume.
+"""Trains a network in epochs of pairs. An interrupted training run can be resumed from a
+checkpoint.
 
 All random numbers depend only on the seed, the epoch and the number of the pair. A checkpoint
-therefore needs no generator states, and a resumed training gives the same bits as an uninterrupted
-one (on the same machine with the same number of threads).
+therefore needs no generator states. A resumed training run is bit-identical to an uninterrupted
+one, if both run on the same machine with the same number of threads.
 """
 
 from __future__ import annotations
@@ -59,20 +60,20 @@ from vslam.loopclosure.training.siamese import (
 )
 
 OnStep = Callable[[int, int, int, float], None]
-"""``(epoch, step, steps of the epoch, loss)``"""
+"""Arguments: epoch, step, number of steps in the epoch, loss."""
 
 _CHECKPOINT_EVERY_S = 300.0
-_HEAD_RATE = 30.0  # factor for the scalars log a and log b, for which Adam's steps are too small
+_HEAD_RATE = 30.0  # factor for the scalars log a and log b: Adam's steps are too small for them
 
 
 @dataclass(frozen=True)
 class TrainingOutcome:
-    """The outcome of a training.
+    """The outcome of a training run.
 
     Attributes:
-        finished: False if the training was stopped early; a call with ``resume`` continues it.
+        finished: False if the training run was stopped early. A call with ``resume`` continues it.
         figures: validation figures of the best network after calibration.
-        progress: the progress, with the figures of every epoch.
+        progress: the progress of the training run, with the figures of every epoch.
         weights: file of the best network.
         train, validation: indices of the training and validation images.
     """
@@ -97,26 +98,27 @@ def train(
     on_step: OnStep | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> TrainingOutcome:
-    """Train a network; write its weights, log, lists of pairs and checkpoints to a folder.
+    """Train a network. Its weights, a log, the lists of pairs and checkpoints are written to a
+    folder.
 
     Args:
-        collection: images and their relations.
-        settings: settings of the training.
-        folder: output folder; ``settings.network`` names the file of the weights.
+        collection: the images and their relations.
+        settings: settings of the training run.
+        folder: output folder. The name of the file of weights is ``settings.network``.
         device: ``cpu`` or ``cuda``.
         threads: number of threads that augment images.
-        resume: whether to continue from the folder's checkpoint, if there is one.
+        resume: whether training continues from the checkpoint in the folder, if there is one.
         start: network to start from instead of random weights (fine-tuning).
         on_step: called after each step.
-        should_stop: called after each step; if it returns True, a checkpoint is written and the
+        should_stop: called after each step. If it returns True, a checkpoint is written and
             training stops.
 
     Raises:
         InputError: there is too little data, the device or a source is unknown, the device does not
-            support the required bfloat16, the checkpoint has other settings, or ``learned_share``
-            is set without a network to start from.
-        ResultsError: the loss is not finite (the last good checkpoint is kept), or the results
-            cannot be written.
+            support the required bfloat16, or the checkpoint has other settings. The error is also
+            raised if ``learned_share`` is set, but there is no network to start from.
+        ResultsError: the loss is not finite, or the results cannot be written. If the loss is not
+            finite, the last good checkpoint is kept.
     """
     if settings.learned_share < 1 and start is None:
         raise InputError("learned_share: needs a network to start from; name it with --weights.")
@@ -135,7 +137,7 @@ def train(
     weights = folder / f"{settings.network}.safetensors"
     if resume and checkpoint.exists():
         progress, pairs = load_checkpoint(checkpoint, settings, network, optimiser)
-    else:  # so that a good checkpoint exists even if the first steps diverge
+    else:  # a good checkpoint then exists even if the first steps diverge
         save_checkpoint(checkpoint, settings, network, optimiser, progress, None)
     last_saved = time.monotonic()
     with ThreadPoolExecutor(threads) as pool:
@@ -175,7 +177,7 @@ def train(
             write_log(folder / "log.csv", progress.history)
     best, about = load_network(weights)
     best.to(torch_device)
-    if before is not None and "learned_share" not in about:  # else an earlier call has blended
+    if before is not None and "learned_share" not in about:  # otherwise an earlier call has blended
         blend(best, before, settings.learned_share)
         about["learned_share"] = settings.learned_share
     figures = calibrated(best, about, collection, validation, settings, weights, torch_device)
@@ -191,7 +193,7 @@ def calibrated(
     weights: Path,
     device: torch.device,
 ) -> dict[str, float]:
-    """Calibrate a network, write its weights and return its validation figures.
+    """Calibrate a network and write its weights. Returns its validation figures.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -205,8 +207,8 @@ def calibrated(
 
 @dataclass(frozen=True)
 class _Training:
-    """The data that training steps read, and the state that they change (network, optimiser and
-    progress)."""
+    """The data that training steps read, and the state that they change. The state consists of
+    network, optimiser and progress."""
 
     collection: Collection
     settings: TrainSettings
@@ -224,8 +226,8 @@ class _Training:
         return max(1, self.settings.pairs // self.settings.batch)
 
     def step(self, pairs: Pairs) -> float:
-        """Make one step of Adam and return the loss. If the loss is not finite, weights and
-        progress do not change."""
+        """Make one step of Adam and return the loss. If the loss is not finite, the weights and the
+        progress are not changed."""
         settings, network, progress = self.settings, self.network, self.progress
         first = progress.step * settings.batch
         a, b, same_place = (x[first : first + settings.batch] for x in vars(pairs).values())
@@ -254,8 +256,8 @@ class _Training:
         return value
 
     def _augmented(self, a: NDArray[np.int64], b: NDArray[np.int64], first: int) -> torch.Tensor:
-        """Augmented images of N successive pairs of the epoch, ``(2 N, 3, H, W)``; ``first`` is the
-        index, in the epoch, of the first of these pairs."""
+        """Augmented images of N successive pairs of the epoch, ``(2 N, 3, H, W)``. ``first`` is the
+        index of the first of these pairs in the epoch."""
         settings, epoch = self.settings, self.progress.epoch
 
         def augmented(job: tuple[int, int, int]) -> NDArray[np.uint8]:
@@ -277,7 +279,7 @@ class _Training:
         """Draw the pairs of the current epoch."""
         settings, network, images, hard = self.settings, self.network, self.images, None
         rng = np.random.default_rng([settings.seed, 4, self.progress.epoch])
-        # In the first epoch, random weights would find no hard pairs.
+        # There are no hard pairs in the first epoch, because random weights would not find any.
         if self.progress.epoch > 0 and settings.hard_share > 0:
             if len(images) > settings.mined_images:
                 images = np.sort(rng.choice(images, settings.mined_images, replace=False))
@@ -294,7 +296,7 @@ class _Training:
         )  # fmt: skip
 
     def end_epoch(self, validation: NDArray[np.int64], weights: Path) -> None:
-        """Validate the network, and write its weights if they are the best so far."""
+        """Validate the network. Its weights are written if they are the best so far."""
         network, progress = self.network, self.progress
         augmentation = self.settings.augmentation
         figures = validate(network, self.collection, validation, augmentation, self.device)[0]
@@ -316,7 +318,8 @@ class _Training:
 
 
 def _optimiser(network: SiameseNetwork, settings: TrainSettings) -> torch.optim.Optimizer:
-    """Adam with separate learning rates for extractor and head; frozen blocks are excluded."""
+    """Adam with separate learning rates for the extractor and the head. Frozen blocks are
+    excluded."""
     extractor = network.branch.extractor
     if isinstance(extractor, LiteExtractor):
         extractor.freeze(settings.frozen)
@@ -335,7 +338,7 @@ def set_threads(threads: int) -> None:
 
 
 def open_device(name: str) -> torch.device:
-    """The torch device of that name.
+    """The torch device with the given name.
 
     Raises:
         InputError: the device is unknown or not available.
@@ -348,7 +351,7 @@ def open_device(name: str) -> torch.device:
 
 
 def _mixed_precision(settings: TrainSettings, device: torch.device) -> bool:
-    """Whether to compute in bfloat16."""
+    """Whether the network computes in bfloat16."""
     supported = device.type == "cpu" or torch.cuda.is_bf16_supported()
     if settings.mixed_precision and not supported:
         raise InputError("mixed_precision: this GPU does not support bfloat16; leave it out.")
@@ -358,7 +361,7 @@ def _mixed_precision(settings: TrainSettings, device: torch.device) -> bool:
 
 
 def write_log(path: Path, history: list[dict[str, float]]) -> None:
-    """Write the figures of each epoch as CSV.
+    """Write the figures of each epoch as a CSV file.
 
     Raises:
         ResultsError: the file cannot be written.

@@ -72,7 +72,7 @@ def test_latency_of_both_systems(speed, kitti_tree):
 def test_a_keyframe_costs_what_memory_grew_by(speed):
     report = {"startup_s": 2.0, "keyframes": 50}
     run = made_run(speed, report, [(0.5, 100.0), (1.5, 200.0), (2.5, 250.0)])
-    assert "200 MB before the first frame, 300 MB" in speed.memory(run)
+    assert "200 MB of memory before the first frame and 300 MB" in speed.memory(run)
     assert "2.00 MB per keyframe" in speed.memory(run)
     assert "too short" in speed.memory(made_run(speed, report))
 

@@ -43,16 +43,20 @@ LOOP_MESSAGE = "*Loop detected"  # ORB-SLAM3 prints it once for each loop that i
 FULL, LEAN, LIVE, ORBSLAM3 = "vslam", "vslam --no-report", "vslam --realtime", "ORB-SLAM3"
 HEAD = """## How it was measured
 
-The command below, under *Setting*, writes these sections. It runs one process at a time. *Load* \
-is the load of the machine when the command began. *Whole process* is the time from the start of \
-Python to its end. It includes reading the vocabulary, loading the kernels from Numba's cache and \
-writing all files. *Frame loop* is the time from the first image to the last pose. vslam runs with \
-the detector `bow`, because ORB-SLAM3 always looks for loops. For its report, vslam evaluates the \
-trajectory by the ground truth and draws figures. ORB-SLAM3 does neither; for a fair comparison, \
-vslam with `--no-report` gets no ground truth. *Reading images* is the CPU time for decoding both \
-images of a frame, measured in separate processes with vslam's own reader for vslam and \
-`cv2.imread` for ORB-SLAM3. The rows without reading images subtract it. The real-time run and the \
-profile, which `tools/profile_frame.py` takes with one thread, are done once per case.
+The command under *Setting* measured everything and wrote these sections. It runs one process at a \
+time.
+
+- **Detector.** vslam runs with the detector `bow`, because ORB-SLAM3 always looks for loops.
+- **Report.** With its report, vslam also evaluates the trajectory and draws figures. ORB-SLAM3 \
+does neither. For a fair comparison, vslam also runs with `--no-report` and without ground truth.
+- **Whole process** is the time from the start of Python to its end. It includes reading the \
+vocabulary, loading the kernels from Numba's cache and writing all files.
+- **Frame loop** is the time from the first image to the last pose.
+- **The same without reading images.** The CPU time for decoding both images of a frame is \
+measured in separate processes: with vslam's own reader for vslam, and with `cv2.imread` for \
+ORB-SLAM3. The rows with this name subtract it.
+- **Real-time run and profile.** Each of them is done once per case. `tools/profile_frame.py` \
+takes the profile, with one thread.
 """
 BEGIN, END = "## How it was measured\n", "\n## Limits\n"  # the rest of the page is hand-written
 READING = """
@@ -367,8 +371,9 @@ def memory(run: Run) -> str:
     growth = run.process.memory_mb - before[-1]
     kept = run.report["keyframes"]
     return (
-        f"Memory: {before[-1]:.0f} MB before the first frame, {run.process.memory_mb:.0f} MB at "
-        f"its peak, with {kept} keyframes in the final map: {growth / kept:.2f} MB per keyframe."
+        f"The process used {before[-1]:.0f} MB of memory before the first frame and "
+        f"{run.process.memory_mb:.0f} MB at its peak. The growth, divided by the {kept} keyframes "
+        f"of the final map, is {growth / kept:.2f} MB per keyframe."
     )
 
 
@@ -391,8 +396,8 @@ def section(
 ) -> str:
     """The section of the page about a case."""
     return (
-        f"## {case.title}\n\n{case.frames} frames. "
-        f"Reading both images takes {reading[FULL]:.1f} ms of CPU time with vslam's reader and "
+        f"## {case.title}\n\nThe drive has {case.frames} frames. Decoding both images of a frame "
+        f"takes {reading[FULL]:.1f} ms of CPU time with vslam's reader, and "
         f"{reading[ORBSLAM3]:.1f} ms with OpenCV.\n\n"
         f"{comparison(measured)}\n\n{latency(runs, case)}\n\n{stages(runs[FULL][-1].report)}\n\n"
         f"{memory(runs[LEAN][-1])}\n\n{profile(case)}"
@@ -449,9 +454,10 @@ def setting_of(report: dict[str, Any], system: OrbSlam3 | None, repeats: int) ->
     machine = report["machine"]
     ours = ", ".join(f"{name} {number}" for name, number in report["versions"].items())
     return (
-        f"Median (least - greatest) of {repeats} runs each, alternating, "
-        f"{time.strftime('%Y-%m-%d')}. "
-        f"{machine['cpu']}, {machine['cores']} cores, {machine['platform']}. {ours}{version}."
+        f"The comparisons give the median (least - greatest) of {repeats} runs of each system. The "
+        f"systems ran alternately, on {time.strftime('%Y-%m-%d')}. The machine was: "
+        f"{machine['cpu']}, {machine['cores']} cores, {machine['platform']}. The versions were: "
+        f"{ours}{version}."
     )
 
 
@@ -504,8 +510,9 @@ def main() -> None:
             tables[case.title] = measures(case, runs, reading)
             sections.append(section(case, runs, reading, tables[case.title]))
     setting = setting_of(done[0][1][FULL][0].report, orbslam3, options.repeats)
+    setting += f" The load of the machine was {load:.1f} when the command began."
     text = "\n".join((
-        HEAD, *sections, f"## Setting\n\n{setting} Load at the start: {load:.1f}.\n",
+        HEAD, *sections, f"## Setting\n\n{setting}\n",
         f"```sh\npython {anonymous(shlex.join(sys.argv))}\n```\n",
     ))  # fmt: skip
     if options.write:

@@ -1,10 +1,11 @@
-"""Loop closing: from the loop candidates of a keyframe to a corrected map (ORB-SLAM, section VII).
+"""Loop closing: verifies the loop candidates of a keyframe and corrects the map (ORB-SLAM, section
+VII).
 
 No other thread may write the map while a method of ``LoopClosing`` runs. The search for a loop only
 reads the map and runs in parallel with tracking (``Mapper``). The global bundle adjustment after a
-loop also runs in parallel, on a snapshot of the map. Its result is merged after a number of
-keyframes that depends only on the size of the problem, so that the same input always gives the same
-map.
+loop also runs in parallel, on a snapshot of the map. Its result is merged after a certain number of
+keyframes. This number depends only on the size of the problem, so the same input always gives the
+same map.
 """
 
 from __future__ import annotations
@@ -46,13 +47,13 @@ class LoopClosing:
     """Finds, verifies and closes loops.
 
     Attributes:
-        detector: proposes candidates.
+        detector: proposes loop candidates.
         verifier: decides which candidates are loops.
         edges: the outcome of every candidate, in order.
         corrections: the loops that were closed.
-        closed: the edges of all closed loops, in the current units of the map; the loops of a
-            loaded map come first.
-        problems: one sentence for each failure that did not harm the map.
+        closed: the edges of all closed loops, in the present unit of the map. The loops of a loaded
+            map come first.
+        problems: one sentence for each step that failed. These failures left the map unchanged.
     """
 
     def __init__(
@@ -166,8 +167,12 @@ class LoopClosing:
         return self._global is not None and keyframe + self._followed >= self._global.due
 
     def conclude(self, map_: Map) -> None:
-        """At the end of a drive, close a verified loop that still waits for another keyframe to
-        confirm it, if an earlier keyframe does so (``LoopConsistency.confirmed_by_earlier``)."""
+        """At the end of a drive, close a verified loop that still waits for confirmation.
+
+        Another keyframe must confirm each loop. At the end of a drive, no later keyframe can do so.
+        The loop is closed if an earlier keyframe confirms it
+        (``LoopConsistency.confirmed_by_earlier``).
+        """
         gates, found, edges = self._config.verification, None, []
         with self._failure_reported("Looking for loops"):
             for edge in self._consistency.confirmed_by_earlier(map_, self._camera, gates):
@@ -180,8 +185,8 @@ class LoopClosing:
     def finish(self, map_: Map) -> None:
         """Wait for the running global bundle adjustment, if there is one, and merge its result.
 
-        The map is sound without it: after a failure, a warning is logged and the map stays as it
-        was.
+        The map is valid without this result. If the adjustment fails, a warning is logged and the
+        map stays as it was.
         """
         pending, self._global = self._global, None
         if pending is None:
@@ -194,8 +199,10 @@ class LoopClosing:
 
     @contextmanager
     def _failure_reported(self, what: str) -> Iterator[None]:
-        """Report an exception in the block instead of raising it; used for steps that leave the map
-        unchanged when they fail."""
+        """Log an exception of the block and add it to ``problems`` instead of raising it.
+
+        This is used for steps that leave the map unchanged when they fail.
+        """
         try:
             yield
         except Exception as error:
@@ -205,8 +212,12 @@ class LoopClosing:
                 _log.warning(problem)
 
     def _solve(self, map_: Map, edge: LoopEdge) -> tuple[LoopEdge, _Loop | None]:
-        """Solve the pose graph with a verified loop. Returns the outcome for ``edges``, and the
-        loop, or None if the loop contradicts the rest of the graph."""
+        """Solve the pose graph with a verified loop.
+
+        Returns:
+            The outcome, which belongs into ``edges``, and the loop. The loop is None if it
+            contradicts the rest of the graph.
+        """
         start = time.perf_counter()
         solution = self._solution(map_, edge, Hypothesis.PREDICTED)
         if not solution.verdict.consistent and solution.has_gaps:
@@ -280,8 +291,10 @@ def _superseded(candidate: LoopCandidate) -> LoopEdge:
 
 @dataclass(frozen=True)
 class _Loop:
-    """A verified loop, its correction of the map, and the time (``perf_counter``) at which the
-    computation of that correction started."""
+    """A verified loop and its correction of the map.
+
+    ``start`` is the time (``perf_counter``) at which the computation of the correction started.
+    """
 
     edge: LoopEdge
     solution: Solution
@@ -294,7 +307,7 @@ class LoopSearch:
 
     Attributes:
         edges: the outcome of every candidate.
-        loop: the verified loop, which is still to be closed; None if there is none.
+        loop: the verified loop, which has not been closed yet. None if no candidate is a loop.
     """
 
     edges: list[LoopEdge] = field(default_factory=list)

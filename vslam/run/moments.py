@@ -1,4 +1,4 @@
-"""Small images of keyframes for the report: a sample of the whole run, and the closed loops."""
+"""Small images of keyframes for the report. They show a sample of the run, and the closed loops."""
 
 from __future__ import annotations
 
@@ -35,9 +35,10 @@ class Moment:
     """A keyframe as the report shows it.
 
     Attributes:
-        frame: index of its frame in the run.
-        jpeg: its left image, 360 pixels wide or less.
-        points: ``(N, 2)`` uint8 keypoints in 255ths of width and height.
+        frame: index of the keyframe's frame in the run.
+        jpeg: left image of the keyframe as JPEG, at most 360 pixels wide.
+        points: ``(N, 2)`` uint8 positions of keypoints. The value 255 corresponds to the width or
+            height of the image.
         tracked: ``(N,)`` bool, whether each keypoint is an inlier match of a landmark.
     """
 
@@ -48,8 +49,10 @@ class Moment:
 
 
 class MomentRecorder(Recorder):
-    """Keeps the images of at most 96 keyframes, spread evenly over a run of any length: when there
-    are more, every second one is dropped."""
+    """Keeps the images of at most 96 keyframes, which are spread evenly over a run of any length.
+
+    When there are more images, every second image is dropped.
+    """
 
     def __init__(self) -> None:
         self.moments: list[Moment] = []
@@ -85,9 +88,9 @@ def _moment(
 class LoopPictureRecorder(Recorder):
     """Keeps a small image of each keyframe, and the data for a picture of each closed loop.
 
-    A loop has no picture if its earlier image was not kept: images of earlier drives and of the
-    part before the run was resumed are not available, and a very long run keeps only every second
-    image.
+    A loop has no picture if its earlier image was not kept. Images of earlier drives are not
+    available. If a run was resumed, images from before the interruption are not available either. A
+    very long run keeps only every second image.
 
     Attributes:
         pictures: pictures of the closed loops, in order.

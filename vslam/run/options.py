@@ -17,10 +17,13 @@ OPTIONS = "run.json"
 
 
 class RunOptions(SourceOptions):
-    """The options as given on the command line. In ``run.json``, paths are absolute.
+    """The options of ``vslam run`` as they were given on the command line.
+
+    In ``run.json``, paths are absolute.
 
     Attributes:
-        plugins: the package of each plug-in that the other options name; set only in ``run.json``.
+        plugins: the package of each plug-in that the other options use. It is set only in
+            ``run.json``.
     """
 
     perturb: str = "none"
@@ -44,7 +47,7 @@ def write_options(folder: Path, options: RunOptions) -> None:
     """Write ``run.json``.
 
     Raises:
-        InputError: it cannot be written.
+        InputError: the file cannot be written.
     """
     data = Path(options.data)
     changed: dict[str, object] = {

@@ -59,7 +59,7 @@ def require_utf8(path: Path) -> None:
         raise InputError(f"{shown}: this name is not UTF-8; rename it.") from None
 
 
-def read_npz(path: Path, what: str, fix: str = "name another file") -> dict[str, NDArray[Any]]:
+def read_npz(path: Path, what: str, fix: str = "give another file") -> dict[str, NDArray[Any]]:
     """Read all arrays of an npz file. Python objects (pickles) are rejected.
 
     Args:
@@ -119,13 +119,13 @@ def _check_size(path: Path, archive: zipfile.ZipFile, what: str) -> None:
     if needed > max(_ANY_SIZE, _MOST_PACKED * packed):
         raise InputError(
             f"{path}: unpacks from {packed / 2**20:.1f} MB to {needed / 2**20:.0f} MB, so it is "
-            f"probably not {what}; name another file."
+            f"probably not {what}; give another file."
         )
     there = psutil.virtual_memory().available
     if needed > there:
         raise InputError(
             f"{path}: unpacks to {needed / 2**30:.1f} GB, but only {there / 2**30:.1f} GB of "
-            f"memory are free; free some memory, or name another file if this is not {what}."
+            f"memory are free; free some memory, or give another file if this is not {what}."
         )
 
 

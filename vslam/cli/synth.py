@@ -50,7 +50,7 @@ def synth(
         option(
             _DRIVE,
             "N",
-            "Stop after N frames; a later command can render the remaining ones.",
+            "Stop after N frames. A later command can render the remaining frames.",
             min=1,
             unset="all",
         ),
@@ -65,7 +65,7 @@ def synth(
         option(
             _TOWN,
             "0-1",
-            "How much the town changes between two passes; above 0.7 it gets dark.",
+            "How much the town changes between two passes. Above 0.7, it gets dark.",
             min=0,
             max=1,
         ),
@@ -93,7 +93,7 @@ def synth(
         bool,
         flag(
             OUTPUT,
-            "Write images with depth in TUM's layout, and also the stereo pairs.",
+            "Write the stereo pairs, and also images with depth in TUM's layout.",
             "--rgbd",
         ),
     ] = False,
@@ -108,7 +108,7 @@ def synth(
         option(
             _PAIRS,
             "LOW:HIGH",
-            "Range of the offset of the second view to the right, in metres; at -3.2, it is in the "
+            "Range of the offset of the second view to the right, in metres. At -3.2, it is in the "
             "opposite lane.",
         ),
     ] = "-1.4:1.4",
@@ -134,7 +134,7 @@ def synth(
     threads: Threads = None,
     quiet: Quiet = False,
 ) -> None:
-    """Render a drive through a town in KITTI's format, with exact ground truth."""
+    """Render a drive through a town, in KITTI's format and with exact ground truth."""
     from vslam.cli.console import Console
     from vslam.datasets.synthetic import (
         DRIVES,
@@ -171,7 +171,7 @@ def synth(
     if side_by_side is not None and (pairs or fisheye):
         raise InputError("--side-by-side: writes a sequence; leave out --pairs and --fisheye.")
     if not route:
-        raise InputError(f"vslam synth: name a route, one of {', '.join(ROUTES)}, or --list.")
+        raise InputError(f"vslam synth: give a route, one of {', '.join(ROUTES)}, or --list.")
     drive = (
         built_in_route(route)
         if trajectory is None

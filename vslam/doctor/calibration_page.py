@@ -74,7 +74,7 @@ def write_page(
         Section("Calibration file", [Code(text)]),
     ]
     page = html(Page("Calibration", [about], parts))
-    write_file(path, page, "name another file with --out")
+    write_file(path, page, "give another file with --out")
 
 
 def _sides(found: Estimate) -> list[tuple[str, CameraFit]]:

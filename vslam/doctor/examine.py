@@ -288,7 +288,7 @@ def write_page(diagnosis: Diagnosis, title: str, path: Path) -> None:
         [counted(faults, "fault") if faults else "no faults"],
         [*sections(diagnosis.findings), Section("", figures)],
     )
-    write_file(path, html(page), "name another file with --out")
+    write_file(path, html(page), "give another file with --out")
 
 
 def _jpeg(picture: Picture) -> bytes:

@@ -67,11 +67,11 @@ def how_to_swap(dataset: str, options: RunOptions) -> str:
     if dataset == "images" and options.right is not None:
         return f"swap them: --data {options.right} --right {options.data}"
     if dataset == "images":
-        return "name the folders the other way round with --data and --right"
+        return "swap the folders of --data and --right"
     if dataset == "bag" and options.topics:
         return f"swap them: --topics {','.join(reversed(options.topics.split(',')))}"
     if dataset == "bag":
-        return "name the topics the other way round with --topics"
+        return "swap the two topics of --topics"
     if dataset == "video":
         return "swap the halves of the images: the left camera's half must be on the left"
     folders = {"kitti": "image_0 and image_1", "euroc": "cam0 and cam1"}

@@ -217,7 +217,7 @@ def read_pair(
     if timestamps is None and len(formats) == 2:
         raise InputError(
             f"{estimate} and {ground_truth}: one is a KITTI file, which has no times; "
-            "give its times with --times, or name two KITTI files."
+            "give its times with --times, or give two KITTI files."
         )
     pair = read_trajectory(estimate, timestamps), read_trajectory(ground_truth, timestamps)
     if timestamps is None and formats == {"kitti"} and len(pair[0]) != len(pair[1]):

@@ -80,7 +80,7 @@ def require_place(path: Path, option: str) -> None:
         InputError: ``path`` is a folder, or its parent folder does not exist.
     """
     if path.is_dir():
-        raise InputError(f"{option} {path}: is a folder; name a file.")
+        raise InputError(f"{option} {path}: is a folder; give a file.")
     if not path.absolute().parent.is_dir():
         raise InputError(f"{option} {path}: there is no folder {path.parent}; create it first.")
 
@@ -92,7 +92,7 @@ def require_free(path: Path) -> None:
         InputError: a file or folder exists there.
     """
     if os.path.lexists(path):
-        raise InputError(f"{path}: exists already; remove it, or name another place with --out.")
+        raise InputError(f"{path}: exists already; remove it, or give another path with --out.")
 
 
 def _beside(path: Path) -> Path:

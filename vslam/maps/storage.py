@@ -29,7 +29,7 @@ from vslam.maps.stored_map import StoredMap
 from vslam.untrusted import ARCHIVE_ERRORS, read_json, require_memory
 
 SCHEMA = 8
-_FOREIGN = "not a map of vslam; name a map.npz or the folder of a run"
+_FOREIGN = "not a map of vslam; give a map.npz or the folder of a run"
 
 
 def save_map(path: Path | str, stored: StoredMap, *, resumable: bool = False) -> None:
@@ -207,7 +207,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
     except OSError as error:
         why = error.strerror or error
         raise InputError(
-            f"{path}: cannot be read ({why}); name a map.npz or the folder of a run."
+            f"{path}: cannot be read ({why}); give a map.npz or the folder of a run."
         ) from error
     except BadZipFile as error:
         raise InputError(f"{path}: {_FOREIGN}, or the file is damaged ({error}).") from error

@@ -45,10 +45,10 @@ def read_run(folder: Path | str) -> FinishedRun:
     """
     folder = Path(folder)
     if not (folder / "map.npz").is_file():
-        raise InputError(f"{folder}: no map.npz here; name the folder of a run, like runs/latest.")
+        raise InputError(f"{folder}: no map.npz here; give the folder of a run, like runs/latest.")
     stored = load_map(folder / "map.npz")
     if not stored.map.n_keyframes:
-        raise InputError(f"{folder / 'map.npz'}: the map is empty; name a run that has one.")
+        raise InputError(f"{folder / 'map.npz'}: the map is empty; give a run that has one.")
     return FinishedRun(
         folder, ReportJson.read(folder / "report.json"), stored.map, stored.camera, stored.loops
     )
@@ -102,5 +102,5 @@ def keyframe_frames(run: FinishedRun, source: Source) -> Iterator[TimedFrame]:
 def _other_images(run: FinishedRun) -> InputError:
     return InputError(
         f"{run.report.dataset} {run.report.sequence}: the times or the camera differ from those of "
-        f"{run.folder}; use --data to name the data that the run was made on."
+        f"{run.folder}; use --data to give the data that the run was made on."
     )

@@ -64,7 +64,7 @@ def create_run_folder(
     except OSError as error:
         raise InputError(
             f"{out}: cannot create a run folder here ({error.strerror}); "
-            "name a writable folder with --out."
+            "give a writable folder with --out."
         ) from error
     with contextlib.suppress(OSError):
         (out / "latest").unlink(missing_ok=True)
@@ -172,7 +172,7 @@ class Results:
         elif all((self.folder / name).exists() for name in ("autosave.npz", "run.json")):
             remedy = f"free some space, then vslam run --resume {self.folder}"
         else:
-            remedy = "free some space or name another folder with --out"
+            remedy = "free some space or give another folder with --out"
         raise ResultsError(
             f"{self.folder}: {failed}, all other results were written; {remedy}."
         ) from first

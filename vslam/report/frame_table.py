@@ -92,7 +92,7 @@ def read_covariances(
                 found[time] = both[0], both[1]
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be read ({error.strerror}); name the folder of a run, or repeat it."
+            f"{path}: cannot be read ({error.strerror}); give the folder of a run, or repeat it."
         ) from error
     except (ValueError, csv.Error) as error:
         raise InputError(f"{path}: damaged ({error}); repeat the run.") from error

@@ -33,7 +33,7 @@ _PHONE, _PAD = 48, 2  # width of a phone and the space between two columns, in c
 
 
 def write_files(
-    folder: Path, files: Mapping[str, str | bytes], fix: str = "name another folder"
+    folder: Path, files: Mapping[str, str | bytes], fix: str = "give another folder"
 ) -> None:
     """Write files into a folder, which is created if it does not exist.
 

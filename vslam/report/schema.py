@@ -40,7 +40,7 @@ class Document(Record):
             if found == known:
                 return cls.model_validate(content)
         except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-            raise InputError(f"{path}: missing or damaged; name the folder of a run.") from error
+            raise InputError(f"{path}: missing or damaged; give the folder of a run.") from error
         raise InputError(
             f"{path}: report schema {found}, but this version of vslam reads {known}; repeat the "
             "run with this version."

@@ -29,7 +29,8 @@ class GpsTrack:
         geodetic: ``(N, 3)`` latitude and longitude (degrees) and altitude (m) of the frames.
         datum: ``(3,)`` latitude, longitude and altitude of the origin of the frame ENU. The origin
             is the first GPS fix.
-        visual: ``(N, 3)`` positions of the trajectory without GPS, rigidly aligned with the fixes.
+        visual: ``(N, 3)`` positions of the trajectory without GPS. The whole trajectory is aligned
+            with the fixes by one transformation.
         fixes: ``(M, 3)`` positions of the antenna in ENU, from the fixes within the time of tracked
             frames.
         antenna: ``(3,)`` position of the antenna in the frame of the camera, in metres.

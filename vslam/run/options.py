@@ -66,7 +66,7 @@ def write_options(folder: Path, options: RunOptions) -> None:
         (folder / OPTIONS).write_text(text + "\n", encoding="utf-8")
     except OSError as error:
         raise InputError(
-            f"{folder / OPTIONS}: cannot be written ({error.strerror}); use --out to name a folder "
+            f"{folder / OPTIONS}: cannot be written ({error.strerror}); use --out to give a folder "
             "on a disk with free space."
         ) from error
 
@@ -106,7 +106,7 @@ def read_options(folder: Path) -> RunOptions:
         return RunOptions.model_validate_json(path.read_bytes())
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be read ({error.strerror}); name the folder of a run."
+            f"{path}: cannot be read ({error.strerror}); give the folder of a run."
         ) from error
     except ValidationError as error:
         raise InputError(f"{path}: damaged or from another version; start a new run.") from error

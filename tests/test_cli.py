@@ -156,7 +156,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--data nowhere", ["nowhere", "no such file or folder", "--data"]),
         ("--data .", ["the folder is empty", "--data"]),
         ("nowhere", ["nowhere", "no such file or folder", "--data"]),
-        ("nowhere --data .", ["nowhere: --data also names data"]),
+        ("nowhere --data .", ["nowhere: data is also given with --data"]),
         ("--data other", ["not a known data set", "sequences", "mav0", "rgb.txt"]),
         ("--data 77 --sensor mono", ["camera 77", "no such device"]),
         ("--dataset images --data . --fps 0", ["--fps 0", "positive"]),

@@ -1,4 +1,4 @@
-"""Read the folder of a finished run: its map and images."""
+"""The folder of a finished run: its map and its images."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _WITHOUT_IMAGES = "export g2o, euroc or ply --no-colours, which need no images"
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """The content of a run's folder.
+    """The content of the folder of a run.
 
     ``map`` contains no culled keyframes. ``loops`` are the closed loops, with the relative poses
     that verification measured.
@@ -40,8 +40,8 @@ def read_run(folder: Path | str) -> FinishedRun:
     """Read the report and the map of a run.
 
     Raises:
-        InputError: the folder is not that of a run, or its map is missing, empty or of another
-            version of vslam.
+        InputError: the folder is not the folder of a run, or its map is missing, empty or from
+            another version of vslam.
     """
     folder = Path(folder)
     if not (folder / "map.npz").is_file():
@@ -62,11 +62,12 @@ def open_images(
     """Open the images of a run again, with the options in its ``run.json``.
 
     Args:
-        data: the location of the data if it has moved; None for the location in ``run.json``.
-        on_render: as in :func:`vslam.datasets.open_sequence`.
+        data: the new location of the data if it has been moved. With None, the location in
+            ``run.json`` is used.
+        on_render: as in ``vslam.datasets.open_sequence``.
 
     Raises:
-        InputError: the images are missing, are of another camera, or came from a live camera, or
+        InputError: the images are missing, belong to another camera or came from a live camera, or
             the map was made from several drives.
     """
     if set(run.map.sessions) != {run.map.scalars.session}:  # the report is of the last drive
@@ -87,10 +88,10 @@ def open_images(
 
 
 def keyframe_frames(run: FinishedRun, source: Source) -> Iterator[TimedFrame]:
-    """The frames of a run's keyframes, in the order of its map.
+    """The frames that became the keyframes of a run, in the order of the map.
 
     Raises:
-        InputError: the times differ from those of the run.
+        InputError: the timestamps differ from the timestamps of the run.
     """
     frames = frames_at(source, run.map.frames.tolist())
     for frame, time in zip_longest(frames, run.map.timestamps.tolist()):

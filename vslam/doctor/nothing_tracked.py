@@ -1,4 +1,4 @@
-"""Explain why a run tracked no frame, from a few of its frames."""
+"""Explanation why a run tracked no frame. A few of its frames are examined."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ _FRAMES = 3  # enough to tell the sign of the disparity, because each has hundre
 
 
 def why_nothing_was_tracked(outcome: RunOutcome) -> str | None:
-    """Explain in one sentence why no frame of a run was tracked and what the user can do; None if a
-    frame was tracked."""
+    """Explain in one sentence why no frame of a run was tracked, and what the user can do.
+
+    The result is None if a frame was tracked.
+    """
     n, options = len(outcome.tracks), outcome.settings
     if n == 0 or outcome.n_tracked:
         return None
@@ -46,7 +48,8 @@ def why_nothing_was_tracked(outcome: RunOutcome) -> str | None:
 
 
 def _negative_disparity(source: Source) -> float | None:
-    """Median disparity (px) of a few frames if left and right seem to be swapped, else None."""
+    """Median disparity (px) of a few frames if left and right seem to be swapped; otherwise
+    None."""
     found = []
     try:
         for frame in islice(source.frames(), _FRAMES):

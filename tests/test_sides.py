@@ -247,7 +247,7 @@ def test_a_fault_of_the_rig_is_said_with_its_size():
     assert residual_warnings(RigResiduals(1e-4, 0.05), CAMERA) == []
     assert residual_warnings(RigResiduals(float("nan"), 0.05), CAMERA) == []
     (said,) = residual_warnings(RigResiduals(1.2e-3, 0.2), CAMERA)
-    assert "right one is at least 1.2 ms late" in said
+    assert "right camera is at least 1.2 ms late" in said
     (said,) = residual_warnings(RigResiduals(1e-4, -0.3), CAMERA)
     assert "0.30 pixels" in said
     assert "3.4 arc minutes" in said

@@ -13,8 +13,8 @@ from typing import Literal, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-Image = NDArray[np.uint8]  # (H, W) grey
-DepthImage = NDArray[np.float32]  # (H, W) metres along z, 0 where unknown
+Image = NDArray[np.uint8]  # (H, W) grey values
+DepthImage = NDArray[np.float32]  # (H, W) metres along z; 0 means unknown
 Sensor = Literal["stereo", "mono", "rgbd"]
 
 # Disparities are measured more accurately than columns and rows, so the reprojection error
@@ -29,7 +29,7 @@ _OFF_CENTRE = 0.2
 # same factor in x and in y. The ratio of both factors must lie between this number and its inverse.
 _SAME_RATIO = 1.25
 _FACTORS = {0.5: "half", 2.0: "twice"}
-_NARROWEST, _WIDEST = 10.0, 150.0  # degrees; plausible fields of view of a camera on a vehicle
+_NARROWEST, _WIDEST = 10.0, 150.0  # degrees, plausible fields of view of a camera on a vehicle
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Camera:
         """Reject impossible numbers.
 
         Raises:
-            ValueError: a number is impossible; the message says which one.
+            ValueError: a number is impossible. The message says which number.
         """
         size = f"{self.width}x{self.height}"
         if not (self.width > 0 and self.height > 0):
@@ -103,7 +103,7 @@ class Camera:
         return self.baseline == 0.0
 
     def left_camera(self) -> Camera:
-        """The left camera alone."""
+        """The left camera as a single camera."""
         return replace(self, baseline=0.0, depth=False, right_delay=0.0)
 
     @property
@@ -183,7 +183,7 @@ def _cause(across: float, down: float) -> str:
     """
     if min(across, down) <= 0.0 or not 1 / _SAME_RATIO < across / down < _SAME_RATIO:
         return "check the order of its numbers, and whether the images were cropped or turned"
-    ratio = across + down  # 1 for a principal point in the middle
+    ratio = across + down  # it is 1 if the principal point is in the middle
     names = [name for factor, name in _FACTORS.items() if abs(ratio / factor - 1.0) < 0.1]
     times = names[0] if names else f"{ratio:.1f} times"
     return f"the calibration seems to belong to images of {times} this size"
@@ -225,7 +225,8 @@ def check_images(left: Image, second: Image | DepthImage | None, camera: Camera)
     """Check that images match a camera (``Slam.step``).
 
     Raises:
-        ValueError: the sizes, types or number of the images are wrong; the message says which.
+        ValueError: the sizes, the types or the number of the images are wrong. The message says
+            what is wrong.
     """
     other = "depth" if camera.depth else "right"
     if left is None:
@@ -262,7 +263,7 @@ def check_mask(mask: NDArray[np.uint8] | NDArray[np.bool_], camera: Camera) -> N
     """Check that a mask matches a camera (``Slam.step``).
 
     Raises:
-        ValueError: its size or type is wrong; the message says which.
+        ValueError: the size or type of the mask is wrong. The message says what is wrong.
     """
     if mask.shape != (expected := (camera.height, camera.width)):
         raise ValueError(

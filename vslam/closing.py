@@ -77,12 +77,12 @@ class LoopClosing:
         self._consistency = LoopConsistency(config.consistency.model_copy(update=memory))
         self._executor = ThreadPoolExecutor(1, "global-adjustment") if threads > 1 else None
         self._global: _PendingAdjustment | None = None
-        self._followed = 0  # how often an old keyframe was reused instead of inserting a new one
+        self._followed = 0  # number of frames for which an old keyframe was reused
 
     def process(
         self, map_: Map, keyframe: int, features: Features, image: NDArray[np.uint8] | None
     ) -> None:
-        """Search for loops at a keyframe, and close the one that is found."""
+        """Search for loops at a keyframe. If a loop is found, close it."""
         self.merge_adjustment_if_due(map_, keyframe)
         self.close(map_, self.search(map_, keyframe, features, image))
 
@@ -92,7 +92,7 @@ class LoopClosing:
         """Search for a loop at a keyframe after its local mapping. The map is only read."""
         with self._failure_reported("Looking for loops"):
             if self.verifier.is_image_redundant(map_, keyframe):
-                image = None  # then no network processes it
+                image = None  # no network needs this image
             self.detector.add(keyframe, image, features)
             self.verifier.add(map_, keyframe, image)
             return self._find(map_, keyframe, self.detector.query(keyframe, map_))

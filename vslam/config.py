@@ -130,9 +130,9 @@ class StereoConfig(Section):
     in grey levels, and the other image has contrast. A black image is not used. Video of limited
     range (16 to 235) needs about 22. [own]"""
     close_depth_baselines: float = Field(40.0, gt=0)
-    """A stereo point is close if its depth is below this, in baselines. Keyframes map close points
-    from a single stereo pair; most far points are triangulated from several keyframes.
-    [OS2 III-A, printed]"""
+    """A stereo point is close if its depth is below this, in baselines. Close points are mapped
+    from a single stereo pair. Most far points are triangulated from several keyframes. [OS2 III-A,
+    printed]"""
     offset_sigma: float = Field(0.2, ge=0)
     """Prior standard deviation of an offset that all disparities have in common, in pixels. The
     offset is estimated from the motion of the camera (docs/research/motorway.md). A larger value

@@ -52,7 +52,7 @@ def write_file(path: Path, content: str | bytes, fix: str = "free some space") -
     The folder of the file is created if needed.
 
     Raises:
-        ResultsError: the file cannot be written; the message ends with ``fix``.
+        ResultsError: the file cannot be written. The message ends with ``fix``.
     """
     part = path.with_name(f"{path.name}.part")
     try:

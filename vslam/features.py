@@ -13,8 +13,8 @@ from vslam.geometry import inverse
 from vslam.kernels import inline, inner_kernel, kernel
 from vslam.odometry import PoseUncertainty
 
-MIN_DISPARITY = 0.01  # pixels; smaller disparities are clamped to this
-PATCH_RADIUS = 8  # half width of the patch kept around a feature, in pixels of its octave
+MIN_DISPARITY = 0.01  # pixels; smaller disparities are set to this
+PATCH_RADIUS = 8  # half width of the patch around a feature, in pixels of its octave
 PATCH_SIDE = 2 * PATCH_RADIUS + 1
 PATCH_PIXELS = PATCH_SIDE**2
 CELL = 16  # side of a FeatureGrid cell in pixels; search windows are 5 to 60 px wide

@@ -121,7 +121,7 @@ def _aligned(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
         T_new = compose(edge.T_query_match, T_cw[edge.match])
     else:
         T_new = compose(inverse(edge.T_query_match), T_cw[edge.query])
-    T_old_new = compose(inverse(T_cw[moving]), T_new)  # new world to old world
+    T_old_new = compose(inverse(T_cw[moving]), T_new)  # from the new world frame to the old
     for keyframe in keyframes:
         T_cw[keyframe] = orthonormalised(compose(T_cw[keyframe], T_old_new))
     return T_cw

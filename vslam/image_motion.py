@@ -3,10 +3,10 @@
 If the right camera exposes later than the left camera, they are used to correct the columns in the
 right image.
 
-The velocities are those of Longuet-Higgins and Prazdny (Proc. R. Soc. B, 1980), eq. 2.9 to 2.11,
-for the point (x, y, 1) z of the left camera. The paper uses the motion of the camera. Here, the
-twist [v, w] is the motion of the points relative to the camera, so all signs are reversed. In the
-right camera, x is smaller by the baseline divided by z.
+The velocities follow Longuet-Higgins and Prazdny (Proc. R. Soc. B, 1980), eq. 2.9 to 2.11, for the
+point (x, y, 1) z of the left camera. The paper uses the motion of the camera. Here, the twist [v,
+w] is the motion of the points relative to the camera, so all signs are reversed. In the right
+camera, x is smaller by the baseline divided by z.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from vslam.camera import Camera
 from vslam.features import MIN_DISPARITY, shifted_columns
 from vslam.geometry import Matrix
 
-_ROUNDS = 3  # of a fixed-point iteration, because speed and disparity depend on each other
+_ROUNDS = 3  # rounds of a fixed-point iteration: speed and disparity depend on each other
 
 
 def rays(

@@ -175,7 +175,7 @@ def _use_temporary_cache() -> None:
 def _cached(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     """Compile a function with Numba and attach the cache."""
     made = numba.njit(**options)(function)
-    if not isinstance(made, Dispatcher):  # NUMBA_DISABLE_JIT
+    if not isinstance(made, Dispatcher):  # NUMBA_DISABLE_JIT is set
         return made
     dispatcher: Any = made
     try:

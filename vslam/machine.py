@@ -52,7 +52,8 @@ def opencv_conflict(found: dict[str, str]) -> str | None:
 
 
 def available_cores() -> int:
-    """Number of cores that this process may use; a container may have fewer than its machine."""
+    """Number of cores that this process may use. A container may have fewer cores than its
+    machine."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -60,9 +61,9 @@ def available_cores() -> int:
 
 def process_age() -> float:
     """Seconds since this process started."""
-    with suppress(OSError, AttributeError):  # not Linux
-        # The process name, in brackets, may contain spaces; field 22 is the start time in ticks
-        # since boot.
+    with suppress(OSError, AttributeError):  # the system is not Linux
+        # The process name is in brackets and may contain spaces. Field 22 is the start time in
+        # ticks since boot.
         started = Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]
         return time.clock_gettime(time.CLOCK_BOOTTIME) - int(started) / os.sysconf("SC_CLK_TCK")
     import psutil

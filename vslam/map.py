@@ -1,6 +1,6 @@
 """The map: keyframes, landmarks and observations as a structure of arrays.
 
-A *row* is one keypoint of one keyframe; the rows of a keyframe are consecutive. The table of rows
+A *row* is one keypoint of one keyframe. The rows of a keyframe are consecutive. The table of rows
 is also the table of observations. ``landmark[row]`` is the landmark that the keypoint observes, and
 ``next_row`` links the rows of each landmark into a linked list. Covisibility is not stored. It is
 counted from the rows when it is needed. The use of arrays instead of objects follows DPVO's
@@ -31,7 +31,7 @@ from vslam.loops import LoopEdge
 from vslam.map_kernels import count_shared, detach_keyframe, resolve
 
 NONE = -1
-_FEW_LANDMARKS = 8192  # take about 1 MB; dropping fewer culled landmarks is not worth it
+_FEW_LANDMARKS = 8192  # they take about 1 MB; it is not worth dropping fewer landmarks
 
 
 class Arrays(NamedTuple):
@@ -223,7 +223,7 @@ class Map:
         if used + extra <= capacity:
             return
         target = max(used + extra, capacity + capacity // 2)
-        for name in fields:  # one by one, so that only one column exists twice in memory
+        for name in fields:  # only one column at a time exists twice in memory
             grown = _grown(getattr(self.arrays, name), target + (name == "first_row"))
             self.arrays = self.arrays._replace(**{name: grown})
 
@@ -379,7 +379,7 @@ class Map:
             the ``(N,)`` numbers of shared landmarks.
         """
         counts = count_shared(self.arrays, keyframe, self.n_keyframes)
-        enough = np.flatnonzero(counts >= max(1, minimum))  # few; only these are sorted
+        enough = np.flatnonzero(counts >= max(1, minimum))  # few, and only these are sorted
         order = enough[np.argsort(-counts[enough], kind="stable")]
         return order, counts[order]
 
@@ -446,7 +446,7 @@ def loop_of_living(map_: Map, loop: LoopEdge) -> LoopEdge:
     query, match, T = loop.query, loop.match, loop.T_query_match
     if not map_.arrays.keyframe_alive[query]:
         T_parent_query = inverse(map_.keyframes.T_c_parent[query])
-        T_parent_query[:3, 3] /= loop.scale  # to the unit of the match
+        T_parent_query[:3, 3] /= loop.scale  # convert to the unit of the match
         T = compose(T_parent_query, T)
         query = int(map_.parents[query])
     if not map_.arrays.keyframe_alive[match]:

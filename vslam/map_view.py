@@ -15,10 +15,11 @@ from vslam.map_kernels import collect_landmarks, count_seen_by
 
 
 class LocalMap(NamedTuple):
-    """Landmarks around a keyframe.
+    """N landmarks around a keyframe.
 
-    ``ids`` (N,) i4; ``xyz``, ``normal`` (N, 3) f8; ``distance_range`` (N, 2) f8; ``descriptor``
-    (N, 4) u8.
+    Attributes:
+        ids: ``(N,)`` int32.
+        xyz, normal, distance_range, descriptor: ``(N, ...)`` columns of ``Arrays``.
     """
 
     ids: NDArray[np.int32]

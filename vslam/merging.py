@@ -62,7 +62,7 @@ def merge_maps(
         on_keyframe: function that is called after the search for loops at each keyframe.
 
     Raises:
-        ValueError: the maps cannot be merged; the message gives the reason in a few words.
+        ValueError: the maps cannot be merged. The message gives the reason in a few words.
     """
     whole, waiting = maps[0].compact(), dict(enumerate(maps))
     del waiting[0]

@@ -27,7 +27,8 @@ class Mode:
 
     @property
     def due(self) -> int:
-        """Index of the frame that is to become a keyframe; -1 if none is planned."""
+        """Index of the frame that is planned to become a keyframe. It is -1 if no keyframe is
+        planned."""
         return -1
 
     def begin(self, frame: PlacedFrame) -> bool:

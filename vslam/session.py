@@ -65,7 +65,7 @@ def open_map(
         resume: continue the last drive of the map instead of starting a new drive.
 
     Raises:
-        ValueError: the map cannot be continued; the message gives the reason in a few words.
+        ValueError: the map cannot be continued. The message gives the reason in a few words.
     """
     if localize and (stored is None or not stored.map.n_keyframes):
         raise ValueError("there is no map to localise in")

@@ -179,7 +179,7 @@ def read_trajectory(path: Path | str, timestamps: NDArray[np.float64] | None = N
 
 def write_kitti(path: Path | str, T_wc: NDArray[np.float64]) -> None:
     """Write ``(N, 4, 4)`` poses in KITTI's format with 13 significant digits."""
-    rows = T_wc[:, :3, :].reshape(-1, 12) + 0.0  # turns -0 into 0, so equal poses give equal bytes
+    rows = T_wc[:, :3, :].reshape(-1, 12) + 0.0  # -0 becomes 0, so equal poses give equal bytes
     lines = (" ".join([f"{x:.12e}" for x in row]) + "\n" for row in rows.tolist())
     Path(path).write_text("".join(lines))
 

@@ -24,7 +24,7 @@ many pixels."""
 
 _OPENCV_LIMIT = "OPENCV_IO_MAX_IMAGE_PIXELS"
 _ANY_SIZE = 2**27  # bytes; any archive may unpack to this size
-_MOST_PACKED = 20  # an archive that unpacks to more must have at least 1/20 of the unpacked size
+_MOST_PACKED = 20  # a larger archive must have at least 1/20 of its unpacked size
 ARCHIVE_ERRORS = (
     EOFError, ValueError, KeyError, RuntimeError, OverflowError, zlib.error,
     zipfile.BadZipFile, zipfile.LargeZipFile,

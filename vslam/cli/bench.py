@@ -35,7 +35,7 @@ from vslam.errors import counted
 if TYPE_CHECKING:
     from vslam.datasets.sources import SourceOptions
 
-_UNKNOWN_LENGTH = 1000  # frames assumed for a stream of unknown length, to estimate the time
+_UNKNOWN_LENGTH = 1000  # frames; a stream of unknown length is assumed to be this long
 _FIRST_SEQUENCES = "00-05"
 _EXAMPLES = """
 [b]Examples[/b]

@@ -28,7 +28,7 @@ _EXAMPLES = """
   vslam calibrate cam_april/mav0 --board april_6x6.yaml --lens fisheye --out stereo.yaml
 """
 _MOST_SEARCHED = 300  # images, which are spread evenly over the source; this takes 1 to 2 minutes
-_EXAMINED = 10  # images in which other boards are searched for, if the given one is not found
+_EXAMINED = 10  # images in which other boards are searched for if the given board is not found
 
 app = typer.Typer()
 

@@ -110,7 +110,7 @@ def drive(
         raise ResultsError(f"{folder}: ended early: {outcome.interrupted}{fix}.")
     if gps_error and not why:
         raise ResultsError(
-            f"{folder}: no trajectory by GPS, all other results were written: {gps_error}"
+            f"{folder}: no trajectory with GPS, all other results were written: {gps_error}"
         )
     if why or outcome.interrupted:
         raise typer.Exit(1)
@@ -247,4 +247,4 @@ def _recorder(
         recorders.append(moments)
     if not recorders:
         return Recorder()
-    return SeveralRecorders((pictures, *recorders))  # pictures first, because the others use them
+    return SeveralRecorders((pictures, *recorders))  # the other recorders use the pictures

@@ -42,7 +42,7 @@ def evaluate_files(
         AlignmentName | None,
         typer.Option(
             metavar="se3|sim3|none",
-            help="Alignment with the ground truth; [b]sim3[/b] also fits the scale.",
+            help="Alignment with the ground truth. [b]sim3[/b] also fits the scale.",
             show_default="sim3 for a monocular run, otherwise se3",
         ),
     ] = None,

@@ -83,7 +83,7 @@ def _described(parameter: Any) -> Text:
     if isinstance(parameter.show_default, str):
         default = parameter.show_default
     elif not parameter.show_default or isinstance(default, bool):
-        default = None  # the names of a flag show what it changes
+        default = None  # the names of a flag already show its effect
     if parameter.required:
         text.append(" [required]", "red")
     elif default not in (None, "", ()):

@@ -34,7 +34,7 @@ DETECTOR_NAMES = _with_plugins(
 if TYPE_CHECKING:
     SourceName = str
     DetectorName = str
-else:  # plug-ins add names
+else:  # plug-ins can add names
     SourceName = Literal[(*_DATASETS, *_SOURCES)]
     DetectorName = Literal[DETECTOR_NAMES]
 # Panels of --help.

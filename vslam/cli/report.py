@@ -34,7 +34,7 @@ def report(
             metavar="NAME=FILE",
             help="Trajectory of another system, in the format of KITTI or TUM. "
             "NAME@SEQ@PERTURB=FILE also gives its sequence and perturbation. The trajectory is "
-            "aligned like the runs of the sequence; a NAME that ends in ', mono' also fits the "
+            "aligned like the runs of the sequence. A NAME that ends in ', mono' also fits the "
             "scale.",
         ),
     ] = None,

@@ -43,7 +43,7 @@ _EXAMPLES = """
 
 To resume a stress test that was stopped, repeat the command (docs/howto/stress.md).
 """
-_FAILURE = "Failure"  # a panel of --help
+_FAILURE = "Failure"  # name of a panel of --help
 
 
 app = typer.Typer()

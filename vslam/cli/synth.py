@@ -21,7 +21,7 @@ _EXAMPLES = """
   vslam synth demo --pairs 1000 --aliased --change 0.8 --out pairs
   vslam synth 05 --pairs 500 --lateral=-3.2:1.4 --heading 0:30 --out pairs
 """
-_DRIVE, _TOWN, _PAIRS = "Drive", "Town", "Pairs of images"  # panels of --help
+_DRIVE, _TOWN, _PAIRS = "Drive", "Town", "Pairs of images"  # names of panels of --help
 
 
 app = typer.Typer()

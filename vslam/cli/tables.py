@@ -51,7 +51,7 @@ def print_summary(report: ReportJson, folder: Path) -> None:
 
 def _how_to_compare(report: ReportJson) -> Rows:
     """A hint on how to compare detectors, if the data has ground truth."""
-    refused = report.realtime or report.map is not None  # --compare is not possible
+    refused = report.realtime or report.map is not None  # --compare would be refused
     if report.detectors or report.compare or report.alignment is None or refused:
         return []
     if report.detector in ("bow", "none"):

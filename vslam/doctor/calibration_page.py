@@ -21,12 +21,12 @@ _FEW_VIEWS = 10
 # A view counts as tilted above the first number, in degrees. The second number is the least number
 # of tilted views. Views of a board that faces the camera do not determine the focal length.
 _TILT, _FEW_TILTED = 15.0, 3
-_CELLS = (8, 6)  # cells of the image, across and down
+_CELLS = (8, 6)  # number of cells across and down the image
 _COVERED = 0.6  # least share of cells with corners; a whole board hardly reaches the image border
-_LARGE_PX = 0.5  # largest RMS in images up to the common width; larger in proportion to the width
+_LARGE_PX = 0.5  # largest RMS, for images of at most the common width; it grows with the width
 _COMMON_WIDTH = 640
-_APART_PX = 2.0  # largest RMS of the pair: more shows that the board moved between the two images
-_SHARED = 0.2  # largest share of the squared residuals that is systematic, see _shared
+_APART_PX = 2.0  # largest RMS of the pair; a larger error means that the board moved
+_SHARED = 0.2  # largest systematic share of the squared residuals (_shared)
 _MOST_DROPPED = 0.25
 _ARROW = 0.02  # length of an arrow of the RMS error, relative to the image width
 

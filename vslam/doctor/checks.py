@@ -21,28 +21,28 @@ from vslam.errors import counted
 from vslam.frontend.orb import extract
 
 Times = NDArray[np.float64]
-Depth = NDArray[Any]  # of any number type; 0 or NaN where the depth is missing
+Depth = NDArray[Any]  # any type of number; 0 or NaN means that the depth is missing
 
 # A run searches for stereo matches within 2 rows. KITTI's rectification has an error of 0.3 to 0.5
 # px.
 ROWS_PX = 0.8
-IN_FRONT = 0.9  # least share of positive disparities; distant points scatter about 0
-EXPOSURE = 0.25  # largest relative difference in brightness; stereo matching compares grey values
+IN_FRONT = 0.9  # least share of positive disparities; those of distant points scatter around 0
+EXPOSURE = 0.25  # largest relative difference in brightness, because matching compares grey values
 # A lag in frames is reported only if it reduces the row error by at least this many pixels, and to
 # at most this fraction.
 LAG_GAIN_PX, LAG_FACTOR = 0.25, 0.6
-FEATURES = 0.5  # least share of the requested features
+FEATURES = 0.5  # least share of the requested number of features
 # Contrast of pixels with their neighbours, relative to the contrast with a wider neighbourhood. It
 # is 0.43 for KITTI, 0.25 for TUM and 0.27 for EuRoC. After a Gaussian blur of 1.5 px, it is at most
 # 0.17.
 SHARP = 0.18
-JITTER = 0.2  # largest standard deviation, relative to the interval
+JITTER = 0.2  # largest standard deviation of the steps, relative to the interval
 GAP = 1.75  # a longer step, in intervals, means that a frame is missing
 # Largest share of steps with a gap. Two standard deviations are added, because the share is
 # uncertain if there are few steps.
 GAPS = 0.05
 LONG_GAP = 3.5  # a longer step, in intervals, means that several frames in a row are missing
-DEPTH_PX = 4.0  # depth edges of structured light are off by 2 to 3 px
+DEPTH_PX = 4.0  # largest shift; depth edges of structured light are off by 2 to 3 px
 DEPTH_SHARE = 0.3  # smallest share of pixels with a depth
 # Misregistered depth is reported only if the fit has one clear peak away from shift 0. Heights are
 # measured above the median of the fit, relative to the highest peak. For correct depth, in nine
@@ -51,7 +51,7 @@ DEPTH_SHARE = 0.3  # smallest share of pixels with a depth
 # the second peak is then mostly 0.65 to 0.77.
 DEPTH_AT_ZERO = 0.6
 DEPTH_SECOND = 0.8
-_ANOTHER_PX = 8.0  # smallest distance of the second peak from the highest one
+_ANOTHER_PX = 8.0  # smallest distance of the second peak from the highest peak
 DEPTH_VIEWS = 2  # least number of different views; a single view may fit a wrong shift by chance
 NEAREST_M, FARTHEST_M = 0.01, 3.0  # plausible baselines of a stereo pair on a vehicle
 # With the right calibration, the fitted factor of the focal length is 0.975 to 1.026. This was
@@ -59,7 +59,7 @@ NEAREST_M, FARTHEST_M = 0.01, 3.0  # plausible baselines of a stereo pair on a v
 # length is 10 % too long, the factor is 0.89 to 0.93.
 FOCAL = 0.05
 FOCAL_SIGMA = 0.01  # largest sigma of a fit that is used; on straight roads, it is 0.05 or more
-TURNED = 2.0  # least rotation in degrees; on straight roads, up to 1.6 within four frames
+TURNED = 2.0  # least rotation in degrees; a straight road has up to 1.6 within four frames
 NEAREST_DEPTH_M, FARTHEST_DEPTH_M = 0.05, 100.0  # plausible median depths of a sensor
 _BORDER = 2  # px; if a peak is this near the end of the search range, the true peak may lie outside
 _REACH = 16, 48  # px, vertical and horizontal search range; the sensors are side by side
@@ -170,7 +170,7 @@ def check_exposure(pairs: Sequence[tuple[Image, Image]], several: Sequence[Match
         "exposure",
         abs(np.log(ratio)) > np.log1p(EXPOSURE),
         f"the right image is {ratio:.2f} times as bright as the left one",
-        "let one camera set the exposure and gain of both",
+        "let one camera set the exposure and gain of both cameras",
     )
 
 
@@ -258,7 +258,7 @@ def check_times(timestamps: Times) -> list[Finding]:
             if len(backwards)
             else f", {1 / interval:.1f} Hz"
         ),
-        "sort the frames by time and drop repeated ones",
+        "sort the frames by time and drop repeated frames",
     )
     if len(backwards):
         return [order]

@@ -24,15 +24,15 @@ from vslam.errors import UnreadableImageError, counted, write_file
 from vslam.report.page import Figure, Page, Section
 from vslam.report.render import html
 
-_FRAMES = 8  # examined frames, spread over the sequence
-_LAGS = range(-2, 3)  # delays of the right image, in frames, that are tried
+_FRAMES = 8  # number of examined frames, which are spread over the sequence
+_LAGS = range(-2, 3)  # delays of the right image that are tried, in frames
 # For the check of the focal length: the number of pairs of frames, the number of frames from the
 # first to the second frame of a pair, and the least and largest number of common points.
 _TURNS, _LATER = 16, 4
 _FEWEST, _MOST = 30, 200
 _PICTURES = 2
 _LEAST_DISPARITY = 1.0  # px
-_DRAWN = 60  # matches drawn in a picture
+_DRAWN = 60  # number of matches that are drawn in a picture
 _GAP = 48  # px between the two images of a picture
 _GREEN, _RED = (80, 200, 60), (60, 60, 230)  # BGR
 
@@ -251,7 +251,7 @@ def _stereo_picture(pair: _Pair) -> Picture:
     agree."""
     left, right, matches = pair.left, pair.right, pair.matches
     height, width = left.shape
-    begin = width + _GAP  # of the right image
+    begin = width + _GAP  # first column of the right image
     canvas = np.full((max(height, right.shape[0]), begin + right.shape[1]), 255, np.uint8)
     canvas[:height, :width] = left
     canvas[: right.shape[0], begin:] = right

@@ -19,14 +19,14 @@ from vslam.camera import Camera
 
 Vectors = NDArray[np.float64]
 
-_PIXEL, _DISPARITY = 0.35, 0.3  # px, standard deviations of matches refined by optical flow
+_PIXEL, _DISPARITY = 0.35, 0.3  # px, standard deviations of refined matches
 # Squared error, divided by its variance, at which the weight of a point is one half. For 95 % of
 # the inliers, the squared error is less than 6 times the variance.
 _CAUCHY = 5.0
 _ITERATIONS = 12
 _FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.6, 1.8, 2.0)  # of the coarse search
-_PRECISION = 1e-3  # of the logarithm of the factor
-_STEP = 0.02  # of the logarithm of the factor, to measure the curvature at the minimum
+_PRECISION = 1e-3  # precision of the logarithm of the factor
+_STEP = 0.02  # step of the logarithm of the factor, to measure the curvature at the minimum
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def _project(
     z = f[0] * camera.baseline / disparity
     points = np.column_stack([(xy - centre) / f * z[:, None], z])
     points = points @ cv2.Rodrigues(pose[:3])[0].T + pose[3:]
-    ahead = np.maximum(points[:, 2:], 1e-3 * camera.baseline)  # points behind get large errors
+    ahead = np.maximum(points[:, 2:], 1e-3 * camera.baseline)  # points behind it get large errors
     return points[:, :2] / ahead * f + centre, points
 
 

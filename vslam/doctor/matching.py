@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from vslam.camera import Image
 
 _FEATURES = 2000
-_MAX_DISTANCE = 64  # bits of 256; ORB-SLAM2's TH_LOW is 50
+_MAX_DISTANCE = 64  # bits, of 256; TH_LOW of ORB-SLAM2 is 50
 _EPIPOLAR_PX = 1.5
-_REFINED_PX = 3.0  # largest move by refinement: keypoints of coarse octaves can be this inaccurate
+_REFINED_PX = 3.0  # largest refinement; keypoints of coarse octaves can be this inaccurate
 _WINDOW = (15, 15)
 _MIN_MATCHES = 12
 _ANOTHER_VIEW = 0.25  # least median motion between two different views, relative to the image width

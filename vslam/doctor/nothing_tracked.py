@@ -13,7 +13,7 @@ from vslam.errors import InputError, counted
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
 
-_FRAMES = 3  # enough to tell the sign of the disparity, because each has hundreds of matches
+_FRAMES = 3  # they determine the sign of the disparity: each has hundreds of matches
 
 
 def why_nothing_was_tracked(outcome: RunOutcome) -> str | None:

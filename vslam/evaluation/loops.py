@@ -18,10 +18,10 @@ from vslam.loops import LoopEdge
 from vslam.run.outcome import RunOutcome, ground_truth_of
 
 # Definition of a revisit.
-MIN_LENGTH_M = 20.0  # of the stretch
-MAX_LATERAL_M = 5.0  # from the earlier path; the next lane is 3 to 4 m away
-MAX_HEADING_DEG = 30.0  # between the optical axes; seen from behind, a place looks different
-MIN_SECONDS, MIN_PATH_M = 10.0, 50.0  # since the earlier passage
+MIN_LENGTH_M = 20.0  # least length of a stretch
+MAX_LATERAL_M = 5.0  # distance from the earlier path; the next lane is 3 to 4 m away
+MAX_HEADING_DEG = 30.0  # angle between the optical axes; a place looks different from behind
+MIN_SECONDS, MIN_PATH_M = 10.0, 50.0  # time and distance since the earlier passage
 # Two stretches with a shorter gap between them count as one stretch, because tracking continues in
 # the old map across the gap.
 MAX_INTERRUPTION_M = 10.0
@@ -30,7 +30,7 @@ MAX_INTERRUPTION_M = 10.0
 MAX_TRANSLATION_M, MAX_ROTATION_DEG = 2.0, 5.0
 _SAMPLE_M = 1.0  # the path is sampled once per metre, so that a standing camera adds no samples
 _UNIT_FRAMES = 20  # frames before and after a frame from which the unit of the map is estimated
-_MAX_STEP_M = 20.0  # between two frames that are farther apart, the path is unknown
+_MAX_STEP_M = 20.0  # the path is unknown between two frames that are farther apart
 
 Indices = NDArray[np.int64]
 Poses = NDArray[np.float64]
@@ -236,7 +236,7 @@ def is_right_loop(edge: LoopEdge, frames: Indices, T_wc: Poses) -> bool | None:
         return None
     T_wq, T_wm = T_wc[query], T_wc[match]
     T_match_query = inverses(T_wm[None])[0] @ T_wq
-    error = edge.T_query_match @ T_match_query  # the identity if the edge is right
+    error = edge.T_query_match @ T_match_query  # it is the identity if the edge is right
     cosine = np.clip((np.trace(error[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)
     return bool(
         np.linalg.norm(error[:3, 3]) <= MAX_TRANSLATION_M
@@ -254,7 +254,7 @@ def _earlier_passage(
     from scipy.spatial import cKDTree
 
     position, axis = T_wc[:, :3, 3], T_wc[:, :3, 2]
-    forward = np.diff(position, axis=0, append=position[-1:])  # to the next sample
+    forward = np.diff(position, axis=0, append=position[-1:])  # vector to the next sample
     length = np.linalg.norm(forward, axis=1)
     forward[length > _MAX_STEP_M] = 0.0
     length[length > _MAX_STEP_M] = 0.0

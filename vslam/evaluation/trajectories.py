@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from vslam.errors import InputError, counted
 from vslam.trajectory import Trajectory, read_table, read_trajectory, trajectory_format
 
-MAX_TIME_DIFFERENCE_S = 0.01  # evo's default
+MAX_TIME_DIFFERENCE_S = 0.01  # the default of evo
 _LENGTHS_M = np.arange(100.0, 801.0, 100.0)
 _STEP_FRAMES = 10
 _EVO_FLAGS = {"se3": " --align", "sim3": " --align --correct_scale", "none": ""}
@@ -248,7 +248,7 @@ def _associate(estimate: Trajectory, ground_truth: Trajectory) -> tuple[Trajecto
         times, true_times, rtol=0.0, atol=MAX_TIME_DIFFERENCE_S
     ):
         return estimate, ground_truth
-    if len(true_times) > len(times):  # like evo, look up the shorter trajectory in the longer one
+    if len(true_times) > len(times):  # evo also looks up the shorter in the longer
         matched, true = matching_time_indices(times, true_times, MAX_TIME_DIFFERENCE_S)
     else:
         true, matched = matching_time_indices(true_times, times, MAX_TIME_DIFFERENCE_S)

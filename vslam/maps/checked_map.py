@@ -71,10 +71,10 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "frame_unit_scale": (np.float64, ("F",)),
 }
 _MAY_BE_NAN = {"row_u_right"}
-_MOST = 1e12  # metres, pixels or seconds; products of a few numbers below this are finite
+_MOST = 1e12  # metres, pixels or seconds; the product of a few smaller numbers is finite
 _ROTATION_TOLERANCE = 1e-6
 _MOST_PIXELS = 1e6  # width, height and focal length of a camera
-_MAX_OFFSET = 100.0  # pixels
+_MAX_OFFSET = 100.0  # pixels, of the disparity
 _MAX_SESSION = 2**31  # it must fit into a column of the map
 
 

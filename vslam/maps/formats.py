@@ -17,7 +17,7 @@ T_SAVED_WORLD = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
 T_CAMERA_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-_LUMA = np.array([299, 587, 114])  # ITU-R BT.601, in thousandths
+_LUMA = np.array([299, 587, 114])  # weights of ITU-R BT.601, in thousandths
 
 
 def save_nerfstudio(

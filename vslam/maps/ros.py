@@ -34,9 +34,9 @@ Types = Callable[[str], Any]
 T_BASE_OPTICAL = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
-_LAST_SECOND = 2**31  # builtin_interfaces/Time counts seconds in 32 bits with a sign
+_LAST_SECOND = 2**31  # builtin_interfaces/Time counts seconds as a signed 32-bit number
 _FLOAT32 = 7  # sensor_msgs/PointField
-_VERSION: Literal[8] = 8  # bag version of ROS 2 Humble, which later releases read, too
+_VERSION: Literal[8] = 8  # bag version of ROS 2 Humble; later releases read it, too
 # The message type of each topic, and whether the topic is latched. A latched topic has a single
 # message, which subscribers that connect later also receive.
 TOPICS = {

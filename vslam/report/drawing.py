@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 BLUE, GREEN, AMBER, RED, GREY = "#3b82f6", "#10b981", "#f59e0b", "#ef4444", "#94a3b8"
 VIOLET = "#8b5cf6"
-COMPARED = ("#ec4899", "#f97316", "#06b6d4")  # colours of the detectors of --compare, repeated
+COMPARED = ("#ec4899", "#f97316", "#06b6d4")  # colours of the detectors of --compare
 STATE_COLORS = {
     TrackingState.WEAK: AMBER, TrackingState.LOST: RED, TrackingState.DROPPED: VIOLET,
 }  # fmt: skip
@@ -64,8 +64,8 @@ STYLE = {
 # width.
 WIDTH, LOW, SQUARE = 4.6, 2.5, 5.4
 DOTS_PER_INCH = 200
-_LEGEND_CHARACTERS = 60  # that fit side by side
-_HANDLE_CHARACTERS = 6  # width of the line or marker of an entry and of the gap to the next entry
+_LEGEND_CHARACTERS = 60  # number of characters that fit side by side
+_HANDLE_CHARACTERS = 6  # width of the marker of an entry and of the gap to the next entry
 
 Drawing = tuple[str, str, Figure]  # name, caption and figure
 

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 _STAGE_COLORS = [BLUE, AMBER, GREEN, VIOLET, "#ec4899", "#06b6d4", "#84cc16", "#f97316", GREY]
 _MOTION_S = 1.0  # duration of the motions whose errors are drawn
-_MAX_BINS = 240  # in the plot of stacked times, so that a bin is one or two pixels wide
+_MAX_BINS = 240  # in the plot of stacked times; a bin is then one or two pixels wide
 
 
 def draw_figures(
@@ -217,7 +217,7 @@ def _stage_times(outcome: RunOutcome) -> Figure:
         np.repeat(mean, 2, axis=0).T,
         labels=names,
         colors=_stage_colors(names),
-        antialiased=False,  # no hairlines between the bands
+        antialiased=False,  # antialiasing would leave thin lines between the bands
         linewidth=0,
     )
     axes.set_ylim(bottom=0)

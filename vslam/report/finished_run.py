@@ -70,7 +70,7 @@ def open_images(
         InputError: the images are missing, belong to another camera or came from a live camera, or
             the map was made from several drives.
     """
-    if set(run.map.sessions) != {run.map.scalars.session}:  # the report is of the last drive
+    if set(run.map.sessions) != {run.map.scalars.session}:  # the report covers only the last drive
         raise InputError(
             f"{run.folder}: the map was made from several drives, whose images cannot be opened "
             f"together; {_WITHOUT_IMAGES}."

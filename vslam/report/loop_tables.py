@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _MAX_CLOSED = 60
 _MAX_REJECTED = 12
-_MAX_PICTURES = 6  # about 0.5 MB of the page
+_MAX_PICTURES = 6  # they take about 0.5 MB of the page
 _DESCRIPTORS = {"orb": "ORB descriptors", "learned": "learned descriptors"}
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
@@ -54,7 +54,7 @@ def _revisits(report: ReportJson) -> Table:
 
 def _closed(report: ReportJson) -> Table:
     closed = [loop for loop in report.loops if loop.accepted]
-    closed.sort(key=lambda loop: loop.right is not False)  # stable: wrong ones come first
+    closed.sort(key=lambda loop: loop.right is not False)  # stable; wrong loops come first
     rows: list[Row] = [
         (
             *_evidence(loop),

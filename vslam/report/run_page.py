@@ -33,7 +33,7 @@ _ALIGNMENTS = {
     "sim3": "Sim3 alignment",
     "none": "not aligned",
 }
-_MANY_LOST = 0.1  # share of the frames
+_MANY_LOST = 0.1  # as a share of the frames
 _COMPARED = (
     ("lost", "lost_frames", "{}"),
     ("ATE", "ate_rmse_m", "{:.3f} m"),

@@ -40,7 +40,7 @@ _OPTIONS = (
 )  # fmt: skip
 
 _WRONG_SCALE = 1.2  # smallest factor that is reported; drift changes the scale by a few per cent
-_LEFT_OVER = 0.3  # largest share of the error, and of the path's size, left after scaling
+_LEFT_OVER = 0.3  # largest share of the error, and of the size of the path, after scaling
 
 
 def summarize(
@@ -167,7 +167,7 @@ def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
         return None, "no frames"
     try:
         found = evaluate_trajectory(outcome.trajectory, ground_truth, outcome.alignment)
-    except InputError as error:  # too short to align; the other results are still of use
+    except InputError as error:  # it is too short to align; the other results are still useful
         return None, str(error)
     if found.frames == len(outcome.trajectory):
         return found, None

@@ -31,7 +31,7 @@ from vslam.trajectory import tum_line
 
 MAP, PROGRESS, ONLINE = "autosave.npz", "autosave_progress.npz", "trajectory_online.tum"
 LOCK = ".lock"
-_DUE = 0.75  # share of the period after which saving is due, which leaves time for writing
+_DUE = 0.75  # share of the period after which saving is due; the rest is for writing
 _DUE_WHILE_ADJUSTING = 0.95  # the same while a global bundle adjustment is running
 _MOST_MISSED = 5  # frames for which saving is postponed because a keyframe is being mapped
 

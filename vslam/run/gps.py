@@ -17,7 +17,7 @@ from vslam.geometry import inverses
 from vslam.maps.stored_map import StoredMap
 from vslam.trajectory import Trajectory, bridge_gaps
 
-_LONGEST_S = 0.5  # between two frames; over longer intervals, no position is interpolated
+_LONGEST_S = 0.5  # no position is interpolated between two frames with a longer interval
 
 
 @dataclass(frozen=True)

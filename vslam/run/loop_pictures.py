@@ -14,7 +14,7 @@ from vslam.loopclosure.learned_localisation import project
 from vslam.loops import LoopEdge
 from vslam.map import NONE, Map
 
-_PANEL_WIDTH, _GUTTER = 640, 8  # pixels of a picture
+_PANEL_WIDTH, _GUTTER = 640, 8  # width of a panel and of the space between panels, in pixels
 _QUALITY = 80
 _SUBPIXEL = 4  # fractional bits of the positions that OpenCV draws
 _WHITE, _INK, _GREEN = (255, 255, 255), (33, 23, 17), (153, 211, 52)  # BGR

@@ -17,8 +17,8 @@ from vslam.run.loop_pictures import LoopPicture, loop_matches, spread
 from vslam.run.recorder import Recorder
 from vslam.trajectory import Trajectory
 
-_MOST = 96  # images, which take about 1 MB of the page
-_WIDTH = 360  # pixels
+_MOST = 96  # images; they take about 1 MB of the page
+_WIDTH = 360  # pixels, of an image
 _QUALITY = 55
 _MOST_POINTS = 400
 
@@ -26,8 +26,8 @@ _MOST_POINTS = 400
 # faster than it scales by other factors. A keyframe of KITTI takes 0.2 ms and 15 kB.
 _LOOP_SCALE = 0.5
 _LOOP_QUALITY = 60
-_MOST_LOOP_IMAGES = 2000  # 30 MB; beyond this, every second image is dropped
-_MOST_MATCHES = 60  # more lines hide the images
+_MOST_LOOP_IMAGES = 2000  # 30 MB; if there are more, every second image is dropped
+_MOST_MATCHES = 60  # more lines would hide the images
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class LoopPictureRecorder(Recorder):
 
     def __init__(self) -> None:
         self.pictures: list[LoopPicture] = []
-        self._jpegs: dict[int, bytes] = {}  # by frame
+        self._jpegs: dict[int, bytes] = {}  # image by frame
         self._camera: Camera | None = None
 
     def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None:

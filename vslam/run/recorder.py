@@ -48,14 +48,14 @@ _P = ParamSpec("_P")
 # MB.
 _IMAGE_SCALE = 0.5
 _JPEG_QUALITY = 75
-_MAX_POINTS_PER_MAP = 30_000  # the last map is complete
+_MAX_POINTS_PER_MAP = 30_000  # except for the last map, which is complete
 
-_TRAJECTORY_STEPS = 100  # 0.6 MB for 1,000 frames
-_REJECTED_SHOWN_FRAMES = 20  # after which the lines of rejected loops are hidden
+_TRAJECTORY_STEPS = 100  # they take 0.6 MB for 1,000 frames
+_REJECTED_SHOWN_FRAMES = 20  # the lines of rejected loops are hidden after this many frames
 _VIEWER_PORT, _WEB_PORT = 9876, 9090  # rerun's default ports
 _VIEWER_STARTS_S = 20.0
 _FLUSH_TIMEOUT_S = 5.0
-_RESERVED_BYTES = 64 * 2**20  # left on the disk for the map, the trajectories and the report
+_RESERVED_BYTES = 64 * 2**20  # kept free for the map, the trajectories and the report
 
 _GREEN, _AMBER, _RED = (16, 185, 129), (245, 158, 11), (239, 68, 68)
 _BLUE, _GREY = (59, 130, 246), (148, 163, 184)
@@ -81,7 +81,7 @@ class _Pace:
 
 
 _FILE_PACE = _Pace(50, 25, 10)
-_VIEWER_PACE = _Pace(5, 5, 2)  # more often than in a file, because there is no file size to limit
+_VIEWER_PACE = _Pace(5, 5, 2)  # more often than for a file, whose size must be limited
 
 
 class Recorder:
@@ -281,7 +281,7 @@ def _guarded(
             return
         try:
             method(self, *args, **kwargs)
-        except Exception as error:  # such as no memory, a full disk, a viewer that was closed
+        except Exception as error:  # such as a full disk or a viewer that was closed
             self._abandon(error)
 
     return call
@@ -340,15 +340,15 @@ class RerunRecorder(Recorder):
         self._open = True
         self._state: TrackingState | None = None
         self._points: dict[str, tuple[int, int, int]] = {}  # colour of each curve of points/*
-        self._index = 0  # of the last frame
+        self._index = 0  # index of the last frame
         self._frames: list[TrackResult] = []
-        self._stages: list[str] = []  # those with a colour
+        self._stages: list[str] = []  # stages that have a colour
         self._keyframes = 0
         self._mapped_keyframes = -self._pace.keyframes
         self._accepted: list[LoopEdge] = []
         self._pictures = pictures
-        self._n_pictures = 0  # recorded so far
-        self._hide_rejected_at: int | None = None  # frame
+        self._n_pictures = 0  # number of pictures recorded so far
+        self._hide_rejected_at: int | None = None  # index of a frame
         try:
             # Otherwise, the time of logging would be the viewer's default timeline.
             self._recording.set_log_time_enabled(False)

@@ -16,7 +16,7 @@ from vslam.frontend.sides import ComparedSides
 from vslam.geometry import compose, inverse, orthonormalised, se3_log
 from vslam.map import Map
 
-_FEWEST = 3  # frames; in fewer, a reflection or a hand in front of the lens may be the cause
+_FEWEST = 3  # frames; fewer may be caused by a reflection or a hand in front of the lens
 _FEWEST_OBSERVATIONS, _MOST_OBSERVATIONS = 3_000, 100_000
 _LARGEST_RESIDUAL_PX = 3.0
 _HUBER_PX = 0.3
@@ -24,7 +24,7 @@ _ROUNDS = 10
 # Least standard deviation of the image speed, in pixels per second. Without motion, a delay cannot
 # be observed.
 _LEAST_IMAGE_SPEED = 50.0
-_LONGEST_GAP_S = 2.0  # between keyframes; the motion over a longer time is unknown
+_LONGEST_GAP_S = 2.0  # between keyframes; the motion over a longer time is not known
 # For a correct rig, the estimated delay is at most 0.15 ms and the estimated offset at most 0.11
 # pixels. Bundle adjustment absorbs a part of both errors. For a true delay of 10 ms, the estimate
 # is 1.1 ms. For a rotation by 2 arc minutes, the estimated offset is 0.29 pixels
@@ -144,9 +144,9 @@ def delay_warnings(delay: SideDelay, camera: Camera) -> list[str]:
     side = "right" if delay.seconds > 0 else "left"
     instead = f" instead of {1e3 * known:.1f} ms (right_delay)" if known else ""
     return [
-        f"The cameras are not synchronised: the rows of stereo matches show that the {side} one is "
-        f"{1e3 * abs(delay.seconds):.1f} ms late{instead}. Trigger both by one signal, or write "
-        f"right_delay: {delay.seconds:.4f} (seconds) into the file that --calib names and run "
+        f"The cameras are not synchronised: the rows of stereo matches show that the {side} "
+        f"camera is {1e3 * abs(delay.seconds):.1f} ms late{instead}. Trigger both by one signal, or "
+        f"write right_delay: {delay.seconds:.4f} (seconds) into the file that --calib names and run "
         "again; see docs/howto/cameras.md."
     ]
 
@@ -159,7 +159,7 @@ def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
     if abs(found.delay_s) > _SUSPECT_DELAY_S:
         side = "right" if found.delay_s > 0 else "left"
         warnings.append(
-            f"The cameras seem not to be synchronised: the {side} one is at least "
+            f"The cameras seem not to be synchronised: the {side} camera is at least "
             f"{1e3 * abs(found.delay_s):.1f} ms late, and usually much more, because bundle "
             "adjustment absorbs most of a delay. Trigger both by one signal."
         )

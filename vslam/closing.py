@@ -1,5 +1,4 @@
-"""Loop closing: verifies the loop candidates of a keyframe and corrects the map (ORB-SLAM, section
-VII).
+"""Loop closing: verifies loop candidates and corrects the map (ORB-SLAM, section VII).
 
 No other thread may write the map while a method of ``LoopClosing`` runs. The search for a loop only
 reads the map and runs in parallel with tracking (``Mapper``). The global bundle adjustment after a
@@ -215,8 +214,8 @@ class LoopClosing:
         """Solve the pose graph with a verified loop.
 
         Returns:
-            The outcome, which belongs into ``edges``, and the loop. The loop is None if it
-            contradicts the rest of the graph.
+            The outcome for ``edges``, and the loop. The loop is None if it contradicts the rest of
+            the graph.
         """
         start = time.perf_counter()
         solution = self._solution(map_, edge, Hypothesis.PREDICTED)

@@ -54,8 +54,7 @@ class Mode:
         return False
 
     def update_map(self, frame: PlacedFrame, found: Found) -> bool:
-        """Count the landmarks that a tracked frame saw, and insert the frame as a keyframe if
-        needed.
+        """Count the landmarks that a tracked frame saw, and insert it as a keyframe if needed.
 
         Returns:
             Whether the frame was inserted as a keyframe.

@@ -4,12 +4,12 @@ The pose of the camera in the map jumps when a loop is closed or the camera is r
 controller of a robot needs poses that do not jump. Therefore, ROS also has the frame ``odom`` (REP
 105). A pose in this frame follows the motion from frame to frame, and drifts.
 
-The error of a pose has two parts. The *local* error is that of the camera relative to the landmarks
-around it. It is independent in every frame. The *drift* is the error of these landmarks relative to
-the start of the drive. It grows with every keyframe, because new landmarks inherit the error of the
-keyframe that maps them. Consecutive keyframes share landmarks, so their errors are correlated.
-Therefore, the drift grows like a random walk with correlated steps (a first-order autoregressive
-process).
+The error of a pose has two parts. The *local* error is the error of the camera pose relative to the
+landmarks around the camera. It is independent in every frame. The *drift* is the error of these
+landmarks relative to the start of the drive. It grows with every keyframe, because new landmarks
+inherit the error of the keyframe that maps them. Consecutive keyframes share landmarks, so their
+errors are correlated. Therefore, the drift grows like a random walk with correlated steps (a
+first-order autoregressive process).
 
 A stereo camera adds a third part. Its disparity offset is estimated during the drive
 (``backend/disparity_offset.py``). The error of this estimate makes all motions too long or too
@@ -200,7 +200,7 @@ class Odometry:
         self.T_odom_camera, self.now = T_odom_camera, uncertainty
 
     def state(self) -> tuple[float, ...]:
-        """The state, for a checkpoint."""
+        """The state for a checkpoint."""
         return (*self.T_odom_camera.ravel(), *self.now.numbers().tolist(), self._lost_s)
 
     def restore(self, state: tuple[float, ...]) -> None:

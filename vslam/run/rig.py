@@ -145,9 +145,9 @@ def delay_warnings(delay: SideDelay, camera: Camera) -> list[str]:
     instead = f" instead of {1e3 * known:.1f} ms (right_delay)" if known else ""
     return [
         f"The cameras are not synchronised: the rows of stereo matches show that the {side} "
-        f"camera is {1e3 * abs(delay.seconds):.1f} ms late{instead}. Trigger both by one signal, or "
-        f"write right_delay: {delay.seconds:.4f} (seconds) into the file that --calib names and run "
-        "again; see docs/howto/cameras.md."
+        f"camera is {1e3 * abs(delay.seconds):.1f} ms late{instead}. Trigger both by one signal, "
+        f"or write right_delay: {delay.seconds:.4f} (seconds) into the file that --calib names "
+        "and run again; see docs/howto/cameras.md."
     ]
 
 

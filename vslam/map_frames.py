@@ -31,10 +31,10 @@ from vslam.trajectory import Trajectory
 def add_frame(
     map_: Map, frame: Frame, certainty: NDArray[np.uint8] | int, reference: int, *, predicted: bool
 ) -> int:
-    """Add a frame to the map as a keyframe. The keyframe observes the landmarks that the frame
-    tracks.
+    """Add a frame to the map as a keyframe.
 
-    A frame that tracks no landmark of another keyframe begins a sub-map.
+    The keyframe observes the landmarks that the frame tracks. A frame that tracks no landmark of
+    another keyframe begins a sub-map.
 
     Args:
         certainty: ``(N,)`` certainty of the frame's features (``Arrays.certainty``).

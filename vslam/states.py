@@ -25,7 +25,7 @@ class TrackerState:
         index, timestamp: index and time (seconds) of the last tracked frame.
         features: the N features of this frame.
         landmark: ``(N,)`` int32, the landmark that each feature observes, or -1.
-        T_cw: ``(4, 4)`` its pose.
+        T_cw: ``(4, 4)`` pose of this frame.
         twist: ``(6,)`` twist of the camera per second at this frame. None if it is unknown.
         lost_frames: number of lost frames since this frame.
         n_tracked: number of landmarks that the frame tracked.

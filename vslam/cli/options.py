@@ -138,7 +138,7 @@ OrbSlam3Python = Annotated[
     option(
         METHOD,
         "FILE",
-        "Python interpreter that has pyorbslam3.",
+        "Python interpreter in which pyorbslam3 is installed.",
         "--orbslam3-python",
         unset="that of vslam",
     ),
@@ -147,7 +147,7 @@ OrbSlam3Vocabulary = Annotated[
     Path | None,
     option(METHOD, "FILE", "Vocabulary of ORB-SLAM3, in DBoW2's text format.", "--vocabulary"),
 ]
-Quiet = Annotated[bool, flag(OUTPUT, "Show no progress and no summary.", "--quiet")]
+Quiet = Annotated[bool, flag(OUTPUT, "Show neither progress nor a summary.", "--quiet")]
 SensorName = Literal["stereo", "mono", "rgbd"]
 ViewerName = Literal["native", "web"]
 AlignmentName = Literal["se3", "sim3", "none"]
@@ -345,8 +345,7 @@ def require_data(options: SourceOptions) -> None:
 
 
 def kind_of_source(options: SourceOptions) -> str:
-    """The kind of data that the options give. Without such an option, it is detected from the
-    files.
+    """The kind of data that the options give, or the kind that is detected from the files.
 
     Raises:
         InputError: there is no data to read, or its kind is unknown.

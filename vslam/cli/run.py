@@ -70,8 +70,8 @@ def run(
         option(
             INPUT,
             "X,Y,Z",
-            "Position of the GPS antenna in metres to the right of, below and ahead of the left "
-            "camera, such as [b]0.1,-0.5,-1.5[/b].",
+            "Position of the GPS antenna relative to the left camera: metres to the right, below "
+            "and ahead, such as [b]0.1,-0.5,-1.5[/b].",
             unset="from KITTI's calibration, or 0,0,0",
         ),
     ] = None,
@@ -83,7 +83,7 @@ def run(
             METHOD,
             "NAME",
             "Loop detector: [b]both[/b] combines the capsule network and the bag of words, "
-            f"[b]none[/b] closes no loops. Others: {_OTHER_DETECTORS}.",
+            f"[b]none[/b] closes no loops. Other detectors: {_OTHER_DETECTORS}.",
             unset="both, or the detector of --map",
         ),
     ] = None,

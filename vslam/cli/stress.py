@@ -184,8 +184,8 @@ def foreign(
     no_report: Annotated[bool, typer.Option("--no-report")] = False,
     quiet: Annotated[bool, typer.Option("--quiet")] = False,
 ) -> None:
-    """Run another system on a sequence, and write its report. bench and stress call this
-    command."""
+    """Run another system on a sequence, and write its report. ``vslam bench`` and ``vslam stress``
+    call this command."""
     from vslam.cli.console import Console
     from vslam.config import load_config
     from vslam.datasets.perturbation import parse_perturbation

@@ -37,12 +37,12 @@ def synth(
     ] = "",
     trajectory: Annotated[
         Path | None,
-        option(_DRIVE, "FILE", "Drive along these poses (KITTI's format, 10 per second)."),
+        option(_DRIVE, "FILE", "Poses to drive along, in KITTI's format, 10 per second."),
     ] = None,
     calibration: Annotated[
         str,
         option(
-            _DRIVE, "00-02|03|04-12", "With --trajectory: the KITTI sequences whose cameras to use."
+            _DRIVE, "00-02|03|04-12", "With --trajectory: use the cameras of these KITTI sequences."
         ),
     ] = "00-02",
     max_frames: Annotated[
@@ -93,7 +93,7 @@ def synth(
         bool,
         flag(
             OUTPUT,
-            "Write the stereo pairs, and also images with depth in TUM's layout.",
+            "Write images with depth in TUM's layout, in addition to the stereo pairs.",
             "--rgbd",
         ),
     ] = False,
@@ -114,9 +114,7 @@ def synth(
     ] = "-1.4:1.4",
     heading: Annotated[
         str,
-        option(
-            _PAIRS, "LOW:HIGH", "Range of the turn of the second view to either side, in degrees."
-        ),
+        option(_PAIRS, "LOW:HIGH", "Range of the angle between the two views, in degrees."),
     ] = "0:14",
     out: Annotated[
         Path | None, option(OUTPUT, "FOLDER", "Folder to write to.", unset="the user's cache")

@@ -328,8 +328,8 @@ class RerunRecorder(Recorder):
         warning is logged and nothing is recorded.
 
         Args:
-            pictures: list of pictures of closed loops to record. Another recorder appends the
-                pictures to this list. It is called before this recorder.
+            pictures: list of pictures of closed loops to record. Another recorder, which is called
+                before this recorder, appends the pictures to this list.
         """
         import rerun as rr
 

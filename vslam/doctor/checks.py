@@ -23,7 +23,7 @@ from vslam.frontend.orb import extract
 Times = NDArray[np.float64]
 Depth = NDArray[Any]  # any type of number; 0 or NaN means that the depth is missing
 
-# A run searches for stereo matches within 2 rows. KITTI's rectification has an error of 0.3 to 0.5
+# A run searches for stereo matches within 2 rows. The error of KITTI's rectification is 0.3 to 0.5
 # px.
 ROWS_PX = 0.8
 IN_FRONT = 0.9  # least share of positive disparities; those of distant points scatter around 0

@@ -106,7 +106,7 @@ def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
 def _examine_mask(sequence: Source, lefts: dict[int, Image]) -> tuple[list[Finding], list[Picture]]:
     """Measure which share of the first image the mask hides, and draw this part in red.
 
-    Both lists are empty if there is no mask.
+    The two lists of the result are empty if there is no mask.
     """
     frame = next(iter(lefts), None)
     read = None if frame is None else sequence.stored[frame].mask

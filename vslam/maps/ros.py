@@ -6,9 +6,8 @@ follow REP 103. In ``map``, ``odom`` and ``base_link``, x points forward, y left
 is at the left camera. ``map`` and ``odom`` are at the first pose of ``base_link``. Lengths are in
 metres, or in the unit of a monocular map.
 
-The functions have an argument ``types``. It is a function that returns the message class for the
-name of a message. To write files, it returns classes of the package rosbags. In a node, it returns
-classes of ROS (``examples/ros2``).
+The argument ``types`` is a function that returns the message class for the name of a message. Files
+are written with classes of the package rosbags. A node uses classes of ROS (``examples/ros2``).
 """
 
 from __future__ import annotations

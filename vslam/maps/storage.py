@@ -74,7 +74,7 @@ def load_checkpoint(path: Path | str) -> StoredMap:
         path: a map file, or the folder of a run that has a map file.
 
     Raises:
-        InputError: as ``load_map``.
+        InputError: for the same reasons as in ``load_map``.
     """
     path = map_file_of(path)
     data, header = _read(path)
@@ -171,7 +171,7 @@ def made_with(path: Path | str) -> MadeWith:
     """Read the camera, detector and thresholds of a map without reading its arrays.
 
     Raises:
-        InputError: as ``load_map``.
+        InputError: for the same reasons as in ``load_map``.
     """
     path = Path(path)
     with _opened(path) as (_, header), _damage_reported(path):

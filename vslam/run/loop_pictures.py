@@ -1,5 +1,4 @@
-"""Picture of a closed loop: its two images side by side, with the matches that verified the
-loop."""
+"""Pictures of closed loops. A picture shows both images side by side, with the verified matches."""
 
 from __future__ import annotations
 

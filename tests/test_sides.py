@@ -188,7 +188,7 @@ def test_warnings_say_what_was_seen_and_done():
     assert warned([fine] * 100) == []
     assert warned([fine] * 100 + [dark, black, black]) == []
     (said,) = warned([dark] * 7 + [fine] * 3)
-    assert "left image was 1.5 stops darker than the right one in 7 of 10 frames" in said
+    assert "left image was 1.5 stops darker than the right image in 7 of 10 frames" in said
     (said,) = warned([black] * 4 + [fine] * 6)
     assert "right image was black in 4 of 10 frames" in said
     assert "left image alone" in said

@@ -200,8 +200,8 @@ def check_synchronisation(rows_of_lag: Mapping[int, float]) -> tuple[Finding, in
         wrong,
         measured,
         f"the right image is {counted(abs(best), 'frame')} "
-        f"{'late' if best > 0 else 'early'}: trigger both cameras together, or shift the times of "
-        "one",
+        f"{'late' if best > 0 else 'early'}: trigger both cameras together, or shift the "
+        "timestamps of one camera",
     )
     return finding, best if wrong else 0
 

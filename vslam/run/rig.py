@@ -192,7 +192,7 @@ def rig_warnings(sides: ComparedSides) -> list[str]:
         stops = statistics.median(darker)
         side, other = ("right", "left") if stops > 0 else ("left", "right")
         warnings.append(
-            f"The {side} image was {abs(stops):.1f} stops darker than the {other} one in "
+            f"The {side} image was {abs(stops):.1f} stops darker than the {other} image in "
             f"{len(darker)} of {sides.n} frames: the {side} image was brightened to match. Check "
             "exposure, gain and aperture of both cameras."
         )

@@ -184,7 +184,7 @@ def kitti_drift(
         T_wc_ground_truth: ``(N, 4, 4)`` ground truth of the same frames.
 
     Returns:
-        ``t_rel`` in percent and ``r_rel`` in degrees per 100 m. Both are None if the path is
+        ``t_rel`` in percent and ``r_rel`` in degrees per 100 m. The result is None if the path is
         shorter than 100 m.
     """
     distances = path_length(T_wc_ground_truth)

@@ -210,7 +210,7 @@ def read_progress(path: Path) -> Progress:
     try:
         header = read_json(arrays["header"])
         if header["kind"] != "vslam progress" or header["schema"] != SCHEMA:
-            raise InputError(f"{path}: written by another version of vslam; resume with that version.")
+            raise InputError(f"{path}: written by another version of vslam; resume with that one.")
         wall_s, cpu_s = arrays["seconds"].tolist()
         return Progress(
             tracks=_checked_table(arrays["frames"], header["stages"], arrays["stage_ms"]),

@@ -135,7 +135,7 @@ def test_second_try_keeps_the_result_of_the_first_and_refuses_other_files(calibr
     assert "a-2.html: the earlier a.html" in calibrate(*words, "a.yaml")[1]
     Path("b.yaml").write_text("left_out: 1\n")
     for name, said in (
-        ("b.yaml", "--out b.yaml: is another program's file; give another name."),
+        ("b.yaml", "--out b.yaml: belongs to another program; give another name."),
         ("none/a.yaml", "--out none/a.yaml: there is no folder none; create it first."),
         ("board", "--out board: is a folder"),
         ("a.html", "--out a.html: a calibration is YAML"),

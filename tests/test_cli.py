@@ -149,14 +149,14 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--dataset synthetic --seq 77", ["synthetic route 77", "choose one of demo"]),
         ("--dataset kitti", ["data/kitti", "cvlibs.net", "--data", "$KITTI_ROOT"]),
         ("--config nothing.json", ["nothing.json", "configuration"]),
-        ("--compare none --detector none", ["--compare none", "name another"]),
+        ("--compare none --detector none", ["--compare none", "give another"]),
         ("--keep-open --view native", ["--keep-open: only for --view web"]),
-        ("--compare both,bow --detector bow", ["--compare bow", "name another"]),
+        ("--compare both,bow --detector bow", ["--compare bow", "give another"]),
         ("--compare bow,words --detector none", ["--compare words", "unknown; choose one of"]),
         ("--data nowhere", ["nowhere", "no such file or folder", "--data"]),
         ("--data .", ["the folder is empty", "--data"]),
         ("nowhere", ["nowhere", "no such file or folder", "--data"]),
-        ("nowhere --data .", ["nowhere: --data also names data"]),
+        ("nowhere --data .", ["nowhere: data is also given with --data"]),
         ("--data other", ["not a known data set", "sequences", "mav0", "rgb.txt"]),
         ("--data 77 --sensor mono", ["camera 77", "no such device"]),
         ("--dataset images --data . --fps 0", ["--fps 0", "positive"]),
@@ -184,7 +184,7 @@ def test_a_bare_command_without_data_says_what_to_do(call, command):
 def test_the_environment_names_kitti_alone(call, root, monkeypatch):
     monkeypatch.setenv("KITTI_ROOT", str(root))
     refused(call("run"), "unequal counts")
-    refused(call("doctor", "--dataset", "euroc"), "--dataset euroc: name the data with --data")
+    refused(call("doctor", "--dataset", "euroc"), "--dataset euroc: give the data with --data")
 
 
 @pytest.mark.parametrize(

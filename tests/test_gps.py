@@ -462,7 +462,7 @@ def test_what_was_computed_is_kept_where_gps_says_too_little(call, kitti_tree, f
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--gps-antenna", "1,2,3"), "name the fixes of this antenna with --gps"),
+        (("--gps-antenna", "1,2,3"), "give the fixes of this antenna with --gps"),
         (("--gps", "fixes.csv", "--gps-antenna", "1,2"), "--gps-antenna 1,2: give three numbers"),
         (("--gps", "fixes.csv", "--gps-antenna", "-1,x,2"), "give three numbers"),
         (("--gps", "fixes.csv", "--gps-antenna", "-1,inf,2"), "give three numbers"),

@@ -297,7 +297,7 @@ def test_report_says_who_wins_in_all_three_files(vocabulary, tmp_path):
         (["--detectors", "bow", "--weights", "capsule=x"], "must be NAME=FILE"),
         (["--detectors", "bow", "--perturb", "fog"], "--perturb fog"),
         (["--detectors", "bow", "--data", "kitti:/nowhere"], "/nowhere"),
-        (["--detectors", "bow", "--out", f"{__file__}/x"], "name another folder with --out"),
+        (["--detectors", "bow", "--out", f"{__file__}/x"], "give another folder with --out"),
     ],
 )
 def test_command_refuses_in_one_sentence(arguments, said, tmp_path, monkeypatch):

@@ -259,7 +259,7 @@ def test_refusals(files, tmp_path):
     out = ("--out", tmp_path / "m.npz")
     assert "two or more" in refusal("map", "merge", files[0], *out)
     assert "exists already" in refusal("map", "merge", *files[:2], "--out", files[2])
-    assert "named twice" in refusal("map", "merge", files[0], files[1], files[0], *out)
+    assert "given twice" in refusal("map", "merge", files[0], files[1], files[0], *out)
     nowhere = ("--out", tmp_path / "gone" / "m.npz")
     assert "there is no folder" in refusal("map", "merge", *files[:2], *nowhere)
     assert "there is no folder" in refusal("map", "crop", files[0], "--box=0,1,0,1", *nowhere)

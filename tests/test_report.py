@@ -444,7 +444,7 @@ def test_compared_trajectories_are_in_the_top_view(looped: tuple[RunOutcome, Pat
     alone = top_view(outcome, None, None).axes[0].lines
     own, compared = (line for line in alone if line.get_label() == "bow")
     np.testing.assert_allclose(own.get_xdata() + 40.0, compared.get_xdata(), atol=1e-6)
-    assert "Dashed: the detectors of --compare" in (folder / "report.html").read_text()
+    assert "Dashed lines: the detectors of --compare" in (folder / "report.html").read_text()
 
 
 def test_rejected_loops_do_not_drown_the_table(looped: tuple[RunOutcome, Path]) -> None:

@@ -106,7 +106,7 @@ def test_on_a_full_disk_all_is_tried_and_nothing_is_incomplete(tmp_path, monkeyp
     for name in ("autosave.npz", "run.json") if saved else ():
         (tmp_path / name).touch()
     names = r"trajectory_kitti\.txt, ground_truth_kitti\.txt could not be written \(No space left"
-    remedy = f"then vslam run --resume {tmp_path}" if saved else "name another folder with --out"
+    remedy = f"then vslam run --resume {tmp_path}" if saved else "give another folder with --out"
     with pytest.raises(ResultsError, match=f"{names}.*{remedy}"):
         write_results(tmp_path, make_outcome(20), pages=False)
     there = {path.name for path in tmp_path.iterdir()}

@@ -200,9 +200,9 @@ def test_the_warning_says_what_to_write_into_the_calibration():
     found = learned(12e-3)
     found.seconds = 4.68e-3
     (said,) = delay_warnings(found, CAMERA)
-    assert "the right one is 4.7 ms late. " in said
+    assert "the right camera is 4.7 ms late. " in said
     assert "right_delay: 0.0047 (seconds) into the file that --calib names" in said
     found.seconds = -2e-3
     (said,) = delay_warnings(found, replace(CAMERA, right_delay=3e-3))
-    assert "the left one is 2.0 ms late instead of 3.0 ms (right_delay). " in said
+    assert "the left camera is 2.0 ms late instead of 3.0 ms (right_delay). " in said
     assert "right_delay: -0.0020" in said

@@ -188,7 +188,7 @@ def test_warnings_say_what_was_seen_and_done():
     assert warned([fine] * 100) == []
     assert warned([fine] * 100 + [dark, black, black]) == []
     (said,) = warned([dark] * 7 + [fine] * 3)
-    assert "left image was 1.5 stops darker than the right one in 7 of 10 frames" in said
+    assert "left image was 1.5 stops darker than the right image in 7 of 10 frames" in said
     (said,) = warned([black] * 4 + [fine] * 6)
     assert "right image was black in 4 of 10 frames" in said
     assert "left image alone" in said
@@ -247,7 +247,7 @@ def test_a_fault_of_the_rig_is_said_with_its_size():
     assert residual_warnings(RigResiduals(1e-4, 0.05), CAMERA) == []
     assert residual_warnings(RigResiduals(float("nan"), 0.05), CAMERA) == []
     (said,) = residual_warnings(RigResiduals(1.2e-3, 0.2), CAMERA)
-    assert "right one is at least 1.2 ms late" in said
+    assert "right camera is at least 1.2 ms late" in said
     (said,) = residual_warnings(RigResiduals(1e-4, -0.3), CAMERA)
     assert "0.30 pixels" in said
     assert "3.4 arc minutes" in said

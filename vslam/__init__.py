@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    """Import public names on first use, so that ``vslam --help`` starts quickly."""
+    """Import a public name when it is first used, so that ``vslam --help`` starts quickly."""
     if name in _MODULES:
         return getattr(import_module(_MODULES[name]), name)
     raise AttributeError(f"module 'vslam' has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""``python -m vslam``."""
+"""Entry point of ``python -m vslam``, which does the same as the command ``vslam``."""
 
 from vslam.cli.main import main
 

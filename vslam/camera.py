@@ -1,6 +1,6 @@
-"""Rectified pinhole cameras.
+"""Pinhole cameras with rectified images.
 
-Camera frame: x right, y down, z forward. Units: metres and pixels.
+In the camera frame, x points right, y down and z forward. Units are metres and pixels.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Literal, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-Image = NDArray[np.uint8]  # (H, W) grey
-DepthImage = NDArray[np.float32]  # (H, W) metres along z, 0 where unknown
+Image = NDArray[np.uint8]  # (H, W) grey values
+DepthImage = NDArray[np.float32]  # (H, W) metres along z; 0 means unknown
 Sensor = Literal["stereo", "mono", "rgbd"]
 
 # Disparities are measured more accurately than columns and rows, so the reprojection error
@@ -22,13 +22,14 @@ Sensor = Literal["stereo", "mono", "rgbd"]
 DISPARITY_WEIGHT = 3.0
 
 # Largest plausible distance of the principal point from the middle, as a share of the image size.
-# A calibration for images of half the size gives 0.25, one for twice the size 0.5.
+# With a calibration for images of half the size, this share is 0.25. With a calibration for images
+# of twice the size, it is 0.5.
 _OFF_CENTRE = 0.2
-# A calibration for another image size puts the principal point at nearly the same share x of the
-# width and y of the height: x / y lies between the inverse of this number and this number.
+# If a calibration belongs to images of another size, the principal point is wrong by nearly the
+# same factor in x and in y. The ratio of both factors must lie between this number and its inverse.
 _SAME_RATIO = 1.25
 _FACTORS = {0.5: "half", 2.0: "twice"}
-_NARROWEST, _WIDEST = 10.0, 150.0  # degrees; plausible fields of view of a camera on a vehicle
+_NARROWEST, _WIDEST = 10.0, 150.0  # degrees, plausible fields of view of a camera on a vehicle
 
 
 @dataclass(frozen=True)
@@ -40,14 +41,16 @@ class Camera:
     Attributes:
         fx, fy: focal lengths in pixels.
         cx, cy: principal point of the left camera in pixels.
-        baseline: distance from the left to the right camera in metres. It is 0 for a single camera,
-            whose map has an arbitrary unit instead of metres (``backend/two_views.py``). For an
-            RGB-D camera it is virtual and sets the uncertainty of depth (``frontend/depth.py``).
+        baseline: distance from the left to the right camera in metres. It is 0 for a single camera.
+            The map of a single camera has an arbitrary unit instead of metres
+            (``backend/two_views.py``). An RGB-D camera has a virtual baseline, which determines the
+            uncertainty of the depth (``frontend/depth.py``).
         width, height: image size in pixels.
-        depth: whether the second image is the depth of the left image's pixels instead of a right
-            image.
-        right_delay: seconds from the exposure of the left image of a pair to that of the right one,
-            negative if the right one comes first; 0 for cameras that share a trigger.
+        depth: whether the second image is a depth image instead of a right image. It holds the
+            depth of each pixel of the left image.
+        right_delay: seconds from the exposure of the left image of a pair to the exposure of the
+            right image. It is negative if the right image is exposed first, and 0 if both cameras
+            share a trigger.
 
     Raises:
         ValueError: a size or focal length is not positive, the baseline is negative, or the
@@ -68,7 +71,7 @@ class Camera:
         """Reject impossible numbers.
 
         Raises:
-            ValueError: a number is impossible; the message says which one.
+            ValueError: a number is impossible. The message says which number.
         """
         size = f"{self.width}x{self.height}"
         if not (self.width > 0 and self.height > 0):
@@ -89,7 +92,7 @@ class Camera:
 
     @property
     def sensor(self) -> Sensor:
-        """The kind of camera, as named by ``--sensor``."""
+        """The kind of camera, as a value of the option ``--sensor``."""
         if self.monocular:
             return "mono"
         return "rgbd" if self.depth else "stereo"
@@ -100,24 +103,26 @@ class Camera:
         return self.baseline == 0.0
 
     def left_camera(self) -> Camera:
-        """The left camera alone."""
+        """The left camera as a single camera."""
         return replace(self, baseline=0.0, depth=False, right_delay=0.0)
 
     @property
     def T_right_left(self) -> NDArray[np.float64]:
-        """``(4, 4)`` pose of the left camera in the frame of the right one."""
+        """``(4, 4)`` pose of the left camera in the frame of the right camera."""
         T = np.eye(4)
         T[0, 3] = -self.baseline
         return T
 
     @property
     def bf(self) -> float:
-        """The baseline times the focal length; a disparity in pixels is ``bf / z``."""
+        """The baseline times the focal length. A point at depth z has the disparity ``bf / z``
+        pixels."""
         return self.baseline * self.fx
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:
-        """``(6,)`` float64 ``[fx, fy, cx, cy, bf, disparity_weight]``, as kernels take it."""
+        """``(6,)`` float64 ``[fx, fy, cx, cy, bf, disparity_weight]``, the form that kernels
+        use."""
         return np.array([self.fx, self.fy, self.cx, self.cy, self.bf, DISPARITY_WEIGHT])
 
     def project(self, p_c: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -137,9 +142,12 @@ class Camera:
 
 
 def calibration_doubts(camera: Camera) -> list[str]:
-    """Reasons why a calibration is implausible, one sentence each without a full stop; empty if
-    there are none. Such a camera can exist, but more often the calibration belongs to other
-    images."""
+    """Reasons why a calibration is implausible.
+
+    Each reason is one sentence without a full stop. The list is empty if the calibration is
+    plausible. A camera with an implausible calibration can exist, but more often the calibration
+    belongs to other images.
+    """
     off_centre = principal_point_doubt((camera.cx, camera.cy), (camera.width, camera.height))
     doubts = [off_centre] if off_centre else []
     fields = field_of_view(camera)
@@ -153,8 +161,10 @@ def calibration_doubts(camera: Camera) -> list[str]:
 
 
 def principal_point_doubt(principal: tuple[float, float], size: tuple[int, int]) -> str:
-    """Why a principal point (pixels) is implausible for the size of the images, as a sentence
-    without a full stop; empty if it is plausible."""
+    """The reason why a principal point (pixels) is implausible for images of a size (pixels).
+
+    The reason is a sentence without a full stop. It is empty if the principal point is plausible.
+    """
     (cx, cy), (width, height) = principal, size
     across, down = cx / width, cy / height
     if max(abs(across - 0.5), abs(down - 0.5)) <= _OFF_CENTRE:
@@ -166,18 +176,21 @@ def principal_point_doubt(principal: tuple[float, float], size: tuple[int, int])
 
 
 def _cause(across: float, down: float) -> str:
-    """The probable cause of an implausible principal point, given as shares of the image's width
-    (``across``) and height (``down``)."""
+    """The probable cause of an implausible principal point.
+
+    Args:
+        across, down: the principal point as a share of the image's width and height.
+    """
     if min(across, down) <= 0.0 or not 1 / _SAME_RATIO < across / down < _SAME_RATIO:
         return "check the order of its numbers, and whether the images were cropped or turned"
-    ratio = across + down  # 1 for a principal point in the middle
+    ratio = across + down  # it is 1 if the principal point is in the middle
     names = [name for factor, name in _FACTORS.items() if abs(ratio / factor - 1.0) < 0.1]
     times = names[0] if names else f"{ratio:.1f} times"
     return f"the calibration seems to belong to images of {times} this size"
 
 
 def field_of_view(camera: Camera) -> tuple[float, float]:
-    """Horizontal and vertical field of view in degrees."""
+    """Horizontal and vertical field of view of a camera, in degrees."""
     across, down = (
         2 * math.degrees(math.atan(size / (2 * focal)))
         for size, focal in ((camera.width, camera.fx), (camera.height, camera.fy))
@@ -186,7 +199,7 @@ def field_of_view(camera: Camera) -> tuple[float, float]:
 
 
 def same_camera(one: Camera, other: Camera) -> bool:
-    """Whether two cameras are the same, up to the rounding of calibration files."""
+    """Whether two cameras are equal, apart from the rounding of numbers in calibration files."""
     shapes = [(c.width, c.height, c.depth, c.monocular) for c in (one, other)]
     first, second = ([*c.intrinsics, c.right_delay] for c in (one, other))
     return shapes[0] == shapes[1] and bool(np.allclose(first, second, rtol=1e-6))
@@ -197,9 +210,11 @@ Made = TypeVar("Made")
 
 
 class ImageMap(Protocol):
-    """Applies a function to each image of a frame: the built-in ``map`` processes one image after
-    the other, the ``map`` of a thread pool in parallel. Both give the same results in the same
-    order."""
+    """A function that applies another function to each image of a frame, such as ``map``.
+
+    The built-in ``map`` processes one image after the other. The ``map`` of a thread pool processes
+    the images in parallel. Both return the same results in the same order.
+    """
 
     def __call__(
         self, function: Callable[[Given], Made], images: Iterable[Given], /
@@ -210,7 +225,8 @@ def check_images(left: Image, second: Image | DepthImage | None, camera: Camera)
     """Check that images match a camera (``Slam.step``).
 
     Raises:
-        ValueError: the sizes, types or number of the images are wrong; the message says which.
+        ValueError: the sizes, the types or the number of the images are wrong. The message says
+            what is wrong.
     """
     other = "depth" if camera.depth else "right"
     if left is None:
@@ -247,7 +263,7 @@ def check_mask(mask: NDArray[np.uint8] | NDArray[np.bool_], camera: Camera) -> N
     """Check that a mask matches a camera (``Slam.step``).
 
     Raises:
-        ValueError: its size or type is wrong; the message says which.
+        ValueError: the size or type of the mask is wrong. The message says what is wrong.
     """
     if mask.shape != (expected := (camera.height, camera.width)):
         raise ValueError(

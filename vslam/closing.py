@@ -1,10 +1,10 @@
-"""Loop closing: from the loop candidates of a keyframe to a corrected map (ORB-SLAM, section VII).
+"""Loop closing: verifies loop candidates and corrects the map (ORB-SLAM, section VII).
 
 No other thread may write the map while a method of ``LoopClosing`` runs. The search for a loop only
 reads the map and runs in parallel with tracking (``Mapper``). The global bundle adjustment after a
-loop also runs in parallel, on a snapshot of the map. Its result is merged after a number of
-keyframes that depends only on the size of the problem, so that the same input always gives the same
-map.
+loop also runs in parallel, on a snapshot of the map. Its result is merged after a certain number of
+keyframes. This number depends only on the size of the problem, so the same input always gives the
+same map.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ class LoopClosing:
     """Finds, verifies and closes loops.
 
     Attributes:
-        detector: proposes candidates.
+        detector: proposes loop candidates.
         verifier: decides which candidates are loops.
         edges: the outcome of every candidate, in order.
         corrections: the loops that were closed.
-        closed: the edges of all closed loops, in the current units of the map; the loops of a
-            loaded map come first.
-        problems: one sentence for each failure that did not harm the map.
+        closed: the edges of all closed loops, in the present unit of the map. The loops of a loaded
+            map come first.
+        problems: one sentence for each step that failed. These failures left the map unchanged.
     """
 
     def __init__(
@@ -76,12 +76,12 @@ class LoopClosing:
         self._consistency = LoopConsistency(config.consistency.model_copy(update=memory))
         self._executor = ThreadPoolExecutor(1, "global-adjustment") if threads > 1 else None
         self._global: _PendingAdjustment | None = None
-        self._followed = 0  # how often an old keyframe was reused instead of inserting a new one
+        self._followed = 0  # number of frames for which an old keyframe was reused
 
     def process(
         self, map_: Map, keyframe: int, features: Features, image: NDArray[np.uint8] | None
     ) -> None:
-        """Search for loops at a keyframe, and close the one that is found."""
+        """Search for loops at a keyframe. If a loop is found, close it."""
         self.merge_adjustment_if_due(map_, keyframe)
         self.close(map_, self.search(map_, keyframe, features, image))
 
@@ -91,7 +91,7 @@ class LoopClosing:
         """Search for a loop at a keyframe after its local mapping. The map is only read."""
         with self._failure_reported("Looking for loops"):
             if self.verifier.is_image_redundant(map_, keyframe):
-                image = None  # then no network processes it
+                image = None  # no network needs this image
             self.detector.add(keyframe, image, features)
             self.verifier.add(map_, keyframe, image)
             return self._find(map_, keyframe, self.detector.query(keyframe, map_))
@@ -166,8 +166,12 @@ class LoopClosing:
         return self._global is not None and keyframe + self._followed >= self._global.due
 
     def conclude(self, map_: Map) -> None:
-        """At the end of a drive, close a verified loop that still waits for another keyframe to
-        confirm it, if an earlier keyframe does so (``LoopConsistency.confirmed_by_earlier``)."""
+        """At the end of a drive, close a verified loop that still waits for confirmation.
+
+        Another keyframe must confirm each loop. At the end of a drive, no later keyframe can do so.
+        The loop is closed if an earlier keyframe confirms it
+        (``LoopConsistency.confirmed_by_earlier``).
+        """
         gates, found, edges = self._config.verification, None, []
         with self._failure_reported("Looking for loops"):
             for edge in self._consistency.confirmed_by_earlier(map_, self._camera, gates):
@@ -180,8 +184,8 @@ class LoopClosing:
     def finish(self, map_: Map) -> None:
         """Wait for the running global bundle adjustment, if there is one, and merge its result.
 
-        The map is sound without it: after a failure, a warning is logged and the map stays as it
-        was.
+        The map is valid without this result. If the adjustment fails, a warning is logged and the
+        map stays as it was.
         """
         pending, self._global = self._global, None
         if pending is None:
@@ -194,8 +198,10 @@ class LoopClosing:
 
     @contextmanager
     def _failure_reported(self, what: str) -> Iterator[None]:
-        """Report an exception in the block instead of raising it; used for steps that leave the map
-        unchanged when they fail."""
+        """Log an exception of the block and add it to ``problems`` instead of raising it.
+
+        This is used for steps that leave the map unchanged when they fail.
+        """
         try:
             yield
         except Exception as error:
@@ -205,8 +211,12 @@ class LoopClosing:
                 _log.warning(problem)
 
     def _solve(self, map_: Map, edge: LoopEdge) -> tuple[LoopEdge, _Loop | None]:
-        """Solve the pose graph with a verified loop. Returns the outcome for ``edges``, and the
-        loop, or None if the loop contradicts the rest of the graph."""
+        """Solve the pose graph with a verified loop.
+
+        Returns:
+            The outcome for ``edges``, and the loop. The loop is None if it contradicts the rest of
+            the graph.
+        """
         start = time.perf_counter()
         solution = self._solution(map_, edge, Hypothesis.PREDICTED)
         if not solution.verdict.consistent and solution.has_gaps:
@@ -280,8 +290,10 @@ def _superseded(candidate: LoopCandidate) -> LoopEdge:
 
 @dataclass(frozen=True)
 class _Loop:
-    """A verified loop, its correction of the map, and the time (``perf_counter``) at which the
-    computation of that correction started."""
+    """A verified loop and its correction of the map.
+
+    ``start`` is the time (``perf_counter``) at which the computation of the correction started.
+    """
 
     edge: LoopEdge
     solution: Solution
@@ -294,7 +306,7 @@ class LoopSearch:
 
     Attributes:
         edges: the outcome of every candidate.
-        loop: the verified loop, which is still to be closed; None if there is none.
+        loop: the verified loop, which has not been closed yet. None if no candidate is a loop.
     """
 
     edges: list[LoopEdge] = field(default_factory=list)

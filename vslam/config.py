@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from vslam.errors import InputError, did_you_mean, plain_reason
 
 _Model = TypeVar("_Model", bound=BaseModel)
-# Thresholds of the section ``learned`` by the names that older maps and configurations have.
+# Older maps and configurations have other names for some thresholds of the section ``learned``.
 _RENAMED = {
     "rated": "max_compared",
     "min_alike": "min_similarity",
@@ -26,18 +26,18 @@ _RENAMED = {
 
 
 class Section(BaseModel):
-    """A frozen group of thresholds; the docstring below each field describes it.
+    """A frozen group of thresholds. The docstring below each field describes the field.
 
     ``tools/threshold_table.py`` reads these docstrings from the source. Pydantic could do so itself
     (``use_attribute_docstrings``), but that would take 0.1 s at the start of every run.
 
     Each docstring ends with the source of the threshold in brackets. [own] means that both the rule
-    and the value are our own. Otherwise, the paper and section of the rule are followed by the
-    source of the value: *printed* in that section, *customary* in the programs of the ORB-SLAM
-    family, or *own*.
+    and the value are our own. Otherwise, the brackets name the paper and section that give the
+    rule, and then the source of the value. *Printed* values stand in that section. *Customary*
+    values are those of the programs of the ORB-SLAM family. *Own* values were chosen for vslam.
 
-    OS1: Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2: Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017.
-    ZS: Zhou and Sun, Sci Rep 15, 7644 (2025).
+    OS1: Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2: Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017. ZS:
+    Zhou and Sun, Sci Rep 15, 7644 (2025).
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -47,7 +47,7 @@ class OrbConfig(Section):
     """ORB extraction."""
 
     n_features: int = Field(2000, ge=100)
-    """Number of features to extract from each image. More features make tracking more robust and
+    """Number of features to extract from each image. More features make tracking more robust, but
     slower. [OS1 V-A, printed]"""
     n_levels: int = Field(8, ge=2, le=16)
     """Number of levels of the image pyramid. With more levels, a landmark can be matched over a
@@ -69,38 +69,40 @@ class WeakImageConfig(Section):
     """Images with much noise or little contrast (docs/research/stress.md)."""
 
     noise_from: float = Field(5.0, ge=0)
-    """Images are blurred if the standard deviation of their noise is at least this, in grey levels.
-    Undisturbed images have at most 2.5. [own]"""
+    """An image is blurred if the standard deviation of its noise is at least this, in grey levels.
+    Images without added noise have at most 2.5. [own]"""
     noise_left: float = Field(4.0, gt=0)
-    """Standard deviation of the noise that should remain after this blur, in grey levels. A smaller
-    value blurs more. [own]"""
+    """Standard deviation of the noise that should remain after the blur, in grey levels. A smaller
+    value blurs the image more. [own]"""
     max_blur: float = Field(3.5, gt=0)
-    """Upper bound of the standard deviation of the blur, in pixels. [own]"""
+    """Upper bound of the standard deviation of the Gaussian blur, in pixels. [own]"""
     spikes_from: float = Field(0.04, ge=0, le=1)
-    """A median filter is applied if more than this share of the pixels are spikes, that is, much
-    brighter or much darker than both neighbours. [own]"""
+    """A median filter is applied if more than this share of the pixels are spikes. A spike is a
+    pixel that is much brighter or much darker than both of its neighbours. [own]"""
     few_features: float = Field(0.5, ge=0, le=1)
     """Contrast is measured only in images that yield fewer features than this share of
     `orb.n_features`. [own]"""
     low_contrast: float = Field(6.0, ge=0)
-    """The contrast of an image is raised if it is below this, in grey levels; with 0 it is never
-    raised. To measure contrast, the image is divided into blocks of 16 x 16 pixels; the contrast is
-    the median of the standard deviations of the grey values in the blocks. [own]"""
+    """The contrast of an image is raised if it is below this, in grey levels. With 0, the contrast
+    is never raised. To measure the contrast, the image is divided into blocks of 16 x 16 pixels,
+    and the standard deviation of the grey values is computed for each block. The contrast is the
+    median of these standard deviations. [own]"""
     least_detail: float = Field(0.25, ge=0)
-    """An image is out of focus, and its contrast is not raised, if its mean absolute second
-    difference is below this share of its contrast. Sharp images have 0.4 and more. [own]"""
+    """An image counts as out of focus if the mean absolute second difference of its grey values is
+    below this share of its contrast. The contrast of such an image is not raised. Sharp images have
+    a share of 0.4 or more. [own]"""
     raised_contrast: float = Field(12.0, gt=0)
     """Contrast is raised until the grey values in each window have this standard deviation, in grey
     levels. The default is the contrast of KITTI's images on a bright day. [own]"""
     contrast_window: int = Field(33, ge=3)
     """Side of the window in which contrast is raised, in pixels. [own]"""
     flat_share: float = Field(0.25, gt=0, le=1)
-    """The contrast of a flat window counts as at least this share of the median over all windows,
-    so that the noise in flat parts of the image is not amplified too much. A larger share amplifies
+    """The contrast of a window counts as at least this share of the median contrast of all windows.
+    This limits how much the noise in flat parts of the image is amplified. A larger share amplifies
     flat parts less. [own]"""
     least_contrast: float = Field(0.15, gt=0)
-    """The contrast of a flat window also counts as at least this, in grey levels. Rounding alone
-    causes a standard deviation of this size. [own]"""
+    """The contrast of a window also counts as at least this, in grey levels. Rounding alone causes
+    a standard deviation of this size. [own]"""
 
 
 class StereoConfig(Section):
@@ -112,34 +114,35 @@ class StereoConfig(Section):
     """Half width of the patch that is compared by the sum of absolute differences (SAD), in pixels
     of the keypoint's octave. [OS2 III-A, customary]"""
     sad_search: int = Field(5, ge=1)
-    """The patch is searched for up to this far to the left and to the right, in pixels of the
+    """The patch is searched for up to this distance to the left and to the right, in pixels of the
     keypoint's octave. [OS2 III-A, customary]"""
     balance_from: float = Field(0.3, ge=0)
-    """The darker image of the pair is brightened before matching if the gain between the two images
-    is above this, in stops (factors of two). [own]"""
+    """The darker image of a stereo pair is brightened before matching if the gain between the two
+    images is above this, in stops (factors of two). [own]"""
     max_gain_disagreement: float = Field(0.75, gt=0)
     """A difference in brightness counts as a gain only if the gains of dark and of bright pixels
     differ by at most this, in stops. [own]"""
     clipped_from: int = Field(250, ge=1, le=255)
-    """A pixel is overexposed, and ignored when the gain is measured, if its grey value is at least
-    this. Video of limited range (16 to 235) needs about 230. [own]"""
+    """A pixel counts as overexposed if its grey value is at least this. Overexposed pixels are
+    ignored when the gain is measured. Video of limited range (16 to 235) needs about 230. [own]"""
     black_below: float = Field(6.0, gt=0, le=255)
-    """An image of the pair counts as black, and is not used, if the 95 % quantile of its pixels is
-    below this, in grey levels, while the other image has contrast. Video of limited range (16 to
-    235) needs about 22. [own]"""
+    """An image of a stereo pair counts as black if the 95 % quantile of its pixels is below this,
+    in grey levels, and the other image has contrast. A black image is not used. Video of limited
+    range (16 to 235) needs about 22. [own]"""
     close_depth_baselines: float = Field(40.0, gt=0)
-    """A stereo point is close if its depth is below this, in baselines. Keyframes map close points
-    from a single stereo pair; most far points are triangulated from several keyframes.
-    [OS2 III-A, printed]"""
+    """A stereo point is close if its depth is below this, in baselines. Close points are mapped
+    from a single stereo pair. Most far points are triangulated from several keyframes. [OS2 III-A,
+    printed]"""
     offset_sigma: float = Field(0.2, ge=0)
-    """Prior standard deviation of an offset common to all disparities, in pixels. The offset is
-    estimated from the motion of the camera (docs/research/motorway.md); a larger value corrects
-    disparities more, and 0 disables the estimation. [own]"""
+    """Prior standard deviation of an offset that all disparities have in common, in pixels. The
+    offset is estimated from the motion of the camera (docs/research/motorway.md). A larger value
+    corrects disparities more. With 0, no offset is estimated. [own]"""
     offset_keyframes: int = Field(12, ge=3)
     """The offset is estimated again after this many keyframes. [own]"""
     least_delay: float = Field(1.2e-3, gt=0)
-    """The report warns if the measured delay of the right camera differs from the calibration's by
-    more than this, in seconds, and by more than `delay_sigmas` (docs/research/stress.md). [own]"""
+    """The report warns if the measured delay of the right camera differs too much from the delay in
+    the calibration. The difference must exceed this, in seconds, and also `delay_sigmas`
+    (docs/research/stress.md). [own]"""
     delay_sigmas: float = Field(5.0, gt=0)
     """The report warns of a delay only if the difference also exceeds this many standard deviations
     of the measured delay. [own]"""
@@ -156,8 +159,8 @@ class DepthConfig(Section):
     """A keypoint gets a depth only if the depths within this radius agree, in pixels at octave 0.
     The default is one pixel more than the radius of FAST's circle. [own]"""
     edge_ratio: float = Field(0.07, gt=0)
-    """A keypoint lies on a depth edge, and gets no depth, if the depths around it differ by more
-    than this share of the nearest depth. [own]"""
+    """A keypoint lies on a depth edge if the depths around it differ by more than this share of the
+    nearest depth. Such a keypoint gets no depth. [own]"""
 
 
 class AlignmentConfig(Section):
@@ -172,8 +175,8 @@ class AlignmentConfig(Section):
     """A match is aligned only if the normalised cross-correlation of its patch with the image is at
     least this. [own]"""
     certainty: int = Field(4, ge=1, le=255)
-    """Ratio of the variance of a keypoint's position to that of an aligned match. A larger ratio
-    gives aligned matches more weight. [own]"""
+    """Ratio of the variance of a keypoint's position to the variance of an aligned match. A larger
+    ratio gives aligned matches more weight. [own]"""
     keyframes: int = Field(5, ge=1)
     """Patches are kept for this many of the newest keyframes. Landmarks that only older keyframes
     observe are not aligned. [own]"""
@@ -183,19 +186,20 @@ class TrackingConfig(Section):
     """Frame-to-map tracking."""
 
     method: Literal["auto", "orb", "patches"] = "auto"
-    """How frames are tracked: `orb` matches ORB features in every frame; `patches` looks for image
-    patches of the landmarks, and extracts features only when a keyframe is due or patches fail
-    (Forster et al., T-RO 2017); `auto` selects `patches` for stereo cameras and `orb` for the
-    others. RGB-D cameras are never tracked by patches. [own]"""
+    """How frames are tracked. `orb` matches ORB features in every frame. `patches` looks for image
+    patches of the landmarks (Forster et al., T-RO 2017), and extracts features only when a keyframe
+    is due or when too few patches are found. `auto` selects `patches` for stereo cameras and `orb`
+    for the other cameras. RGB-D cameras are never tracked by patches. [own]"""
     patch_min_inliers: int = Field(40, ge=10)
     """Features are extracted for a frame if fewer patches than this agree with its pose. [own]"""
     patch_min_inlier_ratio: float = Field(0.8, ge=0, le=1)
     """Features are extracted for a frame if less than this share of its patches agree with its
-    pose. Among moving vehicles, the share falls below 0.8; in static scenes it does not. [own]"""
+    pose. The share falls below 0.8 among moving vehicles, but not in static scenes. [own]"""
     patch_retry_ratio: float = Field(0.86, ge=0, le=1)
-    """If less than this share of the patches agree with the pose of a frame, they are searched for
-    again from the predicted pose, because sparse image alignment, which improves this pose, may
-    have followed moving objects. The result with more inliers is used. [own]"""
+    """If less than this share of the patches agree with the pose of a frame, the patches are
+    searched for a second time. The first search begins at a pose that sparse image alignment has
+    refined, and this alignment may have followed moving objects. The second search begins at the
+    predicted pose. The result with more inliers is used. [own]"""
     match_distance: int = Field(100, ge=0, le=256)
     """Upper bound of the descriptor distance when landmarks are matched near their projections, in
     bits. [OS1 V-D, customary]"""
@@ -222,8 +226,8 @@ class TrackingConfig(Section):
     """Replaces `local_window` for a frame that could be matched with neither the previous frame nor
     the reference keyframe, in pixels at octave 0. [own]"""
     local_keyframes: int = Field(80, ge=1)
-    """Upper bound of the number of keyframes in the local map; those that share the most landmarks
-    with the reference keyframe are chosen. [OS1 V-D, customary]"""
+    """Upper bound of the number of keyframes in the local map. The keyframes that share the most
+    landmarks with the reference keyframe are chosen. [OS1 V-D, customary]"""
     min_stereo_start: int = Field(100, ge=10)
     """Number of stereo features that a frame needs to start a map. [OS2 III-B, own]"""
     min_inliers_motion: int = Field(20, ge=3)
@@ -234,13 +238,13 @@ class TrackingConfig(Section):
     with the previous frame are inliers. [own]"""
     min_inliers_frame: int = Field(10, ge=3)
     """A frame is matched with the local map only if tracking from the previous frame, from the
-    reference keyframe or with `predicted_window` gives at least this many inliers; otherwise, it is
-    LOST. [OS1 V-B, customary]"""
+    reference keyframe or with `predicted_window` gives at least this many inliers. Otherwise, the
+    frame is LOST. [OS1 V-B, customary]"""
     min_inliers: int = Field(30, ge=3)
-    """A frame with fewer inliers than this in the local map is WEAK: its pose is used, but reported
+    """A frame with fewer inliers than this in the local map is WEAK. Its pose is used, but reported
     as uncertain. [OS1 V-D, customary]"""
     min_inliers_lost: int = Field(15, ge=3)
-    """A frame with fewer inliers than this in the local map is LOST: its pose is only predicted.
+    """A frame with fewer inliers than this in the local map is LOST. Its pose is only predicted.
     [own]"""
     depth_min_inlier_ratio: float = Field(0.2, ge=0, le=1)
     """A frame of an RGB-D camera is also LOST if less than this share of its matches are inliers.
@@ -249,8 +253,8 @@ class TrackingConfig(Section):
     """A stereo or RGB-D camera starts a sub-map at the predicted pose after this many lost frames.
     [own]"""
     young_keyframes: int = Field(5, ge=0)
-    """A map with at most this many keyframes is young. There, a stereo or RGB-D camera starts a
-    sub-map after a single lost frame. [own]"""
+    """A map with at most this many keyframes is young. In a young map, a stereo or RGB-D camera
+    starts a sub-map after a single lost frame. [own]"""
     monocular_lost_frames: int = Field(4, ge=1)
     """A monocular camera starts a sub-map from two new views after this many lost frames. [own]"""
 
@@ -273,33 +277,35 @@ class InitializationConfig(Section):
     draws: int = Field(300, ge=1)
     """Number of RANSAC draws for each of the two models. ORB-SLAM uses 200. [OS1 IV, own]"""
     homography_share: float = Field(0.45, gt=0, lt=1)
-    """The homography is chosen if its share of the sum of both scores is above this; otherwise the
+    """The homography is chosen if its share of the sum of both scores is above this. Otherwise, the
     fundamental matrix is chosen. [OS1 IV, printed]"""
     max_error: float = Field(2.0, gt=0)
     """Upper bound of the reprojection error of an inlier, in pixels at octave 0.
     [OS1 IV, customary]"""
     min_parallax_deg: float = Field(1.0, gt=0)
-    """At least `min_points` points must have this parallax, in degrees. A larger value waits for a
-    longer baseline. [OS1 IV, customary]"""
+    """At least `min_points` points must have this parallax, in degrees. With a larger value, the
+    map starts only after a longer motion of the camera. [OS1 IV, customary]"""
     min_points: int = Field(50, ge=8)
-    """At least this many points must be triangulated with that parallax. [OS1 IV, customary]"""
+    """At least this many points must be triangulated with a parallax of `min_parallax_deg`. [OS1
+    IV, customary]"""
     min_point_share: float = Field(0.7, gt=0, le=1)
-    """At least this share of the model's inliers must be triangulated in front of both cameras.
-    [OS1 IV, own]"""
+    """At least this share of the inliers of the model must be triangulated in front of both
+    cameras. [OS1 IV, own]"""
     max_rival_share: float = Field(0.7, gt=0, le=1)
-    """The motion is ambiguous, and rejected, if the second-best motion explains more than this
-    share of the points that the best one explains. [OS1 IV, customary]"""
+    """The motion is ambiguous if the second-best motion explains more than this share of the points
+    that the best motion explains. An ambiguous motion is rejected. [OS1 IV, customary]"""
     min_landmarks: int = Field(100, ge=8)
     """At least this many landmarks must remain after the first bundle adjustment.
     [OS1 IV, customary]"""
     median_depth: float = Field(15.0, gt=0)
     """The first landmarks are scaled to this median depth, in map units. [own]"""
     max_rescaling: float = Field(10.0, gt=1)
-    """A sub-map is rescaled so that the camera keeps the speed that it had before it was lost,
-    unless the factor would be larger than this number or smaller than its inverse. [own]"""
+    """A sub-map is rescaled so that the camera keeps the speed that it had before it was lost. It
+    is not rescaled if the factor would be larger than this number or smaller than its inverse.
+    [own]"""
     max_seconds: float = Field(1.5, gt=0)
-    """Longest time between the two views, in seconds. After that, the next frame becomes the first
-    view. [own]"""
+    """Longest time between the two views, in seconds. After this time, the next frame replaces the
+    first view. [own]"""
 
 
 class KeyframeConfig(Section):
@@ -309,20 +315,20 @@ class KeyframeConfig(Section):
     """A keyframe is inserted if the last one is at least this old, in seconds.
     [OS1 V-E, customary]"""
     depth_max_interval_s: float = Field(0.3, gt=0)
-    """Replaces `max_interval_s` for an RGB-D camera, which is usually hand-held, in seconds.
-    [own]"""
+    """Replaces `max_interval_s` for an RGB-D camera, in seconds. It is shorter, because such a
+    camera is usually hand-held. [own]"""
     min_tracked_close: int = Field(100, ge=0)
-    """A keyframe is inserted if the frame tracks fewer close points than this and could add more
-    than `min_new_close` new ones. [OS2 III-E, printed]"""
+    """A keyframe is inserted if the frame tracks fewer close points than this, and could add more
+    than `min_new_close` new close points. [OS2 III-E, printed]"""
     min_new_close: int = Field(70, ge=0)
-    """Too few tracked close points cause a keyframe only if the keyframe could add more new close
-    points than this. [OS2 III-E, printed]"""
+    """If a frame tracks too few close points, it becomes a keyframe only if it could add more new
+    close points than this. [OS2 III-E, printed]"""
     min_kept_close: float = Field(0.2, ge=0, le=1)
     """If keyframes add on average fewer close points than `min_tracked_close`, this share of the
     average replaces `min_tracked_close` (docs/research/motorway.md). [own]"""
     first_gain: float = Field(2.0, ge=0)
-    """Until the number of close points that a keyframe adds has been observed, it is assumed to be
-    this multiple of `min_tracked_close`. [own]"""
+    """Before the first observation, the number of close points that a keyframe adds is assumed to
+    be this multiple of `min_tracked_close`. [own]"""
     gain_weight: float = Field(0.2, gt=0, le=1)
     """Weight of the latest keyframe in the running mean of the number of close points that a
     keyframe adds. A larger weight adapts faster to the scene. [own]"""
@@ -336,7 +342,7 @@ class KeyframeConfig(Section):
     """A keyframe is inserted if the frame tracks less than this share of the landmarks of the
     reference keyframe. A larger share inserts keyframes more often. [OS1 V-E, customary]"""
     urgent_ratio: float = Field(0.25, gt=0, le=1)
-    """A keyframe is inserted even while local mapping is busy if the frame tracks less than this
+    """A keyframe is inserted, even while local mapping is busy, if the frame tracks less than this
     share of the landmarks of the reference keyframe. [OS1 V-E, customary]"""
     monocular_ratio: float = Field(0.9, gt=0, le=1)
     """Replaces `max_tracked_ratio` for a monocular camera. [OS1 V-E, printed]"""
@@ -346,17 +352,17 @@ class KeyframeConfig(Section):
     monocular_urgent_ratio: float = Field(0.5, gt=0, le=1)
     """Replaces `urgent_ratio` for a monocular camera. [own]"""
     known_after_s: float = Field(30.0, gt=0)
-    """At a known place, an old keyframe becomes the reference again, and no new keyframe is
-    inserted. A keyframe is old after this time, in seconds. [own]"""
+    """A keyframe is old after this time, in seconds. If the camera returns to a known place, an old
+    keyframe becomes the reference again, and no new keyframe is inserted. [own]"""
     known_ratio: float = Field(0.5, gt=0)
     """A place is known if the frame tracks at least this share of the landmarks of an old keyframe.
-    A larger share inserts more new keyframes at old places. [own]"""
+    With a larger share, more new keyframes are inserted at old places. [own]"""
     known_min_inliers: int = Field(50, ge=0)
     """A place is known only if the frame tracks at least this many landmarks. [own]"""
     merge_after_frames: int = Field(2, ge=1)
-    """Tracking uses the result of local mapping this many frames after the keyframe, or at the next
-    keyframe if that comes first. With a smaller value, tracking waits for mapping more often.
-    [own]"""
+    """Tracking uses the result of local mapping this many frames after the keyframe. If the next
+    keyframe comes earlier, tracking uses the result there. With a smaller value, tracking waits for
+    mapping more often. [own]"""
 
 
 class MappingConfig(Section):
@@ -375,7 +381,7 @@ class MappingConfig(Section):
     distance between the keyframes is at least this share of the median depth.
     [OS1 VI-C, customary]"""
     min_parallax_cosine: float = Field(0.9998, gt=0, le=1)
-    """Upper bound of the cosine of the parallax of a triangulated point; the default corresponds to
+    """Upper bound of the cosine of the parallax of a triangulated point. The default corresponds to
     1.1 degrees. A larger value also accepts points with less parallax. [OS1 VI-C, customary]"""
     epipolar_distance: int = Field(50, ge=0, le=256)
     """Upper bound of the descriptor distance when features are matched for triangulation, in bits.
@@ -386,15 +392,15 @@ class MappingConfig(Section):
     fuse_window: float = Field(3.0, gt=0)
     """Search radius for duplicate landmarks, in pixels at octave 0. [OS1 VI-C, customary]"""
     min_stereo_points: int = Field(100, ge=0)
-    """If a keyframe has fewer close stereo features than this, this many of its nearest stereo
-    features are mapped. [OS2 III-E, printed]"""
+    """If a keyframe has fewer close stereo features than this, its nearest stereo features are
+    mapped, up to this number. [OS2 III-E, printed]"""
     min_found_ratio: float = Field(0.25, ge=0, le=1)
     """A recent landmark is culled if it is found in less than this share of the frames in which it
     should be visible. [OS1 VI-B, printed]"""
     redundant_ratio: float = Field(0.9, gt=0, le=1)
-    """A keyframe is culled if more than this share of its landmarks are redundant, that is,
-    observed by three other keyframes as well. A larger share keeps more keyframes.
-    [OS1 VI-E, printed]"""
+    """A keyframe is culled if more than this share of its landmarks are redundant. A landmark is
+    redundant if at least three other keyframes observe it. With a larger share, more keyframes are
+    kept. [OS1 VI-E, printed]"""
     min_shared: int = Field(15, ge=1)
     """Two keyframes are joined by a covisibility edge if they share at least this many landmarks.
     [OS1 III-D, printed]"""
@@ -410,10 +416,10 @@ class VerificationConfig(Section):
     """Geometric verification of loop candidates [OS1, VII-B; OS2, III-C]."""
 
     descriptors: Literal["auto", "orb", "learned", "both"] = "auto"
-    """Which descriptors verify candidates, whatever detector proposed them: `orb`, `learned` (the
-    network's local descriptors), or `both`, which uses the learned ones where ORB fails. `auto`
-    selects `orb` for the detectors `bow` and `capsule-paper` and for plug-ins, and `both` for all
-    other detectors. [own]"""
+    """The descriptors with which loop candidates are verified. `orb` uses ORB descriptors, and
+    `learned` uses the local descriptors of the network. `both` uses the learned descriptors where
+    ORB fails. `auto` selects `orb` for the detectors `bow` and `capsule-paper` and for plug-ins,
+    and `both` for all other detectors. [own]"""
     match_distance: int = Field(50, ge=0, le=256)
     """Upper bound of the descriptor distance of a match, in bits. [OS1 VII-B, customary]"""
     match_ratio: float = Field(0.8, gt=0, le=1)
@@ -442,7 +448,7 @@ class VerificationConfig(Section):
     """At least this share of the matches of guided search must be inliers. [own]"""
     min_elsewhere: int = Field(15, ge=0)
     """At least this many inliers must lie outside the vertical third of the image that has the most
-    inliers, because look-alikes often agree on a single object only. [own]"""
+    inliers. Two similar but different places often agree in a single object only. [own]"""
     min_cells: int = Field(8, ge=1)
     """At least this many cells of an 8 x 4 grid over the image must contain inliers. [own]"""
     min_cell_ratio: float = Field(0.3, ge=0, le=1)
@@ -456,13 +462,13 @@ class VerificationConfig(Section):
 
 
 class LearnedMatchingConfig(Section):
-    """Verification by the network's local descriptors, where ORB fails."""
+    """Verification of loop candidates by the network's local descriptors, where ORB fails."""
 
     max_candidates: int = Field(2, ge=1)
     """Upper bound of the number of candidates that are tried for a keyframe or a lost frame.
     [own]"""
     max_compared: int = Field(5, ge=0)
-    """If the detector has not compared its candidates by local descriptors, this many of its best
+    """If the detector has not compared its candidates by local descriptors, this many of the best
     candidates are compared before verification. [own]"""
     views: int = Field(2, ge=1)
     """Upper bound of the number of keyframes that are matched at each place. [own]"""
@@ -475,8 +481,8 @@ class LearnedMatchingConfig(Section):
     retry_interval: int = Field(8, ge=0)
     """After a failed attempt, `retry_factor` applies to this many keyframes. [own]"""
     retry_factor: float = Field(1.1, ge=1)
-    """In the `retry_interval` keyframes after a failed attempt, a place is tried only if its
-    similarity is at least this many times the similarity of the failed attempt. [own]"""
+    """During the `retry_interval` keyframes after a failed attempt, a place is tried only if its
+    similarity is at least this many times the similarity in the failed attempt. [own]"""
     min_share: float = Field(0.1, ge=0, le=1)
     """At least this share of the cells of the network's coarse feature map must agree with one
     homography. [own]"""
@@ -485,14 +491,14 @@ class LearnedMatchingConfig(Section):
     min_fine_similarity: float = Field(0.5, ge=-1, le=1)
     """Two fine descriptors match only if their cosine is at least this. [own]"""
     reach: int = Field(5, ge=1)
-    """The fine match is searched for up to this far to each side of the coarse match, in cells of
-    the network's fine feature map. [own]"""
+    """The fine match is searched for up to this distance to each side of the coarse match, in cells
+    of the network's fine feature map. [own]"""
     guided_reach: int = Field(3, ge=1)
-    """A landmark is searched for up to this far to each side of its projection, in cells of the
-    network's fine feature map. [own]"""
+    """A landmark is searched for up to this distance to each side of its projection, in cells of
+    the network's fine feature map. [own]"""
     sigma: float = Field(1.5, gt=0)
-    """Standard deviation of the position of a match, in pixels of the network's image. A larger
-    value accepts more distant matches as inliers. [own]"""
+    """Standard deviation of the position of a match, in pixels of the network's input image. With a
+    larger value, matches with larger errors count as inliers. [own]"""
     max_draws: int = Field(1000, ge=1)
     """Upper bound of the number of RANSAC draws. [own]"""
     confidence: float = Field(0.99, gt=0, lt=1)
@@ -519,27 +525,27 @@ class LearnedMatchingConfig(Section):
 
 
 class ConsistencyConfig(Section):
-    """Agreement of several keyframes on a loop [OS1, VII-A]."""
+    """Test whether several keyframes agree on a loop [OS1, VII-A]."""
 
     min_keyframes: int = Field(2, ge=1)
     """At least this many consecutive keyframes must resemble the place. OS1 requires 3.
     [OS1 VII-A, own]"""
     max_gap: int = Field(1, ge=0)
-    """Up to this many keyframes in between need not resemble the place. OS1 allows none.
-    [OS1 VII-A, own]"""
+    """Up to this many keyframes between two keyframes that resemble the place need not resemble it.
+    OS1 allows none. [OS1 VII-A, own]"""
     min_shared: int = Field(30, ge=1)
-    """The keyframes that share at least this many landmarks with a candidate belong to its place.
+    """Keyframes that share at least this many landmarks with a candidate belong to the same place.
     [own]"""
     min_verified: int = Field(2, ge=1)
     """The verified loops of at least this many keyframes must agree. [own]"""
     verified_memory: int = Field(5, ge=1)
     """A verified loop is remembered for this many keyframes. [own]"""
     max_apart: float = Field(0.5, gt=0)
-    """Two loops agree if the positions of the query that they imply are at most this far apart, in
-    metres. [own]"""
+    """Each verified loop implies a pose of the query. Two loops agree if these positions are at
+    most this far apart, in metres. [own]"""
     max_turn: float = Field(1.0, gt=0)
-    """Two loops agree if the orientations of the query that they imply differ by at most this, in
-    degrees. [own]"""
+    """Two loops agree only if the orientations of the query that they imply differ by at most this,
+    in degrees. [own]"""
     min_moved: float = Field(2.0, ge=0)
     """At the end of a drive, an earlier keyframe may confirm a loop only if it is at least this far
     from the query, in metres. A nearer keyframe would only repeat the evidence of the query.
@@ -572,18 +578,19 @@ class RelocalizationConfig(Section):
     max_candidates: int = Field(5, ge=1)
     """Upper bound of the number of places that are tried for a lost frame. [own]"""
     doubtful_gap: float = Field(1.5, gt=1)
-    """A frame comes after a gap if the time since the last tracked frame is above this multiple of
-    the usual interval between frames. [own]"""
+    """A frame comes after a gap if the time since the last tracked frame exceeds the usual interval
+    between frames by more than this factor. [own]"""
     doubtful_share: float = Field(0.5, ge=0, le=1)
-    """The whole map is searched for a doubtful frame. A frame is doubtful if it tracks less than
-    this share of the landmarks of the reference keyframe and there is a second reason for doubt:
-    it comes after a gap, its pose could not be predicted, or it tracks less than this share of the
-    number of landmarks that the previous frame tracked. [own]"""
+    """A frame is doubtful if it tracks less than this share of the landmarks of the reference
+    keyframe, and if there is a second reason for doubt. The second reason is that the frame comes
+    after a gap, that its pose could not be predicted, or that it tracks less than this share of the
+    number of landmarks in the previous frame. For a doubtful frame, vslam searches the whole map.
+    [own]"""
     better: float = Field(1.5, ge=1)
-    """A doubtful frame is moved to the place that the search finds if its number of inliers there
-    is more than this many times the number in tracking. [own]"""
+    """A doubtful frame is moved to the place that the search of the whole map finds if it has more
+    inliers there than this many times its number of inliers in tracking. [own]"""
     neighbours: int = Field(20, ge=1)
-    """The landmarks of this many keyframes around the place are matched. [own]"""
+    """The landmarks of this many keyframes around a candidate place are matched. [own]"""
 
 
 class LoopConfig(Section):
@@ -603,21 +610,21 @@ class BowConfig(Section):
 
     min_shared: int = Field(15, ge=1)
     """Two keyframes are neighbours if they share at least this many landmarks. The neighbours of
-    the query are never candidates. Their lowest score is the least score of a candidate.
-    [OS1 III-D, printed]"""
+    the query are never candidates. A candidate must have at least the lowest score of these
+    neighbours. [OS1 III-D, printed]"""
     exclude_recent: int = Field(20, ge=1)
     """This many of the newest keyframes, including the query, are never candidates. [own]"""
     common_words_ratio: float = Field(0.8, ge=0, le=1)
-    """A candidate must share at least this fraction of the largest number of words that any
-    keyframe shares with the query. [OS1 III-E, customary]"""
+    """The number of words that a candidate shares with the query must be at least this share of the
+    largest number that any keyframe shares with the query. [OS1 III-E, customary]"""
     group_size: int = Field(10, ge=0)
     """A candidate forms a group with at most this many of its most covisible keyframes.
     [OS1 III-E, customary]"""
     group_score_ratio: float = Field(0.75, ge=0, le=1)
-    """A group is kept if its score is at least this share of the best group's.
-    [OS1 III-E, printed]"""
+    """A group is kept if its score is at least this share of the score of the best group. [OS1
+    III-E, printed]"""
     max_groups: int = Field(30, ge=1)
-    """Upper bound of the number of groups; groups are formed around the candidates with the highest
+    """Upper bound of the number of groups. Groups are formed around the candidates with the highest
     scores. [own]"""
 
 
@@ -626,50 +633,54 @@ class PoseGraphConfig(Section):
 
     An edge has less weight if its standard deviation is larger. Drift is modelled as a random walk:
     its standard deviation grows with the square root of the distance travelled. With the default
-    values, the drift is 1.2 % after 400 m, and nearly all of it is caused by errors of rotation. A
-    gap is an edge over frames in which tracking was lost and the motion was only predicted. Such an
-    edge is weak if there was no prediction, or under the hypothesis that the camera was carried
-    elsewhere meanwhile.
+    values, the drift is 1.2 % after 400 m, and nearly all of it is caused by errors of rotation.
+
+    A gap is an edge over frames in which tracking was lost and the motion was only predicted. A gap
+    becomes a weak edge if there was no prediction. It also becomes a weak edge under the hypothesis
+    that the camera was carried to another place while tracking was lost.
     """
 
     min_shared: int = Field(100, ge=1)
-    """A covisibility edge belongs to the graph if its ends share at least this many landmarks.
-    [OS1 III-D, printed]"""
+    """A covisibility edge belongs to the graph if its two keyframes share at least this many
+    landmarks. [OS1 III-D, printed]"""
     min_shared_tree: int = Field(15, ge=1)
-    """An edge of the spanning tree across a restart of mapping is weak if its ends share fewer
-    landmarks than this. [OS1 III-D, printed]"""
+    """An edge of the spanning tree across a restart of mapping is weak if its two keyframes share
+    fewer landmarks than this. [OS1 III-D, printed]"""
     translation_drift: float = Field(0.03, gt=0)
-    """Standard deviation of the drift of odometry, in metres per square root of a metre. [own]"""
+    """Standard deviation of the translational drift of odometry, in metres per square root of a
+    metre. [own]"""
     rotation_drift: float = Field(0.001, gt=0)
-    """Standard deviation of the drift of odometry, in radians per square root of a metre. [own]"""
+    """Standard deviation of the rotational drift of odometry, in radians per square root of a
+    metre. [own]"""
     scale_drift: float = Field(0.01, gt=0)
-    """Standard deviation of the scale drift of monocular odometry, in log scale per square root of
-    a map unit. [own]"""
+    """Standard deviation of the scale drift of monocular odometry, as the logarithm of the scale
+    per square root of a map unit. [own]"""
     min_length: float = Field(0.3, gt=0)
-    """Shorter edges count as this long in the drift model, in metres. [own]"""
+    """An edge shorter than this counts as this long in the drift model, in metres. [own]"""
     loop_translation: float = Field(0.1, gt=0)
-    """Standard deviation of a verified loop, in metres. [own]"""
+    """Standard deviation of the translation of a verified loop, in metres. [own]"""
     loop_rotation: float = Field(0.005, gt=0)
-    """Standard deviation of a verified loop, in radians. [own]"""
+    """Standard deviation of the rotation of a verified loop, in radians. [own]"""
     loop_scale: float = Field(0.02, gt=0)
-    """Standard deviation of a verified loop, in log scale. [own]"""
+    """Standard deviation of the logarithm of the scale of a verified loop. [own]"""
     weak_scale: float = Field(3.0, gt=0)
-    """Standard deviation of a weak edge, in log scale. [own]"""
+    """Standard deviation of the logarithm of the scale of a weak edge. [own]"""
     weak_translation: float = Field(100.0, gt=0)
-    """Standard deviation of a weak edge, in metres. [own]"""
+    """Standard deviation of the translation of a weak edge, in metres. [own]"""
     weak_rotation: float = Field(1.0, gt=0)
-    """Standard deviation of a weak edge, in radians. [own]"""
+    """Standard deviation of the rotation of a weak edge, in radians. [own]"""
     gap_translation: float = Field(0.5, gt=0)
-    """Standard deviation of a gap, as a share of the predicted distance. [own]"""
-    gap_speed: float = Field(2.0, gt=0)
-    """Lower bound of the standard deviation of a gap, in metres per second of its duration.
+    """Standard deviation of the translation of a gap, as a share of the predicted distance.
     [own]"""
+    gap_speed: float = Field(2.0, gt=0)
+    """Lower bound of the standard deviation of the translation of a gap, in metres per second of
+    its duration. [own]"""
     gap_rotation: float = Field(0.3, gt=0)
-    """Standard deviation of a gap, in radians per second of its duration. [own]"""
+    """Standard deviation of the rotation of a gap, in radians per second of its duration. [own]"""
     gap_scale: float = Field(0.3, gt=0)
-    """Standard deviation of a gap, in log scale. [own]"""
+    """Standard deviation of the logarithm of the scale of a gap. [own]"""
     min_gap: float = Field(0.3, gt=0)
-    """Shorter gaps count as this long, in seconds. [own]"""
+    """A gap shorter than this counts as this long, in seconds. [own]"""
     robust_scale: float = Field(3.0, gt=0)
     """Scale of the Cauchy loss on loops, in standard deviations. A smaller scale reduces the
     influence of loops that contradict the other edges. [own]"""
@@ -678,12 +689,12 @@ class PoseGraphConfig(Section):
     max_loop_error: float = Field(30.0, gt=0)
     """A loop is rejected if its chi-square after optimisation is above this. [own]"""
     max_strain: float = Field(60.0, gt=0)
-    """A loop is rejected if the chi-square of all other edges is above this times the number of
-    closed loops. [own]"""
+    """A loop is rejected if the chi-square of all other edges exceeds this number times the number
+    of closed loops. [own]"""
 
 
 class SiameseConfig(Section):
-    """Loop candidates by a network [ZS]."""
+    """Loop candidates by a Siamese network [ZS]."""
 
     threshold: float = Field(0.9, ge=0, le=1)
     """A keyframe is a loop candidate if its similarity is at least this. [ZS, printed]"""
@@ -693,37 +704,38 @@ class SiameseConfig(Section):
     reranked: int = Field(20, ge=1)
     """This many of the most similar keyframes are re-ranked by local descriptors. [own]"""
     max_candidates: int = Field(5, ge=1)
-    """Upper bound of the number of candidates of a query; the best ones are kept. [own]"""
+    """Upper bound of the number of candidates for a query. The best candidates are kept. [own]"""
     recent_keyframes: int = Field(10, ge=0)
     """This many of the newest keyframes are never candidates. [own]"""
     min_shared: int = Field(15, ge=1)
-    """Two keyframes show the same place if they share at least this many landmarks; only the best
-    candidate of a place is proposed. [OS1 III-D, printed]"""
+    """Two keyframes show the same place if they share at least this many landmarks. Only the best
+    candidate of each place is proposed. [OS1 III-D, printed]"""
     reach: float = Field(20.0, ge=0)
     """If learned descriptors verify the candidates, the query is compared only with keyframes
-    within this distance, in metres. The distance grows by `reach_share` of the distance driven
-    since the keyframe. [own]"""
+    within this distance, in metres. `reach_share` increases this distance. [own]"""
     reach_share: float = Field(0.05, ge=0)
-    """`reach` grows by this share of the distance driven since the keyframe. It is several times
-    the drift of a stereo camera in a street, which is about one per cent. [own]"""
+    """This share of the distance driven since the keyframe is added to `reach`. The default is
+    several times the drift of a stereo camera in a street, which is about one per cent. [own]"""
     monocular_reach_share: float = Field(0.3, ge=0)
-    """Replaces `reach` and `reach_share` in monocular maps, whose scale is unknown and drifts: the
-    query is compared only with keyframes nearer than this share of the distance driven since the
-    keyframe. The default is twice what KITTI 00 needs, where the scale drifts by a factor of 2.3.
-    [own]"""
+    """Replaces `reach` and `reach_share` in monocular maps, whose scale is unknown and drifts. The
+    query is compared only with keyframes that are nearer than this share of the distance driven
+    since the keyframe. The default is twice the value that KITTI 00 needs, where the scale drifts
+    by a factor of 2.3. [own]"""
     reach_angle: float = Field(60.0, gt=0, le=180)
-    """The query is compared only with keyframes whose viewing directions differ from its own by at
-    most this, in degrees, because no place is recognised from behind or from the side. [own]"""
+    """The query is compared only with keyframes whose viewing direction differs from its own by at
+    most this, in degrees. The detectors do not recognise a place from behind or from the side.
+    [own]"""
     embedded_at_once: int = Field(8, ge=1)
-    """Upper bound of the number of keyframes that the network processes for one query; the nearest
-    ones are chosen. [own]"""
+    """Upper bound of the number of keyframes that the network processes for one query. The nearest
+    keyframes are chosen. [own]"""
     fit: Literal["squash", "crop"] = "squash"
-    """How an image is fitted to the network's input size: `squash` scales the whole image, `crop`
+    """How an image is fitted to the network's input size. `squash` scales the whole image. `crop`
     cuts out its middle. [own]"""
 
 
 class Config(Section):
-    """The whole configuration: each run writes it to ``config.json``, and --config reads it.
+    """All thresholds. Each run writes them to ``config.json``, and the option ``--config`` reads
+    them.
 
     A threshold can also be given by its dotted name: ``{"orb.n_features": 1000}`` means the same as
     ``{"orb": {"n_features": 1000}}``.
@@ -750,8 +762,8 @@ class Config(Section):
     @model_validator(mode="before")
     @classmethod
     def _nest(cls, given: Any) -> Any:
-        """Move thresholds given by their dotted names into their sections, and rename those of
-        older versions."""
+        """Move thresholds that are given by dotted names into their sections, and rename thresholds
+        of older versions."""
         if not isinstance(given, dict):
             return given
         nested = {name: value for name, value in given.items() if "." not in str(name)}
@@ -771,7 +783,7 @@ class Config(Section):
 
 
 def load_config(path: Path | str) -> Config:
-    """Read a configuration from a JSON file; keys that it omits keep their defaults.
+    """Read a configuration from a JSON file. Keys that the file omits keep their defaults.
 
     Raises:
         InputError: the file is missing or is not JSON, a key is unknown, or a value is out of
@@ -781,11 +793,11 @@ def load_config(path: Path | str) -> Config:
 
 
 def as_config(given: Config | Mapping[str, Any], where: str = "config") -> Config:
-    """Check thresholds given as a dictionary like the content of ``config.json``.
+    """Check thresholds that are given as a dictionary, in the form of ``config.json``.
 
     Args:
-        given: thresholds by section or dotted name; those left out keep their defaults. A
-            ``Config`` is returned unchanged.
+        given: thresholds by section or by dotted name. Thresholds that are left out keep their
+            defaults. A ``Config`` is returned unchanged.
         where: the file or argument that the thresholds come from, for error messages.
 
     Raises:
@@ -798,7 +810,7 @@ def changed_thresholds(config: Mapping[str, Mapping[str, Any]]) -> dict[str, Any
     """The thresholds of a ``config.json`` that differ from the defaults, by dotted name.
 
     Args:
-        config: thresholds by section; the file may come from another version of vslam.
+        config: thresholds by section. They may come from another version of vslam.
     """
     default = Config().model_dump()
     return {
@@ -810,20 +822,22 @@ def changed_thresholds(config: Mapping[str, Mapping[str, Any]]) -> dict[str, Any
 
 
 def thresholds_in_words(changed: Mapping[str, Any], most: int = 3) -> str:
-    """List the first ``most`` thresholds and count the others: ``orb.n_features=1000, 2 more in
-    config.json``."""
+    """List the first ``most`` thresholds, and count the others.
+
+    An example is ``orb.n_features=1000, 2 more in config.json``.
+    """
     words = [f"{name}={value}" for name, value in changed.items()]
     more = [f"{len(words) - most} more in config.json"] if len(words) > most else []
     return ", ".join(words[:most] + more)
 
 
 def read_json(model: type[_Model], path: Path, what: str) -> _Model:
-    """Read a file of thresholds or settings; keys that it omits keep their defaults.
+    """Read a JSON file of thresholds or settings. Keys that the file omits keep their defaults.
 
     Args:
         model: the class that describes the values and their ranges.
         path: the file.
-        what: what error messages call its content, such as ``configuration``.
+        what: the name of the content in error messages, such as ``configuration``.
 
     Raises:
         InputError: the file is missing or is not JSON, a key is unknown, or a value is out of
@@ -837,16 +851,16 @@ def read_json(model: type[_Model], path: Path, what: str) -> _Model:
 
 
 def checked(model: type[_Model], given: object, where: str, what: str) -> _Model:
-    """Check thresholds or settings; those that are left out keep their defaults.
+    """Check thresholds or settings. Values that are left out keep their defaults.
 
     Args:
         model: the class that describes the values and their ranges.
         given: JSON as bytes, a dictionary, or a model, which is returned unchanged.
         where: the file or argument that the values come from, for error messages.
-        what: what error messages call the values, such as ``thresholds``.
+        what: the name of the values in error messages, such as ``thresholds``.
 
     Raises:
-        InputError: as ``read_json``.
+        InputError: for the same reasons as in ``read_json``.
     """
     try:
         if isinstance(given, bytes):
@@ -873,7 +887,8 @@ def _fault(model: type[BaseModel], error: ValidationError, what: str) -> str:
 
 
 def _without_section(model: type[BaseModel], place: list[str]) -> str:
-    """A suggestion for a key that was given without its section; "" if no section has it."""
+    """A suggestion for a key that was given without its section; empty if no section has the
+    key."""
     sections = [section for section in model.model_fields if place[-1] in _keys(model, [section])]
     if len(place) > 1 or not sections:
         return ""
@@ -881,7 +896,8 @@ def _without_section(model: type[BaseModel], place: list[str]) -> str:
 
 
 def _keys(model: type[BaseModel], place: list[str]) -> list[str]:
-    """The keys of the section of ``model`` at ``place``; empty if it is not a section."""
+    """The keys of the section of ``model`` at ``place``; empty if there is no section at
+    ``place``."""
     for name in place:
         field = model.model_fields.get(name)
         if field is None or not isinstance(field.annotation, type):

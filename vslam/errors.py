@@ -8,13 +8,17 @@ from pathlib import Path
 
 
 class InputError(Exception):
-    """Bad input: one sentence that names the file or option and the fix. The CLI exits with 2."""
+    """An input is wrong.
+
+    The message is one sentence that names the file or option and says how to correct the input. The
+    command line exits with status 2.
+    """
 
 
 class UnreadableImageError(InputError):
     """One image of a sequence cannot be decoded or has the wrong size.
 
-    During a run the frame is reported, skipped and counted; before a run it is an error.
+    During a run, the frame is reported, skipped and counted. Before a run, it is an error.
     """
 
     def __init__(self, path: Path, why: str) -> None:
@@ -23,7 +27,7 @@ class UnreadableImageError(InputError):
 
 
 class DroppedFrameError(UnreadableImageError):
-    """A perturbation dropped this frame; during a run it counts as dropped, not as lost."""
+    """A perturbation dropped this frame. During a run, the frame counts as dropped, not as lost."""
 
     def __init__(self, frame: int) -> None:
         super().__init__(Path(f"frame {frame}"), "dropped by --perturb")
@@ -32,20 +36,23 @@ class DroppedFrameError(UnreadableImageError):
 class BrokenSourceError(InputError):
     """A video, bag or camera ended early: the file is cut off, or the device was unplugged.
 
-    During a run the frames before the break are kept; the run fails only if there are none.
+    During a run, the frames before the break are kept. The run fails only if there are no such
+    frames.
     """
 
 
 class ResultsError(Exception):
-    """Results cannot be written, for example because the disk is full. The CLI exits with 1."""
+    """Results cannot be written, for example because the disk is full. The command line exits with
+    status 1."""
 
 
 def write_file(path: Path, content: str | bytes, fix: str = "free some space") -> None:
-    """Write a file atomically, so that it appears only when it is complete. Its folder is created
-    if needed.
+    """Write a file atomically, so that it appears only when it is complete.
+
+    The folder of the file is created if needed.
 
     Raises:
-        ResultsError: the file cannot be written; the message ends with ``fix``.
+        ResultsError: the file cannot be written. The message ends with ``fix``.
     """
     part = path.with_name(f"{path.name}.part")
     try:
@@ -59,8 +66,11 @@ def write_file(path: Path, content: str | bytes, fix: str = "free some space") -
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """`` (did you mean NAME?)`` with the known name that is most similar to a misspelt word; empty
-    if none is similar."""
+    """A suggestion for a misspelt word, such as `` (did you mean NAME?)``.
+
+    NAME is the known name that is most similar to the word. The suggestion is empty if no known
+    name is similar.
+    """
     from difflib import get_close_matches  # slow to import, and only an error message needs it
 
     near = get_close_matches(word.lower(), list(known), n=1)

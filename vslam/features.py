@@ -1,4 +1,4 @@
-"""Image features, and the results of extraction and of tracking for one frame."""
+"""Image features, and the results of feature extraction and of tracking for one frame."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from vslam.geometry import inverse
 from vslam.kernels import inline, inner_kernel, kernel
 from vslam.odometry import PoseUncertainty
 
-MIN_DISPARITY = 0.01  # pixels; smaller disparities are clamped to this
-PATCH_RADIUS = 8  # half width of the patch kept around a feature, in pixels of its octave
+MIN_DISPARITY = 0.01  # pixels; smaller disparities are set to this
+PATCH_RADIUS = 8  # half width of the patch around a feature, in pixels of its octave
 PATCH_SIDE = 2 * PATCH_RADIUS + 1
 PATCH_PIXELS = PATCH_SIDE**2
 CELL = 16  # side of a FeatureGrid cell in pixels; search windows are 5 to 60 px wide
@@ -22,13 +22,13 @@ CELL = 16  # side of a FeatureGrid cell in pixels; search windows are 5 to 60 px
 
 @dataclass(frozen=True)
 class Pyramid:
-    """Image pyramid with all levels in one buffer, so that kernels take it as one array.
+    """Image pyramid that has all its levels in one buffer, so that a kernel takes it as one array.
 
     Attributes:
-        pixels: ``(P + SPARE,)`` uint8, the levels row by row, then padding, because vectorised
-            kernels read up to one register beyond the last pixel and discard those bytes.
-        offsets: ``(L,)`` int64, where each level starts.
-        shapes: ``(L, 2)`` int64, height and width.
+        pixels: ``(P + SPARE,)`` uint8, the levels row by row, followed by padding. Vectorised
+            kernels read up to one register beyond the last pixel and discard these bytes.
+        offsets: ``(L,)`` int64, index of the first pixel of each level.
+        shapes: ``(L, 2)`` int64, height and width of each level.
         scales: ``(L,)`` float64, full-resolution pixels per pixel of the level.
     """
 
@@ -38,7 +38,7 @@ class Pyramid:
     scales: NDArray[np.float64]
 
     def level(self, index: int) -> NDArray[np.uint8]:
-        """View of one level, ``(h, w)``."""
+        """A view of one level as an ``(h, w)`` image."""
         height, width = self.shapes[index]
         start = self.offsets[index]
         return self.pixels[start : start + height * width].reshape(height, width)
@@ -46,7 +46,7 @@ class Pyramid:
 
 @inline
 def level_of(pixels, offsets, shapes, level):
-    """``Pyramid.level`` in a kernel."""
+    """The same as ``Pyramid.level``, for kernels."""
     height, width = shapes[level]
     start = offsets[level]
     return pixels[start : start + height * width].reshape(height, width)
@@ -54,8 +54,12 @@ def level_of(pixels, offsets, shapes, level):
 
 @inner_kernel
 def level_pixel(x, ratio):
-    """Convert the image coordinate ``x`` to a pyramid level, where ``ratio`` is the number of image
-    pixels per pixel of the level, and round it."""
+    """Convert an image coordinate to the nearest pixel of a pyramid level.
+
+    Args:
+        x: the coordinate in pixels of the image.
+        ratio: number of image pixels per pixel of the level.
+    """
     return int(np.rint((np.float64(x) + 0.5) / ratio - 0.5))
 
 
@@ -68,7 +72,8 @@ class Features:
         octave: ``(N,)`` uint8, pyramid level.
         angle: ``(N,)`` float32, orientation in radians.
         descriptors: ``(N, 32)`` uint8, 256-bit rotated BRIEF.
-        u_right: ``(N,)`` float32, column of the stereo match in the right image, NaN without one.
+        u_right: ``(N,)`` float32, column of the stereo match in the right image. NaN if the feature
+            has no stereo match.
     """
 
     xy: NDArray[np.float32]
@@ -93,7 +98,7 @@ class Features:
 
 
 Keypoints = tuple[NDArray[np.float32], NDArray[np.uint8]]
-"""``(N, 2)`` positions at full resolution (pixels), and ``(N,)`` pyramid levels."""
+"""``(N, 2)`` positions in pixels at full resolution, and ``(N,)`` pyramid levels."""
 
 
 class Side(StrEnum):
@@ -105,16 +110,17 @@ class Side(StrEnum):
 
 @dataclass(frozen=True)
 class Extracted:
-    """The result of extraction for one frame.
+    """The result of feature extraction for one frame.
 
     Attributes:
         features: the N features that were extracted from the image of ``side``.
-        pyramid: the pyramid of that image; None if matches are not aligned in it.
+        pyramid: the pyramid of this image. None if matches are not aligned to sub-pixel accuracy in
+            the image.
         row_offset: ``(N,)`` float32, row of the stereo match in the right image minus row in the
-            left image, in pixels; NaN for features without this measurement. None if no feature
-            has it.
-        side: the camera whose image was used. The right image is used only if the left one is
-            black; then no feature has a stereo match.
+            left image, in pixels. NaN for a feature without this measurement. None if no feature
+            has this measurement.
+        side: the camera whose image was used. The right image is used only if the left image is
+            black. In this case, no feature has a stereo match.
     """
 
     features: Features
@@ -124,7 +130,7 @@ class Extracted:
 
     @classmethod
     def nothing(cls) -> Extracted:
-        """The result of extraction for a frame without images: no features."""
+        """The result for a frame without images, which has no features."""
         return cls(Features.none())
 
 
@@ -148,8 +154,8 @@ class LandmarkPatches(NamedTuple):
 
     Attributes:
         ids: ``(N,)`` int32 landmark ids, sorted.
-        where: ``(N,)`` int64, row of each landmark in ``pixels`` and ``shift``.
-        view: ``(N,)`` int64, index into ``T_cw`` of the keyframe that the patch was taken from.
+        where: ``(N,)`` int64, the row of ``pixels`` and ``shift`` that belongs to each landmark.
+        view: ``(N,)`` int64, the keyframe that the patch was taken from, as an index into ``T_cw``.
         size: ``(N,)`` float64, full-resolution pixels per pixel of the patch.
         angle: ``(N,)`` float32, orientation of the feature in radians.
         pixels: ``(P, PATCH_PIXELS)`` uint8, as in ``KeyframePatches``.
@@ -184,15 +190,17 @@ def shifted_columns(
 ) -> NDArray[np.float32]:
     """Move ``(N,)`` columns of the right image ``change`` pixels to the left.
 
-    The disparity never falls below ``MIN_DISPARITY``, so that no point comes to lie behind the
-    camera. NaN stays NaN.
+    A disparity is never reduced below ``MIN_DISPARITY``. A smaller disparity could move a point
+    behind the camera. NaN stays NaN.
     """
     return np.minimum(u_right - np.asarray(change, np.float32), u - np.float32(MIN_DISPARITY))
 
 
 class FeatureGrid(NamedTuple):
-    """Feature indices sorted by image cell, the cells row by row: cell c holds
-    ``items[start[c]:start[c + 1]]``."""
+    """Indices of features, sorted by the cell of the image that each feature lies in.
+
+    The cells are numbered row by row. Cell c holds ``items[start[c]:start[c + 1]]``.
+    """
 
     start: NDArray[np.int64]
     items: NDArray[np.int32]
@@ -208,7 +216,7 @@ class FeatureGrid(NamedTuple):
 
 @kernel
 def build_grid(xy, columns, rows):
-    """Counting sort of ``(N, 2)`` positions into cells, row by row."""
+    """Sort ``(N, 2)`` positions into cells by counting sort. The cells are numbered row by row."""
     n = len(xy)
     cell = np.empty(n, np.int64)
     start = np.zeros(columns * rows + 1, np.int64)
@@ -230,9 +238,9 @@ def build_grid(xy, columns, rows):
 class TrackingState(StrEnum):
     """How a frame was tracked.
 
-    OK: the pose has enough inliers. WEAK: it has few inliers. LOST: it is only predicted, or no map
-    has begun yet. DROPPED: the images arrived while earlier ones were being processed
-    (``--realtime``), and the pose is interpolated.
+    OK: the pose has enough inliers. WEAK: the pose has few inliers. LOST: the pose is only
+    predicted, or no map has begun yet. DROPPED: the images arrived while earlier images were still
+    being processed (``--realtime``), so the pose is interpolated.
     """
 
     OK = "OK"
@@ -243,24 +251,28 @@ class TrackingState(StrEnum):
 
 @dataclass(frozen=True)
 class TrackResult:
-    """The result of tracking one frame. Lost frames have one, too.
+    """The result of tracking one frame. Lost frames have a result, too.
 
     Attributes:
         index: frame number within the run, from 0.
         timestamp: seconds.
-        T_wc: ``(4, 4)`` float64 pose (camera to world) as tracked; ``Slam.trajectory()`` returns
-            the final poses, after later bundle adjustments.
+        T_wc: ``(4, 4)`` float64 pose (camera to world) at the time of tracking. Later bundle
+            adjustments improve it: ``Slam.trajectory()`` returns the final poses.
         state: OK, WEAK, LOST or DROPPED.
-        n_features: features extracted from the left image; 0 if the frame was tracked by patches.
-        n_stereo: features with a stereo match.
-        n_matches: landmarks matched by descriptor or patch, before the last pose optimisation.
-        n_inliers: matches that are inliers of that optimisation.
+        n_features: number of features that were extracted from the left image. It is 0 if the frame
+            was tracked by patches.
+        n_stereo: number of features with a stereo match.
+        n_matches: number of landmarks that were matched by descriptor or by patch before the last
+            pose optimisation.
+        n_inliers: number of these matches that are inliers of the last pose optimisation.
         is_keyframe: whether the frame became a keyframe.
         relocalised: whether the pose was found by a search in the whole map.
         stage_ms: wall time of each stage of the pipeline, in milliseconds.
-        T_odom_camera: ``(4, 4)`` pose by odometry, which drifts but never jumps; it is the identity
-            at the first frame. None in the results of older files.
-        uncertainty: covariance of the pose; None in the results of older files.
+        T_odom_camera: ``(4, 4)`` pose from odometry, which drifts but never jumps. It is the
+            identity at the first frame. None in results that were read from files of older
+            versions.
+        uncertainty: covariance of the pose. None in results that were read from files of older
+            versions.
     """
 
     index: int
@@ -279,8 +291,11 @@ class TrackResult:
 
     @property
     def T_map_odom(self) -> NDArray[np.float64]:
-        """``(4, 4)`` correction of the odometry: ``T_wc = T_map_odom @ T_odom_camera``. It jumps
-        when a loop is closed, the map is adjusted or the camera is relocalised (ROS REP 105)."""
+        """``(4, 4)`` correction of the odometry (ROS REP 105).
+
+        ``T_wc = T_map_odom @ T_odom_camera``. The correction jumps when a loop is closed, when the
+        map is adjusted, and when the camera is relocalised.
+        """
         if self.T_odom_camera is None:
             return np.eye(4)
         T: NDArray[np.float64] = self.T_wc @ inverse(self.T_odom_camera)

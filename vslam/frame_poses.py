@@ -1,4 +1,7 @@
-"""The pose of every frame relative to a keyframe, so that frames move with corrected keyframes."""
+"""The pose of every frame relative to a keyframe.
+
+When the pose of a keyframe is corrected, the frames that are relative to it move with it.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ class KeyframePoses(Protocol):
     """The present poses of the keyframes that frame poses are relative to.
 
     Attributes:
-        n_keyframes: number of keyframes, culled ones included.
+        n_keyframes: number of keyframes, including culled keyframes.
         reference: the keyframe that the poses of new frames are relative to.
     """
 
@@ -29,8 +32,10 @@ class KeyframePoses(Protocol):
         ...
 
     def unit_scale(self, keyframe: int) -> float:
-        """Factor by which loops have scaled lengths near a keyframe since it was added; 1 in metric
-        maps."""
+        """Factor by which loop closures have scaled lengths near a keyframe since it was added.
+
+        It is 1 in metric maps.
+        """
         ...
 
 
@@ -40,10 +45,11 @@ class FrameTable(NamedTuple):
     Attributes:
         timestamp: ``(N,)`` float64 seconds.
         reference: ``(N,)`` int64, the keyframe that each pose is relative to.
-        T_c_reference: ``(N, 4, 4)`` float64.
+        T_c_reference: ``(N, 4, 4)`` float64, maps points from the camera of the keyframe to the
+            camera of the frame.
         tracked: ``(N,)`` bool, False where the pose is only predicted.
-        unit_scale: ``(N,)`` float64, the unit scale of ``reference`` when ``T_c_reference`` was
-            measured.
+        unit_scale: ``(N,)`` float64, the ``unit_scale`` that the keyframe had when
+            ``T_c_reference`` was measured.
     """
 
     timestamp: NDArray[np.float64]
@@ -68,11 +74,13 @@ def _room_for(frames: int) -> FrameTable:
 
 
 class FramePoses:
-    """The poses of all frames, in order, relative to keyframes. Before there is a keyframe, they
-    are relative to the world."""
+    """The poses of all frames, in order, relative to keyframes.
+
+    While there is no keyframe, poses are relative to the world.
+    """
 
     def __init__(self, keyframes: KeyframePoses, before: FrameTable | None = None) -> None:
-        """``before``: the poses of earlier frames of the same drive."""
+        """Begin with the poses ``before`` of earlier frames of the same drive."""
         self._keyframes = keyframes
         self._n = 0 if before is None else len(before.timestamp)
         self._frames = _room_for(max(1024, self._n))
@@ -92,12 +100,12 @@ class FramePoses:
 
     @property
     def unit(self) -> float:
-        """``unit_scale`` of the reference keyframe; 1 while there is none."""
+        """``unit_scale`` of the reference keyframe; 1 while there is no keyframe."""
         keyframes = self._keyframes
         return keyframes.unit_scale(keyframes.reference) if keyframes.n_keyframes else 1.0
 
     def timestamp(self, index: int) -> float:
-        """Timestamp of a frame in seconds; index -1 is the last frame."""
+        """Timestamp of a frame in seconds. Index -1 is the last frame."""
         return float(self._frames.timestamp[self._number(index)])
 
     def append(self, timestamp: float, T_cw: Matrix, *, tracked: bool) -> None:
@@ -140,7 +148,8 @@ class FramePoses:
         return index % self._n
 
     def pose(self, index: int) -> Matrix:
-        """``T_cw`` of a frame, from the present pose of its keyframe; index -1 is the last one."""
+        """``T_cw`` of a frame, from the present pose of its keyframe. Index -1 is the last
+        frame."""
         index = self._number(index)
         T_c_reference = self._frames.T_c_reference[index].copy()
         if self._keyframes.n_keyframes == 0:
@@ -154,8 +163,8 @@ class FramePoses:
     def trajectory(self) -> Trajectory:
         """The pose of every frame.
 
-        Predicted poses are replaced by an interpolation between the tracked frames before and
-        after. Frames before the first tracked one get its pose.
+        A predicted pose is replaced by an interpolation between the tracked frames before and after
+        it. Frames before the first tracked frame get the pose of the first tracked frame.
         """
         frames = self._frames.until(self._n)
         poses = [inverse(self.pose(k)) for k in range(self._n)]

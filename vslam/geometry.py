@@ -1,8 +1,9 @@
-"""SE(3) algebra that both Python code and Numba kernels call.
+"""SE(3) algebra that both Python code and Numba kernels can call.
 
-Conventions. Camera frame: x right, y down, z forward. World: the first left camera. ``T_a_b`` is a
-4x4 float64 matrix that maps points of frame b to frame a; ``T_cw`` is used where points are
-projected, ``T_wc`` where poses are saved. A twist is ``[v, w]``: translation first, then rotation.
+In the camera frame, x points right, y down and z forward. The world frame is the frame of the left
+camera at the first frame. ``T_a_b`` is a 4x4 float64 matrix that maps points of frame b to frame a.
+``T_cw`` is used where points are projected, and ``T_wc`` where poses are saved. A twist is ``[v,
+w]``, with the translation before the rotation.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ Matrix = NDArray[np.float64]
 
 @kernel
 def compose(T_a_b: Matrix, T_b_c: Matrix) -> Matrix:
-    """``T_a_c``, for ``(4, 4)`` float64."""
+    """``T_a_c``, the product of two ``(4, 4)`` float64 motions."""
     T = np.zeros((4, 4))
     for i in range(3):
         for j in range(4):
@@ -30,7 +31,7 @@ def compose(T_a_b: Matrix, T_b_c: Matrix) -> Matrix:
 
 @kernel
 def inverse(T_a_b: Matrix) -> Matrix:
-    """``T_b_a`` of a rigid motion, ``(4, 4)``."""
+    """``T_b_a``, the inverse of a ``(4, 4)`` rigid motion."""
     T = np.zeros((4, 4))
     for i in range(3):
         for j in range(3):
@@ -42,10 +43,10 @@ def inverse(T_a_b: Matrix) -> Matrix:
 
 @kernel
 def orthonormalised(T_a_b: Matrix) -> Matrix:
-    """Project the rotation of a ``(4, 4)`` motion, which is inexact by round-off, back onto SO(3).
+    """Project the rotation of a ``(4, 4)`` motion back onto SO(3), to remove round-off errors.
 
-    One Newton step of the polar decomposition, R (3 I - R'R) / 2, corrects the round-off of a few
-    compositions.
+    One Newton step of the polar decomposition, R (3 I - R'R) / 2, is enough to correct the
+    round-off of a few compositions.
     """
     T = T_a_b.copy()
     for i in range(3):
@@ -62,7 +63,8 @@ def orthonormalised(T_a_b: Matrix) -> Matrix:
 
 @kernel
 def se3_exp(twist: Matrix) -> Matrix:
-    """``(4, 4)`` motion of a ``(6,)`` twist ``[v, w]`` (Solà et al., "A micro Lie theory", D.2)."""
+    """``(4, 4)`` motion of a ``(6,)`` twist ``[v, w]``, by the exponential map of SE(3) (Solà et
+    al., "A micro Lie theory", D.2)."""
     v, w = twist[:3], twist[3:]
     angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     if angle2 < 1e-6:
@@ -87,7 +89,8 @@ def se3_exp(twist: Matrix) -> Matrix:
 
 @kernel
 def se3_log(T: Matrix) -> Matrix:
-    """``(6,)`` twist ``[v, w]`` of a ``(4, 4)`` motion with a rotation below 180 degrees."""
+    """``(6,)`` twist ``[v, w]`` of a ``(4, 4)`` motion, by the logarithm of SE(3). The rotation
+    must be below 180 degrees."""
     cos = 0.5 * (T[0, 0] + T[1, 1] + T[2, 2] - 1.0)
     w = 0.5 * np.array([T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]])
     sin = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
@@ -151,10 +154,10 @@ def solve_positive(H: Matrix, b: Matrix) -> Matrix:
 
 @kernel
 def symmetric_eigen(A: Matrix) -> tuple[Matrix, Matrix]:
-    """Unsorted eigenvalues ``(n,)`` and eigenvectors (columns) of a small symmetric matrix.
+    """Eigenvalues ``(n,)``, unsorted, and eigenvectors (columns) of a small symmetric matrix.
 
-    Cyclic Jacobi rotations (Golub and Van Loan, "Matrix Computations", 8.5), which are exact to
-    round-off even for multiple eigenvalues.
+    The method is cyclic Jacobi rotations (Golub and Van Loan, "Matrix Computations", 8.5). They are
+    exact to round-off even if eigenvalues coincide.
     """
     n = len(A)
     D, V = A.copy(), np.eye(n)

@@ -1,9 +1,10 @@
 """The pose graph of a loop under two hypotheses about how the camera moved while it was lost.
 
-After tracking is lost, a new sub-map begins, whose pose in the map is only predicted. Either the
-camera moved about as predicted, so that the prediction is a measurement with a known error, or it
-was kidnapped, that is, carried to an unknown place, so that the prediction is worthless. A loop is
-tried under the first hypothesis, then under the second.
+After tracking is lost, a new sub-map begins. The pose of the sub-map in the map is only predicted.
+Under the first hypothesis, the camera moved about as predicted, and the prediction is a measurement
+with a known error. Under the second hypothesis, the camera was kidnapped: somebody carried it to an
+unknown place, and the prediction is worthless. A loop is tried under the first hypothesis. If the
+loop is inconsistent, it is tried under the second hypothesis.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ class Solution:
     Attributes:
         graph: N keyframes, with the poses that the optimisation started from.
         T_cw: ``(N, 4, 4)`` optimised poses.
-        S_wc: ``(N, 4, 4)`` their inverses as similarities; the scale is 1 in a metric map.
+        S_wc: ``(N, 4, 4)`` the inverses of these poses as similarities. The scale is 1 in a metric
+            map.
         verdict: whether the edges of the optimised graph are consistent.
     """
 
@@ -61,8 +63,10 @@ class Solution:
 
     @property
     def has_gaps(self) -> bool:
-        """Whether tracking was lost between keyframes of the graph; only then can the two
-        hypotheses give different solutions."""
+        """Whether tracking was lost between keyframes of the graph.
+
+        Without such a gap, both hypotheses give the same solution.
+        """
         return bool(np.isin(self.graph.kind, (GAP, WEAK)).any())
 
 
@@ -78,10 +82,10 @@ def solve(
     """Build and optimise the pose graph with a new loop. The map is only read.
 
     Args:
-        closed: loops that were closed before, in the map's present units.
+        closed: loops that were closed before, in the present unit of the map.
         edge: the new loop, with its pose.
-        monocular: whether to optimise similarities instead of rigid motions, because the scale of
-            a monocular map drifts.
+        monocular: whether to optimise similarities instead of rigid motions. A monocular map needs
+            similarities, because its scale drifts.
     """
     predicted = hypothesis is Hypothesis.PREDICTED
     graph = essential_graph(map_, [*closed, edge], config, driven=predicted)
@@ -99,15 +103,17 @@ def solve(
 
 
 def joined_submaps(map_: Map, closed: Sequence[LoopEdge]) -> NDArray[np.int64]:
-    """``(n_keyframes,)`` sub-map of each keyframe; sub-maps joined by closed loops count as one."""
+    """``(n_keyframes,)`` sub-map of each keyframe. Sub-maps that closed loops join count as one."""
     submap = map_.submaps()
     ends = np.array([(edge.query, edge.match) for edge in closed], np.int64).reshape(-1, 2)
     return parts_of(submap[ends], len(submap))[submap]
 
 
 def _aligned(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
-    """Initial ``(n_keyframes, 4, 4)`` ``T_cw`` for a kidnapped camera: the sub-map at one end of
-    the loop is moved rigidly to where the loop places it."""
+    """Initial ``(n_keyframes, 4, 4)`` ``T_cw`` for a kidnapped camera.
+
+    The sub-map at one end of the loop is moved rigidly to the place that the loop gives it.
+    """
     T_cw = map_.arrays.T_cw[: map_.n_keyframes].copy()
     moving, keyframes = _moving_submap(map_, closed, edge)
     assert edge.T_query_match is not None
@@ -115,15 +121,18 @@ def _aligned(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
         T_new = compose(edge.T_query_match, T_cw[edge.match])
     else:
         T_new = compose(inverse(edge.T_query_match), T_cw[edge.query])
-    T_old_new = compose(inverse(T_cw[moving]), T_new)  # new world to old world
+    T_old_new = compose(inverse(T_cw[moving]), T_new)  # from the new world frame to the old
     for keyframe in keyframes:
         T_cw[keyframe] = orthonormalised(compose(T_cw[keyframe], T_old_new))
     return T_cw
 
 
 def _aligned_similarities(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
-    """As ``_aligned``, but ``S_wc`` for a monocular map: the sub-map that moves also adopts the
-    unit of the other one, so its poses become similarities."""
+    """Initial ``S_wc`` of a monocular map for a kidnapped camera, as in ``_aligned``.
+
+    The sub-map that moves also adopts the unit of the other sub-map, so its poses become
+    similarities.
+    """
     T_cw = map_.arrays.T_cw[: map_.n_keyframes]
     S_wc = inverses(T_cw)
     moving, keyframes = _moving_submap(map_, closed, edge)
@@ -141,8 +150,10 @@ def _aligned_similarities(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge)
 def _moving_submap(
     map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge
 ) -> tuple[int, NDArray[np.int64]]:
-    """The end of a loop whose sub-map moves, and the ``(N,)`` keyframes of that sub-map. N is 0 if
-    both ends lie in the same sub-map."""
+    """The keyframe of a loop whose sub-map moves, and the ``(N,)`` keyframes of this sub-map.
+
+    N is 0 if both keyframes of the loop lie in the same sub-map.
+    """
     submap = joined_submaps(map_, closed)
     if submap[edge.query] == submap[edge.match]:
         return edge.query, np.empty(0, np.int64)

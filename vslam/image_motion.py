@@ -1,10 +1,12 @@
-"""Image velocities of points in a rectified stereo pair, and the correction of the right image's
-columns if the right camera exposes later than the left one.
+"""Image velocities of points in a rectified stereo pair.
 
-The velocities are those of Longuet-Higgins and Prazdny (Proc. R. Soc. B, 1980), eq. 2.9 to 2.11,
-for the point (x, y, 1) z of the left camera. The paper uses the motion of the camera. Here, the
-twist [v, w] is that of the points relative to the camera, so all signs are reversed. In the right
-camera x is smaller by the baseline divided by z.
+If the right camera exposes later than the left camera, they are used to correct the columns in the
+right image.
+
+The velocities follow Longuet-Higgins and Prazdny (Proc. R. Soc. B, 1980), eq. 2.9 to 2.11, for the
+point (x, y, 1) z of the left camera. The paper uses the motion of the camera. Here, the twist [v,
+w] is the motion of the points relative to the camera, so all signs are reversed. In the right
+camera, x is smaller by the baseline divided by z.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from vslam.camera import Camera
 from vslam.features import MIN_DISPARITY, shifted_columns
 from vslam.geometry import Matrix
 
-_ROUNDS = 3  # of a fixed-point iteration, because speed and disparity depend on each other
+_ROUNDS = 3  # rounds of a fixed-point iteration: speed and disparity depend on each other
 
 
 def rays(
@@ -31,8 +33,10 @@ def rays(
 def row_speeds(
     x: NDArray[np.float64], y: NDArray[np.float64], inverse_depth: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """``(N, 6)`` derivative of a point's row velocity with respect to the twist, in focal lengths;
-    it is the same in both images."""
+    """``(N, 6)`` derivative of a point's row velocity with respect to the twist, in focal lengths.
+
+    The row velocity is the same in both images.
+    """
     zero = np.zeros_like(x)
     return np.column_stack([zero, inverse_depth, -y * inverse_depth, -1.0 - y * y, x * y, x])
 

@@ -1,21 +1,22 @@
-"""How vslam compiles its kernels, and the bit arithmetic that several of them share.
+"""Compilation of vslam's Numba kernels, and the bit arithmetic that several kernels share.
 
 A kernel is compiled once on each machine and kept in Numba's cache. It releases the GIL, so that
 threads of the pipeline run kernels in parallel. ``error_model="numpy"`` and fused multiply-add are
-the only relaxations of floating-point arithmetic. Sums are not re-associated, so a result never
-depends on how a loop was vectorised.
+the only relaxations of floating-point arithmetic. Sums are not re-associated. Therefore, a result
+never depends on how a loop was vectorised.
 
-Numba prepares for compilation before it looks into its cache: it imports support for everything
-that it can compile, including scipy for linear algebra, which takes 0.25 s of CPU time. For each
-kernel it also loads the environments of all functions in it, which imports their modules, and
-parses the code that would be needed to inline the kernel into another one. A run that finds all
-kernels in the cache needs none of this. ``_KernelCache`` skips it, or defers it until a kernel is
-compiled, and so loads kernels in a fifth of the time. Its files have Numba's format. It relies on
-Numba's internals, so releases of Numba with which it was not tested use Numba's own cache instead.
+Numba prepares for compilation before it looks into its cache. It imports support for everything
+that it can compile, which takes 0.25 s of CPU time. For each kernel, it also imports the modules of
+all functions that the kernel calls. Finally, it parses the code that would be needed to inline the
+kernel into another kernel. A run that finds all kernels in the cache needs none of this.
+``_KernelCache`` defers these steps until a kernel is compiled, and so loads kernels in a fifth of
+the time. Its files have Numba's format. It relies on internals of Numba. With releases of Numba for
+which it was not tested, Numba's own cache is used instead.
 
-A cache problem never ends a run. A checksum detects files that were truncated by a power cut, which
-would abort Python if they were loaded; they are compiled again. If neither the folder of the source
-nor the home folder is writable, the process uses a temporary cache.
+A cache problem never ends a run. A power cut can truncate a cache file, and loading such a file
+would abort Python. A checksum detects truncated files, and their kernels are compiled again. If
+neither the folder of the source nor the home folder is writable, the process uses a temporary
+cache.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ class _KernelFormat(CompileResultCacheImpl):
 
     def rebuild(self, target_context: Any, payload: tuple[Any, ...]) -> Any:
         (name, kind, (machine_code, bitcode)), function, *rest = payload
-        # The entry point for calls from Python; an inner kernel has none.
+        # The entry point for calls from Python. An inner kernel has no such entry point.
         entry = function.llvm_cpython_wrapper_name
         if entry.encode() in machine_code:
             target_context.codegen()._engine._defined_symbols.add(entry)
@@ -83,7 +84,7 @@ def _no_bitcode() -> bytes:
 
 
 def _parsed(library: Any, bitcode: bytes) -> Any:
-    """The LLVM module of a loaded kernel, parsed when another kernel inlines it."""
+    """The LLVM module of a loaded kernel. It is parsed only when another kernel inlines it."""
     if library._shared_module is None:
         module = llvm.parse_bitcode(bitcode)
         library.codegen._engine._load_defined_symbols(module)
@@ -93,12 +94,12 @@ def _parsed(library: Any, bitcode: bytes) -> Any:
 
 @cache
 def _warn(message: str) -> None:
-    """Log a message once."""
+    """Log a message, but only once."""
     _log.warning(message)
 
 
 class _CheckedFiles(IndexDataCacheFile):
-    """The cache files of a kernel; those with code end with a checksum of the code."""
+    """The cache files of a kernel. Each file with code ends with a checksum of the code."""
 
     def _load_index(self) -> dict[Any, str]:
         try:
@@ -174,7 +175,7 @@ def _use_temporary_cache() -> None:
 def _cached(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     """Compile a function with Numba and attach the cache."""
     made = numba.njit(**options)(function)
-    if not isinstance(made, Dispatcher):  # NUMBA_DISABLE_JIT
+    if not isinstance(made, Dispatcher):  # NUMBA_DISABLE_JIT is set
         return made
     dispatcher: Any = made
     try:
@@ -198,8 +199,10 @@ def kernel(function: Function) -> Function:
 
 
 def inner_kernel(function: Function) -> Function:
-    """Compile a function that only kernels call. It has no entry point for Python, which makes
-    compilation faster."""
+    """Compile a function that only kernels call.
+
+    The function gets no entry point for Python, which makes compilation faster.
+    """
     return cast(Function, _cached(function, _OPTIONS | {"no_cpython_wrapper": True}))
 
 
@@ -231,10 +234,11 @@ def trailing_zeros(typing_context, value):
 
 @intrinsic
 def borrowed(typing_context, array):
-    """The same array without reference counting, valid while a caller holds the original.
+    """The same array without reference counting. It is valid while a caller holds the original
+    array.
 
     Numba counts a reference whenever an array is passed to another function. This atomic operation
-    takes longer than a small function.
+    takes longer than the call of a small function.
     """
 
     def generate(context, builder, signature, arguments):

@@ -1,4 +1,4 @@
-"""A lock on a file that admits one process at a time."""
+"""A lock file that admits one process at a time."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from vslam.errors import InputError
 
 @contextmanager
 def locked(lock: Path, folder: Path, doing: str) -> Iterator[None]:
-    """Keep other processes from writing to a folder. If the process is killed, the system releases
-    the lock.
+    """Keep other processes from writing to a folder.
+
+    If the process is killed, the system releases the lock.
 
     Args:
         lock: the lock file, which is created and removed.

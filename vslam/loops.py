@@ -1,4 +1,4 @@
-"""The types that loop detection, verification and correction exchange and store."""
+"""Data types that loop detection, verification and correction exchange and store."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ class LoopCandidate:
     """A pair of keyframes that, according to a detector, show the same place.
 
     Attributes:
-        query: keyframe whose place is searched for; -1 for a frame that is not in the map.
-        match: keyframe of the map that shows the same place; it has not been culled.
-        score: the detector's own measure; greater means more similar.
-        similarity: that of the two images by the network's local descriptors. Learned verification
-            is tried only for similar images. None if it was not computed.
+        query: keyframe whose place is searched for. It is -1 for a frame that is not in the map.
+        match: keyframe of the map that shows the same place. It has not been culled.
+        score: similarity in the detector's own measure. A greater score means more similar.
+        similarity: similarity of the two images by the network's local descriptors. Learned
+            verification is tried only for similar images. None if the similarity was not computed.
         promising: whether the candidate is verified even if the consistency test rejects it.
-        proposed_by: name of the detector that proposed it; several names are joined by ``+``.
+        proposed_by: name of the detector that proposed the candidate. Several names are joined by
+            ``+``.
     """
 
     query: int
@@ -33,12 +34,12 @@ class LoopCandidate:
 
 
 class Localisation(NamedTuple):
-    """The pose of a frame outside the map, and the landmarks of the map that it observes.
+    """The pose of a frame that is not in the map, and the landmarks of the map that it observes.
 
     Attributes:
         keyframe: the keyframe that the frame resembles.
         T_cw: ``(4, 4)`` pose of the frame.
-        feature, landmark: ``(N,)`` features of the frame and the landmarks that they observe.
+        feature, landmark: ``(N,)`` features of the frame, and ``(N,)`` landmarks that they observe.
     """
 
     keyframe: int
@@ -54,16 +55,17 @@ class LoopEdge:
     Attributes:
         query, match, score, proposed_by: as in the candidate.
         accepted: whether the loop was closed.
-        reason: "closed", or in a few words why the candidate was rejected.
+        reason: "closed", or the reason in a few words why the candidate was rejected.
         n_matches: number of landmarks of the place that were matched to features of the query.
         n_inliers: number of matches that agree with ``T_query_match``.
-        T_query_match: ``(4, 4)`` float64, maps the match's camera to the query's, in the unit of
-            the map around the match; None if the candidate was rejected before it was computed.
-        features: ``(N,)`` int32, inlier features of the query (index within the keyframe).
+        T_query_match: ``(4, 4)`` float64, maps points from the camera of the match to the camera of
+            the query, in the unit of the map around the match. None if the candidate was rejected
+            before this pose was computed.
+        features: ``(N,)`` int32, indices of the inlier features within the query keyframe.
         landmarks: ``(N,)`` int32, the landmark of the place that each feature observes.
-        scale: map units around the query per map unit around the match. It is 1 in metric maps, and
-            differs from 1 by the scale drift in monocular ones.
-        matched_by: "orb" or "learned", the descriptors that were matched.
+        scale: number of map units around the query per map unit around the match. It is 1 in metric
+            maps. In monocular maps, it differs from 1 by the scale drift.
+        matched_by: the kind of descriptors that were matched, "orb" or "learned".
     """
 
     query: int
@@ -87,7 +89,7 @@ class LoopEdge:
         reason: str = "",
         matched_by: Literal["orb", "learned"] = "orb",
     ) -> LoopEdge:
-        """A loop edge for a rejected candidate, with the reason, or for one that is not verified
+        """A loop edge for a candidate that was rejected for a reason, or has not been verified
         yet."""
         return cls(
             candidate.query,
@@ -128,8 +130,9 @@ class LoopCorrection:
     Attributes:
         edge: the loop.
         keyframes: ``(N,)`` ids of the keyframes in the pose graph.
-        T_cw_before, T_cw_after: ``(N, 4, 4)`` their poses before and after the pose graph.
-        seconds: wall time of the correction without the global bundle adjustment.
+        T_cw_before, T_cw_after: ``(N, 4, 4)`` poses of these keyframes before and after the
+            optimisation of the pose graph.
+        seconds: wall time of the correction in seconds, without the global bundle adjustment.
     """
 
     edge: LoopEdge
@@ -147,7 +150,7 @@ def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.int
 
 @dataclass(frozen=True)
 class PerKeyframe:
-    """Values of different length for each of K keyframes: words, a descriptor, an image file.
+    """Values of different length for each of K keyframes, such as words or an image file.
 
     Attributes:
         first: ``(K + 1,)`` int64 offsets.
@@ -165,26 +168,27 @@ class PerKeyframe:
         return self.values[self.first[keyframe] : self.first[keyframe + 1]]
 
     def select(self, keyframes: NDArray[np.int64]) -> PerKeyframe:
-        """The values of ``(M,)`` keyframes, renumbered from 0; unknown keyframes have none."""
+        """The values of ``(M,)`` keyframes, which are renumbered from 0. Unknown keyframes get no
+        values."""
         nothing = self.values[:0]
         parts = [self.of(k) if k < len(self) else nothing for k in keyframes.tolist()]
         first = np.cumsum([0, *map(len, parts)]).astype(np.int64)
         return PerKeyframe(first, np.concatenate([nothing, *parts]))
 
     def followed_by(self, other: PerKeyframe) -> PerKeyframe:
-        """These values, followed by those of another map's keyframes."""
+        """These values, followed by the values of the keyframes of another map."""
         first = np.concatenate([self.first, self.first[-1] + other.first[1:]])
         return PerKeyframe(first, np.concatenate([self.values, other.values]))
 
 
 @dataclass(frozen=True)
 class DetectorMemory:
-    """What a loop detector has stored about keyframes, in a form that can be saved.
+    """The data that a loop detector has stored about keyframes, in a form that can be saved.
 
     Attributes:
         name: name of the detector.
         fingerprint: checksum of the vocabulary or weights that it used.
-        tables: what it stored for each keyframe, under names that the detector chooses.
+        tables: the data for each keyframe, under names that the detector chooses.
     """
 
     name: str = "none"
@@ -194,7 +198,8 @@ class DetectorMemory:
 
 @dataclass(frozen=True)
 class ResembledPlace:
-    """A place that resembled recent keyframes: a candidate with its covisible keyframes.
+    """A place that resembled recent keyframes. It consists of a candidate and its covisible
+    keyframes.
 
     ``length`` consecutive keyframes resembled it, the last of them ``age`` keyframes ago.
     """

@@ -1,4 +1,4 @@
-"""Properties of this machine and this process, found without slow imports."""
+"""Properties of this machine and of this process, which are determined without slow imports."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-# From glibc's malloc.h.
+# Constants of glibc's malloc.h.
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
 KEPT_BYTES = 1 << 28
 _PACKAGES = (
@@ -41,7 +41,7 @@ def versions() -> dict[str, str]:
 
 
 def opencv_conflict(found: dict[str, str]) -> str | None:
-    """A warning if several wheels that overwrite each other's ``cv2`` are installed, else None."""
+    """A warning if several wheels that all install ``cv2`` are installed; None otherwise."""
     wheels = [name for name in found if name.startswith("opencv-")]
     if len(wheels) < 2:
         return None
@@ -52,7 +52,8 @@ def opencv_conflict(found: dict[str, str]) -> str | None:
 
 
 def available_cores() -> int:
-    """Number of cores that this process may use; a container may have fewer than its machine."""
+    """Number of cores that this process may use. A container may have fewer cores than its
+    machine."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -60,9 +61,9 @@ def available_cores() -> int:
 
 def process_age() -> float:
     """Seconds since this process started."""
-    with suppress(OSError, AttributeError):  # not Linux
-        # The process name, in brackets, may contain spaces; field 22 is the start time in ticks
-        # since boot.
+    with suppress(OSError, AttributeError):  # the system is not Linux
+        # The process name is in brackets and may contain spaces. Field 22 is the start time in
+        # ticks since boot.
         started = Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]
         return time.clock_gettime(time.CLOCK_BOOTTIME) - int(started) / os.sysconf("SC_CLK_TCK")
     import psutil
@@ -86,10 +87,12 @@ def peak_memory_mb() -> float:
 def keep_memory() -> None:
     """Let the C library keep large freed blocks for the next frame's images.
 
-    By default it returns them to the system, which must clear each page again: this caused 150,000
-    page faults in 216 frames of KITTI, and took a thirtieth of the CPU time. All threads share one
-    arena, which saves 40 MB compared with one arena for each thread. Does nothing if the C library
-    is not glibc.
+    By default, the C library returns these blocks to the system, which must clear each page again.
+    This caused 150,000 page faults in 216 frames of KITTI and took a thirtieth of the CPU time. In
+    addition, all threads share one arena, which saves 40 MB compared with one arena for each
+    thread.
+
+    The function does nothing if the C library is not glibc.
     """
     import ctypes
 
@@ -101,7 +104,10 @@ def keep_memory() -> None:
 
 
 def give_back_memory() -> None:
-    """Return the unused memory that ``keep_memory`` retained to the system (glibc only)."""
+    """Return to the system the unused memory that ``keep_memory`` retained.
+
+    The function does nothing if the C library is not glibc.
+    """
     import ctypes
 
     with suppress(OSError, AttributeError):
@@ -109,7 +115,7 @@ def give_back_memory() -> None:
 
 
 def cpu_name() -> str:
-    """The processor's model name."""
+    """Model name of the processor."""
     # platform.processor() is empty or just "x86_64" on Linux.
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -129,7 +135,7 @@ class StageClock:
     last: float = field(default_factory=time.perf_counter)
 
     def lap(self, stage: str) -> None:
-        """Add the time since the last lap to a stage."""
+        """Add the time since the last call to a stage."""
         now = time.perf_counter()
         self.ms[stage] = self.ms.get(stage, 0.0) + 1e3 * (now - self.last)
         self.last = now

@@ -1,17 +1,19 @@
 """The map: keyframes, landmarks and observations as a structure of arrays.
 
-A *row* is one keypoint of one keyframe; the rows of a keyframe are consecutive. The table of rows
-is also the table of observations: ``landmark[row]`` is the landmark that the keypoint observes, and
-``next_row`` links the rows of each landmark into a chain. Covisibility is not stored, but counted
-from the rows when it is needed. The use of arrays instead of objects follows DPVO's PatchGraph. The
-entries of culled keyframes and landmarks remain, marked as such; a landmark that was merged into
-another one counts as culled. Ids of keyframes are never reused; ids of landmarks change only when
-culled landmarks are dropped. Arrays grow by half their size.
+A *row* is one keypoint of one keyframe. The rows of a keyframe are consecutive. The table of rows
+is also the table of observations. ``landmark[row]`` is the landmark that the keypoint observes, and
+``next_row`` links the rows of each landmark into a linked list. Covisibility is not stored. It is
+counted from the rows when it is needed. The use of arrays instead of objects follows DPVO's
+PatchGraph.
+
+Culled keyframes and landmarks stay in the tables and are marked as culled. A landmark that was
+merged into another landmark counts as culled. Ids of keyframes are never reused. Ids of landmarks
+change only when culled landmarks are dropped. A full array grows by half its size.
 
 To add a column, declare it in ``Arrays`` or ``KeyframeTable`` with an empty array of its dtype and
-shape as the default. It is then grown, copied, selected, appended, saved and loaded with the other
-columns. A new entry is zero unless ``Map.add_keyframe`` or ``Map.add_landmarks`` sets it. A number
-that describes the map as a whole belongs in ``Scalars``.
+shape as the default. The column is then grown, copied, selected, appended, saved and loaded like
+the other columns. A new entry is zero unless ``Map.add_keyframe`` or ``Map.add_landmarks`` sets it.
+A number that describes the map as a whole belongs in ``Scalars``.
 """
 
 from __future__ import annotations
@@ -29,25 +31,41 @@ from vslam.loops import LoopEdge
 from vslam.map_kernels import count_shared, detach_keyframe, resolve
 
 NONE = -1
-_FEW_LANDMARKS = 8192  # take about 1 MB; dropping fewer culled landmarks is not worth it
+_FEW_LANDMARKS = 8192  # they take about 1 MB; it is not worth dropping fewer landmarks
 
 
 class Arrays(NamedTuple):
-    """The part of the map that kernels read and write: arrays with a capacity of K keyframes, L
-    landmarks and R rows.
+    """The part of the map that kernels read and write.
 
-    Keyframes: ``T_cw`` (K, 4, 4) f8; ``first_row`` (K + 1,) i8; ``keyframe_alive`` (K,) bool.
-    Landmarks: ``xyz`` (L, 3) f8 world; ``normal`` (L, 3) f8 mean viewing direction;
-    ``distance_range`` (L, 2) f8 least and greatest distance at which the pyramid detects it;
-    ``landmark_descriptor`` (L, 4) u8; ``first_keyframe`` (L,) i4 the first one that observed it;
-    ``visible`` (L,) i4 number of frames in which it should have been found; ``found`` (L,) i4
-    number of frames in which it was found; ``landmark_alive`` (L,) bool; ``merged_into`` (L,) i4;
-    ``head`` (L,) i4 first row of its chain; ``n_observations`` (L,) i4, in which a stereo
-    observation counts twice (ORB-SLAM2).
-    Rows: ``xy`` (R, 2) f4 pixels; ``u_right`` (R,) f4; ``octave`` (R,) u1; ``angle`` (R,) f4
-    radians; ``descriptor`` (R, 4) u8; ``keyframe`` (R,) i4; ``landmark``, ``next_row`` (R,) i4;
-    ``certainty`` (R,) u1, variance of an unaligned keypoint divided by the variance of ``xy``.
-    The types are NumPy's: f8 is float64, u8 is uint64. An id of -1 means none.
+    The arrays have a capacity of K keyframes, L landmarks and R rows. An id of -1 means none. The
+    types are abbreviated as in NumPy: f8 is float64, u8 is uint64, i4 is int32.
+
+    Attributes:
+        T_cw: ``(K, 4, 4)`` f8, pose of each keyframe.
+        first_row: ``(K + 1,)`` i8, first row of each keyframe.
+        keyframe_alive: ``(K,)`` bool, False for a culled keyframe.
+        xyz: ``(L, 3)`` f8, position of each landmark in the world frame.
+        normal: ``(L, 3)`` f8, mean viewing direction.
+        distance_range: ``(L, 2)`` f8, least and greatest distance at which the pyramid detects the
+            landmark.
+        landmark_descriptor: ``(L, 4)`` u8.
+        first_keyframe: ``(L,)`` i4, the first keyframe that observed the landmark.
+        visible: ``(L,)`` i4, number of frames in which the landmark should have been found.
+        found: ``(L,)`` i4, number of frames in which the landmark was found.
+        landmark_alive: ``(L,)`` bool, False for a culled or merged landmark.
+        merged_into: ``(L,)`` i4, the landmark that this landmark was merged into.
+        head: ``(L,)`` i4, first row of the landmark's linked list.
+        n_observations: ``(L,)`` i4, number of observations. A stereo observation counts twice
+            (ORB-SLAM2).
+        xy: ``(R, 2)`` f4, position of each keypoint in pixels.
+        u_right: ``(R,)`` f4, column of the stereo match in pixels; NaN if there is no match.
+        octave: ``(R,)`` u1, pyramid level.
+        angle: ``(R,)`` f4, orientation in radians.
+        descriptor: ``(R, 4)`` u8.
+        keyframe: ``(R,)`` i4, the keyframe that the row belongs to.
+        landmark: ``(R,)`` i4, the landmark that the keypoint observes.
+        next_row: ``(R,)`` i4, the next row that observes the same landmark.
+        certainty: ``(R,)`` u1, variance of an unaligned keypoint divided by the variance of ``xy``.
     """
 
     T_cw: NDArray[np.float64] = np.zeros((0, 4, 4))
@@ -86,16 +104,20 @@ PREDICTED, UNPREDICTED = 1, 2  # values of KeyframeTable.restart
 class KeyframeTable(NamedTuple):
     """The columns of keyframes that kernels do not need, with a capacity of K keyframes.
 
-    ``timestamp`` (K,) f8 seconds; ``frame`` (K,) i8 index of the frame that became the keyframe;
-    ``parent`` (K,) i8 parent of the keyframe in the spanning tree, or -1;
-    ``session`` (K,) i8 the drive, counted from 0, that its timestamp and frame index belong to;
-    ``unit_scale`` (K,) f8 factor by which loops have scaled lengths near the keyframe since it was
-    added, always 1 in metric maps;
-    ``T_c_parent`` (K, 4, 4) f8 the pose of a culled keyframe relative to its parent, identity while
-    the keyframe is alive;
-    ``restart`` (K,) u1 nonzero if mapping restarted at this keyframe after the camera was lost, so
-    that it is the root of a sub-map: ``PREDICTED`` if its pose relative to its parent was
-    predicted, ``UNPREDICTED`` if it was not, because the camera's speed was unknown.
+    Attributes:
+        timestamp: ``(K,)`` f8, seconds.
+        frame: ``(K,)`` i8, index of the frame that became the keyframe.
+        parent: ``(K,)`` i8, parent of the keyframe in the spanning tree, or -1.
+        session: ``(K,)`` i8, the drive, counted from 0, that the timestamp and the frame index
+            belong to.
+        unit_scale: ``(K,)`` f8, factor by which loop closures have scaled lengths near the keyframe
+            since it was added. It is always 1 in metric maps.
+        T_c_parent: ``(K, 4, 4)`` f8, pose of a culled keyframe relative to its parent. It is the
+            identity while the keyframe is alive.
+        restart: ``(K,)`` u1, nonzero if mapping restarted at this keyframe after the camera was
+            lost. Such a keyframe is the root of a sub-map. The value is ``PREDICTED`` if the pose
+            of the keyframe relative to its parent was predicted. It is ``UNPREDICTED`` if the speed
+            of the camera was unknown, so that no prediction was possible.
     """
 
     timestamp: NDArray[np.float64] = np.zeros(0)
@@ -109,14 +131,16 @@ class KeyframeTable(NamedTuple):
 
 @dataclass(frozen=True)
 class Scalars:
-    """Numbers that describe the map as a whole.
+    """Numbers that describe the whole map.
 
     Attributes:
         session: the drive that new keyframes belong to.
-        disparity_offset: pixels by which every measured disparity is too small; ``u_right`` of all
-            rows is corrected by it (``backend/disparity_offset.py``).
-        offset_information: inverse variance of the measurements behind ``disparity_offset``.
-        calibrated_until: the newest keyframe that those measurements used, or -1.
+        disparity_offset: number of pixels by which every measured disparity is too small. The
+            column ``u_right`` of all rows is corrected by this offset
+            (``backend/disparity_offset.py``).
+        offset_information: inverse variance of the measurements from which ``disparity_offset`` was
+            estimated.
+        calibrated_until: the newest keyframe that these measurements used, or -1.
     """
 
     session: int = 0
@@ -132,17 +156,21 @@ def _grown(array: NDArray, capacity: int) -> NDArray:
 
 
 class Map:
-    """A growable map. Callers must ensure that there is one writer at a time.
+    """A map that can grow. Callers must ensure that only one thread writes it at a time.
 
     Attributes:
         arrays: the columns that kernels use.
         keyframes: the other columns of keyframes.
         scalars: numbers that describe the map as a whole.
-        n_keyframes, n_landmarks, n_rows: number of entries in use, including culled ones.
+        n_keyframes, n_landmarks, n_rows: number of entries in use, including culled entries.
     """
 
     def __init__(self, scales: NDArray[np.float64]) -> None:
-        """``scales``: ``(levels,)`` pyramid scale factors that octaves refer to."""
+        """Create an empty map.
+
+        Args:
+            scales: ``(levels,)`` scale factor of each level of the image pyramid.
+        """
         self.scales = scales
         self.n_keyframes = 0
         self.n_landmarks = 0
@@ -186,7 +214,7 @@ class Map:
 
     @property
     def unpredicted_restarts(self) -> list[int]:
-        """The ``restarts`` whose pose was not predicted."""
+        """The keyframes of ``restarts`` whose pose was not predicted."""
         unpredicted = self.keyframes.restart[: self.n_keyframes] == UNPREDICTED
         return np.flatnonzero(unpredicted).tolist()
 
@@ -195,7 +223,7 @@ class Map:
         if used + extra <= capacity:
             return
         target = max(used + extra, capacity + capacity // 2)
-        for name in fields:  # one by one, so that only one column exists twice in memory
+        for name in fields:  # only one column at a time exists twice in memory
             grown = _grown(getattr(self.arrays, name), target + (name == "first_row"))
             self.arrays = self.arrays._replace(**{name: grown})
 
@@ -213,11 +241,11 @@ class Map:
         frame: int,
         certainty: NDArray[np.uint8] | int = 1,
     ) -> int:
-        """Append a keyframe without observations; returns its id.
+        """Append a keyframe without observations, and return its id.
 
         Args:
             features: the N features of the keyframe.
-            T_cw: ``(4, 4)`` its pose.
+            T_cw: ``(4, 4)`` pose of the keyframe.
             timestamp: seconds.
             frame: index of the frame that becomes the keyframe.
             certainty: ``(N,)`` certainty of the features (``Arrays``).
@@ -250,9 +278,10 @@ class Map:
     def add_landmarks(
         self, xyz: NDArray[np.float64], descriptors: NDArray[np.uint64], keyframe: int
     ) -> NDArray[np.int32]:
-        """Append ``(N, 3)`` landmarks first seen by ``keyframe``; returns their ``(N,)`` ids.
+        """Append ``(N, 3)`` landmarks that ``keyframe`` sees first, and return their ``(N,)`` ids.
 
-        They have no observation yet; link them before the map is used again.
+        The new landmarks have no observations. They must be linked to rows before the map is used
+        again.
         """
         n, start = len(xyz), self.n_landmarks
         self._reserve(LANDMARK_FIELDS, start, n)
@@ -283,8 +312,10 @@ class Map:
         return of_arrays | {name: column[: self.n_keyframes] for name, column in of_keyframes}
 
     def with_columns(self, columns: dict[str, NDArray]) -> Map:
-        """This map with other arrays as its columns, named as in ``columns()``. The arrays are not
-        copied."""
+        """This map with other arrays as its columns, under the names of ``columns()``.
+
+        The arrays are not copied.
+        """
         other = copy.copy(self)
         other.arrays = Arrays(**{name: columns[name] for name in Arrays._fields})
         other.keyframes = KeyframeTable(**{name: columns[name] for name in KeyframeTable._fields})
@@ -298,23 +329,23 @@ class Map:
         return self.with_columns({name: column.copy() for name, column in self.columns().items()})
 
     def begin_drive(self) -> None:
-        """Begin a new drive, which later keyframes belong to."""
+        """Begin a new drive. Keyframes that are added later belong to this drive."""
         self.scalars = replace(self.scalars, session=self.scalars.session + 1)
 
     @property
     def many_culled_landmarks(self) -> bool:
-        """Whether culled landmarks take so much memory that dropping them is worth it."""
+        """Whether culled landmarks take so much memory that it is worth dropping them."""
         living = int(np.count_nonzero(self.arrays.landmark_alive[: self.n_landmarks]))
         return self.n_landmarks - living > max(_FEW_LANDMARKS, living // 2)
 
     def drop_culled_landmarks(self) -> NDArray[np.int32]:
-        """Remove culled landmarks and renumber the others in their order.
+        """Remove culled landmarks, and renumber the other landmarks in their order.
 
         Most landmarks die within a few keyframes of their creation.
 
         Returns:
-            ``(n_landmarks,)`` for each old id, the new id of the living landmark that it was merged
-            into (``resolve``), or -1.
+            ``(n_landmarks,)`` the new id of each old landmark, or -1 if it was culled. A landmark
+            that was merged into another landmark has the new id of that landmark (``resolve``).
         """
         a, living = self.arrays, self.living_landmarks()
         resolved = resolve(a, np.arange(self.n_landmarks, dtype=np.int32))
@@ -341,24 +372,32 @@ class Map:
     def covisible(
         self, keyframe: int, minimum: int = 1
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """``(N,)`` keyframes that share at least ``minimum`` landmarks with a keyframe, most
-        landmarks first, and ``(N,)`` how many they share."""
+        """Keyframes that share at least ``minimum`` landmarks with a keyframe.
+
+        Returns:
+            ``(N,)`` ids of these keyframes, sorted by decreasing number of shared landmarks, and
+            the ``(N,)`` numbers of shared landmarks.
+        """
         counts = count_shared(self.arrays, keyframe, self.n_keyframes)
-        enough = np.flatnonzero(counts >= max(1, minimum))  # few; only these are sorted
+        enough = np.flatnonzero(counts >= max(1, minimum))  # few, and only these are sorted
         order = enough[np.argsort(-counts[enough], kind="stable")]
         return order, counts[order]
 
     def keyframe_pose(self, keyframe: int) -> NDArray[np.float64]:
-        """Copy of ``T_cw``; the pose of a culled keyframe follows from that of its parent."""
+        """A copy of the ``T_cw`` of a keyframe.
+
+        The pose of a culled keyframe is computed from the pose of its parent.
+        """
         if self.arrays.keyframe_alive[keyframe]:
             return self.arrays.T_cw[keyframe].copy()
         table = self.keyframes
         return table.T_c_parent[keyframe] @ self.arrays.T_cw[table.parent[keyframe]]
 
     def cull_keyframe(self, keyframe: int) -> None:
-        """Remove a keyframe and its observations; its children become children of its parent.
+        """Cull a keyframe and remove its observations. Its children become children of its parent.
 
-        Its children include keyframes that were culled before, so that every parent is alive.
+        This also applies to children that were culled before, so that every parent is a living
+        keyframe.
         """
         a, table, parents = self.arrays, self.keyframes, self.parents
         parent = parents[keyframe]
@@ -372,8 +411,10 @@ class Map:
         a.keyframe_alive[keyframe] = False
 
     def begin_submap(self, keyframe: int, parent: int, *, predicted: bool) -> None:
-        """Record that mapping restarted at a keyframe, and whether its pose relative to the parent
-        was ``predicted``."""
+        """Record that mapping restarted at a keyframe.
+
+        ``predicted`` says whether the pose of the keyframe relative to its parent was predicted.
+        """
         self.keyframes.parent[keyframe] = parent
         self.keyframes.restart[keyframe] = PREDICTED if predicted else UNPREDICTED
 
@@ -386,16 +427,16 @@ class Map:
         return root
 
     def living_keyframes(self) -> NDArray[np.int64]:
-        """Ids of the keyframes that were not culled."""
+        """Ids of the keyframes that have not been culled."""
         return np.flatnonzero(self.arrays.keyframe_alive[: self.n_keyframes])
 
     def living_landmarks(self) -> NDArray[np.int64]:
-        """Ids of the landmarks that were neither culled nor merged into another."""
+        """Ids of the landmarks that have neither been culled nor merged into another landmark."""
         return np.flatnonzero(self.arrays.landmark_alive[: self.n_landmarks])
 
 
 def loop_of_living(map_: Map, loop: LoopEdge) -> LoopEdge:
-    """The same loop between living keyframes: a culled keyframe is replaced by its parent.
+    """The same loop between living keyframes. A culled keyframe is replaced by its parent.
 
     Raises:
         ValueError: the loop has no pose.
@@ -405,7 +446,7 @@ def loop_of_living(map_: Map, loop: LoopEdge) -> LoopEdge:
     query, match, T = loop.query, loop.match, loop.T_query_match
     if not map_.arrays.keyframe_alive[query]:
         T_parent_query = inverse(map_.keyframes.T_c_parent[query])
-        T_parent_query[:3, 3] /= loop.scale  # to the unit of the match
+        T_parent_query[:3, 3] /= loop.scale  # convert to the unit of the match
         T = compose(T_parent_query, T)
         query = int(map_.parents[query])
     if not map_.arrays.keyframe_alive[match]:

@@ -1,6 +1,6 @@
 """Functions that connect a frame with the map through observations, landmarks and places.
 
-The caller must ensure that no other thread writes the map while one of them runs.
+The caller must ensure that no other thread writes the map while one of these functions runs.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ from vslam.trajectory import Trajectory
 def add_frame(
     map_: Map, frame: Frame, certainty: NDArray[np.uint8] | int, reference: int, *, predicted: bool
 ) -> int:
-    """Add a frame to the map as a keyframe that observes the landmarks it tracks.
+    """Add a frame to the map as a keyframe.
 
-    A frame that tracks no landmark of another keyframe begins a sub-map.
+    The keyframe observes the landmarks that the frame tracks. A frame that tracks no landmark of
+    another keyframe begins a sub-map.
 
     Args:
         certainty: ``(N,)`` certainty of the frame's features (``Arrays.certainty``).
@@ -58,7 +59,7 @@ def add_frame(
 
 
 def add_two_views(map_: Map, start: TwoViewStart, reference: int) -> tuple[int, int]:
-    """Add the two keyframes of a monocular map or sub-map, and the points that both see.
+    """Add the first two keyframes of a monocular map or sub-map, and the points that both observe.
 
     Args:
         reference: the parent of the first keyframe if it begins a sub-map.
@@ -86,20 +87,28 @@ def add_two_views(map_: Map, start: TwoViewStart, reference: int) -> tuple[int, 
 
 
 class LandmarkCounts:
-    """Collects the landmarks that frames should have seen and those that they found, until no other
-    thread writes the map and its counters can be updated."""
+    """Collects the landmarks that frames should have seen and the landmarks that they found.
+
+    The counters of the map can be updated only while no other thread writes the map. Until then,
+    this object keeps the landmarks.
+    """
 
     def __init__(self) -> None:
         self._visible: list[NDArray[np.int32]] = []
         self._found: list[NDArray[np.int32]] = []
 
     def add(self, visible: NDArray[np.int32], found: NDArray[np.int32]) -> None:
-        """Add a frame with the ids ``(N,)`` of visible landmarks and ``(M,)`` of found ones."""
+        """Add a frame.
+
+        Args:
+            visible: ``(N,)`` ids of the landmarks that the frame should have seen.
+            found: ``(M,)`` ids of the landmarks that the frame found.
+        """
         self._visible.append(visible)
         self._found.append(found)
 
     def write(self, map_: Map) -> None:
-        """Update the map's counters and forget the frames."""
+        """Update the counters of the map, and forget the collected frames."""
         a = map_.arrays
         for seen, counter in ((self._visible, a.visible), (self._found, a.found)):
             for ids in seen:
@@ -108,7 +117,7 @@ class LandmarkCounts:
 
 
 def drop_culled_landmarks(map_: Map, frames: Sequence[Frame]) -> None:
-    """Drop the map's culled landmarks, and renumber the landmarks that the frames track."""
+    """Drop the culled landmarks of the map, and renumber the landmarks that the frames track."""
     new_id = map_.drop_culled_landmarks()
     for frame in {id(frame): frame for frame in frames}.values():
         tracked = frame.landmark >= 0
@@ -117,21 +126,26 @@ def drop_culled_landmarks(map_: Map, frames: Sequence[Frame]) -> None:
 
 
 def has_more_points(map_: Map, keyframe: int, frame: Frame) -> bool:
-    """Whether the far stereo points of a keyframe are still to be mapped: it is the first of a map
-    or sub-map, no other keyframe follows it, and ``frame`` is the frame that became it."""
+    """Whether the far stereo points of a keyframe have not been mapped yet.
+
+    This is the case if the keyframe is the first keyframe of a map or sub-map, if no other keyframe
+    follows it, and if ``frame`` is the frame that became this keyframe.
+    """
     begins = keyframe == 0 or keyframe in map_.restarts
     return begins and keyframe == map_.n_keyframes - 1 and map_.frames[keyframe] == frame.index
 
 
 def observe_keyframe(frame: Frame, map_: Map, keyframe: int) -> None:
-    """Assign all landmarks that a keyframe observes to the frame that became it."""
+    """Assign all landmarks that a keyframe observes to the frame that became this keyframe."""
     frame.landmark = map_.arrays.landmark[map_.rows(keyframe)]
     update_landmarks(frame, map_)
 
 
 def update_landmarks(frame: Frame, map_: Map) -> None:
-    """Update a frame's landmarks: ids of merged landmarks are replaced, ids of culled ones become
-    -1, and ``frame.xyz`` is set to their present positions.
+    """Update the landmarks of a frame after the map has changed.
+
+    The ids of merged landmarks are replaced, and the ids of culled landmarks become -1.
+    ``frame.xyz`` is set to the present positions of the landmarks.
 
     If two tracked landmarks were merged, only the first of the two features keeps the landmark.
     """
@@ -146,7 +160,7 @@ def update_landmarks(frame: Frame, map_: Map) -> None:
 
 
 def count_shared_landmarks(map_: Map, frame: Frame) -> NDArray[np.int64]:
-    """``(n_keyframes,)`` the number of landmarks that each keyframe shares with a frame."""
+    """``(n_keyframes,)`` number of landmarks that each keyframe shares with a frame."""
     a, n = map_.arrays, map_.n_keyframes
     _, rows = gather_observations(a, frame.landmark[frame.landmark >= 0], np.arange(n))
     return np.bincount(a.keyframe[rows], minlength=n)
@@ -157,8 +171,8 @@ class OldPlace(NamedTuple):
 
     Attributes:
         keyframe: the keyframe that shares the most landmarks with a frame.
-        n_shared: how many it shares.
-        n_place: how many of its landmarks are observed by at least three keyframes.
+        n_shared: number of landmarks that the keyframe shares with the frame.
+        n_place: number of landmarks of the keyframe that at least three keyframes observe.
     """
 
     keyframe: int
@@ -167,8 +181,11 @@ class OldPlace(NamedTuple):
 
 
 def find_old_place(map_: Map, frame: Frame, known_after_s: float) -> OldPlace | None:
-    """The place that shares the most landmarks with a frame, among keyframes that are at least
-    ``known_after_s`` seconds old; None if these share no landmark with it."""
+    """The old place that shares the most landmarks with a frame.
+
+    Only keyframes that are at least ``known_after_s`` seconds old are considered. The result is
+    None if none of these keyframes shares a landmark with the frame.
+    """
     young = map_.sessions == map_.scalars.session
     young &= map_.timestamps > frame.timestamp - known_after_s
     shared = np.where(young, 0, count_shared_landmarks(map_, frame))
@@ -186,11 +203,10 @@ def keyframe_trajectory(map_: Map) -> Trajectory:
 
 
 def in_first_part(map_: Map, closed: Sequence[LoopEdge], frames: FrameTable) -> NDArray[np.bool_]:
-    """``(N,)`` bool: which frames were tracked in the part of the map that contains the first
-    keyframe.
+    """``(N,)`` bool, whether each frame was tracked in the part of the map with the first keyframe.
 
     Args:
-        closed: closed loops; the sub-maps that they join form one part.
+        closed: closed loops. Sub-maps that these loops join form one part.
     """
     if not map_.n_keyframes:
         return frames.tracked

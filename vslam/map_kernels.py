@@ -1,8 +1,8 @@
 """Kernels that read and write the observations of a map.
 
-``a`` is the map's ``Arrays`` (vslam/map.py). The rows of a landmark form a linked list that begins
-at ``head`` and continues through ``next_row``, so that adding, removing and merging observations
-change only that list.
+``a`` is the ``Arrays`` of the map (vslam/map.py). The rows of a landmark form a linked list, which
+begins at ``head`` and continues through ``next_row``. Adding, removing and merging observations
+changes only this list.
 """
 
 from __future__ import annotations
@@ -15,7 +15,10 @@ from vslam.kernels import hamming, inner_kernel, kernel
 @kernel
 def count_shared(a, keyframe, n_keyframes):
     """``(n_keyframes,)`` int64, the number of landmarks that each keyframe shares with
-    ``keyframe``; 0 for ``keyframe`` itself."""
+    ``keyframe``.
+
+    The number is 0 for ``keyframe`` itself.
+    """
     counts = np.zeros(n_keyframes, np.int64)
     for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
         landmark = a.landmark[row]
@@ -31,7 +34,7 @@ def count_shared(a, keyframe, n_keyframes):
 
 @kernel
 def link(a, row, landmark):
-    """Record that a free row observes a landmark."""
+    """Record that a row observes a landmark. The row must not observe a landmark yet."""
     a.landmark[row] = landmark
     a.next_row[row] = a.head[landmark]
     a.head[landmark] = row
@@ -40,14 +43,14 @@ def link(a, row, landmark):
 
 @kernel
 def link_many(a, rows, landmarks):
-    """Record that ``(N,)`` free rows observe ``(N,)`` landmarks."""
+    """Record that each of ``(N,)`` rows observes one of ``(N,)`` landmarks, as ``link`` does."""
     for i in range(len(rows)):
         link(a, rows[i], landmarks[i])
 
 
 @kernel
 def unlink(a, row):
-    """Remove one observation. A landmark that has no observations left is culled."""
+    """Remove the observation of a row. A landmark that has no observations left is culled."""
     landmark = a.landmark[row]
     if a.head[landmark] == row:
         a.head[landmark] = a.next_row[row]
@@ -65,7 +68,7 @@ def unlink(a, row):
 
 @kernel
 def erase_landmark(a, landmark):
-    """Remove a landmark and its observations."""
+    """Cull a landmark and remove its observations."""
     row = a.head[landmark]
     while row >= 0:
         following = a.next_row[row]
@@ -98,10 +101,12 @@ def observed_by(a, landmark, keyframe):
 
 @kernel
 def merge_landmarks(a, loser, winner):
-    """Move the observations of ``loser`` to ``winner``; a keyframe that observes both keeps one.
+    """Move the observations of landmark ``loser`` to landmark ``winner``.
 
-    Rows and keyframes are cast to int64, the type that other callers pass, so that ``link`` and
-    ``observed_by`` are compiled only once.
+    A keyframe that observes both landmarks keeps only its observation of ``winner``.
+
+    Rows and keyframes are cast to int64, which is the type that other callers pass. Therefore,
+    ``link`` and ``observed_by`` are compiled only once.
     """
     row = np.int64(a.head[loser])
     while row >= 0:
@@ -121,7 +126,8 @@ def merge_landmarks(a, loser, winner):
 
 @kernel
 def resolve(a, landmarks):
-    """``(N,)`` int32, the living landmark that each id was merged into, or -1 if it was culled."""
+    """``(N,)`` int32, the living landmark that each landmark was merged into, or -1 if it was
+    culled."""
     out = np.empty(len(landmarks), np.int32)
     for i in range(len(landmarks)):
         landmark = landmarks[i]
@@ -133,7 +139,7 @@ def resolve(a, landmarks):
 
 @inner_kernel
 def lower_median(values, n):
-    """Lower median of the first ``n`` values, which are sorted in place (insertion sort)."""
+    """Lower median of the first ``n`` values. These values are sorted in place (insertion sort)."""
     for i in range(1, n):
         value, j = values[i], i
         while j > 0 and values[j - 1] > value:
@@ -145,11 +151,12 @@ def lower_median(values, n):
 
 @kernel
 def refresh_landmarks(a, landmarks, scales):
-    """Recompute descriptor, normal and distance range of landmarks from their observations.
+    """Recompute the descriptor, normal and distance range of landmarks from their observations.
 
-    The descriptor is that of the observation with the least median distance to the others
-    (ORB-SLAM, III-C). Only the newest 32 observations are considered, to bound the work. The
-    distance range follows from the octave in the first keyframe that observes the landmark.
+    The descriptor is taken from the observation whose median distance to the descriptors of the
+    other observations is least (ORB-SLAM, III-C). Only the newest 32 observations are considered,
+    to limit the computing time. The distance range is computed from the octave in the first
+    keyframe that observes the landmark.
     """
     limit = 32
     rows = np.empty(limit, np.int64)
@@ -211,7 +218,7 @@ def predict_octave(distance, farthest, log_scale, levels):
 
 @kernel
 def collect_landmarks(a, keyframes, n_landmarks):
-    """Ids of the landmarks that any of the keyframes observes, ``(N,)`` i4, in id order."""
+    """``(N,)`` int32, sorted ids of the landmarks that at least one of the keyframes observes."""
     seen = np.zeros(n_landmarks, np.bool_)
     for keyframe in keyframes:
         for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
@@ -222,8 +229,10 @@ def collect_landmarks(a, keyframes, n_landmarks):
 
 @kernel
 def count_seen_by(a, keyframe, needed):
-    """Count a keyframe's landmarks that at least ``needed`` keyframes observe, including this
-    one."""
+    """Number of landmarks of a keyframe that at least ``needed`` keyframes observe.
+
+    The keyframe itself counts as one of the ``needed`` keyframes.
+    """
     count = 0
     for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
         if a.landmark[row] < 0:
@@ -240,10 +249,10 @@ def count_seen_by(a, keyframe, needed):
 
 @kernel
 def covisible_pairs(a, keyframes, n_keyframes, minimum):
-    """Pairs of ``(N,)`` keyframes that share at least ``minimum`` landmarks, in one pass.
+    """All pairs of ``(N,)`` keyframes that share at least ``minimum`` landmarks.
 
-    Returns ``(M, 2)`` int64 pairs in ascending order, each with the lower id first, and ``(M,)``
-    how many landmarks each pair shares.
+    Returns ``(M, 2)`` int64 pairs in ascending order, each with the lower id first, and the
+    ``(M,)`` numbers of landmarks that the pairs share.
     """
     counts = np.zeros(n_keyframes, np.int64)
     listed = np.zeros(n_keyframes, np.bool_)
@@ -282,9 +291,9 @@ def covisible_pairs(a, keyframes, n_keyframes, minimum):
 
 @kernel
 def gather_observations(a, landmarks, index):
-    """Rows that observe each of ``(P,)`` landmarks in keyframes with ``index[keyframe] >= 0``.
+    """Rows of the keyframes with ``index[keyframe] >= 0`` that observe each of ``(P,)`` landmarks.
 
-    Returns ``(P + 1,)`` int64 offsets and the rows, one landmark after the other.
+    Returns ``(P + 1,)`` int64 offsets, and the rows of one landmark after the other.
     """
     first = np.zeros(len(landmarks) + 1, np.int64)
     for i in range(len(landmarks)):

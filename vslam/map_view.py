@@ -1,4 +1,4 @@
-"""Copies of the map that tracking reads while local mapping writes the map."""
+"""Copies of parts of the map, which tracking reads while local mapping writes the map."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from vslam.map_kernels import collect_landmarks, count_seen_by
 
 
 class LocalMap(NamedTuple):
-    """Landmarks around a keyframe.
+    """N landmarks around a keyframe.
 
-    ``ids`` (N,) i4; ``xyz``, ``normal`` (N, 3) f8; ``distance_range`` (N, 2) f8; ``descriptor``
-    (N, 4) u8.
+    Attributes:
+        ids: ``(N,)`` int32.
+        xyz, normal, distance_range, descriptor: ``(N, ...)`` columns of ``Arrays``.
     """
 
     ids: NDArray[np.int32]
@@ -31,11 +32,11 @@ class LocalMap(NamedTuple):
 def local_map(map_: Map, keyframe: int, limit: int) -> LocalMap:
     """Copy the landmarks of a keyframe and of its covisible keyframes (ORB-SLAM, V-D).
 
-    ORB-SLAM also takes the neighbours of neighbours, which made no difference here
-    (docs/explanation/design.md).
+    ORB-SLAM also takes the neighbours of the covisible keyframes. These made no difference in our
+    measurements (docs/explanation/design.md).
 
     Args:
-        limit: greatest number of keyframes; those that share the most landmarks are chosen.
+        limit: greatest number of keyframes. The keyframes that share the most landmarks are chosen.
     """
     first, _ = map_.covisible(keyframe)
     chosen = [keyframe, *first[: limit - 1].tolist()]
@@ -57,21 +58,23 @@ NO_LANDMARKS = LocalMap(
 
 @dataclass(frozen=True)
 class MapView:
-    """The map as tracking sees it: a copy of its state at the last merge of local mapping. The
-    defaults describe an empty map.
+    """The map as tracking sees it: a copy of its state when the last result of local mapping was
+    merged.
+
+    The defaults describe an empty map.
 
     Attributes:
-        reference: the keyframe that frames are tracked against and that their poses are relative
-            to, usually the newest.
-        T_reference: ``(4, 4)`` its ``T_cw``.
-        unit_scale: its ``Map.unit_scale``.
-        n_keyframes: number of keyframes so far, culled ones included.
+        reference: the keyframe that frames are tracked against. The poses of frames are relative to
+            it. It is usually the newest keyframe.
+        T_reference: ``(4, 4)`` the ``T_cw`` of the reference keyframe.
+        unit_scale: the ``Map.unit_scale`` of the reference keyframe.
+        n_keyframes: number of keyframes so far, including culled keyframes.
         local_landmarks: landmarks of the reference keyframe and of its covisible keyframes.
         reference_landmarks: landmarks of the reference keyframe alone.
-        n_reference: number of these that at least three keyframes observe (in a map with fewer
-            keyframes, all of them).
+        n_reference: number of ``reference_landmarks`` that at least three keyframes observe. If the
+            map has fewer than three keyframes, all of its keyframes must observe the landmark.
         patches: image patches of the local landmarks that the newest keyframes observe.
-        with_patches: these landmarks, in the order of ``patches``.
+        with_patches: the landmarks that have patches, in the order of ``patches``.
     """
 
     reference: int = 0
@@ -88,7 +91,7 @@ class MapView:
 def view_of(
     map_: Map, keyframe: int, local: LocalMap, patches: LandmarkPatches, *, monocular: bool
 ) -> MapView:
-    """The view of the map from a reference keyframe.
+    """Create the view of the map for a reference keyframe.
 
     Args:
         local: the landmarks of the keyframe and of its covisible keyframes.

@@ -1,9 +1,9 @@
-"""Merging the maps of several drives by loops between them.
+"""Merging of the maps of several drives by loop closures between them.
 
-Each further map is appended to the first as a sub-map at an unknown place. For each keyframe of the
-appended map, the detector of the first map proposes candidates. These are verified and closed as
-usual: the first loop moves the sub-map to its place, later loops correct drift and fuse landmarks,
-and a global bundle adjustment concludes the merge.
+Each further map is appended to the first map as a sub-map at an unknown place. For each keyframe of
+the appended map, the detector of the first map proposes loop candidates. These candidates are
+verified and closed as in a run. The first loop moves the sub-map to its place. Later loops correct
+drift and fuse landmarks. At the end, a global bundle adjustment optimises the merged map.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ Memory = tuple[LoopDetector, KeyframeImages | None]
 
 @dataclass(frozen=True)
 class MergedMaps:
-    """The result of merging several maps, which are named by their position in the input.
+    """The result of merging several maps. A map is named by its position in the input.
 
     Attributes:
-        stored: the first map together with all maps that were joined to it.
-        joined: the joined maps, in the order in which they were joined.
-        left_out: the maps that no verified loop connects to the first one.
+        stored: the first map, together with all maps that were joined to it.
+        joined: the maps that were joined to the first map, in the order in which they were joined.
+        left_out: the maps that no verified loop connects to the first map.
         loops: for each joined map, the loops that connect it to the maps before it.
     """
 
@@ -50,16 +50,19 @@ def merge_maps(
     create: Callable[[], Memory],
     on_keyframe: Callable[[], None] = lambda: None,
 ) -> MergedMaps:
-    """Join maps to the first one; a map that overlaps only another map is joined after that one.
+    """Join maps to the first map.
+
+    A map need not overlap the first map if it overlaps another map. It is then joined after that
+    map.
 
     Args:
         maps: two or more maps with the same camera, pyramid and detector.
-        create: creates an empty detector of the same kind as that of the maps, and the store of its
-            images.
-        on_keyframe: called after each keyframe for which loops were searched.
+        create: function that creates an empty detector of the same kind as the detector of the
+            maps, and the store of its images.
+        on_keyframe: function that is called after the search for loops at each keyframe.
 
     Raises:
-        ValueError: the maps cannot be merged; the message gives the reason in a few words.
+        ValueError: the maps cannot be merged. The message gives the reason in a few words.
     """
     whole, waiting = maps[0].compact(), dict(enumerate(maps))
     del waiting[0]
@@ -87,10 +90,13 @@ def join(
     memory: Memory,
     on_keyframe: Callable[[], None] = lambda: None,
 ) -> tuple[StoredMap, list[LoopEdge]] | None:
-    """Join two compact maps; the joined map has the world frame of the first.
+    """Join two maps that ``StoredMap.compact`` returned.
+
+    The joined map has the world frame of the first map.
 
     Args:
-        memory: an empty detector of the same kind as that of the maps, and the store of its images.
+        memory: an empty detector of the same kind as the detector of the maps, and the store of its
+            images.
 
     Returns:
         The joined map and the loops that were closed between the two, or None if there are none.
@@ -126,8 +132,10 @@ def _candidates(
     images: KeyframeImages | None,
     config: Config,
 ) -> list[LoopCandidate]:
-    """Keyframes of the first map that resemble a keyframe of the second one and do not share enough
-    landmarks with it yet."""
+    """Keyframes of the first map that resemble a keyframe of the second map.
+
+    Keyframes that already share enough landmarks with it are left out.
+    """
     image = images.image(keyframe) if images is not None and keyframe in images else None
     found = detector.locate(image, features_of(map_, keyframe), map_)
     joined = set(map_.covisible(keyframe, config.consistency.min_shared)[0].tolist())

@@ -1,4 +1,5 @@
-"""The version of the method, which stands for its trajectories."""
+"""Version of the method. It changes whenever trajectories change."""
 
-# Increment it whenever the results of the method change; tests/test_method_version.py detects that.
+# Increment it whenever the results of the method change. tests/test_method_version.py fails if the
+# results have changed, but the version has not.
 METHOD_VERSION = 2

@@ -1,4 +1,4 @@
-"""The two modes of SLAM: build a map from the frames, or localise in a map without changing it."""
+"""The two modes of SLAM: building a map, and localising in a map without changing it."""
 
 from __future__ import annotations
 
@@ -27,39 +27,51 @@ class Mode:
 
     @property
     def due(self) -> int:
-        """Index of the frame that is to become a keyframe; -1 if none is planned."""
+        """Index of the frame that is planned to become a keyframe. It is -1 if no keyframe is
+        planned."""
         return -1
 
     def begin(self, frame: PlacedFrame) -> bool:
-        """Try to begin a map or sub-map with a frame that has a pose but was not tracked; returns
-        whether one was begun."""
+        """Try to begin a map or sub-map with a frame that has a pose but was not tracked.
+
+        Returns:
+            Whether a map or sub-map was begun.
+        """
         return False
 
     def begin_after_loss(self, frame: PlacedFrame) -> bool:
-        """As ``begin``, but only if the camera has been lost for enough frames."""
+        """Do the same as ``begin``, but only if the camera has been lost for enough frames."""
         return False
 
     def map_far_points(self) -> bool:
-        """Map the far stereo points of the first keyframe of a map or sub-map if the frame right
-        after it was lost; returns whether points were added, so that tracking can be retried."""
+        """Map the far stereo points of the first keyframe if the frame directly after it was lost.
+
+        This concerns the first keyframe of a map or sub-map.
+
+        Returns:
+            Whether points were added, so that tracking can be tried again.
+        """
         return False
 
     def update_map(self, frame: PlacedFrame, found: Found) -> bool:
-        """Count the landmarks that a tracked frame saw, and insert the frame as a keyframe if the
-        policy wants one; returns whether it was inserted."""
+        """Count the landmarks that a tracked frame saw, and insert it as a keyframe if needed.
+
+        Returns:
+            Whether the frame was inserted as a keyframe.
+        """
         self._mapper.refer_to_nearest(frame)
         return False
 
     def state(self) -> PolicyState | None:
-        """The state for a checkpoint; None if no checkpoint is possible now."""
+        """The state for a checkpoint. None if no checkpoint is possible now."""
         return None
 
     def restore(self, state: PolicyState) -> None:
-        """Restore what ``state`` returned."""
+        """Continue from a state that ``state`` returned."""
 
 
 class MapBuilding(Mode):
-    """Inserts frames that see something new as keyframes.
+    """Builds a map: inserts frames that see something new as keyframes.
 
     Attributes:
         starter: finds the frames with which a map or a sub-map begins.
@@ -141,8 +153,11 @@ class MapBuilding(Mode):
         return self.policy.is_due(frame.index, evidence)
 
     def _match_features(self, frame: PlacedFrame) -> bool:
-        """Give a frame that was tracked by patches the features that a keyframe needs. Returns
-        False, and leaves the frame as it is, if they do not match the map."""
+        """Give a frame that was tracked by patches the features that a keyframe needs.
+
+        Returns:
+            False if the features do not match the map. The frame is then left as it is.
+        """
         if frame.source is None:
             return True
         before = frame.snapshot()
@@ -153,8 +168,11 @@ class MapBuilding(Mode):
         return False
 
     def state(self) -> PolicyState | None:
-        """The state of the keyframe policy; None while the starter keeps a frame and waits for a
-        second one to begin a map with."""
+        """The state of the keyframe policy.
+
+        It is None while the starter keeps a first frame and waits for a second frame to begin a
+        map.
+        """
         return None if self.starter.is_waiting else self.policy.state()
 
     def restore(self, state: PolicyState) -> None:

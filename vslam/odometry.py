@@ -1,24 +1,25 @@
 """Odometry: poses that drift but never jump, and the uncertainty of each pose.
 
 The pose of the camera in the map jumps when a loop is closed or the camera is relocalised. The
-controller of a robot needs poses that do not jump: the frame ``odom`` follows the motion from frame
-to frame, and drifts (ROS REP 105).
+controller of a robot needs poses that do not jump. Therefore, ROS also has the frame ``odom`` (REP
+105). A pose in this frame follows the motion from frame to frame, and drifts.
 
-The error of a pose has two parts. The *local* error is that of the camera relative to the landmarks
-around it, and is independent in every frame. The *drift* is the error of these landmarks relative
-to the start of the drive. It grows with every keyframe, because new landmarks inherit the error of
-the keyframe that maps them. Consecutive keyframes share landmarks, so that their errors are
-correlated: the drift grows like a random walk with correlated steps (a first-order autoregressive
-process).
+The error of a pose has two parts. The *local* error is the error of the camera pose relative to the
+landmarks around the camera. It is independent in every frame. The *drift* is the error of these
+landmarks relative to the start of the drive. It grows with every keyframe, because new landmarks
+inherit the error of the keyframe that maps them. Consecutive keyframes share landmarks, so their
+errors are correlated. Therefore, the drift grows like a random walk with correlated steps (a
+first-order autoregressive process).
 
 A stereo camera adds a third part. Its disparity offset is estimated during the drive
-(``backend/disparity_offset.py``), and the error of this estimate makes all motions too long or too
-short by the same share: in contrast to the drift, it does not average out.
+(``backend/disparity_offset.py``). The error of this estimate makes all motions too long or too
+short by the same share. In contrast to the drift, this error does not average out.
 
-Covariances are those of ``xi = [v, w]``, metres and radians, in the frame of the camera: with an
-estimated pose ``T_cw``, the true one is ``exp(xi) T_cw``. The covariance describes odometry alone:
-it ignores that loop closures reduce the drift, that the scale of a monocular map is unknown, and
-errors of the calibration other than the estimated offset.
+A covariance is the covariance of ``xi = [v, w]`` in metres and radians, in the frame of the camera.
+If ``T_cw`` is the estimated pose, the true pose is ``exp(xi) T_cw``. The covariance describes
+odometry alone. It does not take into account that loop closures reduce the drift, or that the scale
+of a monocular map is unknown. It also ignores all errors of the calibration except the disparity
+offset.
 """
 
 from __future__ import annotations
@@ -30,9 +31,10 @@ from numpy.typing import NDArray
 
 from vslam.geometry import Matrix, inverse, orthonormalised
 
-# Factor on the computed covariance of the drift, and the correlation of consecutive steps of the
-# drift. They were chosen on three rendered drives so that the squared errors over 1 s and 10 s
-# match the covariances, and tested on others (docs/research/uncertainty.md).
+# The computed covariance of the drift is multiplied by the first number. The second number is the
+# correlation of consecutive steps of the drift. Both were chosen on three rendered drives so that
+# the squared errors over 1 s and 10 s match the covariances. They were tested on other drives
+# (docs/research/uncertainty.md).
 DRIFT, CORRELATION = 1.4, 0.4
 # Standard deviations of the acceleration of a lost camera, in m/s^2 and rad/s^2.
 ACCELERATION, TURNING = 2.0, 1.0
@@ -51,8 +53,8 @@ class PoseUncertainty:
         drift: ``(6, 6)`` sum of the local covariances of all keyframes since the start of the
             drive.
         n_keyframes: number of these keyframes.
-        offset: ``(6,)`` error of the pose relative to the start of the drive if the disparity
-            offset is wrong by one standard deviation.
+        offset: ``(6,)`` error of the pose relative to the start of the drive that an error of the
+            disparity offset by one standard deviation causes.
     """
 
     local: Matrix
@@ -61,8 +63,11 @@ class PoseUncertainty:
     offset: Matrix = field(default_factory=lambda: np.zeros(6))
 
     def numbers(self) -> NDArray[np.float64]:
-        """``(49,)`` the upper triangles of ``local`` and ``drift``, row by row, ``offset`` and
-        ``n_keyframes``; ``of_numbers`` is the inverse."""
+        """All numbers of the uncertainty as a ``(49,)`` array. ``of_numbers`` is the inverse.
+
+        The array holds the upper triangles of ``local`` and ``drift``, row by row, then ``offset``
+        and ``n_keyframes``.
+        """
         return np.array([*self.local[_UPPER], *self.drift[_UPPER], *self.offset, self.n_keyframes])
 
     @classmethod
@@ -90,12 +95,13 @@ class PoseUncertainty:
 def relative_covariance(
     first: PoseUncertainty, last: PoseUncertainty, T_last_first: Matrix
 ) -> Matrix:
-    """``(6, 6)`` covariance of the motion from an earlier to a later frame of a drive, in the frame
-    of the later camera: the true motion is ``exp(xi) T_last_first``.
+    """``(6, 6)`` covariance of the motion from an earlier to a later frame of a drive.
+
+    It refers to the frame of the later camera. The true motion is ``exp(xi) T_last_first``.
 
     Args:
-        T_last_first: ``(4, 4)`` the estimated motion, which maps points from the first camera to
-            the last.
+        T_last_first: ``(4, 4)`` estimated motion, which maps points from the camera of the first
+            frame to the camera of the last frame.
     """
     n = last.n_keyframes - first.n_keyframes
     A = adjoint(T_last_first)
@@ -121,8 +127,11 @@ def _symmetric(matrix: Matrix) -> Matrix:
 
 
 def _growth(n: int) -> float:
-    """Ratio of the variance of a sum of n correlated steps to that of n independent steps, for an
-    AR(1) process (Hamilton, Time Series Analysis, 1994, 7.2)."""
+    """Ratio of the variance of a sum of n correlated steps to the variance of a sum of n
+    independent steps.
+
+    The steps are an AR(1) process (Hamilton, Time Series Analysis, 1994, 7.2).
+    """
     if n == 0:
         return 1.0
     r = CORRELATION
@@ -133,8 +142,8 @@ class Odometry:
     """Follows the motion of the camera from frame to frame, and the uncertainty of its pose.
 
     Attributes:
-        T_odom_camera: ``(4, 4)`` pose of the last frame; the first frame is the origin.
-        now: its uncertainty.
+        T_odom_camera: ``(4, 4)`` pose of the last frame. The first frame is the origin.
+        now: the uncertainty of this pose.
     """
 
     def __init__(self) -> None:
@@ -152,13 +161,15 @@ class Odometry:
         """Advance to the next frame.
 
         Args:
-            T_now_last: ``(4, 4)`` motion, which maps points from the last camera to this one.
+            T_now_last: ``(4, 4)`` motion, which maps points from the camera of the last frame to
+                the camera of the next frame.
             elapsed: seconds between the two frames.
-            covariance: ``(6, 6)`` covariance of the optimised pose (``pose_covariance``); None if
+            covariance: ``(6, 6)`` covariance of the optimised pose (``pose_covariance``). None if
                 the pose is only predicted with constant velocity. The error of a predicted pose
                 grows with the square of the time since tracking was lost.
-            of_offset: ``(6, 3)`` error of the motion, by its translation, if the disparity offset
-                is wrong by one standard deviation (``offset_effect``); None if it has no effect.
+            of_offset: ``(6, 3)`` error of the motion per unit of its translation, if the disparity
+                offset is wrong by one standard deviation (``offset_effect``). None if the offset
+                has no effect.
         """
         self.T_odom_camera = orthonormalised(self.T_odom_camera @ inverse(T_now_last))
         A = adjoint(T_now_last)
@@ -177,8 +188,10 @@ class Odometry:
         self.now = PoseUncertainty(local, drift, self.now.n_keyframes, offset)
 
     def keyframe(self) -> None:
-        """Record that the last frame became a keyframe. Its error is added to the drift, because
-        new landmarks inherit it."""
+        """Record that the last frame became a keyframe.
+
+        The error of the frame is added to the drift, because new landmarks inherit it.
+        """
         now = self.now
         self.now = replace(now, drift=now.drift + now.local, n_keyframes=now.n_keyframes + 1)
 
@@ -187,7 +200,7 @@ class Odometry:
         self.T_odom_camera, self.now = T_odom_camera, uncertainty
 
     def state(self) -> tuple[float, ...]:
-        """The state, for a checkpoint."""
+        """The state for a checkpoint."""
         return (*self.T_odom_camera.ravel(), *self.now.numbers().tolist(), self._lost_s)
 
     def restore(self, state: tuple[float, ...]) -> None:

@@ -1,7 +1,7 @@
-"""Detectors, readers and perturbations of other packages, found by their entry points.
+"""Loop detectors, readers and perturbations that other packages provide as entry points.
 
 docs/howto/plugins.md explains how to write one. Plug-ins are found in the metadata of packages. A
-package is imported only when its plug-in is used, so a broken one does not affect other runs.
+package is imported only when its plug-in is used, so a broken package does not affect other runs.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class PlugIn:
     Attributes:
         group: one of `KINDS`.
         name: the name on the command line.
-        packages: all packages that offer this name, with versions; using a plug-in that more than
-            one package offers is an error.
+        packages: all packages that offer this name, with versions. It is an error to use a plug-in
+            that more than one package offers.
         entry_point: the entry point of the first package.
     """
 
@@ -52,8 +52,8 @@ class PlugIn:
         """Import the function or class that the entry point names, and call it.
 
         Raises:
-            InputError: it cannot be imported, is not callable or fails, or several packages offer
-                this name.
+            InputError: the entry point cannot be imported, is not callable or fails, or several
+                packages offer this name.
         """
         if len(self.packages) > 1:
             raise InputError(f"{self}: several packages offer this name; uninstall all but one.")
@@ -75,7 +75,8 @@ class PlugIn:
         """Call a function of the package.
 
         Raises:
-            InputError: the function failed; an `InputError` that it raises itself is passed on.
+            InputError: the function failed. An `InputError` that the function raises itself is
+                passed on.
         """
         try:
             return function(*arguments, **named)
@@ -88,8 +89,11 @@ class PlugIn:
             ) from error
 
     def _line(self, error: Exception) -> str:
-        """The file and line of the package that raised the error or called the code that raised it;
-        empty if the package appears nowhere in the traceback."""
+        """The line of the package's code at which an error occurred, with the name of its file.
+
+        If other code raised the error, it is the line that called this code. It is empty if the
+        traceback does not contain the package.
+        """
         package = self.entry_point.module.partition(".")[0]
         lines = [
             f"; {Path(frame.f_code.co_filename).name}, line {line}"
@@ -100,13 +104,13 @@ class PlugIn:
 
 
 def reason(error: Exception) -> str:
-    """An exception in one line."""
+    """Describe an exception in one line."""
     text = next(iter(str(error).splitlines()), "")
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 def find_plugins(group: str) -> dict[str, PlugIn]:
-    """The plug-ins of all installed packages by name, in alphabetical order.
+    """The plug-ins of all installed packages by name, sorted alphabetically.
 
     Args:
         group: one of `KINDS`.
@@ -129,13 +133,13 @@ def find_plugins(group: str) -> dict[str, PlugIn]:
 
 
 def packages_of(names: Collection[str]) -> dict[str, str]:
-    """The packages, with versions, of those ``names`` that are plug-ins, by name."""
+    """The packages, with versions, of the plug-ins among ``names``. Other names are left out."""
     found = {name: plugin for group in KINDS for name, plugin in find_plugins(group).items()}
     return {name: " and ".join(found[name].packages) for name in names if name in found}
 
 
 def _entry_points(group: str) -> list[tuple[str, EntryPoint]]:
-    """Pairs of a package, with its version, and an entry point."""
+    """All entry points of a group, each with the name and version of its package."""
     found = []
     for distribution in distributions():
         text = distribution.read_text("entry_points.txt")

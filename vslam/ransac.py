@@ -1,7 +1,7 @@
 """Random generator and stopping rule of the RANSAC kernels (Fischler and Bolles, CACM 1981).
 
-Each kernel owns the state of its generator, so that the same seed gives the same result whatever
-other threads draw.
+Each kernel owns the state of its generator. Therefore, the same seed always gives the same result,
+regardless of the random numbers that other threads draw.
 """
 
 from __future__ import annotations
@@ -18,20 +18,22 @@ _S27, _S30, _S31, _S33 = np.uint64(27), np.uint64(30), np.uint64(31), np.uint64(
 
 @kernel
 def random_index(state, n):
-    """Random integer in ``[0, n)``; advances ``state`` ``(1,)`` uint64 (SplitMix64, Steele et al.
-    2014)."""
+    """Random integer in ``[0, n)``, by SplitMix64 (Steele et al. 2014).
+
+    The ``(1,)`` uint64 array ``state`` is advanced.
+    """
     state[0] += _STEP
     z = state[0]
     z = (z ^ (z >> _S30)) * _MIX_A
     z = (z ^ (z >> _S27)) * _MIX_B
     z = z ^ (z >> _S31)
-    # 31 bits times n: the bias is below n / 2^31, and int64 cannot overflow.
+    # 31 random bits are multiplied by n. The bias is below n / 2^31, and int64 cannot overflow.
     return (np.int64(z >> _S33) * n) >> 31
 
 
 @kernel
 def draw_three(state, n):
-    """Three different random integers in ``[0, n)``; ``n`` is at least 3."""
+    """Three different random integers in ``[0, n)``. ``n`` must be at least 3."""
     i = random_index(state, n)
     j = random_index(state, n - 1)
     k = random_index(state, n - 2)
@@ -47,8 +49,11 @@ def draw_three(state, n):
 
 @kernel
 def draws_needed(inlier_share, confidence, limit):
-    """Number of draws of three items after which, with probability ``confidence``, at least one
-    draw contains only inliers; at most ``limit`` (Fischler and Bolles 1981, section II-B)."""
+    """Number of draws of three items that RANSAC needs (Fischler and Bolles 1981, section II-B).
+
+    After this number of draws, at least one draw contains only inliers, with probability
+    ``confidence``. The number is at most ``limit``.
+    """
     good = inlier_share**3
     if good >= 1.0:
         return 1

@@ -1,10 +1,10 @@
 """Reprojection errors: the layout of observations and the inlier test.
 
-An observation is a row ``u, v, u_right`` in pixels. ``u_right`` is NaN for a monocular observation,
-that is, for a keypoint without a stereo match.
+An observation is a row ``u, v, u_right`` in pixels. A keypoint without a stereo match gives a
+monocular observation, whose ``u_right`` is NaN.
 
-Kernels that only test for inliers call ``chi_square_ratio``; optimisers, which also need the
-``residual``, test it with ``chi_square``.
+Kernels that only test for inliers call ``chi_square_ratio``. Optimisers need the residual as well.
+They call ``residual`` and test its result with ``chi_square``.
 """
 
 from __future__ import annotations
@@ -15,14 +15,16 @@ from numpy.typing import NDArray
 from vslam.geometry import Matrix
 from vslam.kernels import inner_kernel
 
-# 95 % quantiles of chi-square with 2 and 3 degrees of freedom: the largest squared error, divided
-# by the variance, of a monocular (u, v) or stereo (u, v, u_right) inlier. ORB-SLAM2, III-C.
+# 95 % quantiles of chi-square with 2 and 3 degrees of freedom (ORB-SLAM2, III-C). The squared error
+# of an inlier, divided by the variance, is at most the first number for a monocular observation (u,
+# v), and at most the second number for a stereo observation (u, v, u_right).
 CHI2_MONO = 5.991
 CHI2_STEREO = 7.815
 
 
 def stack_uvr(xy: NDArray[np.floating], u_right: NDArray[np.floating]) -> Matrix:
-    """``(N, 3)`` float64 observations of ``(N, 2)`` keypoints and their ``(N,)`` stereo columns."""
+    """``(N, 3)`` float64 observations, from ``(N, 2)`` keypoints and their ``(N,)`` stereo
+    columns."""
     uvr = np.empty((len(xy), 3))
     uvr[:, :2], uvr[:, 2] = xy, u_right
     return uvr
@@ -30,8 +32,10 @@ def stack_uvr(xy: NDArray[np.floating], u_right: NDArray[np.floating]) -> Matrix
 
 @inner_kernel
 def unpacked(intrinsics):
-    """``Camera.intrinsics`` as a tuple. Unlike the values of an array, those of a tuple stay in
-    registers."""
+    """``Camera.intrinsics`` as a tuple.
+
+    A kernel keeps the values of a tuple in registers, but not the values of an array.
+    """
     return (
         intrinsics[0],
         intrinsics[1],
@@ -44,11 +48,13 @@ def unpacked(intrinsics):
 
 @inner_kernel
 def chi_square_ratio(x, y, z, u, v, u_right, inverse_sigma2, pinhole):
-    """Squared reprojection error of a point ``x, y, z`` in the camera frame, divided by its
-    chi-square limit: at most 1 for an inlier. The point must lie in front of the camera.
+    """Squared reprojection error of a point, divided by its chi-square limit.
+
+    The ratio is at most 1 for an inlier. The point must lie in front of the camera.
 
     Args:
-        u, v, u_right: float64 observation.
+        x, y, z: float64 point in the camera frame.
+        u, v, u_right: float64 observation in pixels.
         inverse_sigma2: inverse variance of a pixel coordinate.
         pinhole: intrinsics as ``unpacked`` returns them.
     """
@@ -63,9 +69,14 @@ def chi_square_ratio(x, y, z, u, v, u_right, inverse_sigma2, pinhole):
 
 @inner_kernel
 def residual(x, y, z, u, v, u_right, pinhole):
-    """Reprojection errors in u, in v and in the negative disparity, and whether the observation is
-    stereo. The error of the disparity is weighted, and 0 without a stereo match. The arguments are
-    those of ``chi_square_ratio``."""
+    """Reprojection errors of a point in u, in v and in the negative disparity.
+
+    The arguments are the same as for ``chi_square_ratio``.
+
+    Returns:
+        The three errors in pixels, and whether the observation is stereo. The error of the
+        disparity is multiplied by the disparity weight. It is 0 for a monocular observation.
+    """
     fx, fy, cx, cy, bf, disparity_weight = pinhole
     iz = 1.0 / z
     stereo = not np.isnan(u_right)
@@ -75,7 +86,9 @@ def residual(x, y, z, u, v, u_right, pinhole):
 
 @inner_kernel
 def chi_square(r_u, r_v, r_disparity, stereo, inverse_sigma2):
-    """Squared error of a ``residual`` divided by its variance, and the largest such value of an
-    inlier. Beyond that value, the Huber loss is linear."""
+    """Squared error of a ``residual``, divided by its variance, and the limit for an inlier.
+
+    The Huber loss is linear above this limit.
+    """
     chi2 = (r_u * r_u + r_v * r_v + r_disparity * r_disparity) * inverse_sigma2
     return chi2, CHI2_STEREO if stereo else CHI2_MONO

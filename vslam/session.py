@@ -1,4 +1,5 @@
-"""Continuing in a stored map, and collecting everything that a map file stores."""
+"""Resuming a drive or starting a new drive in a stored map, and collecting the content of a map
+file."""
 
 from __future__ import annotations
 
@@ -28,14 +29,14 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class OpenedMap:
-    """The map, new or stored, in which a drive begins.
+    """The new or stored map in which a drive begins.
 
     Attributes:
-        map: the stored map; None for a new one.
-        frames: poses of the drive's earlier frames; None for a new drive.
-        checkpoint: state from which the drive continues with identical results; None for a new
-            drive, or if the map was saved without one.
-        drives: sources of the images of the earlier drives, such as "kitti 06".
+        map: the stored map; None for a new map.
+        frames: poses of the earlier frames of the drive; None for a new drive.
+        checkpoint: state from which the drive continues with the same results as an uninterrupted
+            run. None for a new drive, or if the map was saved without a checkpoint.
+        drives: source of the images of each earlier drive, such as "kitti 06".
         truth_alignment: the transformation of the map into the frame of a ground truth; None if
             unknown.
     """
@@ -55,15 +56,16 @@ def open_map(
     localize: bool,
     resume: bool,
 ) -> OpenedMap:
-    """Restore detector, images and closed loops from a stored map, or begin a new map if ``stored``
-    is None.
+    """Restore the detector, the images and the closed loops from a stored map.
+
+    If ``stored`` is None, a new map begins.
 
     Args:
         localize: only localise in the map, without changing it.
-        resume: continue the map's last drive instead of starting a new one.
+        resume: continue the last drive of the map instead of starting a new drive.
 
     Raises:
-        ValueError: the map cannot be continued; the message gives the reason in a few words.
+        ValueError: the map cannot be continued. The message gives the reason in a few words.
     """
     if localize and (stored is None or not stored.map.n_keyframes):
         raise ValueError("there is no map to localise in")
@@ -92,7 +94,7 @@ def open_map(
 
 @dataclass(frozen=True)
 class Session:
-    """The parts of SLAM that have a state, and the map, new or stored, in which the drive began."""
+    """The parts of SLAM that have a state, and the map in which the drive began."""
 
     context: TrackingContext
     closing: LoopClosing
@@ -104,10 +106,12 @@ class Session:
     opened: OpenedMap
 
     def stored_map(self, drive: str) -> StoredMap:
-        """The map, with a checkpoint if one is possible now. The map is not copied.
+        """The map as it is stored in a file. It has a checkpoint if a checkpoint is possible now.
+
+        The arrays of the map are not copied.
 
         Args:
-            drive: source of the present drive's images, such as "kitti 06".
+            drive: source of the images of the present drive, such as "kitti 06".
         """
         map_, images, opened = self.mapper.complete(), self.closing.verifier.images, self.opened
         return StoredMap(
@@ -126,9 +130,10 @@ class Session:
     def state(self) -> Checkpoint | None:
         """The state of all parts between two frames, or None if no checkpoint is possible now.
 
-        It is None before the first frame is tracked, when only localising, while a keyframe is
-        being mapped, while a monocular map begins, while a found loop is not closed yet, and during
-        a global bundle adjustment.
+        A checkpoint is impossible before the first frame is tracked and when the run only
+        localises. It is also impossible while a keyframe is being mapped, while a monocular map
+        begins, while a verified loop is waiting to be closed, and during a global bundle
+        adjustment.
         """
         tracker, policy = self.tracker.state(), self.mode.state()
         if tracker is None or policy is None:
@@ -146,7 +151,10 @@ class Session:
         )
 
     def restore(self, state: Checkpoint) -> None:
-        """Restore the state of all parts; the map must be the one that ``state`` was taken with."""
+        """Restore the state of all parts.
+
+        The map must be the map that was stored together with ``state``.
+        """
         self.mapper.restore(state.mapper)
         self.mode.restore(state.policy)
         self.closing.restore(state.closing)
@@ -158,8 +166,10 @@ class Session:
         self.rig.mark_corrected(self.tracker.restore(state.tracker, xyz))
 
     def resume_odometry(self, last: TrackResult) -> None:
-        """Continue the odometry of a resumed drive after its last frame, unless ``resume`` has
-        restored it from a checkpoint."""
+        """Continue the odometry of a resumed drive after its last frame.
+
+        Nothing is done if ``resume`` has already restored the odometry from a checkpoint.
+        """
         T_odom_camera, uncertainty = last.T_odom_camera, last.uncertainty
         if T_odom_camera is None or uncertainty is None or self.opened.checkpoint is not None:
             return
@@ -168,8 +178,8 @@ class Session:
     def resume(self) -> None:
         """Continue after the last frame of a resumed drive, if there is one.
 
-        With a checkpoint, the results are identical to those of an uninterrupted run. Without one,
-        tracking continues from the last pose and speed.
+        With a checkpoint, the results are identical to the results of an uninterrupted run. Without
+        a checkpoint, tracking continues from the last pose and speed.
         """
         frames = self.opened.frames
         if frames is None:

@@ -1,7 +1,7 @@
-"""The start of a map, and of a sub-map after the camera was lost.
+"""The start of a map, and the start of a sub-map after the camera was lost.
 
 A stereo or RGB-D map begins with one frame that has enough points. A monocular map needs two
-frames: the first one is kept until a later frame forms a pair with it.
+frames. The first frame is kept until a later frame forms a pair with it.
 """
 
 from __future__ import annotations
@@ -23,13 +23,15 @@ class TwoViewStart:
     """Two frames that begin a monocular map.
 
     Attributes:
-        first, second: the frames; the first has the pose at which the map begins.
-        T_2_1: ``(4, 4)`` maps points of the first camera to the second.
-        features: matched features of the first and of the second frame, ``(N,)`` int64 each.
-        points: ``(N, 3)`` the triangulated points of these features, in the frame of the first
-            camera.
-        predicted: whether the unit of the map was derived from the speed before the camera was
-            lost.
+        first, second: the two frames. The pose of the first frame is the pose at which the map
+            begins.
+        T_2_1: ``(4, 4)``, maps points from the camera of the first frame to the camera of the
+            second frame.
+        features: ``(N,)`` int64 indices of the matched features of the first frame, and the same
+            for the second frame.
+        points: ``(N, 3)`` triangulated points of these features, in the frame of the first camera.
+        predicted: whether the unit of the map was derived from the speed that the camera had before
+            it was lost.
     """
 
     first: Frame
@@ -41,17 +43,19 @@ class TwoViewStart:
 
     @property
     def twist(self) -> Matrix:
-        """``(6,)`` twist per second from the first frame to the second."""
+        """``(6,)`` twist per second from the first frame to the second frame."""
         return se3_log(self.T_2_1) / (self.second.timestamp - self.first.timestamp)
 
     def at_speed(self, twist: Matrix | None, max_rescaling: float) -> TwoViewStart:
         """Scale the start of a sub-map so that the camera has the same speed as before it was lost.
-        The sub-map then has approximately the unit of the map before the loss.
+
+        The unit of the sub-map is then approximately the unit of the map before the loss.
 
         Args:
-            twist: ``(6,)`` twist of the camera per second before it was lost; None if unknown.
-            max_rescaling: if the scale factor is above this or below its inverse, the start remains
-                unchanged.
+            twist: ``(6,)`` twist of the camera per second before it was lost. None if it is
+                unknown.
+            max_rescaling: largest scale factor. If the factor is larger than this number or smaller
+                than its inverse, the start is not scaled.
         """
         if twist is None:
             return self
@@ -83,23 +87,27 @@ class Starter:
 
     @property
     def is_waiting(self) -> bool:
-        """Whether a first frame is kept until a second one forms a pair with it."""
+        """Whether a first frame is kept and waits for a second frame."""
         return self._first is not None
 
     def reset(self) -> None:
-        """Discard the first frame if one is kept."""
+        """Discard the first frame if a first frame is kept."""
         self._first = None
 
     def offer(self, frame: PlacedFrame) -> Start | None:
-        """Try to begin with an untracked frame; None if that is not possible yet."""
+        """Try to begin a map or sub-map with an untracked frame. None if this is not possible
+        yet."""
         if self._context.camera.monocular:
             return self._offer_monocular(frame)
         enough = frame.n_stereo >= self._context.config.tracking.min_stereo_start
         return OneViewStart(frame) if enough else None
 
     def _offer_monocular(self, frame: PlacedFrame) -> TwoViewStart | None:
-        """Try to pair a frame with the kept one; if they have too few matches or are too far apart
-        in time, keep the new frame instead."""
+        """Try to pair a frame with the kept frame.
+
+        If the two frames have too few matches or are too far apart in time, the new frame replaces
+        the kept frame.
+        """
         config = self._context.config.initialization
         if self._first is None or frame.timestamp - self._first.timestamp > config.max_seconds:
             self._keep(frame)

@@ -1,7 +1,8 @@
 """The state of each part of SLAM between two frames, apart from the map.
 
-Every part returns its state from ``state()`` and accepts it in ``restore(state)``. With all states
-and the map, a run continues with the same results, to the byte, as if it had not stopped.
+Every part returns its state from ``state()`` and accepts it in ``restore(state)``. A run that
+continues from all these states and the map produces results that are byte-identical to the results
+of an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -22,13 +23,14 @@ class TrackerState:
 
     Attributes:
         index, timestamp: index and time (seconds) of the last tracked frame.
-        features: its N features.
+        features: the N features of this frame.
         landmark: ``(N,)`` int32, the landmark that each feature observes, or -1.
-        T_cw: ``(4, 4)`` its pose.
-        twist: ``(6,)`` twist of the camera at that time, per second; None if unknown.
-        lost_frames: number of lost frames since then.
+        T_cw: ``(4, 4)`` pose of this frame.
+        twist: ``(6,)`` twist of the camera per second at this frame. None if it is unknown.
+        lost_frames: number of lost frames since this frame.
         n_tracked: number of landmarks that the frame tracked.
-        coarse: ``(Q,)`` uint8, the pixels of its ``coarse_levels``; empty if it has none.
+        coarse: ``(Q,)`` uint8, the pixels of the ``coarse_levels`` of the frame. It is empty if the
+            frame has no such levels.
     """
 
     index: int
@@ -47,8 +49,8 @@ class MapperState:
     """State of the mapper.
 
     Attributes:
-        reference: the keyframe that frames are tracked against and that their poses are relative
-            to.
+        reference: the keyframe that frames are tracked against. The poses of frames are relative to
+            it.
         last_frame, last_timestamp: index and time (seconds) of the frame that became the last
             keyframe.
         patches: image patches of the newest keyframes, oldest first.
@@ -68,9 +70,10 @@ class PolicyState:
         gained_close: running mean of the number of close points that the first frame after a
             keyframe tracks.
         gain_awaited: whether the next frame is the first after a keyframe.
-        first_close: how many close points the first frame after the last keyframe tracked.
-        first_frame: index of that frame; -1 before the first keyframe.
-        due: index of the frame that is to become a keyframe; -1 if none is planned.
+        first_close: number of close points that the first frame after the last keyframe tracked.
+        first_frame: index of this first frame. It is -1 before the first keyframe.
+        due: index of the frame that is planned to become a keyframe. It is -1 if no keyframe is
+            planned.
     """
 
     gained_close: float
@@ -86,9 +89,9 @@ class ConsistencyState:
 
     Attributes:
         places: places that recent keyframes resembled.
-        verified: verified loops that other keyframes must confirm, each with the ``turn`` of its
-            keyframe.
-        turn: number of keyframes tested so far.
+        verified: verified loops that other keyframes must still confirm, each with the ``turn`` of
+            its keyframe.
+        turn: number of keyframes that have been tested so far.
     """
 
     places: tuple[ResembledPlace, ...] = ()
@@ -98,10 +101,13 @@ class ConsistencyState:
 
 @dataclass(frozen=True)
 class VerifierState:
-    """State of the verifier of loop candidates: its last failed attempt with learned descriptors.
+    """State of the verifier of loop candidates.
+
+    It describes the last failed attempt with learned descriptors.
 
     Attributes:
-        resting_until: before this keyframe, only clearly more similar candidates are tried.
+        resting_until: before this keyframe, only candidates with a clearly higher similarity are
+            tried.
         failed_similarity: similarity of the two images of the failed attempt.
     """
 
@@ -115,7 +121,7 @@ class ClosingState:
 
     Attributes:
         consistency, verifier: the states of its parts.
-        followed: how often an old keyframe was reused instead of inserting a new one.
+        followed: how often an old keyframe was reused instead of inserting a new keyframe.
     """
 
     consistency: ConsistencyState = field(default_factory=ConsistencyState)

@@ -1,10 +1,12 @@
-"""Trajectories: one pose for each frame, read and written in the field's text formats.
+"""Trajectories with one pose for each frame, and their text formats.
 
 Each line holds one pose:
 
 - KITTI (Geiger et al., CVPR 2012): the upper 3x4 part of ``T_wc``, row by row, without time.
-- TUM (Sturm et al., IROS 2012): ``t x y z qx qy qz qw`` in seconds and metres.
-- EuRoC (Burri et al., IJRR 2016), only written: ``t,x,y,z,qw,qx,qy,qz`` with t in nanoseconds.
+- TUM (Sturm et al., IROS 2012): ``t x y z qx qy qz qw``, with t in seconds and the position in
+  metres.
+- EuRoC (Burri et al., IJRR 2016): ``t,x,y,z,qw,qx,qy,qz``, with t in nanoseconds. This format is
+  only written, not read.
 """
 
 from __future__ import annotations
@@ -22,13 +24,18 @@ from vslam.geometry import compose, inverse, orthonormalised, se3_exp, se3_log
 
 _FORMAT_OF_COLUMNS: dict[int, Literal["kitti", "tum"]] = {12: "kitti", 8: "tum"}
 
-# Published poses are rounded to about 7 digits; a matrix with a larger error is not a rotation.
+# Published poses are rounded to about 7 digits. A matrix with a larger error is not a rotation.
 _ROTATION_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """``timestamps`` ``(N,)`` in seconds and ``T_wc`` ``(N, 4, 4)`` float64, camera to world."""
+    """The poses of N frames.
+
+    Attributes:
+        timestamps: ``(N,)`` float64 seconds.
+        T_wc: ``(N, 4, 4)`` float64 poses (camera to world).
+    """
 
     timestamps: NDArray[np.float64]
     T_wc: NDArray[np.float64]
@@ -42,11 +49,11 @@ class Trajectory:
 
 
 def bridge_gaps(trajectory: Trajectory, known: NDArray[np.bool_]) -> Trajectory:
-    """Replace the poses between known ones by interpolation at constant velocity.
+    """Replace unknown poses by interpolation at constant velocity between known poses.
 
     Args:
-        known: ``(N,)`` bool, the poses to keep. Poses before the first known one and after the last
-            are kept as well.
+        known: ``(N,)`` bool, True for the poses to keep. Poses before the first known pose and
+            after the last known pose are kept as well.
     """
     T_wc, times = trajectory.T_wc.copy(), trajectory.timestamps
     anchors = np.flatnonzero(known)
@@ -63,12 +70,12 @@ def bridge_gaps(trajectory: Trajectory, known: NDArray[np.bool_]) -> Trajectory:
 def read_table(
     path: Path | str, columns: tuple[int, ...], what: str, max_rows: int | None = None
 ) -> NDArray[np.float64]:
-    """Read a text file of numbers; blank lines and lines that begin with ``#`` are skipped.
+    """Read a text file of numbers. Blank lines and lines that begin with ``#`` are skipped.
 
     Args:
         path: file to read.
-        columns: the allowed numbers of columns; all lines must have the same number.
-        what: what a line holds, for the error messages ("a pose").
+        columns: the allowed numbers of columns. All lines must have the same number of columns.
+        what: the content of a line, for error messages, such as "a pose".
         max_rows: stop reading after this many rows.
 
     Returns:
@@ -115,10 +122,10 @@ def read_table(
 
 
 def trajectory_format(path: Path | str) -> Literal["kitti", "tum"]:
-    """Determine the format by the number of columns of the first pose.
+    """Determine the format of a trajectory file by the number of columns of its first pose.
 
     Raises:
-        InputError: as :func:`read_table`.
+        InputError: for the same reasons as in ``read_table``.
     """
     return _FORMAT_OF_COLUMNS[read_table(path, (12, 8), "a pose", max_rows=1).shape[1]]
 
@@ -137,12 +144,12 @@ def read_trajectory(path: Path | str, timestamps: NDArray[np.float64] | None = N
 
     Args:
         path: file to read.
-        timestamps: ``(N,)`` seconds, the times of the poses of a KITTI file; None uses the frame
-            number. A TUM file has its own timestamps, and these are ignored.
+        timestamps: ``(N,)`` seconds, the timestamps of the poses of a KITTI file. With None, the
+            frame numbers are used. A TUM file contains its timestamps, so this argument is ignored.
 
     Raises:
         InputError: the file is malformed, the numbers of poses and timestamps differ, a rotation is
-            invalid, or TUM times do not increase.
+            invalid, or the timestamps of a TUM file do not increase.
     """
     rows = read_table(path, (12, 8), "a pose")
     if _FORMAT_OF_COLUMNS[rows.shape[1]] == "kitti":
@@ -172,18 +179,18 @@ def read_trajectory(path: Path | str, timestamps: NDArray[np.float64] | None = N
 
 def write_kitti(path: Path | str, T_wc: NDArray[np.float64]) -> None:
     """Write ``(N, 4, 4)`` poses in KITTI's format with 13 significant digits."""
-    rows = T_wc[:, :3, :].reshape(-1, 12) + 0.0  # turns -0 into 0, so equal poses give equal bytes
+    rows = T_wc[:, :3, :].reshape(-1, 12) + 0.0  # -0 becomes 0, so equal poses give equal bytes
     lines = (" ".join([f"{x:.12e}" for x in row]) + "\n" for row in rows.tolist())
     Path(path).write_text("".join(lines))
 
 
 def tum_line(timestamp: float, T_wc: NDArray[np.float64]) -> str:
-    """One ``(4, 4)`` pose as a line of TUM's format."""
+    """Format a ``(4, 4)`` pose as a line of TUM's format."""
     return _tum_lines(np.array([timestamp]), T_wc[None])
 
 
 def write_tum(path: Path | str, trajectory: Trajectory) -> None:
-    """Write a trajectory in TUM's format with nine decimals and quaternions with qw >= 0."""
+    """Write a trajectory in TUM's format, with nine decimals and qw >= 0."""
     Path(path).write_text(_tum_lines(trajectory.timestamps, trajectory.T_wc))
 
 
@@ -198,8 +205,8 @@ def _tum_lines(timestamps: NDArray[np.float64], T_wc: NDArray[np.float64]) -> st
 def write_euroc(path: Path | str, trajectory: Trajectory) -> None:
     """Write a trajectory in the format of EuRoC's ground truth, without velocities and biases.
 
-    Times are written in nanoseconds, but Unix time in float64 seconds has a resolution of only
-    0.2 us.
+    Timestamps are written in nanoseconds. However, their resolution is only 0.2 us if they are Unix
+    times, because they are float64 seconds.
     """
     names = ("x [m]", "y [m]", "z [m]"), ("w []", "x []", "y []", "z []")
     columns = [*(f"p_RS_R_{name}" for name in names[0]), *(f"q_RS_{name}" for name in names[1])]
@@ -212,11 +219,11 @@ def write_euroc(path: Path | str, trajectory: Trajectory) -> None:
 
 
 def quaternions(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``(N, 4)`` float64 quaternions x, y, z, w with w >= 0 of ``(N, 3, 3)`` rotations.
+    """Convert ``(N, 3, 3)`` rotations to ``(N, 4)`` float64 quaternions x, y, z, w with w >= 0.
 
-    They equal those of ``scipy.spatial.transform.Rotation`` to the last bit, but SciPy takes longer
-    to import than all files of a run take to write. A matrix whose error is above 1e-12 is replaced
-    by the nearest rotation.
+    The results are bit-identical to the results of ``scipy.spatial.transform.Rotation``. SciPy is
+    not used, because importing it takes longer than writing all files of a run. A matrix whose
+    error is above 1e-12 is replaced by the nearest rotation.
     """
     error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3))
     off = (error > 1e-12 + 1e-5 * np.eye(3)).any(axis=(1, 2))
@@ -243,7 +250,8 @@ def quaternions(R: NDArray[np.float64]) -> NDArray[np.float64]:
     q[rest, 3] = 1.0 + trace[rest]
     x, y, z, w = q.T
     q /= np.sqrt(x * x + y * y + z * z + w * w)[:, None]
-    # Of the two quaternions of a half turn, choose the one whose first non-zero number is positive.
+    # Two quaternions describe a half turn. The quaternion whose first non-zero number is positive
+    # is chosen.
     first = np.where(q[:, 0] != 0, q[:, 0], np.where(q[:, 1] != 0, q[:, 1], q[:, 2]))
     return np.where(((q[:, 3] < 0) | ((q[:, 3] == 0) & (first < 0)))[:, None], -q, q)
 

@@ -1,4 +1,4 @@
-"""Limits on the memory that untrusted files can make this process allocate.
+"""Limits on the memory that this process allocates when it reads untrusted files.
 
 A small file can declare huge content, such as an image of 100,000 x 100,000 pixels or a zip member
 that unpacks to 100 GB. The declared size is checked before memory is allocated.
@@ -19,23 +19,30 @@ if TYPE_CHECKING:  # `vslam --help` loads this module and must not load NumPy
     from numpy.typing import NDArray
 
 MOST_PIXELS = 2**27
-"""Largest number of pixels of an image file (11,585 x 11,585); OpenCV itself allows eight times as
-many."""
+"""Largest number of pixels of an image file (11,585 x 11,585). OpenCV itself allows eight times as
+many pixels."""
 
 _OPENCV_LIMIT = "OPENCV_IO_MAX_IMAGE_PIXELS"
 _ANY_SIZE = 2**27  # bytes; any archive may unpack to this size
-_MOST_PACKED = 20  # an archive that unpacks to more must have at least 1/20 of the unpacked size
+_MOST_PACKED = 20  # a larger archive must have at least 1/20 of its unpacked size
 ARCHIVE_ERRORS = (
     EOFError, ValueError, KeyError, RuntimeError, OverflowError, zlib.error,
     zipfile.BadZipFile, zipfile.LargeZipFile,
 )  # fmt: skip
-"""Exceptions of NumPy, zipfile and zlib for a file that is not an archive of arrays, or that is
-damaged, encrypted or compressed with an unsupported method."""
+"""Exceptions that NumPy, zipfile and zlib raise for a file that cannot be read as an archive of
+arrays.
+
+The file may be another kind of file, it may be damaged or encrypted, or its compression method may
+be unsupported.
+"""
 
 
 def limit_images() -> None:
-    """Make OpenCV reject images whose header declares more than ``MOST_PIXELS``. OpenCV reads this
-    limit when it is imported, so call this before."""
+    """Make OpenCV reject images whose header declares more than ``MOST_PIXELS`` pixels.
+
+    OpenCV reads this limit when it is imported. Therefore, call this function before OpenCV is
+    imported.
+    """
     os.environ.setdefault(_OPENCV_LIMIT, str(MOST_PIXELS))
 
 
@@ -52,12 +59,12 @@ def require_utf8(path: Path) -> None:
         raise InputError(f"{shown}: this name is not UTF-8; rename it.") from None
 
 
-def read_npz(path: Path, what: str, fix: str = "name another file") -> dict[str, NDArray[Any]]:
-    """Read all arrays of an npz file; Python objects (pickles) are rejected.
+def read_npz(path: Path, what: str, fix: str = "give another file") -> dict[str, NDArray[Any]]:
+    """Read all arrays of an npz file. Python objects (pickles) are rejected.
 
     Args:
-        what: what the file should be, with an article, for the error messages.
-        fix: what the user can do, for the error messages.
+        what: the kind of file that is expected, with an article, for error messages.
+        fix: what the user can do, for error messages.
 
     Raises:
         InputError: the file is missing, damaged or not an npz file, or its arrays do not fit into
@@ -83,7 +90,7 @@ def read_json(array: NDArray[Any]) -> Any:
     """Parse the JSON in an array of bytes.
 
     Raises:
-        ValueError: the array does not hold bytes, or these are not JSON.
+        ValueError: the array does not hold bytes, or the bytes are not JSON.
     """
     if array.dtype != "uint8" or array.ndim != 1:  # bytes() of a number n would be n zeros
         raise ValueError("the header is not text")
@@ -91,11 +98,13 @@ def read_json(array: NDArray[Any]) -> Any:
 
 
 def require_memory(path: Path, what: str) -> None:
-    """Check that an archive does not unpack to far more than its own size or to more than the free
-    memory. Files that are not archives pass.
+    """Check that unpacking an archive does not take too much memory.
+
+    The unpacked archive must not be far larger than the archive itself, and must fit into the free
+    memory. Files that are not archives are accepted.
 
     Raises:
-        InputError: the unpacked archive is too large.
+        InputError: the unpacked archive would be too large.
     """
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
@@ -110,18 +119,23 @@ def _check_size(path: Path, archive: zipfile.ZipFile, what: str) -> None:
     if needed > max(_ANY_SIZE, _MOST_PACKED * packed):
         raise InputError(
             f"{path}: unpacks from {packed / 2**20:.1f} MB to {needed / 2**20:.0f} MB, so it is "
-            f"probably not {what}; name another file."
+            f"probably not {what}; give another file."
         )
     there = psutil.virtual_memory().available
     if needed > there:
         raise InputError(
             f"{path}: unpacks to {needed / 2**30:.1f} GB, but only {there / 2**30:.1f} GB of "
-            f"memory are free; free some memory, or name another file if this is not {what}."
+            f"memory are free; free some memory, or give another file if this is not {what}."
         )
 
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
-    """Read an array after checking that its member is as long as its header says."""
+    """Read an array of an archive.
+
+    Raises:
+        ValueError: the member is not as long as its header says, holds Python objects, or has an
+            unknown version of the format.
+    """
     import numpy as np
 
     layout = np.lib.format

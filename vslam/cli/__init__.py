@@ -1,4 +1,4 @@
 """The command line: ``main.py`` and one file for each group of commands.
 
-Heavy imports stay inside the commands, so that ``--help`` appears at once.
+Slow imports are made inside the commands, so that ``--help`` appears at once.
 """

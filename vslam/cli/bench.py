@@ -35,7 +35,7 @@ from vslam.errors import counted
 if TYPE_CHECKING:
     from vslam.datasets.sources import SourceOptions
 
-_UNKNOWN_LENGTH = 1000  # frames assumed for a stream of unknown length, to estimate the time
+_UNKNOWN_LENGTH = 1000  # frames; a stream of unknown length is assumed to be this long
 _FIRST_SEQUENCES = "00-05"
 _EXAMPLES = """
 [b]Examples[/b]
@@ -46,7 +46,7 @@ _EXAMPLES = """
   vslam bench --seqs 00 --systems vslam,orbslam3 --vocabulary voc.txt
   vslam bench --data drive.mp4 --side-by-side --calib stereo.yaml --seeds 1
 
-The same command continues a benchmark that was stopped (docs/howto/bench.md).
+To resume a benchmark that was stopped, repeat the command (docs/howto/bench.md).
 """
 
 
@@ -63,8 +63,8 @@ def bench(
         option(
             METHOD,
             "LIST",
-            "Perturbations, separated by commas; + combines several, as in fog:60+blur:0.5 "
-            "([b]vslam perturb --list[/b] shows all).",
+            "Perturbations, separated by commas. + combines several, as in fog:60+blur:0.5 "
+            "([b]vslam perturb --list[/b] shows all of them).",
         ),
     ] = "none,brightness",
     detectors: Detectors = "bow,both",
@@ -81,7 +81,7 @@ def bench(
     out: Annotated[Path, option(OUTPUT, "FOLDER", "Folder to write to.")] = Path("bench"),
     quiet: Quiet = False,
 ) -> None:
-    """Compare loop detectors and other systems on sequences under perturbations."""
+    """Compare loop detectors and other systems on perturbed sequences."""
     from vslam.lab.bench import execute
     from vslam.lab.bench.estimate import check_disk, duration, estimate, size
     from vslam.lab.bench.grid import parse_perturbations

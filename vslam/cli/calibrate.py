@@ -27,8 +27,8 @@ _EXAMPLES = """
   vslam calibrate pair.mkv --side-by-side --board charuco --size 7x5 --square 0.04 --marker 0.03
   vslam calibrate cam_april/mav0 --board april_6x6.yaml --lens fisheye --out stereo.yaml
 """
-_MOST_SEARCHED = 300  # images, spread evenly over the source; this takes a minute or two
-_EXAMINED = 10  # images in which other boards are searched for, if the given one is not found
+_MOST_SEARCHED = 300  # images, which are spread evenly over the source; this takes 1 to 2 minutes
+_EXAMINED = 10  # images in which other boards are searched for if the given board is not found
 
 app = typer.Typer()
 
@@ -42,7 +42,7 @@ def calibrate(
         option(
             "Board",
             "KIND|FILE",
-            "Kind of board: checkerboard, charuco or aprilgrid; or a target file of Kalibr.",
+            "Kind of board: checkerboard, charuco, aprilgrid, or a target file of Kalibr.",
         ),
     ],
     size: Annotated[
@@ -59,8 +59,8 @@ def calibrate(
         option(
             "Board",
             "METRES",
-            "Side of a square; for an AprilGrid, the distance from the edge of a tag to the same "
-            "edge of the next one. Not needed for a single camera and a checkerboard.",
+            "Side of a square. For an AprilGrid, the distance from the edge of a tag to the same "
+            "edge of the next tag. Not needed for a single camera and a checkerboard.",
         ),
     ] = None,
     marker: Annotated[
@@ -72,7 +72,7 @@ def calibrate(
         option(
             "Board",
             "NAME",
-            "Dictionary of a ChArUco board's markers: OpenCV's name without DICT_.",
+            "Dictionary of the markers of a ChArUco board, as OpenCV names it, but without DICT_.",
         ),
     ] = "5X5_1000",
     lens: Annotated[
@@ -89,12 +89,12 @@ def calibrate(
         option(
             OUTPUT,
             "FILE",
-            "Calibration file to write; a page with residuals is written beside it. Existing files "
+            "Calibration file to write. A page of residuals is written next to it. Existing files "
             "are renamed.",
         ),
     ] = Path("calibration.yaml"),
 ) -> None:
-    """Calibrate a camera or stereo pair from images of a board.
+    """Calibrate a camera or a stereo pair from images of a calibration board.
 
     The exit code is 1 if the calibration has faults.
     """
@@ -148,7 +148,7 @@ def _check_place(out: Path) -> None:
     """Check, before any work, that a calibration can be written to a file.
 
     Raises:
-        InputError: the file cannot be written, is not YAML, or is another program's.
+        InputError: the file cannot be written, is not YAML, or belongs to another program.
     """
     from vslam.calibration.documents import read_document
     from vslam.maps.new_output import require_place
@@ -157,12 +157,15 @@ def _check_place(out: Path) -> None:
     if out.suffix not in (".yaml", ".yml"):
         raise InputError(f"--out {out}: a calibration is YAML; give a name that ends in .yaml.")
     if out.exists() and "left" not in read_document(out):
-        raise InputError(f"--out {out}: is another program's file; give another name.")
+        raise InputError(f"--out {out}: belongs to another program; give another name.")
 
 
 def _keep_earlier(*files: Path) -> None:
-    """Rename the files of an earlier calibration: ``a.yaml`` to ``a-1.yaml``, or to ``a-2.yaml``
-    if one of the files already has a renamed file with the number 1, and so on."""
+    """Rename the files of an earlier calibration.
+
+    ``a.yaml`` is renamed to ``a-1.yaml``. If the number 1 is taken for one of the files, the number
+    2 is used, and so on.
+    """
     for n in count(1):
         kept = {path: path.with_stem(f"{path.stem}-{n}") for path in files}
         if not any(path.exists() for path in kept.values()):
@@ -172,7 +175,7 @@ def _keep_earlier(*files: Path) -> None:
             path.rename(kept[path])
         except OSError as error:
             raise ResultsError(
-                f"{path}: cannot be renamed to {kept[path].name} ({error.strerror}); name another "
+                f"{path}: cannot be renamed to {kept[path].name} ({error.strerror}); give another "
                 "file with --out."
             ) from error
         typer.echo(f"{kept[path]}: the earlier {path.name}, which is replaced.")
@@ -210,12 +213,14 @@ def _board(
 
 
 def _frames(raw: RawSource, most: int) -> Iterator[TimedFrame]:
-    """Yield the frames of a source, or about ``most`` evenly spread ones if it has more.
+    """Yield the frames of a source. If it has more than ``most`` frames, yield about ``most`` of
+    them, spread evenly.
 
-    If the source breaks off, print a warning and end after the last frame that could be read.
+    If the source ends early because it is damaged, a warning is printed, and the frames that could
+    be read are used.
 
     Raises:
-        BrokenSourceError: not even the second frame can be read.
+        BrokenSourceError: fewer than two frames can be read.
     """
     every = -(-(raw.n_expected or 1) // most)
     n = 0
@@ -230,7 +235,11 @@ def _frames(raw: RawSource, most: int) -> Iterator[TimedFrame]:
 
 
 def _search(raw: RawSource, board: Board) -> tuple[list[Frame], list[Image]]:
-    """Search images for the board; return the views of each frame, and some of the left images."""
+    """Search images for the board.
+
+    Returns:
+        The views of the board in each frame, and some of the left images.
+    """
     from vslam.calibration.boards import find_corners, same_order
 
     total = min(raw.n_expected or _MOST_SEARCHED, _MOST_SEARCHED)

@@ -31,8 +31,8 @@ class Systems:
 
     Attributes:
         detectors: loop detectors of vslam.
-        weights: weight files by detector, for detectors that do not use the shipped weights.
-        others: command templates of other systems by name (:mod:`vslam.lab.stress.external`).
+        weights: weight file of each detector that does not use the shipped weights.
+        others: command templates of other systems by name (``vslam.lab.stress.external``).
     """
 
     detectors: list[str]
@@ -41,7 +41,7 @@ class Systems:
 
     @property
     def names(self) -> list[str]:
-        """The detectors, then the other systems."""
+        """Names of the detectors, followed by the names of the other systems."""
         return [*self.detectors, *self.others]
 
 
@@ -53,10 +53,11 @@ def choose_systems(
     python: Path | None,
     vocabulary: Path | None,
 ) -> Systems:
-    """The systems that the options name.
+    """The systems that the options select.
 
     Raises:
-        InputError: no system is named, or a named system is unknown or lacks a file.
+        InputError: no system is selected, a system is unknown, or a file that a system needs is
+            missing.
     """
     from vslam.loopclosure.registry import parse_weights, require_detector
 
@@ -71,7 +72,7 @@ def choose_systems(
             f"--system {clash[0]}: a detector of this test has the same name; choose another."
         )
     if not chosen and not others:
-        raise InputError("--systems: names no system; give vslam, orbslam3 or a name of --system.")
+        raise InputError("--systems: is empty; give vslam, orbslam3 or a name of --system.")
     return Systems(chosen, files, others)
 
 
@@ -92,18 +93,18 @@ def _others(
     if _ORBSLAM3 in wanted and _ORBSLAM3 not in templates:
         if vocabulary is None or not vocabulary.is_file():
             raise InputError(
-                "--systems orbslam3: name its vocabulary in DBoW2's text format with --vocabulary."
+                "--systems orbslam3: give its vocabulary in DBoW2's text format with --vocabulary."
             )
         interpreter = python or Path(sys.executable)
         if not interpreter.exists():
-            raise InputError(f"--orbslam3-python {interpreter}: no such file; name an interpreter.")
+            raise InputError(f"--orbslam3-python {interpreter}: no such file; give an interpreter.")
         words = [interpreter.absolute(), Path(orbslam3.__file__), vocabulary.absolute()]
         templates[_ORBSLAM3] = f"{shlex.join(map(str, words))} {{folder}} {{out}}"
     for name in wanted:
         if name != "vslam" and name not in templates:
             raise InputError(
                 f"--systems {name}: unknown{did_you_mean(name, ('vslam', _ORBSLAM3, *templates))}; "
-                f"name vslam, orbslam3, or give --system {name}=COMMAND."
+                f"give vslam or orbslam3, or add --system {name}=COMMAND."
             )
     return {name: templates[name] for name in [*wanted, *templates] if name in templates}
 
@@ -114,14 +115,13 @@ class Cells:
 
     Attributes:
         kind: kind of data.
-        given: options of the data; paths are absolute, because each run has its own working
-            folder.
+        given: options of the data. Paths are absolute, because each run has its own working folder.
         systems: the systems to test.
         sequences: the opened sequences by name.
         options: settings that all cells share.
         jobs: number of runs at a time on this machine.
-        scheduler: address of a Dask scheduler whose workers run the cells instead; None for this
-            machine.
+        scheduler: address of a Dask scheduler whose workers run the cells. None if this machine
+            runs the cells.
         out: folder of the results.
         console: shows the progress.
     """
@@ -137,7 +137,7 @@ class Cells:
     console: Console
 
     def grid(self, perturbations: Collection[str], seeds: int) -> list[Cell]:
-        """The cells of all sequences and systems; see :func:`vslam.lab.bench.grid.make_grid`."""
+        """The cells of all sequences and systems (``vslam.lab.bench.grid.make_grid``)."""
         from vslam.lab.bench.grid import make_grid, thresholds_digest
 
         return make_grid(
@@ -148,7 +148,7 @@ class Cells:
         )  # fmt: skip
 
     def prepare(self) -> None:
-        """Create the folder; see :func:`vslam.lab.bench.execute.prepare`."""
+        """Create the folder of the results (``vslam.lab.bench.execute.prepare``)."""
         from vslam.lab.bench.execute import prepare
 
         prepare(self.out, _identity(self.kind, self.given))
@@ -184,7 +184,7 @@ def open_cells(
     """Open all sequences.
 
     Args:
-        seqs: list of sequences; None for data that has only one.
+        seqs: list of sequences. None for data that has only one sequence.
 
     Raises:
         InputError: data is missing or cannot be used.
@@ -230,7 +230,8 @@ def _absolute(given: SourceOptions) -> SourceOptions:
 
 
 def _words_of(given: SourceOptions) -> list[str]:
-    """The options of ``vslam run`` for the data, except those that are part of a cell."""
+    """The options of ``vslam run`` that describe the data. Options that are part of a cell are left
+    out."""
     words = ["--side-by-side"] if given.side_by_side else []
     values = {
         "--right": given.right,
@@ -256,7 +257,7 @@ def _open_all(
 ) -> dict[str, Source]:
     """Open every sequence by name, so that missing data is reported before the first run.
 
-    Synthetic sequences are rendered here, so that parallel runs do not render the same one.
+    Synthetic sequences are rendered here, so that parallel runs do not render the same sequence.
     """
     from vslam.datasets.sources import LIVE
     from vslam.lab.bench.grid import parse_sequences

@@ -1,7 +1,9 @@
-"""``python -m vslam.cli.child run ...``: the command line of vslam, which ends with its parent.
+"""``python -m vslam.cli.child run ...`` runs a command of vslam and ends when its parent process
+ends.
 
-The parent process holds the other end of our standard input. When it ends, even if it is killed,
-the pipe closes, and this process ends because nobody would read its results.
+The parent process holds the other end of the pipe that is the standard input of this process. When
+the parent ends, even if it is killed, the pipe closes. This process then ends, too, because nobody
+would read its results.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Show the progress of a command on stderr; stdout is for results."""
+"""Progress of a command, which is shown on stderr. Results are printed on stdout."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ if TYPE_CHECKING:
 
 
 class Console:
-    """Draws progress bars and prints messages, or does nothing if it is not ``shown``.
+    """Draws progress bars and prints messages. If it is not ``shown``, it does nothing.
 
-    rich is imported only to show something, because its import takes as long as tracking forty
-    frames. A bar appears at its first step.
+    The package rich is imported only when something is shown, because its import takes as long as
+    tracking forty frames. A bar appears at its first step.
     """
 
     def __init__(self, *, shown: bool) -> None:
@@ -29,11 +29,12 @@ class Console:
 
     @contextmanager
     def progress_bar(self, total: int | None) -> Iterator[Callable[[TrackResult], None]]:
-        """Show frames, fps, tracking state and time left; yield a function to be called with the
-        result of each frame.
+        """Show frames, frames per second, tracking state and remaining time.
+
+        The method yields a function, which must be called with the result of each frame.
 
         Args:
-            total: approximate number of frames, None if unknown.
+            total: approximate number of frames. None if it is unknown.
         """
         with self._bar(after=("{task.fields[state]}",), fps=True) as update:
             update(total=total, state="starting")
@@ -41,13 +42,14 @@ class Console:
 
     @contextmanager
     def render_bar(self) -> Iterator[Callable[[int, int], None]]:
-        """Yield a function to be called with the numbers of rendered frames and of all frames."""
+        """Yield a function, which must be called with the number of rendered frames and of all
+        frames."""
         with self._bar("rendering", fps=True) as update:
             yield lambda done, total: update(total=total, completed=done)
 
     @contextmanager
     def training_bar(self) -> Iterator[Callable[[int, int, int, float], None]]:
-        """Yield a function to be called with epoch, step, steps per epoch and loss."""
+        """Yield a function, which must be called with epoch, step, steps per epoch and loss."""
         with self._bar("epoch {task.fields[epoch]}", ("loss {task.fields[loss]:.3f}",)) as update:
             yield lambda epoch, step, steps, loss: update(
                 anew=step == 1, total=steps, completed=step, epoch=epoch, loss=loss
@@ -55,7 +57,7 @@ class Console:
 
     @contextmanager
     def count_bar(self, what: str, total: int) -> Iterator[Callable[[], None]]:
-        """Yield a function to be called when one of ``total`` items is done."""
+        """Yield a function, which must be called when one of ``total`` items is done."""
         with self._bar(what) as update:
             update(total=total)
             yield lambda: update(advance=1)
@@ -64,8 +66,10 @@ class Console:
     def _bar(
         self, before: str = "", after: tuple[str, ...] = (), *, fps: bool = False
     ) -> Iterator[Callable[..., None]]:
-        """Yield a function with the arguments of rich's ``Progress.update``; ``anew`` restarts the
-        bar."""
+        """Yield a function with the arguments of rich's ``Progress.update``.
+
+        Its additional argument ``anew`` restarts the bar.
+        """
         if not self._shown:
             yield lambda **changes: None
             return

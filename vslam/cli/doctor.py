@@ -44,13 +44,15 @@ def doctor(
         option(
             OUTPUT,
             "FILE",
-            "HTML page to write; an existing file is replaced.",
+            "HTML page to write. An existing file is replaced.",
             unset="doctor.html, or doctor-2.html and so on",
         ),
     ] = None,
 ) -> None:
-    """Check images, calibration and time stamps before a run; the exit code is 1 if there is a
-    fault."""
+    """Check images, calibration and timestamps before a run.
+
+    The exit code is 1 if the check finds a fault.
+    """
     from vslam.datasets.frames import first_frames
     from vslam.doctor.examine import Diagnosis, examine, write_page
     from vslam.doctor.findings import Finding, lines
@@ -74,7 +76,7 @@ def doctor(
 
 
 def _free(path: Path) -> Path:
-    """The path if it does not exist, else the first of ``doctor-2.html``, ``doctor-3.html``, ...
-    that does not exist."""
+    """The path if it does not exist. Otherwise, the first of ``doctor-2.html``, ``doctor-3.html``,
+    ... that does not exist."""
     numbered = (path.with_stem(f"{path.stem}-{n}") for n in count(2))
     return next(one for one in chain((path,), numbered) if not one.exists())

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Output:
-    """What a run shows and writes; a resumed run may change these options."""
+    """Options for what a run shows and writes. A resumed run may change these options."""
 
     record: bool
     view: Literal["native", "web"] | None
@@ -49,7 +49,7 @@ def drive(
 
     Args:
         out: the folder in which the folder of the run is created.
-        resume: the folder of an interrupted run to continue; None starts a new run.
+        resume: the folder of an interrupted run to continue. With None, a new run starts.
     """
     if options.localize and output.save_map is not None:
         raise InputError("--save-map: localising does not change the map; leave it out.")
@@ -58,7 +58,7 @@ def drive(
     _refuse_live_source(source, resume)
     fixes = None if options.gps is None else _fixes(options.gps, options.gps_antenna, source)
 
-    # These imports take a second, so bad input is refused before them.
+    # These imports take a second. Therefore, bad input is refused before them.
     from vslam.cli.tables import print_summary
     from vslam.doctor.nothing_tracked import why_nothing_was_tracked
     from vslam.report.folder import write_results
@@ -110,17 +110,17 @@ def drive(
         raise ResultsError(f"{folder}: ended early: {outcome.interrupted}{fix}.")
     if gps_error and not why:
         raise ResultsError(
-            f"{folder}: no trajectory by GPS, all other results were written: {gps_error}"
+            f"{folder}: no trajectory with GPS, all other results were written: {gps_error}"
         )
     if why or outcome.interrupted:
         raise typer.Exit(1)
 
 
 def _open(options: RunOptions, console: Console) -> tuple[Source, Perturbation]:
-    """The images and their perturbation.
+    """Open the images and create their perturbation.
 
     Raises:
-        InputError: the images cannot be read, or lack data that the perturbation needs.
+        InputError: the images cannot be read, or data that the perturbation needs is missing.
     """
     from vslam.datasets.perturbation import parse_perturbation
 
@@ -131,7 +131,7 @@ def _open(options: RunOptions, console: Console) -> tuple[Source, Perturbation]:
 
 
 def _fixes(path: Path, antenna: tuple[float, ...] | None, source: Source) -> Fixes:
-    """The GPS fixes of ``--gps``, which must overlap with the images in time."""
+    """Read the GPS fixes of ``--gps``. Their times must overlap with the times of the images."""
     from vslam.datasets.fixes import read_fixes, require_overlap
 
     fixes = read_fixes(path, antenna)
@@ -140,8 +140,12 @@ def _fixes(path: Path, antenna: tuple[float, ...] | None, source: Source) -> Fix
 
 
 def _georeferenced(outcome: RunOutcome, fixes: Fixes) -> tuple[RunOutcome, str]:
-    """The outcome with the georeferenced trajectory, and an error message that is empty on
-    success."""
+    """Georeference the trajectory of an outcome.
+
+    Returns:
+        The outcome with the georeferenced trajectory, and an error message. The message is empty on
+        success.
+    """
     from vslam.plugins import reason
     from vslam.run.gps import locate
 
@@ -168,7 +172,7 @@ def _refuse_live_source(source: Source, resume: Path | None) -> None:
 def _unfinished(
     options: RunOptions, source: Source, resume: Path | None, lock: ExitStack
 ) -> Unfinished | None:
-    """The saved state of the run to resume; None for a new run.
+    """The saved state of the run to resume. None for a new run.
 
     Raises:
         InputError: there is no saved state, or the map to continue was made with another camera.
@@ -243,4 +247,4 @@ def _recorder(
         recorders.append(moments)
     if not recorders:
         return Recorder()
-    return SeveralRecorders((pictures, *recorders))  # pictures first, because the others use them
+    return SeveralRecorders((pictures, *recorders))  # the other recorders use the pictures

@@ -35,28 +35,30 @@ def evaluate_files(
         typer.Option(
             metavar="FILE",
             help="Ground truth in the format of KITTI or TUM.",
-            show_default="that of the run",
+            show_default="the ground truth of the run",
         ),
     ] = None,
     align: Annotated[
         AlignmentName | None,
         typer.Option(
             metavar="se3|sim3|none",
-            help="Alignment with the ground truth; [b]sim3[/b] also fits the scale.",
-            show_default="sim3 for a monocular run, else se3",
+            help="Alignment with the ground truth. [b]sim3[/b] also fits the scale.",
+            show_default="sim3 for a monocular run, otherwise se3",
         ),
     ] = None,
     times: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="times.txt of the sequence, which the comparison of a KITTI file with a TUM file "
-            "needs.",
+            help="times.txt of the sequence. It is needed to compare a KITTI file with a TUM file.",
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Compare the trajectory of a run or a file with the ground truth: ATE, RPE and KITTI drift."""
+    """Compare the trajectory of a run or of a file with the ground truth.
+
+    The command prints ATE, RPE and the drift as KITTI defines it.
+    """
     import json
 
     from vslam.cli.tables import print_rows
@@ -69,7 +71,7 @@ def evaluate_files(
         alignment = align or of_run
     elif gt is None:
         raise InputError(
-            f"{estimate}: name its ground truth with --gt, or name the folder of a run that had "
+            f"{estimate}: give its ground truth with --gt, or give the folder of a run that has "
             "one, such as runs/latest; for a video or images, use vslam run first."
         )
     trajectory, ground_truth = read_pair(estimate, gt, times)
@@ -90,7 +92,7 @@ def evaluate_files(
     else:
         rows.append(("t_rel", f"{evaluation.t_rel_percent:.3f} %"))
         rows.append(("r_rel", f"{evaluation.r_rel_deg_per_100m:.3f} deg/100 m"))
-    # evo compares only files of the same format, and it cannot align straight lines.
+    # evo compares only files of the same format. It cannot align straight trajectories.
     format_ = trajectory_format(gt)
     if format_ == trajectory_format(estimate) and not evaluation.on_one_line:
         rows.append(("reproduce", evo_command(estimate, gt, alignment, format_)))
@@ -107,7 +109,7 @@ def _files_of_run(folder: Path, gt: Path | None, times: Path | None) -> tuple[Pa
     written = (folder / name for name in ("ground_truth_kitti.txt", "ground_truth.tum"))
     gt = gt or next((file for file in written if file.exists()), None)
     if gt is None:
-        raise InputError(f"{folder}: this run had no ground truth; name one with --gt.")
+        raise InputError(f"{folder}: this run had no ground truth; give one with --gt.")
     with_times = times is not None or trajectory_format(gt) == "tum"
     name = "trajectory.tum" if with_times else "trajectory_kitti.txt"
     return folder / name, gt, alignment_of(report.sensor)

@@ -1,4 +1,4 @@
-"""The commands ``vslam export ...`` for maps; ``train.py`` adds those for networks."""
+"""The commands ``vslam export ...`` for maps. ``train.py`` adds the commands for networks."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ Data = Annotated[
     option(
         INPUT,
         "DATA",
-        "Images of the run, if they were moved since.",
-        unset="where the run read them",
+        "New location of the images of the run, if they were moved.",
+        unset="the location from which the run read them",
     ),
 ]
 Link = Annotated[
@@ -67,12 +67,12 @@ def colmap(
     data: Data = None,
     out: Annotated[Path | None, _out("colmap")] = None,
     text: Annotated[
-        bool, flag(OUTPUT, "Write text files instead of binary ones.", "--text")
+        bool, flag(OUTPUT, "Write text files instead of binary files.", "--text")
     ] = False,
     link: Link = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write keyframe images and a sparse model in COLMAP's format."""
+    """Write the images of keyframes and a sparse model in COLMAP's format."""
     from vslam.maps.colmap import save_colmap
 
     def save(folder: Path, model: Reconstruction, names: list[str], colours: Colours) -> None:
@@ -91,7 +91,7 @@ def nerfstudio(
     link: Link = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write keyframe images, poses and landmarks for nerfstudio."""
+    """Write the images of keyframes, their poses and the landmarks for nerfstudio."""
     from vslam.maps.formats import save_nerfstudio
 
     def save(folder: Path, model: Reconstruction, names: list[str], colours: Colours) -> None:
@@ -109,13 +109,13 @@ def ply(
         bool,
         flag(
             OUTPUT,
-            "Whether to colour the landmarks, which needs the images of the run.",
+            "Whether to colour the landmarks. This needs the images of the run.",
             "--colours/--no-colours",
         ),
     ] = True,
     quiet: Quiet = False,
 ) -> None:
-    """Write the landmarks as a point cloud, coloured from the images."""
+    """Write the landmarks as a point cloud. The colours are taken from the images."""
     from vslam.maps.formats import landmark_colours, save_ply
     from vslam.maps.new_output import new_output
 
@@ -139,7 +139,8 @@ def g2o(
     out: Annotated[Path | None, _out("pose_graph.g2o")] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Write the pose graph: keyframe poses, odometry and loop edges, and information matrices."""
+    """Write the pose graph: poses of keyframes, odometry and loop edges, and information
+    matrices."""
     import numpy as np
 
     from vslam.backend.pose_graph import LOOP
@@ -167,7 +168,7 @@ def euroc(
 ) -> None:
     """Write the trajectory in EuRoC's CSV format.
 
-    Every run already writes it in the formats of TUM and KITTI.
+    Every run writes its trajectory in the formats of TUM and KITTI, too.
     """
     from vslam.maps.new_output import new_output
     from vslam.trajectory import read_trajectory, write_euroc
@@ -188,14 +189,14 @@ def ros(
         bool,
         flag(
             OUTPUT,
-            "Use the poses as first estimated instead of the final ones, so that map -> odom jumps "
-            "at loops as it did during the drive.",
+            "Use the poses at the time of tracking, not the final poses. Then, map -> odom jumps "
+            "at loops, as it did during the drive.",
             "--online",
         ),
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write odometry, transforms, path and landmarks as ROS 2 messages, in an MCAP file."""
+    """Write odometry, transforms, path and landmarks as ROS 2 messages in an MCAP file."""
     import numpy as np
 
     from vslam.maps.new_output import new_output
@@ -206,7 +207,7 @@ def ros(
 
     target = out or run / "ros.mcap"
     if target.suffix != ".mcap":
-        raise InputError(f"--out {target}: must end in .mcap, by which ROS recognises the format.")
+        raise InputError(f"--out {target}: must end in .mcap, so that ROS recognises the format.")
     trajectory = read_trajectory(run / f"trajectory{'_causal' * online}.tum")
     odometry = read_trajectory(run / "trajectory_odom.tum")
     if not np.array_equal(odometry.timestamps, trajectory.timestamps):
@@ -223,14 +224,18 @@ def ros(
 
 
 def _beside(run: Path, name: str) -> Path:
-    """A file in the folder of a run; for a map file, a file beside it with the same stem."""
+    """The path of a file to write into the folder of a run.
+
+    If ``run`` is a map file, the path is next to it, with the same stem.
+    """
     return run / name if run.is_dir() else run.with_suffix(Path(name).suffix)
 
 
 def _graph(run: Path) -> tuple[PoseGraph, Map]:
     """The pose graph and the map of a run, or of a map file.
 
-    The thresholds that weight the edges are those of the run, or of the map's last drive.
+    The edges are weighted by the thresholds of the run. For a map file, these are the thresholds of
+    its last drive.
     """
     from vslam.backend.pose_graph import essential_graph
     from vslam.config import as_config, load_config
@@ -285,7 +290,8 @@ def _export_images(
     link: bool,
     quiet: bool,
 ) -> None:
-    """Write the keyframe images of a run into a new folder, then let ``save`` write the model.
+    """Write the images of the keyframes of a run into a new folder, then call ``save`` to write the
+    model.
 
     ``save`` gets the folder, the map, the names of the images and the colours of the landmarks.
     """
@@ -316,7 +322,7 @@ def _export_images(
 
 
 def _image_of(frame: TimedFrame) -> NDArray[np.uint8]:
-    """The left image, in colour if the source has it."""
+    """The left image of a frame. It is in colour if the source has colour images."""
     return frame.read(map)[0] if frame.colour is None else frame.colour()
 
 

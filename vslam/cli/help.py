@@ -1,4 +1,4 @@
-"""Print the ``--help`` of a command, with a panel for each group of options."""
+"""The ``--help`` of a command, with a panel for each group of options."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def show_help(command: Any, context: Any) -> None:
     """Print the help of a command or of a group of commands on stdout.
 
     Args:
-        command: a ``TyperCommand`` or ``TyperGroup``; the ``rich_help_panel`` of a parameter names
-            its panel.
+        command: a ``TyperCommand`` or ``TyperGroup``. The ``rich_help_panel`` of a parameter is the
+            name of its panel.
         context: the click context of the command.
     """
     console = Console(theme=_THEME, highlighter=_Options())
@@ -68,7 +68,7 @@ def describe_parameters(command: Any, context: Any) -> str:
 
 
 def _name(parameter: Any) -> str:
-    """How the help names a parameter: ``--record/--no-record``, ``--map FILE`` or ``RUN``."""
+    """The name of a parameter in the help: ``--record/--no-record``, ``--map FILE`` or ``RUN``."""
     if parameter.param_type_name == "argument":
         name = parameter.metavar or parameter.name.upper()
         return f"{name}..." if parameter.nargs != 1 else str(name)
@@ -77,13 +77,13 @@ def _name(parameter: Any) -> str:
 
 
 def _described(parameter: Any) -> Text:
-    """The description of a parameter, then its default or that it is required."""
+    """The description of a parameter, followed by its default or by the word required."""
     text = Text.from_markup(parameter.help or "")
     default = parameter.default
     if isinstance(parameter.show_default, str):
         default = parameter.show_default
     elif not parameter.show_default or isinstance(default, bool):
-        default = None  # the names of a flag show what it changes
+        default = None  # the names of a flag already show its effect
     if parameter.required:
         text.append(" [required]", "red")
     elif default not in (None, "", ()):

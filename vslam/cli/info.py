@@ -26,7 +26,8 @@ def info(
         ),
     ] = None,
 ) -> None:
-    """Show versions, cores, compiled kernels, installed plug-ins, and the KITTI data found."""
+    """Show versions, cores, compiled kernels, installed plug-ins, and the KITTI sequences on this
+    machine."""
     from vslam import machine, plugins
     from vslam.datasets.kitti import list_kitti
 
@@ -57,7 +58,7 @@ def info(
 
 
 def _numba_caches() -> dict[Path, int]:
-    """Folders with compiled kernels, and their sizes in bytes."""
+    """Folders that contain compiled kernels, and their sizes in bytes."""
     import platformdirs
 
     import vslam

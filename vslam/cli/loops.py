@@ -47,8 +47,8 @@ def bench(
         option(
             METHOD,
             "retrieval|online",
-            "[b]retrieval[/b] searches a gallery of images for every query image. [b]online[/b] "
-            "compares every image of a drive with the earlier ones and decides at once.",
+            "[b]retrieval[/b] searches a gallery of images for each query image. [b]online[/b] "
+            "compares each image of a drive with the earlier images and decides at once.",
         ),
     ] = "retrieval",
     data: Annotated[
@@ -59,7 +59,7 @@ def bench(
             "Images: rendered places, [b]town:ROUTE\\[seed=101,aliased=1,places=150][/b], "
             "or a source of [b]vslam train[/b]. With online: a rendered drive, "
             "[b]drive:ROUTE\\[seed=101,aliased=1,change=0.5,every=10][/b], kitti:DIR or "
-            "fabmap:DIR. Repeat the option for several.",
+            "fabmap:DIR. Repeat the option for several sources.",
             unset="three towns, or two drives",
         ),
     ] = None,
@@ -76,14 +76,15 @@ def bench(
     ] = PERTURB,
     strengths: Annotated[
         str,
-        option(METHOD, "NUMBERS", "Strengths of these changes, from 0 to 1, separated by commas."),
+        option(METHOD, "NUMBERS", "Strengths of the changes, from 0 to 1, separated by commas."),
     ] = STRENGTHS,
     window: Annotated[
         str,
         option(
             METHOD,
             "AGE",
-            "With online: do not search the last seconds (20s) or images (200) before the query.",
+            "With online: the time (20s) or number of images (200) before the query that is not "
+            "searched.",
         ),
     ] = WINDOW,
     seed: Seed = 0,
@@ -127,7 +128,7 @@ def bench(
     scorers = [open_scorer(name, files.get(name), vocabulary) for name in names]
     threads, console = threads or available_cores(), Console(shown=not quiet)
     cache, bar = store.cache_folder(), console.count_bar
-    # The report is written after every set, so that stopping the command loses little.
+    # The report is written after every set. If the command is stopped, little work is lost.
     if protocol == "online":
         drives = [
             drive
@@ -163,14 +164,14 @@ def bench(
 
 
 def _require_writable(out: Path) -> None:
-    """Refuse an output folder that cannot be written, before the work begins."""
+    """Refuse an output folder that cannot be written, before any work begins."""
     try:
         there = next(path for path in (out, *out.absolute().parents) if path.exists())
         with TemporaryFile(dir=there):
             pass
     except OSError as error:
         raise InputError(
-            f"{out}: cannot be written ({error.strerror}); name another folder with --out."
+            f"{out}: cannot be written ({error.strerror}); give another folder with --out."
         ) from error
 
 

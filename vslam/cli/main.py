@@ -1,4 +1,4 @@
-"""The command line application and its entry point."""
+"""The command line application, and its entry point."""
 
 from __future__ import annotations
 
@@ -49,7 +49,8 @@ _UsageError: Any = typer.BadParameter.__base__  # typer does not export it
 
 
 class _Command(TyperCommand):
-    """A command with our own help, whose errors say what to use instead of a wrong option."""
+    """A command with vslam's own help. Its error messages suggest a correction for a wrong
+    option."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         from vslam.cli.help import show_help
@@ -71,7 +72,7 @@ class _Command(TyperCommand):
 
 
 class _Group(TyperGroup):
-    """Several commands under one name, with our own help."""
+    """A group of commands under one name, with vslam's own help."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         from vslam.cli.help import show_help
@@ -80,7 +81,7 @@ class _Group(TyperGroup):
 
 
 def _plain(message: str) -> str:
-    """The parser's message in plain words, with a suggestion for a misspelt name."""
+    """The error message of the parser in plain words, with a suggestion for a misspelt name."""
     message = plain_reason(message)
     word, found, choices = message.partition(" is not one of ")
     if not found:
@@ -91,7 +92,7 @@ def _plain(message: str) -> str:
 
 
 def application(groups: Collection[ModuleType]) -> typer.Typer:
-    """An application with the commands of some modules."""
+    """Create an application with the commands of some modules."""
     made = typer.Typer(
         help="Visual SLAM in pure Python.",
         cls=_Group,
@@ -122,7 +123,7 @@ app = application(_GROUPS)
 
 
 def _treat_as_ctrl_c(signal_number: int, stack: FrameType | None) -> None:
-    """Treat SIGTERM, which a machine sends when it shuts down, as Ctrl-C."""
+    """Treat SIGTERM as Ctrl-C. A machine sends SIGTERM when it shuts down."""
     handler = signal.getsignal(signal.SIGINT)
     if not callable(handler):  # background jobs of a shell ignore Ctrl-C
         raise KeyboardInterrupt
@@ -130,9 +131,12 @@ def _treat_as_ctrl_c(signal_number: int, stack: FrameType | None) -> None:
 
 
 def main() -> None:
-    """Run the command line; bad input gives one line on stderr and exit code 2."""
-    # Imports and cached kernels create a million objects that stay alive. Searching them for
-    # garbage would take a tenth of the start-up time, and another 0.16 s at the exit.
+    """Run the command line.
+
+    If an input is wrong, one line is printed on stderr, and the exit code is 2.
+    """
+    # Imports and cached kernels create a million objects that stay alive. To search them for
+    # garbage would take a tenth of the start-up time and another 0.16 s at the exit.
     gc.set_threshold(200_000, 20, 100)
     atexit.register(gc.freeze)
     keep_memory()
@@ -145,7 +149,7 @@ def main() -> None:
             require_utf8(Path(word))
         with suppress(FileNotFoundError):  # the folder was removed
             require_utf8(Path.cwd())
-        # vslam run does not load the other commands: preparing their options takes 30 ms.
+        # vslam run does not load the other commands, because preparing their options takes 30 ms.
         (application((run,)) if sys.argv[1:2] == ["run"] else app)()
     except InputError as error:
         typer.echo(f"error: {error}", err=True)

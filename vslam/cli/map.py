@@ -27,7 +27,7 @@ app = typer.Typer(
     no_args_is_help=True,
 )
 
-Out = Annotated[Path, option(OUTPUT, "FILE", "Map to write; it must not exist yet.")]
+Out = Annotated[Path, option(OUTPUT, "FILE", "Map to write. The file must not exist yet.")]
 MapFile = Annotated[Path, typer.Argument(metavar="MAP", help="Folder of a run, or a map.npz.")]
 
 
@@ -35,7 +35,7 @@ MapFile = Annotated[Path, typer.Argument(metavar="MAP", help="Folder of a run, o
 def info(
     map_file: MapFile,
 ) -> None:
-    """Show what a map contains: keyframes, landmarks, length, extent and more."""
+    """Show the content of a map: keyframes, landmarks, length, extent and more."""
     from vslam.cli.tables import print_rows
     from vslam.maps.reconstruction import reconstruction_of
     from vslam.maps.storage import load_map, map_file_of
@@ -106,7 +106,7 @@ def merge(
     maps: Annotated[
         list[Path],
         typer.Argument(
-            metavar="MAP", help="Maps or folders of runs; the first one defines the world frame."
+            metavar="MAP", help="Maps or folders of runs. The first one defines the world frame."
         ),
     ],
     out: Out,
@@ -122,11 +122,11 @@ def merge(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Merge several maps into one, using verified loops between them.
+    """Merge several maps into one map by verified loops between them.
 
-    Maps without a loop to the others are left out and listed. If no map has a loop to the first
-    one, nothing is written and the exit code is 1. The input files are not changed. Without
-    --config, the thresholds of the first map are used.
+    Maps without a loop to the other maps are left out, and their names are printed. If no map has a
+    loop to the first map, nothing is written, and the exit code is 1. The input files are not
+    changed. Without --config, the thresholds of the first map are used.
     """
     from vslam.cli.console import Console
     from vslam.loopclosure.registry import detector_with_images
@@ -134,23 +134,23 @@ def merge(
     from vslam.merging import Memory, merge_maps
 
     if len(maps) < 2:
-        raise InputError(f"{maps[0]}: a single map cannot be merged; name two or more.")
+        raise InputError(f"{maps[0]}: a single map cannot be merged; give two or more.")
     _require_place(out)
     files = [map_file_of(path) for path in maps]
     for number, file in enumerate(files):
         if file.resolve() in [other.resolve() for other in files[:number]]:
-            raise InputError(f"{file}: named twice; name each map only once.")
+            raise InputError(f"{file}: given twice; give each map only once.")
     stored = [load_map(file) for file in files]
     thresholds = _thresholds_of(stored, files) if config is None else read_thresholds(config)
-    # Nothing has to run in real time here, so the network may embed all keyframes at once.
+    # Merging need not run in real time, so the network may process all keyframes at once.
     siamese = thresholds.siamese.model_copy(update={"embedded_at_once": sys.maxsize})
     thresholds = thresholds.model_copy(update={"siamese": siamese})
     if not stored[0].map.n_keyframes:
-        raise InputError(f"{files[0]}: the map is empty; name another map first.")
+        raise InputError(f"{files[0]}: the map is empty; give another map first.")
     name = stored[0].detector.name
     if name == "none":
         raise InputError(
-            f"{files[0]}: was made with the detector none, which finds no loops; name another map "
+            f"{files[0]}: was made with the detector none, which finds no loops; give another map "
             "first."
         )
 
@@ -174,7 +174,8 @@ def merge(
 
 
 def _thresholds_of(stored: list[StoredMap], files: list[Path]) -> Config:
-    """The thresholds of the first map; a message lists the maps that were made with others."""
+    """The thresholds of the first map. A message lists the maps that were made with other
+    thresholds."""
     from vslam.config import as_config
 
     thresholds = stored[0].thresholds
@@ -227,9 +228,10 @@ def crop(
         ),
     ] = 0.0,
 ) -> None:
-    """Cut out a part of a map: some keyframes and the landmarks that they observe.
+    """Cut out a part of a map.
 
-    x points to the right of the first camera, z ahead; the height is ignored.
+    The result contains the chosen keyframes and the landmarks that they observe. The axis x points
+    to the right of the first camera, and z points ahead. The height is ignored.
     """
     from vslam.maps.storage import load_map, map_file_of
     from vslam.maps.stored_map import in_box, near_frames, near_point

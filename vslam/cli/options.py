@@ -1,4 +1,4 @@
-"""Options that several commands share, and functions that open the data they describe."""
+"""Options that several commands share, and functions that open the data that they describe."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def _with_plugins(names: tuple[str, ...], group: str) -> tuple[str, ...]:
-    """vslam's own names, then those of plug-ins (docs/howto/plugins.md)."""
+    """vslam's own names, followed by the names of plug-ins (docs/howto/plugins.md)."""
     return (*names, *(name for name in plugins.find_plugins(group) if name not in names))
 
 
@@ -34,7 +34,7 @@ DETECTOR_NAMES = _with_plugins(
 if TYPE_CHECKING:
     SourceName = str
     DetectorName = str
-else:  # plug-ins add names
+else:  # plug-ins can add names
     SourceName = Literal[(*_DATASETS, *_SOURCES)]
     DetectorName = Literal[DETECTOR_NAMES]
 # Panels of --help.
@@ -44,7 +44,7 @@ INPUT, METHOD, MAP, OUTPUT, EXECUTION = "Input", "Method", "Map", "Output", "Exe
 def option(
     panel: str, metavar: str, text: str, *names: str, unset: str | bool = True, **more: Any
 ) -> Any:
-    """An option in a panel of ``--help``; a text ``unset`` is shown as the default."""
+    """An option in a panel of ``--help``. The text ``unset`` is shown as the default."""
     return typer.Option(
         *names, metavar=metavar, help=text, show_default=unset, rich_help_panel=panel, **more
     )
@@ -55,7 +55,7 @@ def flag(panel: str, text: str, *names: str) -> Any:
     return typer.Option(*names, help=text, rich_help_panel=panel)
 
 
-def threads(unset: str, text: str = "Number of threads, which does not change the result.") -> Any:
+def threads(unset: str, text: str = "Number of threads. It does not change the result.") -> Any:
     """The option ``--threads`` of a command whose default is ``unset``."""
     return option(EXECUTION, "N", text, min=1, unset=unset)
 
@@ -65,8 +65,8 @@ Perturb = Annotated[
     option(
         METHOD,
         "LAWS",
-        "Perturbations of the images, with strengths, such as [b]fog:60,blur:0.5[/b]; "
-        "[b]vslam perturb --list[/b] shows all.",
+        "Perturbations of the images, with strengths, such as [b]fog:60,blur:0.5[/b]. "
+        "[b]vslam perturb --list[/b] shows all of them.",
     ),
 ]
 Seed = Annotated[int, option(METHOD, "N", "Seed of the random numbers.", min=0)]
@@ -85,7 +85,7 @@ Weights = Annotated[
     option(
         METHOD,
         "NAME=FILE",
-        "Weights of a detector; repeat the option for several detectors.",
+        "Weights of a detector. Repeat the option for several detectors.",
         unset="the shipped ones",
     ),
 ]
@@ -94,7 +94,7 @@ Detectors = Annotated[
     option(
         METHOD,
         "NAMES",
-        "Loop detectors, separated by commas; the others are compared with the first.",
+        "Loop detectors, separated by commas. The first one is the baseline.",
     ),
 ]
 Seeds = Annotated[
@@ -102,7 +102,7 @@ Seeds = Annotated[
 ]
 Jobs = Annotated[
     int,
-    option(EXECUTION, "N", "Number of runs at a time; with 1, speeds can be compared.", min=1),
+    option(EXECUTION, "N", "Number of runs at a time. Speeds can be compared only with 1.", min=1),
 ]
 Threads = Annotated[int | None, threads("all cores, at most 4")]
 AllThreads = Annotated[int | None, threads("all cores")]
@@ -120,7 +120,7 @@ SystemNames = Annotated[
     option(
         METHOD,
         "NAMES",
-        "Systems to test: [b]vslam[/b], [b]orbslam3[/b] and names given with --system.",
+        "Systems to test: [b]vslam[/b], [b]orbslam3[/b] and the names given with --system.",
     ),
 ]
 OtherSystems = Annotated[
@@ -138,7 +138,7 @@ OrbSlam3Python = Annotated[
     option(
         METHOD,
         "FILE",
-        "Python interpreter that has pyorbslam3.",
+        "Python interpreter in which pyorbslam3 is installed.",
         "--orbslam3-python",
         unset="that of vslam",
     ),
@@ -147,14 +147,14 @@ OrbSlam3Vocabulary = Annotated[
     Path | None,
     option(METHOD, "FILE", "Vocabulary of ORB-SLAM3, in DBoW2's text format.", "--vocabulary"),
 ]
-Quiet = Annotated[bool, flag(OUTPUT, "Show no progress and no summary.", "--quiet")]
+Quiet = Annotated[bool, flag(OUTPUT, "Show neither progress nor a summary.", "--quiet")]
 SensorName = Literal["stereo", "mono", "rgbd"]
 ViewerName = Literal["native", "web"]
 AlignmentName = Literal["se3", "sim3", "none"]
 
-KITTI_ROOT = "data/kitti"  # unless $KITTI_ROOT names another folder
+KITTI_ROOT = "data/kitti"  # unless $KITTI_ROOT is set to another folder
 
-_WITHOUT_DATA = """there is no data to read; name your data, or use rendered images:
+_WITHOUT_DATA = """there is no data to read; give your data, or use rendered images:
   --dataset synthetic    rendered drives, which need no download
   DATA --calib FILE      images, video, bag or camera (docs/howto/sources.md)
   --data FOLDER          KITTI; or set $KITTI_ROOT to its folder (datasets.md)"""
@@ -224,25 +224,26 @@ def _source_options(
     ] = None,
     right: Annotated[
         Path | None,
-        option(INPUT, "FOLDER", "Right images; [b]--data[/b] names the left ones."),
+        option(INPUT, "FOLDER", "Right images. [b]--data[/b] gives the left images."),
     ] = None,
     depth: Annotated[
         Path | None,
-        option(INPUT, "FOLDER", "Depth images; [b]--data[/b] names the grey or colour ones."),
+        option(INPUT, "FOLDER", "Depth images. [b]--data[/b] gives the grey or colour images."),
     ] = None,
     fps: Annotated[
         float | None,
-        option(INPUT, "NUMBER", "Frames per second, for data without time stamps."),
+        option(INPUT, "NUMBER", "Frames per second, for data without timestamps."),
     ] = None,
     side_by_side: Annotated[
-        bool, flag(INPUT, "Each image shows the left and the right view.", "--side-by-side")
+        bool, flag(INPUT, "Each image contains both views side by side.", "--side-by-side")
     ] = False,
     topics: Annotated[
         str,
         option(
             INPUT,
             "LEFT,RIGHT",
-            "Image topics of a bag; a single topic for mono, COLOUR,DEPTH for RGB-D.",
+            "Image topics of a bag: LEFT,RIGHT for stereo, one topic for mono, COLOUR,DEPTH for "
+            "RGB-D.",
         ),
     ] = "",
     depth_scale: Annotated[
@@ -250,7 +251,7 @@ def _source_options(
         option(
             INPUT,
             "NUMBER",
-            "Pixel value that stands for a depth of one metre.",
+            "Value of a pixel at a depth of one metre.",
             unset="from the calibration, data set or encoding",
         ),
     ] = None,
@@ -259,8 +260,8 @@ def _source_options(
         option(
             INPUT,
             "stereo|mono|rgbd",
-            "Images to use. [b]mono[/b] uses the left ones only and has an arbitrary scale.",
-            unset="all that the data has",
+            "Images to use. [b]mono[/b] uses only the left images, and its scale is arbitrary.",
+            unset="all images of the data",
         ),
     ] = None,
     mask: Annotated[
@@ -268,8 +269,8 @@ def _source_options(
         option(
             INPUT,
             "FILE|FOLDER",
-            "Mask image, black where the left images must not be used, or a folder with a mask for "
-            "each image (docs/howto/masks.md).",
+            "Mask image that is black where the left images must not be used, or a folder with "
+            "a mask for each image (docs/howto/masks.md).",
         ),
     ] = None,
     start: Annotated[int, option(INPUT, "N", "First frame.", min=0)] = 0,
@@ -278,17 +279,17 @@ def _source_options(
         int | None, option(INPUT, "N", "Stop after N frames.", min=1, unset="all")
     ] = None,
 ) -> SourceOptions:
-    """The source that the options describe."""
+    """Options of the source that the command line describes."""
     from vslam.datasets.sources import SourceOptions
 
     if source is not None and data is not None:
-        raise InputError(f"{source}: --data also names data; leave one of the two out.")
+        raise InputError(f"{source}: data is also given with --data; leave one of the two out.")
     data = source if source is not None else data
     if data is None and dataset in (None, "kitti"):
         data = kitti_root()
         dataset = "kitti" if data != KITTI_ROOT else dataset
     elif data is None and dataset not in ("synthetic", *_DEPTH_CAMERAS):
-        raise InputError(f"--dataset {dataset}: name the data with --data.")
+        raise InputError(f"--dataset {dataset}: give the data with --data.")
     return SourceOptions(
         data=data or "", dataset=dataset, seq=seq, calib=tuple(calib or ()), right=right,
         depth=depth, fps=fps, side_by_side=side_by_side, topics=topics, depth_scale=depth_scale,
@@ -302,7 +303,7 @@ _NAMES = {"SourceOptions": object}  # annotations whose types are slow to import
 def reads_source(
     *, without: tuple[str, ...] = ()
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Replace the parameter ``given`` of a command by the options that describe a source.
+    """Decorator that replaces the parameter ``given`` of a command by the options for a source.
 
     Args:
         without: options that the command does not have.
@@ -334,7 +335,7 @@ def _parameters(function: Callable[..., object]) -> list[inspect.Parameter]:
 
 
 def require_data(options: SourceOptions) -> None:
-    """Refuse a command that names no data, unless the default folder of KITTI's data exists.
+    """Refuse a command without data, unless the default folder of KITTI's data exists.
 
     Raises:
         InputError: there is no data to read.
@@ -344,7 +345,7 @@ def require_data(options: SourceOptions) -> None:
 
 
 def kind_of_source(options: SourceOptions) -> str:
-    """The kind of data that the options name, or else the kind detected from the files.
+    """The kind of data that the options give, or the kind that is detected from the files.
 
     Raises:
         InputError: there is no data to read, or its kind is unknown.
@@ -356,7 +357,7 @@ def kind_of_source(options: SourceOptions) -> str:
 
 
 def read_thresholds(given: str | None) -> Config:
-    """The thresholds of ``--config``, which is a file, values, or None for the defaults.
+    """The thresholds of ``--config``. ``given`` is a file, values, or None for the defaults.
 
     Raises:
         InputError: the file cannot be read, or a name or value is not valid.
@@ -373,7 +374,7 @@ def read_thresholds(given: str | None) -> Config:
 
 
 def open_given(options: SourceOptions, console: Console) -> Source:
-    """Open the source that the options name, and show progress while a town is rendered.
+    """Open the source that the options describe, and show progress while a town is rendered.
 
     Raises:
         InputError: there is no data to read, or it cannot be read.

@@ -37,14 +37,15 @@ def preview(
         bool,
         flag(
             OUTPUT,
-            "Only list the perturbations with their default strengths.",
+            "Only list the perturbations and their default strengths.",
             "--list",
         ),
     ] = False,
 ) -> None:
-    """Write a picture of a perturbation, with a row for each frame: original and perturbed images.
+    """Write a picture of a perturbation.
 
-    [b]--perturb all[/b] shows one frame under every perturbation at its default strength.
+    Each row shows the original and the perturbed images of a frame. [b]--perturb all[/b] shows one
+    frame under every perturbation at its default strength.
     """
     if list_:
         _list_laws()
@@ -78,7 +79,7 @@ def preview(
         image = contact_sheet(
             sequence, parse_perturbation(perturb, seed), shown, given.start, given.every
         )
-    write_file(out, cv2.imencode(".png", image)[1].tobytes(), "name another file with --out")
+    write_file(out, cv2.imencode(".png", image)[1].tobytes(), "give another file with --out")
     frames_shown = ", ".join(str(given.start + given.every * frame) for frame in shown)
     typer.echo(f"{out}: {name}, seed {seed}, frames {frames_shown}")
 

@@ -1,4 +1,4 @@
-"""The command ``vslam report``: one report of many runs."""
+"""The command ``vslam report``, which writes one report about many runs."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def report(
         typer.Option(
             metavar="NAME=FILE",
             help="Trajectory of another system, in the format of KITTI or TUM. "
-            "NAME@SEQ@PERTURB=FILE also names its sequence and perturbation. The trajectory is "
-            "aligned like the runs of the sequence; a NAME that ends in ', mono' also fits the "
+            "NAME@SEQ@PERTURB=FILE also gives its sequence and perturbation. The trajectory is "
+            "aligned like the runs of the sequence. A NAME that ends in ', mono' also fits the "
             "scale.",
         ),
     ] = None,
@@ -51,7 +51,7 @@ def report(
         bool,
         flag(
             OUTPUT,
-            "Instead of writing a report, serve a page of all runs, for this machine only, until "
+            "Instead of writing a report, serve a page of all runs to this machine only, until "
             "Ctrl-C.",
             "--serve",
         ),
@@ -88,7 +88,8 @@ def write_overview_of(
     baseline: str | None = None,
     quiet: bool,
 ) -> None:
-    """Write the report of finished runs and, unless ``quiet``, print its first tables and path."""
+    """Write the report about finished runs. Unless ``quiet``, print its first tables and its
+    path."""
     from vslam.cli.tables import show_sections
     from vslam.lab.overview.render import write_overview
     from vslam.lab.overview.versus import versus

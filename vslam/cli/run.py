@@ -61,8 +61,8 @@ def run(
         option(
             INPUT,
             "FILE",
-            "GPS fixes to georeference the trajectory: CSV, a bag, or the folder oxts of KITTI raw "
-            "(docs/howto/gps.md).",
+            "GPS fixes that georeference the trajectory: CSV, a bag, or the folder oxts of KITTI "
+            "raw (docs/howto/gps.md).",
         ),
     ] = None,
     gps_antenna: Annotated[
@@ -70,9 +70,9 @@ def run(
         option(
             INPUT,
             "X,Y,Z",
-            "Position of the GPS antenna in metres to the right of, below and ahead of the left "
-            "camera, such as [b]0.1,-0.5,-1.5[/b].",
-            unset="that of KITTI's calibration, or 0,0,0",
+            "Position of the GPS antenna relative to the left camera: metres to the right, below "
+            "and ahead, such as [b]0.1,-0.5,-1.5[/b].",
+            unset="from KITTI's calibration, or 0,0,0",
         ),
     ] = None,
     perturb: Perturb = "none",
@@ -83,8 +83,8 @@ def run(
             METHOD,
             "NAME",
             "Loop detector: [b]both[/b] combines the capsule network and the bag of words, "
-            f"[b]none[/b] closes no loops. Others: {_OTHER_DETECTORS}.",
-            unset="both, or that of --map",
+            f"[b]none[/b] closes no loops. Other detectors: {_OTHER_DETECTORS}.",
+            unset="both, or the detector of --map",
         ),
     ] = None,
     weights: Annotated[
@@ -106,8 +106,8 @@ def run(
         option(
             METHOD,
             "NAMES",
-            "Other loop detectors, separated by commas, to run on the same frames and compare in a "
-            "table.",
+            "Other loop detectors, separated by commas. They run on the same frames, and a table "
+            "compares them.",
         ),
     ] = "",
     map_file: Annotated[
@@ -119,18 +119,18 @@ def run(
     ] = False,
     save_map: Annotated[
         Path | None,
-        option(MAP, "FILE", "Also save the map to this file; an existing file is replaced."),
+        option(MAP, "FILE", "Also save the map to this file. An existing file is replaced."),
     ] = None,
     autosave: Annotated[
         float,
-        option(MAP, "SECONDS", "Time between saves of the map; 0 saves only at the end.", min=0),
+        option(MAP, "SECONDS", "Time between saves of the map. 0 saves it only at the end.", min=0),
     ] = 60.0,
     resume: Annotated[
         Path | None,
         option(
             MAP,
             "FOLDER",
-            "Continue an interrupted run in its folder, with its own options. Only --record, "
+            "Resume an interrupted run in its folder, with its own options. Only --record, "
             "--view, --keep-open, --report, --ply, --save-map and --quiet can be given again.",
         ),
     ] = None,
@@ -139,7 +139,7 @@ def run(
         bool,
         flag(
             EXECUTION,
-            "Play the frames in real time, and drop frames while tracking is too slow.",
+            "Process the frames in real time. Frames are dropped while tracking is too slow.",
             "--realtime",
         ),
     ] = False,
@@ -167,7 +167,7 @@ def run(
     ply: Annotated[bool, flag(OUTPUT, "Write the landmarks as map.ply.", "--ply")] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Run SLAM on a sequence and write trajectory, map, recording and report to a folder."""
+    """Run SLAM on a sequence, and write the trajectory, map, recording and report to a folder."""
     from vslam.loopclosure.registry import DEFAULT_DETECTOR, require_detector
 
     if save_map is not None:
@@ -191,13 +191,13 @@ def run(
         drive(options, output, resume=resume)
         return
     if local_weights is not None and not local_weights.is_file():
-        raise InputError(f"--local-weights {local_weights}: no such file; name an .onnx file.")
+        raise InputError(f"--local-weights {local_weights}: no such file; give an .onnx file.")
     if localize and map_file is None:
-        raise InputError("--localize: name the map to localise in with --map.")
+        raise InputError("--localize: give the map to localise in with --map.")
     if localize and gps is not None:
         raise InputError("--gps: changes the map, but --localize must not; leave one of them out.")
     if gps_antenna is not None and gps is None:
-        raise InputError("--gps-antenna: name the fixes of this antenna with --gps.")
+        raise InputError("--gps-antenna: give the fixes of this antenna with --gps.")
     of_map: dict[str, object] = {}
     if map_file is not None:
         if compare:
@@ -242,7 +242,8 @@ _WITH_RESUME = {"resume", "record", "view", "keep_open", "pages", "ply", "save_m
 
 
 def _refuse_with_resume(context: typer.Context) -> None:
-    """Refuse options that cannot be combined with ``--resume``: a resumed run keeps its options.
+    """Refuse options that cannot be combined with ``--resume``, because a resumed run keeps its
+    options.
 
     Raises:
         InputError: such an option was given.
@@ -257,7 +258,7 @@ def _refuse_with_resume(context: typer.Context) -> None:
 
 
 def _antenna(text: str) -> tuple[float, float, float]:
-    """The position that ``--gps-antenna`` names."""
+    """The position that ``--gps-antenna`` gives."""
     try:
         right, down, ahead = map(float, text.split(","))
     except ValueError:
@@ -278,7 +279,7 @@ def _compared(names: str, detector: str) -> tuple[str, ...]:
     for name in found:
         require_detector(name, option="--compare")
     if detector in found:
-        raise InputError(f"--compare {detector}: this is the run's own detector; name another one.")
+        raise InputError(f"--compare {detector}: this is the run's own detector; give another one.")
     return found
 
 

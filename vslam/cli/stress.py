@@ -1,4 +1,5 @@
-"""The command ``vslam stress``: the strength of each perturbation at which a run fails."""
+"""The command ``vslam stress``, which finds the strength of each perturbation at which a run
+fails."""
 
 from __future__ import annotations
 
@@ -40,9 +41,9 @@ _EXAMPLES = """
   vslam stress --seqs 00 --systems vslam,orbslam3 --vocabulary voc.txt
   vslam stress --seqs 00 --preset kitti-c --detectors bow,both
 
-The same command continues a stress test that was stopped (docs/howto/stress.md).
+To resume a stress test that was stopped, repeat the command (docs/howto/stress.md).
 """
-_FAILURE = "Failure"  # a panel of --help
+_FAILURE = "Failure"  # name of a panel of --help
 
 
 app = typer.Typer()
@@ -58,7 +59,7 @@ def stress(
         option(
             METHOD,
             "NAMES",
-            "Perturbations to test, without strengths ([b]vslam perturb --list[/b] shows all).",
+            "Perturbations to test, without strengths. [b]vslam perturb --list[/b] shows all.",
         ),
     ] = "all",
     detectors: Annotated[
@@ -73,7 +74,7 @@ def stress(
         option(
             METHOD,
             "kitti-c",
-            "Test the five severities of KITTI-C, a published benchmark, instead of --laws.",
+            "Test the five severities of the published benchmark KITTI-C, instead of --laws.",
         ),
     ] = None,
     baseline: Annotated[
@@ -183,7 +184,8 @@ def foreign(
     no_report: Annotated[bool, typer.Option("--no-report")] = False,
     quiet: Annotated[bool, typer.Option("--quiet")] = False,
 ) -> None:
-    """Run another system on a sequence and write its report, for bench and stress."""
+    """Run another system on a sequence, and write its report. ``vslam bench`` and ``vslam stress``
+    call this command."""
     from vslam.cli.console import Console
     from vslam.config import load_config
     from vslam.datasets.perturbation import parse_perturbation
@@ -203,7 +205,11 @@ def foreign(
 
 
 def _fitting(laws: list[str], opened: Mapping[str, Source]) -> tuple[list[str], list[str]]:
-    """The perturbations that suit every sequence, and a note on each one that does not."""
+    """The perturbations that can be applied to every sequence.
+
+    Returns:
+        These perturbations, and a note on each perturbation that cannot be applied.
+    """
     from vslam.datasets.perturbation import laws_for
 
     notes: dict[str, None] = {}

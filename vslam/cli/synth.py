@@ -21,7 +21,7 @@ _EXAMPLES = """
   vslam synth demo --pairs 1000 --aliased --change 0.8 --out pairs
   vslam synth 05 --pairs 500 --lateral=-3.2:1.4 --heading 0:30 --out pairs
 """
-_DRIVE, _TOWN, _PAIRS = "Drive", "Town", "Pairs of images"  # panels of --help
+_DRIVE, _TOWN, _PAIRS = "Drive", "Town", "Pairs of images"  # names of panels of --help
 
 
 app = typer.Typer()
@@ -37,12 +37,12 @@ def synth(
     ] = "",
     trajectory: Annotated[
         Path | None,
-        option(_DRIVE, "FILE", "Drive along these poses (KITTI's format, 10 per second)."),
+        option(_DRIVE, "FILE", "Poses to drive along, in KITTI's format, 10 per second."),
     ] = None,
     calibration: Annotated[
         str,
         option(
-            _DRIVE, "00-02|03|04-12", "With --trajectory: the KITTI sequences whose cameras to use."
+            _DRIVE, "00-02|03|04-12", "With --trajectory: use the cameras of these KITTI sequences."
         ),
     ] = "00-02",
     max_frames: Annotated[
@@ -50,7 +50,7 @@ def synth(
         option(
             _DRIVE,
             "N",
-            "Stop after N frames; a later command can render the remaining ones.",
+            "Stop after N frames. A later command can render the remaining frames.",
             min=1,
             unset="all",
         ),
@@ -65,7 +65,7 @@ def synth(
         option(
             _TOWN,
             "0-1",
-            "How much the town changes between two passes; above 0.7 it gets dark.",
+            "How much the town changes between two passes. Above 0.7, it gets dark.",
             min=0,
             max=1,
         ),
@@ -93,7 +93,7 @@ def synth(
         bool,
         flag(
             OUTPUT,
-            "Write images with depth in TUM's layout, and also the stereo pairs.",
+            "Write images with depth in TUM's layout, in addition to the stereo pairs.",
             "--rgbd",
         ),
     ] = False,
@@ -108,15 +108,13 @@ def synth(
         option(
             _PAIRS,
             "LOW:HIGH",
-            "Range of the offset of the second view to the right, in metres; at -3.2, it is in the "
+            "Range of the offset of the second view to the right, in metres. At -3.2, it is in the "
             "opposite lane.",
         ),
     ] = "-1.4:1.4",
     heading: Annotated[
         str,
-        option(
-            _PAIRS, "LOW:HIGH", "Range of the turn of the second view to either side, in degrees."
-        ),
+        option(_PAIRS, "LOW:HIGH", "Range of the angle between the two views, in degrees."),
     ] = "0:14",
     out: Annotated[
         Path | None, option(OUTPUT, "FOLDER", "Folder to write to.", unset="the user's cache")
@@ -134,7 +132,7 @@ def synth(
     threads: Threads = None,
     quiet: Quiet = False,
 ) -> None:
-    """Render a drive through a town in KITTI's format, with exact ground truth."""
+    """Render a drive through a town, in KITTI's format and with exact ground truth."""
     from vslam.cli.console import Console
     from vslam.datasets.synthetic import (
         DRIVES,
@@ -171,7 +169,7 @@ def synth(
     if side_by_side is not None and (pairs or fisheye):
         raise InputError("--side-by-side: writes a sequence; leave out --pairs and --fisheye.")
     if not route:
-        raise InputError(f"vslam synth: name a route, one of {', '.join(ROUTES)}, or --list.")
+        raise InputError(f"vslam synth: give a route, one of {', '.join(ROUTES)}, or --list.")
     drive = (
         built_in_route(route)
         if trajectory is None

@@ -17,7 +17,10 @@ _LOOK_AT = (("report", "report.html"), ("recording", "recording*.rrd"))
 
 
 def show_sections(sections: Iterable[Section]) -> None:
-    """Print sections of a report on stdout; lines are not broken if it is not a terminal."""
+    """Print sections of a report on stdout.
+
+    Long lines are wrapped only if stdout is a terminal.
+    """
     from rich.console import Console
 
     from vslam.report.render import show
@@ -31,7 +34,8 @@ def print_rows(rows: Rows) -> None:
 
 
 def print_summary(report: ReportJson, folder: Path) -> None:
-    """Print the first sections of a run's report, and the files in its folder to look at."""
+    """Print the first sections of the report of a run, and the most important files in its
+    folder."""
     from vslam.report.run_page import run_page
     from vslam.run.autosave import MAP
 
@@ -46,8 +50,8 @@ def print_summary(report: ReportJson, folder: Path) -> None:
 
 
 def _how_to_compare(report: ReportJson) -> Rows:
-    """A hint on how to compare detectors, if there is a ground truth."""
-    refused = report.realtime or report.map is not None  # --compare is not possible
+    """A hint on how to compare detectors, if the data has ground truth."""
+    refused = report.realtime or report.map is not None  # --compare would be refused
     if report.detectors or report.compare or report.alignment is None or refused:
         return []
     if report.detector in ("bow", "none"):

@@ -1,7 +1,7 @@
-"""The commands ``vslam train`` and, for networks and training images, ``vslam export``.
+"""The command ``vslam train``, and the commands ``vslam export`` for networks and training images.
 
 The libraries of the extra ``train`` are imported inside the commands, because ``vslam`` must work
-without them.
+if they are not installed.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ DataSources = Annotated[
         INPUT,
         "KIND:PATH",
         "Source of images: kitti, fabmap, pairs, photos or pack, with options in brackets "
-        "(docs/howto/training.md). Repeat the option for several.",
+        "(docs/howto/training.md). Repeat the option for several sources.",
         "--data",
     ),
 ]
@@ -94,11 +94,11 @@ def train(
         option(
             METHOD,
             "FILE",
-            "Network to start from; for capsule-pruned and capsule-paper, the network to prune.",
+            "Network to start from. For capsule-pruned and capsule-paper, the network to prune.",
         ),
     ] = None,
     pixels: Annotated[
-        str | None, option(METHOD, "SIDE|HxW", "Size of the images; smaller images train faster.")
+        str | None, option(METHOD, "SIDE|HxW", "Size of the images. Smaller images train faster.")
     ] = None,
     allow_test_data: Annotated[
         bool,
@@ -107,11 +107,13 @@ def train(
     device: Annotated[DeviceName, option(EXECUTION, "cpu|cuda", "Where to train.")] = "cpu",
     threads: AllThreads = None,
     resume: Annotated[
-        bool, flag(EXECUTION, "Continue from the checkpoint in [b]--out[/b].", "--resume")
+        bool, flag(EXECUTION, "Resume an interrupted training run in [b]--out[/b].", "--resume")
     ] = False,
     max_minutes: Annotated[
         float | None,
-        option(EXECUTION, "NUMBER", "Stop after this time; --resume continues.", min=0),
+        option(
+            EXECUTION, "NUMBER", "Stop after this time. --resume continues the training.", min=0
+        ),
     ] = None,
     out: Annotated[
         Path | None,
@@ -121,8 +123,8 @@ def train(
 ) -> None:
     """Train a loop detector.
 
-    The command writes weights (.safetensors for further training, .onnx for runs), a log, the
-    pairs, checkpoints and a model card.
+    The command writes the weights as .safetensors for further training and as .onnx for runs. It
+    also writes a log, the pairs, checkpoints and a model card.
     """
     _require_libraries("train")
     from vslam.cli.console import Console
@@ -186,7 +188,7 @@ def train(
 def _require_libraries(command: str) -> None:
     """Refuse a command if a package of the extra ``train`` is missing.
 
-    This is checked at the start, because training needs onnxscript only hours later.
+    This is checked at the start, because training needs the package onnxscript only hours later.
 
     Raises:
         InputError: a package is not installed.
@@ -205,7 +207,7 @@ def onnx(
         Path | None, option(OUTPUT, "FILE", "File to write.", unset="as --weights, with .onnx")
     ] = None,
 ) -> None:
-    """Write the ONNX file that runs use, and compare its output with that of torch."""
+    """Write the ONNX file that runs use, and compare its output with the output of torch."""
     _require_libraries("export onnx")
     from vslam.loopclosure.training.export import export_onnx
     from vslam.loopclosure.training.siamese import load_network
@@ -225,7 +227,10 @@ def weights_(
     weights: Annotated[Path, option(INPUT, "FILE", "Trained weights, .safetensors.")],
     out: Annotated[Path, option(OUTPUT, "FILE", "File to write, .safetensors.")],
 ) -> None:
-    """Write weights as vslam ships them: in half precision, with the model card and ONNX file."""
+    """Write weights in the form in which vslam ships them.
+
+    They are in half precision, and a model card and an ONNX file are written with them.
+    """
     _require_libraries("export weights")
     from vslam.loopclosure.training.export import export_onnx
     from vslam.loopclosure.training.siamese import load_network, save_network
@@ -244,7 +249,7 @@ def places(
     data: DataSources,
     fit: Annotated[
         FitName,
-        option(OUTPUT, "squash|crop", "Squash the whole image to the size, or crop its middle."),
+        option(OUTPUT, "squash|crop", "Scale the whole image to the size, or cut out its middle."),
     ] = "squash",
     pixels: Annotated[str, option(OUTPUT, "SIDE|HxW", "Size of the images.")] = "227",
     out: Annotated[Path, option(OUTPUT, "FILE", "File to write.")] = Path("places.npz"),

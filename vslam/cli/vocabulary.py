@@ -36,9 +36,7 @@ def train(
     k: Annotated[int, typer.Option(min=2, max=20, metavar="N", help="Children per node.")] = 10,
     levels: Annotated[
         int,
-        typer.Option(
-            min=1, max=10, metavar="N", help="Levels of the tree, which has k^levels words."
-        ),
+        typer.Option(min=1, max=10, metavar="N", help="Levels of the tree. It has k^levels words."),
     ] = 5,
     seed: Seed = 0,
     out: Annotated[Path, option(OUTPUT, "FILE", "File to write, .npz or .txt.")] = Path(
@@ -46,7 +44,7 @@ def train(
     ),
     quiet: Quiet = False,
 ) -> None:
-    """Train a vocabulary on images, preferably of many different places."""
+    """Train a vocabulary on images. They should show many different places."""
     from vslam.cli.console import Console
     from vslam.config import OrbConfig
     from vslam.loopclosure import vocabulary_training
@@ -94,7 +92,7 @@ def convert(
         Path, typer.Argument(metavar="TARGET", help="File to write, .npz or .txt (DBoW2).")
     ],
 ) -> None:
-    """Convert a vocabulary between vslam's npz and the text format of DBoW2 and ORB-SLAM."""
+    """Convert a vocabulary between vslam's npz format and the text format of DBoW2 and ORB-SLAM."""
     from vslam.loopclosure.vocabulary_text import is_text, read_vocabulary, write_vocabulary
 
     is_text(target)
@@ -108,7 +106,7 @@ def info(
     file: Annotated[
         Path | None,
         typer.Argument(
-            metavar="FILE", help="Vocabulary, .npz or .txt.", show_default="the shipped one"
+            metavar="FILE", help="Vocabulary, .npz or .txt.", show_default="the shipped vocabulary"
         ),
     ] = None,
 ) -> None:
@@ -153,13 +151,13 @@ def _find(images: list[str]) -> list[Path]:
         else:
             files = sorted(Path(p) for p in glob.glob(name, recursive=True))
         if not files:
-            raise InputError(f"{name}: no images found; name files, folders or globs of images.")
+            raise InputError(f"{name}: no images found; give files, folders or globs of images.")
         found.update(dict.fromkeys(files))
     return list(found)
 
 
 def _extract_all(paths: list[Path], config: OrbConfig) -> Iterator[NDArray[np.uint8] | None]:
-    """Yield the ``(n, 32)`` descriptors of each image in order, None if it cannot be read."""
+    """Yield the ``(n, 32)`` descriptors of each image in order. None if an image cannot be read."""
     from concurrent.futures import ThreadPoolExecutor
 
     from vslam.datasets.image_files import read_grey

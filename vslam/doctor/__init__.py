@@ -1,1 +1,2 @@
-"""Checks of images, calibration and timestamps before a run, each with a verdict and a fix."""
+"""Checks of images, calibration and timestamps before a run. Each check gives a verdict and a
+fix."""

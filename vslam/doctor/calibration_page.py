@@ -1,4 +1,4 @@
-"""Checks of a calibration from images of a board, and its page."""
+"""Checks of a calibration from images of a board, and the HTML page with the results."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from vslam.report.page import Code, Page, Section, Tile, Tiles
 from vslam.report.render import html
 
 _FEW_VIEWS = 10
-# Least tilt in degrees, and least number of views that are tilted more. Views of a board that faces
-# the camera do not determine the focal length.
+# A view counts as tilted above the first number, in degrees. The second number is the least number
+# of tilted views. Views of a board that faces the camera do not determine the focal length.
 _TILT, _FEW_TILTED = 15.0, 3
-_CELLS = (8, 6)  # cells of the image, across and down
+_CELLS = (8, 6)  # number of cells across and down the image
 _COVERED = 0.6  # least share of cells with corners; a whole board hardly reaches the image border
-_LARGE_PX = 0.5  # largest RMS in images up to the common width; larger in proportion to the width
+_LARGE_PX = 0.5  # largest RMS, for images of at most the common width; it grows with the width
 _COMMON_WIDTH = 640
-_APART_PX = 2.0  # largest RMS of the pair: more shows that the board moved between the two images
-_SHARED = 0.2  # largest share of the squared residuals that is systematic, see _shared
+_APART_PX = 2.0  # largest RMS of the pair; a larger error means that the board moved
+_SHARED = 0.2  # largest systematic share of the squared residuals (_shared)
 _MOST_DROPPED = 0.25
 _ARROW = 0.02  # length of an arrow of the RMS error, relative to the image width
 
 
 def findings_of(found: Estimate) -> list[Finding]:
-    """Check the calibration of each camera, and then that of the pair."""
+    """Check the calibration of each camera, and then the calibration of the pair."""
     findings = [finding for side, fit in _sides(found) for finding in _camera(side, fit)]
     if found.pair is not None:
         error = _rms(found.pair.errors)
@@ -52,8 +52,9 @@ def findings_of(found: Estimate) -> list[Finding]:
 def write_page(
     found: Estimate, findings: Sequence[Finding], about: str, text: str, path: Path
 ) -> None:
-    """Write a self-contained HTML page with ``about`` below its title and the ``text`` of the
-    calibration file.
+    """Write a self-contained HTML page about a calibration.
+
+    ``about`` is shown below the title. ``text`` is the content of the calibration file.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -74,7 +75,7 @@ def write_page(
         Section("Calibration file", [Code(text)]),
     ]
     page = html(Page("Calibration", [about], parts))
-    write_file(path, page, "name another file with --out")
+    write_file(path, page, "give another file with --out")
 
 
 def _sides(found: Estimate) -> list[tuple[str, CameraFit]]:
@@ -134,15 +135,18 @@ def _kept(check: str, n: int, dropped: Sequence[tuple[str, float]]) -> Finding:
 
 
 def _cells(fit: CameraFit) -> NDArray[np.int64]:
-    """The cell of the image in which each corner of all views lies, counted column by column."""
+    """The cell of the image in which each corner of all views lies. Cells are numbered column by
+    column."""
     xy = np.concatenate([view.xy for view in fit.views]) / (fit.model.width, fit.model.height)
     x, y = (xy * _CELLS).astype(np.int64).clip(0, np.subtract(_CELLS, 1)).T
     return np.asarray(x * _CELLS[1] + y, np.int64)
 
 
 def _shared(cells: NDArray[np.int64], residuals: Array) -> float:
-    """The share of the squared residuals that the mean residual of each cell explains: about 0 for
-    noise, close to 1 for a model that does not fit the lens."""
+    """The share of the squared residuals that the mean residual of each cell explains.
+
+    It is about 0 for noise, and close to 1 for a camera model that does not fit the lens.
+    """
     n = np.bincount(cells)
     sums = np.stack([np.bincount(cells, weights=column) for column in residuals.T], axis=1)
     common = (sums[n > 0] ** 2 / n[n > 0, None]).sum() / (residuals**2).sum()
@@ -172,4 +176,4 @@ def _drawings(found: Estimate) -> Iterator[Drawing]:
         colours = [BLUE] * len(fit.views) + [RED] * len(fit.dropped)
         axes.bar(np.arange(len(errors)), errors, color=colours)
         axes.axhline(float(np.median(fit.errors)), color=GREY)
-        yield f"errors-{name}", "Line: the median. Red: views that were dropped.", figure
+        yield f"errors-{name}", "The line is the median. Red views were dropped.", figure

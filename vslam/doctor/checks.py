@@ -1,4 +1,4 @@
-"""The checks, as functions of images, matches and timestamps.
+"""The checks of a data set, as functions of images, matches and timestamps.
 
 The checks are short and share this file, so that their thresholds are in one place.
 """
@@ -21,49 +21,52 @@ from vslam.errors import counted
 from vslam.frontend.orb import extract
 
 Times = NDArray[np.float64]
-Depth = NDArray[Any]  # of any number type; 0 or NaN where the depth is missing
+Depth = NDArray[Any]  # any type of number; 0 or NaN means that the depth is missing
 
-# A run searches for stereo matches within 2 rows; KITTI's rectification is off by 0.3 to 0.5 px.
+# A run searches for stereo matches within 2 rows. The error of KITTI's rectification is 0.3 to 0.5
+# px.
 ROWS_PX = 0.8
-IN_FRONT = 0.9  # least share of positive disparities; distant points scatter about 0
-EXPOSURE = 0.25  # largest relative difference in brightness; stereo matching compares grey values
-# A frame lag is reported only if it reduces the row error by so many pixels and to this fraction.
+IN_FRONT = 0.9  # least share of positive disparities; those of distant points scatter around 0
+EXPOSURE = 0.25  # largest relative difference in brightness, because matching compares grey values
+# A lag in frames is reported only if it reduces the row error by at least this many pixels, and to
+# at most this fraction.
 LAG_GAIN_PX, LAG_FACTOR = 0.25, 0.6
-FEATURES = 0.5  # least share of the requested features
-# Contrast of pixels with their neighbours, relative to the contrast with a wider neighbourhood:
-# KITTI 0.43, TUM 0.25, EuRoC 0.27; at most 0.17 after a Gaussian blur of 1.5 px.
+FEATURES = 0.5  # least share of the requested number of features
+# Contrast of pixels with their neighbours, relative to the contrast with a wider neighbourhood. It
+# is 0.43 for KITTI, 0.25 for TUM and 0.27 for EuRoC. After a Gaussian blur of 1.5 px, it is at most
+# 0.17.
 SHARP = 0.18
-JITTER = 0.2  # largest standard deviation, relative to the interval
+JITTER = 0.2  # largest standard deviation of the steps, relative to the interval
 GAP = 1.75  # a longer step, in intervals, means that a frame is missing
-# Largest share of steps with a gap. Two standard deviations are added, because a share of few steps
-# is uncertain.
+# Largest share of steps with a gap. Two standard deviations are added, because the share is
+# uncertain if there are few steps.
 GAPS = 0.05
 LONG_GAP = 3.5  # a longer step, in intervals, means that several frames in a row are missing
-DEPTH_PX = 4.0  # depth edges of structured light are off by 2 to 3 px
+DEPTH_PX = 4.0  # largest shift; depth edges of structured light are off by 2 to 3 px
 DEPTH_SHARE = 0.3  # smallest share of pixels with a depth
 # Misregistered depth is reported only if the fit has one clear peak away from shift 0. Heights are
-# measured above the median of the fit, relative to the highest peak. In nine parts of TUM fr1/desk,
-# the height near shift 0 is at least 0.67, or the height of the second peak is 0.85. If the depth
-# is moved by 20 px, the height near shift 0 is 0.25 to 0.66, and the height of the second peak is
-# mostly 0.65 to 0.77.
+# measured above the median of the fit, relative to the highest peak. For correct depth, in nine
+# parts of TUM fr1/desk, the height near shift 0 is at least 0.67, or the height of the second peak
+# is 0.85. If the depth is shifted by 20 px, the height near shift 0 is 0.25 to 0.66. The height of
+# the second peak is then mostly 0.65 to 0.77.
 DEPTH_AT_ZERO = 0.6
 DEPTH_SECOND = 0.8
-_ANOTHER_PX = 8.0  # smallest distance of the second peak from the highest one
+_ANOTHER_PX = 8.0  # smallest distance of the second peak from the highest peak
 DEPTH_VIEWS = 2  # least number of different views; a single view may fit a wrong shift by chance
 NEAREST_M, FARTHEST_M = 0.01, 3.0  # plausible baselines of a stereo pair on a vehicle
-# With the right calibration, the fitted factor of the focal length is 0.975 to 1.026 (KITTI 00,
-# three parts of fr1/desk, six rendered drives). If the calibrated focal length is 10 % too long,
-# the factor is 0.89 to 0.93.
+# With the right calibration, the fitted factor of the focal length is 0.975 to 1.026. This was
+# measured on KITTI 00, three parts of fr1/desk and six rendered drives. If the calibrated focal
+# length is 10 % too long, the factor is 0.89 to 0.93.
 FOCAL = 0.05
 FOCAL_SIGMA = 0.01  # largest sigma of a fit that is used; on straight roads, it is 0.05 or more
-TURNED = 2.0  # least rotation in degrees; on straight roads, up to 1.6 within four frames
+TURNED = 2.0  # least rotation in degrees; a straight road has up to 1.6 within four frames
 NEAREST_DEPTH_M, FARTHEST_DEPTH_M = 0.05, 100.0  # plausible median depths of a sensor
 _BORDER = 2  # px; if a peak is this near the end of the search range, the true peak may lie outside
 _REACH = 16, 48  # px, vertical and horizontal search range; the sensors are side by side
 
 
 def check_rectification(matches: Matches) -> Finding:
-    """Check that matches lie in the same rows, by their median row difference."""
+    """Check by their median row difference that matches lie in the same rows."""
     rows = float(np.median(np.abs(matches.left[:, 1] - matches.right[:, 1])))
     return judge(
         "rectification",
@@ -74,7 +77,7 @@ def check_rectification(matches: Matches) -> Finding:
 
 
 def check_sides(matches: Matches) -> Finding:
-    """Check the sign of the disparities, which is wrong if left and right are swapped."""
+    """Check the sign of the disparities. It is wrong if the left and right images are swapped."""
     disparity = matches.left[:, 0] - matches.right[:, 0]
     in_front = float(np.mean(disparity > -ROWS_PX))
     middle = float(np.median(disparity))
@@ -100,7 +103,7 @@ def check_scale(camera: Camera, matches: Matches | None) -> Finding:
     baseline. Only a baseline that seems to be in a wrong unit is reported as a fault.
 
     Args:
-        matches: matches of the stereo pair; None for a monocular or RGB-D camera.
+        matches: matches of the stereo pair. None for a monocular or RGB-D camera.
     """
     across, down = field_of_view(camera)
     measured = f"{camera.width}x{camera.height} pixels see {across:.0f} x {down:.0f} degrees"
@@ -138,7 +141,7 @@ def check_focal_length(fit: FocalFit | None, camera: Camera) -> Finding:
     """Check whether the rotations of the camera fit the calibrated focal length.
 
     Args:
-        fit: None if too few frames have points in common.
+        fit: the fitted focal length. None if too few frames have points in common.
     """
     if fit is None:
         return Finding("focal length", "unknown", "too few frames have points in common")
@@ -154,7 +157,7 @@ def check_focal_length(fit: FocalFit | None, camera: Camera) -> Finding:
 
 
 def check_exposure(pairs: Sequence[tuple[Image, Image]], several: Sequence[Matches]) -> Finding:
-    """Compare the brightness of the same points in both images."""
+    """Check whether the same points have the same brightness in both images."""
     ratios = []
     for (left, right), matches in zip(pairs, several, strict=True):
         greys = [
@@ -167,19 +170,20 @@ def check_exposure(pairs: Sequence[tuple[Image, Image]], several: Sequence[Match
         "exposure",
         abs(np.log(ratio)) > np.log1p(EXPOSURE),
         f"the right image is {ratio:.2f} times as bright as the left one",
-        "let one camera set the exposure and gain of both",
+        "let one camera set the exposure and gain of both cameras",
     )
 
 
 def check_synchronisation(rows_of_lag: Mapping[int, float]) -> tuple[Finding, int]:
-    """Check whether the cameras are synchronised, or the right image of another frame fits better.
+    """Check whether the cameras are synchronised, or whether the right image of another frame fits
+    better.
 
     Args:
-        rows_of_lag: median vertical error (px) for each lag, which is the delay of the right image
-            in frames; empty if no frame has matches at all lags.
+        rows_of_lag: median vertical error (px) for each lag. The lag is the delay of the right
+            image in frames. It is empty if no frame has matches at all lags.
 
     Returns:
-        The finding, and the best lag, which is 0 if the camera hardly moves.
+        The finding, and the best lag. The lag is 0 if the camera hardly moves.
     """
     if not rows_of_lag:
         return Finding("synchronisation", "unknown", "too few frames with matches"), 0
@@ -196,14 +200,14 @@ def check_synchronisation(rows_of_lag: Mapping[int, float]) -> tuple[Finding, in
         wrong,
         measured,
         f"the right image is {counted(abs(best), 'frame')} "
-        f"{'late' if best > 0 else 'early'}: trigger both cameras together, or shift the times of "
-        "one",
+        f"{'late' if best > 0 else 'early'}: trigger both cameras together, or shift the "
+        "timestamps of one camera",
     )
     return finding, best if wrong else 0
 
 
 def check_features(images: Sequence[Image], config: OrbConfig) -> Finding:
-    """Check the number of features per image."""
+    """Check the number of features in each image."""
     counts = [len(extract(image, config).xy) for image in images]
     middle = int(np.median(counts))
     return judge(
@@ -216,7 +220,7 @@ def check_features(images: Sequence[Image], config: OrbConfig) -> Finding:
 
 
 def check_sharpness(images: Sequence[Image]) -> Finding:
-    """Check the `sharpness` of images."""
+    """Check the ``sharpness`` of images."""
     values = [sharpness(image) for image in images]
     middle = float(np.median(values))
     return judge(
@@ -229,14 +233,17 @@ def check_sharpness(images: Sequence[Image]) -> Finding:
 
 def sharpness(image: Image) -> float:
     """Contrast of pixels with their neighbours, relative to the contrast with a wider
-    neighbourhood: 0 without fine detail, about 1 for white noise."""
+    neighbourhood.
+
+    It is 0 for an image without fine detail, and about 1 for white noise.
+    """
     grey = image.astype(np.float32)
     fine, wide = (grey - cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1.0, 4.0))
     return float(np.std(fine) / max(float(np.std(wide)), 1e-6))
 
 
 def check_times(timestamps: Times) -> list[Finding]:
-    """Check order, gaps and jitter of timestamps (s), which may be out of order."""
+    """Check the order, gaps and jitter of timestamps (s). They may be out of order."""
     steps = np.diff(timestamps)
     if len(steps) < 3:
         return [Finding("times", "unknown", f"{len(timestamps)} frames are too few")]
@@ -251,7 +258,7 @@ def check_times(timestamps: Times) -> list[Finding]:
             if len(backwards)
             else f", {1 / interval:.1f} Hz"
         ),
-        "sort the frames by time and drop repeated ones",
+        "sort the frames by time and drop repeated frames",
     )
     if len(backwards):
         return [order]
@@ -303,8 +310,11 @@ def check_depth(images: Sequence[Image], depths: Sequence[Depth]) -> list[Findin
 
 
 def _registration(fit: NDArray[np.float32], views: Callable[[], int]) -> Finding:
-    """Check whether the best shift is 0. Another shift is a fault only if it is the single clear
-    peak inside the search range, and more than one view was examined."""
+    """Check whether the best shift is 0.
+
+    Another shift is a fault only if it is the single clear peak inside the search range, and if
+    more than one view was examined.
+    """
     reach = np.array(_REACH)
     best = np.array(np.unravel_index(np.argmax(fit), fit.shape)) - reach
     shifts = np.moveaxis(np.indices(fit.shape), 0, -1) - reach
@@ -329,8 +339,7 @@ def _registration(fit: NDArray[np.float32], views: Callable[[], int]) -> Finding
 
 
 def _edge_fit(image: Image, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """``(33, 97)`` mean edge strength of the image at the depth edges, for each shift of the depth
-    edges."""
+    """``(33, 97)`` mean edge strength of the image at the shifted depth edges, for each shift."""
     down, across = _REACH
     grey = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32)
     strength = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
@@ -343,7 +352,10 @@ def _edge_fit(image: Image, depth: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def depth_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """``(H, W)`` bool: pixels where the depth (0 if missing) jumps by more than a tenth."""
+    """``(H, W)`` bool, True for pixels where the depth jumps by more than a tenth.
+
+    A depth of 0 means that the depth is missing.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         log = np.where(depth > 0, np.log(depth), np.nan)
         jump = np.zeros(depth.shape, bool)

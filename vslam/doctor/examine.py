@@ -1,5 +1,8 @@
-"""Examination of a sequence: all its timestamps, and a few frames spread over it. The result is a
-table of findings, and pictures."""
+"""Examination of a sequence.
+
+All timestamps and a few frames are checked. The frames are spread over the sequence. The result is
+a table of findings, and pictures.
+"""
 
 from __future__ import annotations
 
@@ -21,22 +24,22 @@ from vslam.errors import UnreadableImageError, counted, write_file
 from vslam.report.page import Figure, Page, Section
 from vslam.report.render import html
 
-_FRAMES = 8  # examined frames, spread over the sequence
-_LAGS = range(-2, 3)  # delays of the right image, in frames, that are tried
-# To check the focal length: number of pairs of frames, number of frames from the first to the
-# second of a pair, and least and largest number of common points.
+_FRAMES = 8  # number of examined frames, which are spread over the sequence
+_LAGS = range(-2, 3)  # delays of the right image that are tried, in frames
+# For the check of the focal length: the number of pairs of frames, the number of frames from the
+# first to the second frame of a pair, and the least and largest number of common points.
 _TURNS, _LATER = 16, 4
 _FEWEST, _MOST = 30, 200
 _PICTURES = 2
 _LEAST_DISPARITY = 1.0  # px
-_DRAWN = 60  # matches drawn in a picture
+_DRAWN = 60  # number of matches that are drawn in a picture
 _GAP = 48  # px between the two images of a picture
 _GREEN, _RED = (80, 200, 60), (60, 60, 230)  # BGR
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture for the page; ``image`` is ``(H, W, 3)`` uint8, BGR."""
+    """A picture for the page. ``image`` is ``(H, W, 3)`` uint8, BGR."""
 
     caption: str
     image: Image
@@ -51,7 +54,7 @@ class Diagnosis:
 
     @property
     def faults(self) -> list[Finding]:
-        """The findings that need repair."""
+        """The findings that are faults."""
         return [finding for finding in self.findings if finding.verdict == "fault"]
 
 
@@ -101,8 +104,10 @@ def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
 
 
 def _examine_mask(sequence: Source, lefts: dict[int, Image]) -> tuple[list[Finding], list[Picture]]:
-    """Measure which share of the first image the mask hides, and draw this part in red; return
-    empty lists without a mask."""
+    """Measure which share of the first image the mask hides, and draw this part in red.
+
+    The two lists of the result are empty if there is no mask.
+    """
     frame = next(iter(lefts), None)
     read = None if frame is None else sequence.stored[frame].mask
     if frame is None or read is None:
@@ -128,12 +133,12 @@ class _Pair:
 
     @property
     def rows(self) -> float:
-        """Median vertical error (px)."""
+        """Median vertical error of the matches (px)."""
         return float(np.median(np.abs(self.matches.left[:, 1] - self.matches.right[:, 1])))
 
 
 def _pairs(sequence: Source, lefts: dict[int, Image], lag: int) -> list[_Pair]:
-    """Pair each left image with the right image ``lag`` frames later, if this can be read."""
+    """Pair each left image with the right image ``lag`` frames later, if this image can be read."""
     found = []
     for frame, left in lefts.items():
         try:
@@ -188,8 +193,10 @@ def _examine_focal_length(sequence: Source, found: list[Finding]) -> list[Findin
 
 
 def _track(sequence: Source, frame: int) -> Moved | None:
-    """Find points of a frame, their disparities and their positions a few frames later; None if
-    there are too few points or an image cannot be read."""
+    """Find points of a frame, their disparities, and their positions a few frames later.
+
+    The result is None if there are too few points or if an image cannot be read.
+    """
     try:
         left, second = sequence.read(frame)
         later, _ = sequence.read(frame + _LATER)
@@ -210,7 +217,7 @@ def _track(sequence: Source, frame: int) -> Moved | None:
 def _disparities(
     xy: NDArray[np.float32], left: Image, second: Image | DepthImage, camera: Camera
 ) -> NDArray[np.float64]:
-    """``(N,)`` disparities of ``(N, 2)`` keypoints of the left image, 0 if unknown."""
+    """``(N,)`` disparities of ``(N, 2)`` keypoints of the left image. An unknown disparity is 0."""
     if second.dtype != np.uint8:
         x, y = np.rint(xy).astype(int).T
         depth = np.asarray(second, np.float64)[y, x]
@@ -226,7 +233,7 @@ def _disparities(
 
 
 def _rows_by_lag(by_lag: dict[int, list[_Pair]]) -> dict[int, float]:
-    """Median vertical error for each lag, over the frames that have matches at all lags."""
+    """Median vertical error for each lag. Only frames that have matches at all lags are used."""
     rows = {
         lag: {pair.frame: pair.rows for pair in pairs if len(pair.matches)}
         for lag, pairs in by_lag.items()
@@ -240,10 +247,11 @@ def _rows_by_lag(by_lag: dict[int, list[_Pair]]) -> dict[int, float]:
 
 
 def _stereo_picture(pair: _Pair) -> Picture:
-    """Draw both images side by side with a line for each match, green if its rows agree."""
+    """Draw both images side by side, with a line for each match. The line is green if the rows
+    agree."""
     left, right, matches = pair.left, pair.right, pair.matches
     height, width = left.shape
-    begin = width + _GAP  # of the right image
+    begin = width + _GAP  # first column of the right image
     canvas = np.full((max(height, right.shape[0]), begin + right.shape[1]), 255, np.uint8)
     canvas[:height, :width] = left
     canvas[: right.shape[0], begin:] = right
@@ -268,12 +276,13 @@ def _depth_picture(image: Image, depth: checks.Depth) -> Picture:
     """Draw the depth edges over the image."""
     drawn = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     drawn[checks.depth_edges(np.nan_to_num(depth.astype(np.float32)))] = _RED
-    caption = "Depth edges in red; they lie on the edges of objects if the depth is registered."
+    caption = "Depth edges in red. They lie on the edges of objects if the depth is registered."
     return Picture(caption, np.asarray(drawn, np.uint8))
 
 
 def write_page(diagnosis: Diagnosis, title: str, path: Path) -> None:
-    """Write the page as self-contained HTML: faults with their fixes first, then the other checks.
+    """Write the page as self-contained HTML. Faults and their fixes come first, then the other
+    checks.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -288,7 +297,7 @@ def write_page(diagnosis: Diagnosis, title: str, path: Path) -> None:
         [counted(faults, "fault") if faults else "no faults"],
         [*sections(diagnosis.findings), Section("", figures)],
     )
-    write_file(path, html(page), "name another file with --out")
+    write_file(path, html(page), "give another file with --out")
 
 
 def _jpeg(picture: Picture) -> bytes:

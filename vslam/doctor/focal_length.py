@@ -2,8 +2,8 @@
 
 With a wrong focal length, a stereo pair reconstructs a scene that is stretched along the optical
 axis. A pure translation of the camera is consistent with such a scene, but a rotation about any
-axis other than the optical axis is not. The estimate is the focal length with the least
-reprojection error, after the motion between two frames was optimised for each focal length.
+axis other than the optical axis is not. For each focal length, the motion between two frames is
+optimised. The estimate is the focal length with the least reprojection error.
 """
 
 from __future__ import annotations
@@ -19,23 +19,24 @@ from vslam.camera import Camera
 
 Vectors = NDArray[np.float64]
 
-_PIXEL, _DISPARITY = 0.35, 0.3  # px, standard deviations of matches refined by optical flow
+_PIXEL, _DISPARITY = 0.35, 0.3  # px, standard deviations of refined matches
 # Squared error, divided by its variance, at which the weight of a point is one half. For 95 % of
-# the inliers, the squared error is less than 6 variances.
+# the inliers, the squared error is less than 6 times the variance.
 _CAUCHY = 5.0
 _ITERATIONS = 12
 _FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.6, 1.8, 2.0)  # of the coarse search
-_PRECISION = 1e-3  # of the logarithm of the factor
-_STEP = 0.02  # of the logarithm of the factor, to measure the curvature at the minimum
+_PRECISION = 1e-3  # precision of the logarithm of the factor
+_STEP = 0.02  # step of the logarithm of the factor, to measure the curvature at the minimum
 
 
 @dataclass(frozen=True)
 class Moved:
-    """N points seen in two frames.
+    """N points that were seen in two frames.
 
     Attributes:
-        before, after: ``(N, 2)`` pixels in the left images of the first and the second frame.
-        disparity: ``(N,)`` pixels, in the first frame.
+        before, after: ``(N, 2)`` positions in pixels in the left images of the first and the second
+            frame.
+        disparity: ``(N,)`` disparities in the first frame, in pixels.
     """
 
     before: Vectors
@@ -45,13 +46,13 @@ class Moved:
 
 @dataclass(frozen=True)
 class FocalFit:
-    """The focal length that fits best.
+    """The focal length that fits the motion of the camera best.
 
     Attributes:
-        factor: its ratio to the calibrated focal length.
+        factor: ratio of this focal length to the calibrated focal length.
         sigma: standard deviation of the logarithm of ``factor``.
-        turned: largest rotation (degrees) about an axis perpendicular to the optical axis, among
-            the frames whose points agree with ``factor``.
+        turned: largest rotation about an axis perpendicular to the optical axis, in degrees. Only
+            frames whose points agree with ``factor`` are considered.
     """
 
     factor: float
@@ -60,12 +61,14 @@ class FocalFit:
 
 
 def fit_focal_length(several: Sequence[Moved], camera: Camera) -> FocalFit:
-    """Find the focal length that fits the motion best, between 0.5 and 2 times the calibrated one.
+    """Find the focal length that fits the motion best.
+
+    The search covers 0.5 to 2 times the calibrated focal length.
 
     Args:
         several: at least one pair of frames, each with at least three points.
-        camera: stereo or RGB-D camera; disparities of an RGB-D camera are those of its virtual
-            baseline.
+        camera: stereo or RGB-D camera. The disparities of an RGB-D camera are computed with its
+            virtual baseline.
     """
     from scipy.optimize import minimize_scalar
 
@@ -101,8 +104,11 @@ def fit_focal_length(several: Sequence[Moved], camera: Camera) -> FocalFit:
 def _best_pose(
     moved: Moved, camera: Camera, factor: float, start: Vectors
 ) -> tuple[Vectors, float]:
-    """Optimise the motion by Gauss-Newton with Cauchy's loss: ``(6,)`` rotation vector and
-    translation, and their loss."""
+    """Optimise the motion by Gauss-Newton with a Cauchy loss.
+
+    Returns:
+        The motion as ``(6,)`` rotation vector and translation, and its loss.
+    """
     pose = start
     for _ in range(_ITERATIONS):
         error, variance, points = _errors(moved, camera, factor, pose)
@@ -129,7 +135,10 @@ def _errors(
     moved: Moved, camera: Camera, factor: float, pose: Vectors
 ) -> tuple[Vectors, Vectors, Vectors]:
     """``(N, 2)`` reprojection errors, their ``(N,)`` variances, and ``(N, 3)`` points in the later
-    frame. The variances include the uncertainty of the depths of the points."""
+    frame.
+
+    The variances include the uncertainty of the depths of the points.
+    """
     projected, points = _project(moved.before, moved.disparity, camera, factor, pose)
     nearer, _ = _project(moved.before, moved.disparity + _DISPARITY, camera, factor, pose)
     return moved.after - projected, _PIXEL**2 + ((nearer - projected) ** 2).sum(axis=1), points
@@ -142,12 +151,12 @@ def _project(
     z = f[0] * camera.baseline / disparity
     points = np.column_stack([(xy - centre) / f * z[:, None], z])
     points = points @ cv2.Rodrigues(pose[:3])[0].T + pose[3:]
-    ahead = np.maximum(points[:, 2:], 1e-3 * camera.baseline)  # points behind get large errors
+    ahead = np.maximum(points[:, 2:], 1e-3 * camera.baseline)  # points behind it get large errors
     return points[:, :2] / ahead * f + centre, points
 
 
 def _jacobian(points: Vectors, camera: Camera, factor: float, pose: Vectors) -> Vectors:
-    """``(N, 2, 6)`` derivatives of the pixels with respect to rotation and translation."""
+    """``(N, 2, 6)`` derivatives of the pixel positions with respect to rotation and translation."""
     x, y, z = points.T
     z = np.maximum(z, 1e-3 * camera.baseline)
     zero = np.zeros_like(z)

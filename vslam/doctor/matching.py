@@ -1,4 +1,4 @@
-"""Match two images without assumptions about the poses of the cameras.
+"""Matching of two images without assumptions about the poses of the cameras.
 
 A run searches for stereo matches only in the same rows, but a check of the rectification must
 search the whole image.
@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from vslam.camera import Image
 
 _FEATURES = 2000
-_MAX_DISTANCE = 64  # bits of 256; ORB-SLAM2's TH_LOW is 50
+_MAX_DISTANCE = 64  # bits, of 256; TH_LOW of ORB-SLAM2 is 50
 _EPIPOLAR_PX = 1.5
-_REFINED_PX = 3.0  # largest move by refinement: keypoints of coarse octaves can be this inaccurate
+_REFINED_PX = 3.0  # largest refinement; keypoints of coarse octaves can be this inaccurate
 _WINDOW = (15, 15)
 _MIN_MATCHES = 12
 _ANOTHER_VIEW = 0.25  # least median motion between two different views, relative to the image width
@@ -26,10 +26,10 @@ _ANOTHER_VIEW = 0.25  # least median motion between two different views, relativ
 
 @dataclass(frozen=True)
 class Matches:
-    """Pixels of the same N points in two images, accurate to about 0.1 px.
+    """Positions of the same N points in two images, accurate to about 0.1 px.
 
     Attributes:
-        left, right: ``(N, 2)`` float32.
+        left, right: ``(N, 2)`` float32 positions in pixels.
     """
 
     left: NDArray[np.float32]
@@ -40,8 +40,10 @@ class Matches:
 
 
 def match_images(left: Image, right: Image) -> Matches:
-    """Find ORB matches that satisfy one epipolar geometry, and refine them by optical flow; no
-    matches are returned if there are fewer than twelve."""
+    """Find ORB matches that satisfy one epipolar geometry, and refine them by optical flow.
+
+    If there are fewer than twelve matches, no matches are returned.
+    """
     orb = cv2.ORB.create(_FEATURES)
     kp_left, d_left = orb.detectAndCompute(left, None)
     kp_right, d_right = orb.detectAndCompute(right, None)
@@ -70,7 +72,7 @@ def match_images(left: Image, right: Image) -> Matches:
 
 
 def count_views(images: Sequence[Image]) -> int:
-    """Number of different views in a sequence of images."""
+    """Number of clearly different views in a sequence of images."""
     views: list[Image] = []
     for image in images:
         if not any(_same_view(image, view) for view in views):
@@ -85,7 +87,7 @@ def _same_view(image: Image, other: Image) -> bool:
 
 
 def joined(several: list[Matches]) -> Matches:
-    """The matches of at least one pair of images, joined."""
+    """Join the matches of several pairs of images. At least one pair is needed."""
     return Matches(
         np.concatenate([matches.left for matches in several]),
         np.concatenate([matches.right for matches in several]),
@@ -93,7 +95,8 @@ def joined(several: list[Matches]) -> Matches:
 
 
 def _normalised(image: Image, model: Image) -> Image:
-    """Give an image the brightness and contrast of another one, as optical flow assumes."""
+    """Give an image the brightness and contrast of another image, because optical flow assumes
+    this."""
     gain = float(model.std()) / max(float(image.std()), 1.0)
     shifted = (image.astype(np.float32) - image.mean()) * gain + model.mean()
     return np.clip(np.rint(shifted), 0, 255).astype(np.uint8)

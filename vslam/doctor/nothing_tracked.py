@@ -1,4 +1,4 @@
-"""Explain why a run tracked no frame, from a few of its frames."""
+"""Explanation why a run tracked no frame. A few of its frames are examined."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ from vslam.errors import InputError, counted
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
 
-_FRAMES = 3  # enough to tell the sign of the disparity, because each has hundreds of matches
+_FRAMES = 3  # they determine the sign of the disparity: each has hundreds of matches
 
 
 def why_nothing_was_tracked(outcome: RunOutcome) -> str | None:
-    """Explain in one sentence why no frame of a run was tracked and what the user can do; None if a
-    frame was tracked."""
+    """Explain in one sentence why no frame of a run was tracked, and what the user can do.
+
+    The result is None if a frame was tracked.
+    """
     n, options = len(outcome.tracks), outcome.settings
     if n == 0 or outcome.n_tracked:
         return None
@@ -46,7 +48,8 @@ def why_nothing_was_tracked(outcome: RunOutcome) -> str | None:
 
 
 def _negative_disparity(source: Source) -> float | None:
-    """Median disparity (px) of a few frames if left and right seem to be swapped, else None."""
+    """Median disparity (px) of a few frames if left and right seem to be swapped; otherwise
+    None."""
     found = []
     try:
         for frame in islice(source.frames(), _FRAMES):
@@ -67,11 +70,11 @@ def how_to_swap(dataset: str, options: RunOptions) -> str:
     if dataset == "images" and options.right is not None:
         return f"swap them: --data {options.right} --right {options.data}"
     if dataset == "images":
-        return "name the folders the other way round with --data and --right"
+        return "swap the folders of --data and --right"
     if dataset == "bag" and options.topics:
         return f"swap them: --topics {','.join(reversed(options.topics.split(',')))}"
     if dataset == "bag":
-        return "name the topics the other way round with --topics"
+        return "swap the two topics of --topics"
     if dataset == "video":
         return "swap the halves of the images: the left camera's half must be on the left"
     folders = {"kitti": "image_0 and image_1", "euroc": "cam0 and cam1"}

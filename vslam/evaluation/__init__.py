@@ -1,1 +1,1 @@
-"""Evaluation of trajectories and loops against a ground truth."""
+"""Evaluation of trajectories and loop closures against ground truth."""

@@ -1,8 +1,7 @@
 """Evaluation of loops: where the camera revisited a place, and whether a loop was closed there.
 
-ATE alone does not show this: without drift, a missed loop causes no error, and a wrong loop may
-distort only a part of the map with few frames. Here, each loop and each revisit is judged by
-itself.
+ATE alone does not show this. Without drift, a missed loop causes no error. A wrong loop may distort
+only a part of the map with few frames. Therefore, each loop and each revisit is judged separately.
 """
 
 from __future__ import annotations
@@ -19,19 +18,19 @@ from vslam.loops import LoopEdge
 from vslam.run.outcome import RunOutcome, ground_truth_of
 
 # Definition of a revisit.
-MIN_LENGTH_M = 20.0  # of the stretch
-MAX_LATERAL_M = 5.0  # from the earlier path; the next lane is 3 to 4 m away
-MAX_HEADING_DEG = 30.0  # between the optical axes; seen from behind, a place looks different
-MIN_SECONDS, MIN_PATH_M = 10.0, 50.0  # since the earlier passage
-# Stretches with a shorter gap between them count as one stretch, because tracking continues in the
-# old map across the gap.
+MIN_LENGTH_M = 20.0  # least length of a stretch
+MAX_LATERAL_M = 5.0  # distance from the earlier path; the next lane is 3 to 4 m away
+MAX_HEADING_DEG = 30.0  # angle between the optical axes; a place looks different from behind
+MIN_SECONDS, MIN_PATH_M = 10.0, 50.0  # time and distance since the earlier passage
+# Two stretches with a shorter gap between them count as one stretch, because tracking continues in
+# the old map across the gap.
 MAX_INTERRUPTION_M = 10.0
-# Largest error of the relative pose of a correct loop: well above the error of KITTI's ground truth
-# between two passages, and well below the distance between similar houses in a row.
+# Largest error of the relative pose of a correct loop. It is well above the error of KITTI's ground
+# truth between two passages, and well below the distance between similar houses in a row.
 MAX_TRANSLATION_M, MAX_ROTATION_DEG = 2.0, 5.0
 _SAMPLE_M = 1.0  # the path is sampled once per metre, so that a standing camera adds no samples
 _UNIT_FRAMES = 20  # frames before and after a frame from which the unit of the map is estimated
-_MAX_STEP_M = 20.0  # between two frames that are farther apart, the path is unknown
+_MAX_STEP_M = 20.0  # the path is unknown between two frames that are farther apart
 
 Indices = NDArray[np.int64]
 Poses = NDArray[np.float64]
@@ -39,12 +38,13 @@ Poses = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Revisits:
-    """M stretches of the path, in order, on which the camera revisits places.
+    """M stretches of the path on which the camera revisits places, in order.
 
     Attributes:
         first, last: ``(M,)`` first and last frame of each stretch.
-        first_match, last_match: ``(M,)`` earlier frames at the places of ``first`` and ``last``.
-        length_m: ``(M,)`` length of each stretch.
+        first_match, last_match: ``(M,)`` earlier frames at the same places as ``first`` and
+            ``last``.
+        length_m: ``(M,)`` length of each stretch in metres.
     """
 
     first: Indices
@@ -63,9 +63,9 @@ class LoopEvaluation:
 
     Attributes:
         revisits: M stretches.
-        loop_frame: ``(M,)`` query frame of the first correct loop that was closed on each stretch;
-            -1 if no correct loop was closed there.
-        right: for each edge, including rejected edges, whether its relative pose is right; None if
+        loop_frame: ``(M,)`` query frame of the first correct loop that was closed on each stretch.
+            It is -1 if no correct loop was closed there.
+        right: whether the relative pose of each edge is right, including rejected edges. None if
             the edge has no pose or its frames have no ground truth.
         n_wrong: number of accepted edges whose relative pose is wrong.
     """
@@ -92,8 +92,8 @@ class LoopEvaluation:
 def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
     """Judge the loops of a run by the ground truth of its frames.
 
-    Returns None if a frame has no ground truth, because revisits cannot be found on a path with
-    gaps.
+    The result is None if a frame has no ground truth, because revisits cannot be found on a path
+    with gaps.
     """
     truth = ground_truth_of(outcome.sequence)
     if truth is None or not len(outcome.trajectory):
@@ -111,13 +111,13 @@ def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
 
 
 def metres_per_unit(T_wc: Poses, T_wc_true: Poses) -> NDArray[np.float64]:
-    """``(N,)`` metres per unit of a monocular map at the time of each frame.
+    """``(N,)`` metres per map unit of a monocular map at the time of each frame.
 
-    It is the median ratio of the true to the estimated distance between consecutive frames, over
-    the 41 frames around each frame; 1 if the camera did not move.
+    It is the median ratio of the true distance to the estimated distance between consecutive
+    frames, over the 41 frames around each frame. It is 1 if the camera did not move.
 
     Args:
-        T_wc: ``(N, 4, 4)`` poses as tracked.
+        T_wc: ``(N, 4, 4)`` poses at the time of tracking.
         T_wc_true: ``(N, 4, 4)`` ground truth.
     """
     true, estimated = (
@@ -142,11 +142,12 @@ def _in_metres(edge: LoopEdge, metres: float) -> LoopEdge:
 
 
 def revisits(T_wc: Poses, timestamps: NDArray[np.float64]) -> Revisits:
-    """Find the stretches on which the camera drives where it drove before, in the same direction.
+    """Find the stretches on which the camera revisits places in the same direction.
 
-    A frame is a revisit if, at least ``MIN_SECONDS`` and ``MIN_PATH_M`` earlier, the camera passed
-    within ``MAX_LATERAL_M`` of it with a heading that differed by at most ``MAX_HEADING_DEG``. The
-    path between two frames is assumed to be straight.
+    A frame is a revisit if the camera passed within ``MAX_LATERAL_M`` of the same position earlier,
+    with a heading that differed by at most ``MAX_HEADING_DEG``. The earlier passage must be at
+    least ``MIN_SECONDS`` and ``MIN_PATH_M`` before. The path between two frames is assumed to be
+    straight.
 
     Args:
         T_wc: ``(N, 4, 4)`` ground truth.
@@ -187,16 +188,17 @@ def judge_loops(
     T_wc: Poses,
     timestamps: NDArray[np.float64],
 ) -> LoopEvaluation:
-    """Determine whether each edge is right, and whether each revisit was found by a loop.
+    """Determine whether each loop edge is right, and whether each revisit was found by a loop.
 
     An edge is right if ``T_query_match`` agrees with the ground truth within ``MAX_TRANSLATION_M``
-    and ``MAX_ROTATION_DEG``. A right and accepted edge finds a stretch if its match belongs to an
-    earlier passage (not to the frames just before) and its query lies on the stretch or within
-    ``MAX_INTERRUPTION_M`` of it: a camera sees a place also shortly before and after it is there.
+    and ``MAX_ROTATION_DEG``. A right and accepted edge finds a stretch under two conditions. Its
+    match must belong to an earlier passage, not to the frames directly before. Its query must lie
+    on the stretch or within ``MAX_INTERRUPTION_M`` of it, because a camera also sees a place
+    shortly before and after it is there.
 
     Args:
-        edges: E loops, accepted or not.
-        frames: ``(K,)`` frame of each keyframe, -1 if the keyframe belongs to another drive.
+        edges: accepted and rejected loops.
+        frames: ``(K,)`` frame of each keyframe. It is -1 if the keyframe belongs to another drive.
         T_wc: ``(N, 4, 4)`` ground truth of the frames.
         timestamps: ``(N,)`` seconds.
     """
@@ -223,8 +225,10 @@ def judge_loops(
 
 
 def is_right_loop(edge: LoopEdge, frames: Indices, T_wc: Poses) -> bool | None:
-    """Whether the relative pose of a loop agrees with the ground truth, as in `judge_loops`; None
-    if the loop has no pose or its frames have no ground truth."""
+    """Whether the relative pose of a loop agrees with the ground truth, as in ``judge_loops``.
+
+    The result is None if the loop has no pose or if its frames have no ground truth.
+    """
     if edge.T_query_match is None or edge.query < 0:
         return None
     query, match = frames[edge.query], frames[edge.match]
@@ -232,7 +236,7 @@ def is_right_loop(edge: LoopEdge, frames: Indices, T_wc: Poses) -> bool | None:
         return None
     T_wq, T_wm = T_wc[query], T_wc[match]
     T_match_query = inverses(T_wm[None])[0] @ T_wq
-    error = edge.T_query_match @ T_match_query  # the identity if the edge is right
+    error = edge.T_query_match @ T_match_query  # it is the identity if the edge is right
     cosine = np.clip((np.trace(error[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)
     return bool(
         np.linalg.norm(error[:3, 3]) <= MAX_TRANSLATION_M
@@ -243,12 +247,14 @@ def is_right_loop(edge: LoopEdge, frames: Indices, T_wc: Poses) -> bool | None:
 def _earlier_passage(
     T_wc: Poses, timestamps: NDArray[np.float64], path: NDArray[np.float64]
 ) -> Indices:
-    """``(S,)`` index of the nearest sample of an earlier passage for each sample of the path; -1 if
-    the camera was not there before."""
+    """``(S,)`` index of the nearest sample of an earlier passage, for each sample of the path.
+
+    The index is -1 if the camera was not there before.
+    """
     from scipy.spatial import cKDTree
 
     position, axis = T_wc[:, :3, 3], T_wc[:, :3, 2]
-    forward = np.diff(position, axis=0, append=position[-1:])  # to the next sample
+    forward = np.diff(position, axis=0, append=position[-1:])  # vector to the next sample
     length = np.linalg.norm(forward, axis=1)
     forward[length > _MAX_STEP_M] = 0.0
     length[length > _MAX_STEP_M] = 0.0

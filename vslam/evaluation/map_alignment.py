@@ -1,8 +1,8 @@
 """The transformation from a map to its ground truth, and the error of localisation in the map.
 
-A trajectory is usually aligned with its ground truth before the comparison. Frames that were
-localised in a map are instead transformed by the alignment of the map, so that their error includes
-the error of the map.
+A trajectory is usually aligned with its ground truth before both are compared. Frames that were
+localised in a map are not aligned in this way. They are transformed by the alignment of the map, so
+their error includes the error of the map.
 """
 
 from __future__ import annotations
@@ -16,14 +16,18 @@ from vslam.run.outcome import RunOutcome
 
 
 def name_of_world(outcome: RunOutcome) -> str:
-    """Name of the world frame of a run's ground truth. All rendered drives along a route have the
-    same name, whatever their light and traffic."""
+    """Name of the world frame of the ground truth of a run.
+
+    All rendered drives along a route have the same name, even if their light or traffic differ.
+    """
     return f"{outcome.sequence.dataset} {outcome.sequence.name.partition('+')[0]}"
 
 
 def truth_alignment_of(outcome: RunOutcome, evaluation: Evaluation) -> TruthAlignment:
-    """The transformation from a map to its ground truth: the alignment of the trajectory of the
-    run that made the map."""
+    """The transformation from a map to its ground truth.
+
+    It is the alignment of the trajectory of the run that made the map.
+    """
     truth = outcome.ground_truth
     assert truth is not None
     kept = np.isin(outcome.trajectory.timestamps, truth.timestamps)
@@ -32,8 +36,11 @@ def truth_alignment_of(outcome: RunOutcome, evaluation: Evaluation) -> TruthAlig
 
 
 def error_in_map(outcome: RunOutcome) -> float | None:
-    """Position RMSE (m) of the frames that were localised in the map that a run continued; None if
-    the transformation from this map to the ground truth of the run is unknown."""
+    """Position RMSE in metres of the frames that were localised in the map that a run continued.
+
+    The result is None if the transformation from this map to the ground truth of the run is
+    unknown.
+    """
     alignment, truth = outcome.truth_alignment, outcome.ground_truth
     if alignment is None or truth is None or outcome.in_map is None:
         return None
@@ -46,7 +53,7 @@ def error_in_map(outcome: RunOutcome) -> float | None:
 
 
 def _similarity(T_wc: Matrix, aligned: Matrix) -> Matrix:
-    """``(4, 4)`` similarity that maps ``(N, 4, 4)`` poses to the aligned ones."""
+    """``(4, 4)`` similarity that maps ``(N, 4, 4)`` poses to the ``(N, 4, 4)`` aligned poses."""
     spread, aligned_spread = (
         np.linalg.norm(T[:, :3, 3] - T[:, :3, 3].mean(axis=0)) for T in (T_wc, aligned)
     )

@@ -1,4 +1,4 @@
-"""Errors of odometry over short motions, and the errors that its covariances predict."""
+"""Errors of odometry over short motions, compared with the errors that its covariances predict."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from vslam.trajectory import Trajectory
 
 @dataclass(frozen=True, eq=False)
 class MotionErrors:
-    """Errors of M motions over an interval of time.
+    """Errors of M motions. All motions have about the same duration.
 
     Attributes:
         first: ``(M,)`` int64, index of the frame in which each motion begins.
-        xi: ``(M, 6)`` errors in metres and radians, in the camera frame at the end: the true motion
-            is ``exp(xi) T_last_first``.
+        xi: ``(M, 6)`` errors in metres and radians, in the camera frame at the end of the motion.
+            The true motion is ``exp(xi) T_last_first``.
         covariance: ``(M, 6, 6)`` covariances of ``xi`` that ``relative_covariance`` predicts.
     """
 
@@ -32,32 +32,36 @@ class MotionErrors:
     @property
     def nees(self) -> NDArray[np.float64]:
         """``(M,)`` normalised estimation errors squared (NEES), divided by the six degrees of
-        freedom, so that their mean is 1 if the covariances are right (Bar-Shalom et al., Estimation
-        with Applications to Tracking and Navigation, 2001, 5.4)."""
+        freedom.
+
+        Their mean is 1 if the covariances are right (Bar-Shalom et al., Estimation with
+        Applications to Tracking and Navigation, 2001, 5.4).
+        """
         solved = np.linalg.solve(self.covariance, self.xi[:, :, None])[:, :, 0]
         return np.asarray((self.xi * solved).sum(axis=1) / 6.0, np.float64)
 
     @property
     def distance(self) -> NDArray[np.float64]:
-        """``(M,)`` errors of the translation, metres."""
+        """``(M,)`` errors of the translation in metres."""
         return np.asarray(np.linalg.norm(self.xi[:, :3], axis=1), np.float64)
 
     @property
     def sigma(self) -> NDArray[np.float64]:
-        """``(M,)`` predicted standard deviations of the translation, metres."""
+        """``(M,)`` predicted standard deviations of the translation in metres."""
         return np.asarray(np.sqrt(np.trace(self.covariance[:, :3, :3], axis1=1, axis2=2)))
 
 
 def motion_errors(
     tracks: Sequence[TrackResult], truth: Trajectory, interval_s: float
 ) -> MotionErrors:
-    """Compare the motions of odometry with the true ones.
+    """Compare the motions that odometry measured with the true motions.
 
     Args:
-        tracks: one result per frame; frames without an uncertainty or a true pose are not used.
+        tracks: result of tracking each frame. Frames without an uncertainty or without a true pose
+            are not used.
         truth: true poses at the times of some or all frames.
-        interval_s: duration of a motion; it ends at the first frame that is at least this many
-            seconds later.
+        interval_s: duration of a motion in seconds. The motion ends at the first frame that is at
+            least this much later.
     """
     true_pose = dict(zip(truth.timestamps.tolist(), truth.T_wc, strict=True))
     usable = [

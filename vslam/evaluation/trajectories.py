@@ -1,7 +1,7 @@
-"""Errors of a trajectory, by their usual definitions: ATE, RPE and KITTI's drift.
+"""Error metrics of a trajectory by their usual definitions: ATE, RPE and KITTI's drift.
 
-evo (Grupp, 2017) computes ATE and RPE, and its command line reproduces them. Only this module
-imports evo.
+The package evo (Grupp, 2017) computes ATE and RPE. Therefore, its command line reproduces them.
+Only this module imports evo.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from vslam.errors import InputError, counted
 from vslam.trajectory import Trajectory, read_table, read_trajectory, trajectory_format
 
-MAX_TIME_DIFFERENCE_S = 0.01  # evo's default
+MAX_TIME_DIFFERENCE_S = 0.01  # the default of evo
 _LENGTHS_M = np.arange(100.0, 801.0, 100.0)
 _STEP_FRAMES = 10
 _EVO_FLAGS = {"se3": " --align", "sim3": " --align --correct_scale", "none": ""}
@@ -28,18 +28,19 @@ class Evaluation:
     """Errors of an estimate against the ground truth over N matched frames.
 
     Attributes:
-        frames: N, number of compared frames.
-        alignment: ``se3``, ``sim3`` or ``none``, the transformation fitted before the comparison.
-        on_one_line: whether all positions lie on one line. The rotation about this line was then
-            fitted to the orientations, because the positions do not determine it. evo rejects such
-            trajectories.
-        timestamps: ``(N,)`` seconds of the estimate.
+        frames: number N of compared frames.
+        alignment: ``se3``, ``sim3`` or ``none``, the kind of transformation that was fitted before
+            the comparison.
+        on_one_line: whether all positions lie on one line. In this case, the positions do not
+            determine the rotation about this line, so it was fitted to the orientations. evo
+            rejects such trajectories.
+        timestamps: ``(N,)`` timestamps of the estimate in seconds.
         ate_rmse_m, ate_mean_m, ate_max_m: RMSE, mean and maximum of ``errors_m``.
-        errors_m: ``(N,)`` distance of each aligned position from the ground truth.
-        T_wc_aligned: ``(N, 4, 4)`` the estimate, aligned to the ground truth.
-        distances_m: ``(N,)`` path length along the ground truth up to each frame.
-        rpe_m, rpe_deg: RMSE of the motion from one frame to the next.
-        t_rel_percent, r_rel_deg_per_100m: KITTI's drift over 100 to 800 m; None if the path is
+        errors_m: ``(N,)`` distance of each aligned position from the ground truth, in metres.
+        T_wc_aligned: ``(N, 4, 4)`` poses of the estimate, aligned with the ground truth.
+        distances_m: ``(N,)`` path length along the ground truth up to each frame, in metres.
+        rpe_m, rpe_deg: RMSE of the motion from one frame to the next, in metres and degrees.
+        t_rel_percent, r_rel_deg_per_100m: KITTI's drift over 100 to 800 m. None if the path is
             shorter than 100 m.
     """
 
@@ -68,14 +69,17 @@ class Evaluation:
 def evaluate_trajectory(
     estimate: Trajectory, ground_truth: Trajectory, alignment: str = "se3"
 ) -> Evaluation:
-    """Compare an estimate with the ground truth after alignment by ``se3`` or ``sim3``, or without
-    alignment (``none``).
+    """Compare an estimated trajectory with the ground truth.
+
+    The alignment is ``se3``, ``sim3``, or ``none`` to compare without alignment.
 
     Trajectories with the same timestamps are compared frame by frame. Otherwise, each pose is
-    compared with the true pose nearest in time if that is at most 10 ms away;
-    ``Evaluation.frames`` is the number of such pairs. ATE is the RMSE of the positions [Sturm et
-    al., IROS 2012] after alignment by Umeyama's method (TPAMI 1991; without scale for ``se3``). RPE
-    is computed from one frame to the next, and KITTI's drift by `kitti_drift`.
+    compared with the true pose that is nearest in time, if the two timestamps differ by at most 10
+    ms. ``Evaluation.frames`` is the number of such pairs.
+
+    ATE is the RMSE of the positions [Sturm et al., IROS 2012] after alignment by Umeyama's method
+    (TPAMI 1991). With ``se3``, no scale is fitted. RPE is computed from one frame to the next.
+    KITTI's drift is computed by ``kitti_drift``.
 
     Raises:
         InputError: the alignment is unknown, the trajectories have no common frames, or the camera
@@ -129,7 +133,7 @@ def evaluate_trajectory(
 
 
 def _align(estimate: Any, reference: Any, with_scale: bool) -> bool:
-    """Align a trajectory of evo in place; returns whether the positions lie on one line.
+    """Align a trajectory of evo in place, and return whether its positions lie on one line.
 
     Positions on a line do not determine the rotation about the line. In this case, a point to the
     right of each camera and a point below it are aligned together with the positions.
@@ -152,7 +156,7 @@ def _align(estimate: Any, reference: Any, with_scale: bool) -> bool:
 
 
 def _with_axes(trajectory: Any) -> NDArray[np.float64]:
-    """``(3, 3N)`` positions, and points to the right of and below each of them."""
+    """``(3, 3N)`` positions, and for each of them a point to its right and a point below it."""
     T_wc = np.array(trajectory.poses_se3)
     position = T_wc[:, :3, 3]
     short = 1e-3 * np.linalg.norm(position.std(axis=0))
@@ -161,7 +165,7 @@ def _with_axes(trajectory: Any) -> NDArray[np.float64]:
 
 
 def path_length(T_wc: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``(N,)`` metres travelled up to each of ``(N, 4, 4)`` poses."""
+    """``(N,)`` distance travelled up to each of ``(N, 4, 4)`` poses, in metres."""
     steps = np.linalg.norm(np.diff(T_wc[:, :3, 3], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
@@ -180,8 +184,8 @@ def kitti_drift(
         T_wc_ground_truth: ``(N, 4, 4)`` ground truth of the same frames.
 
     Returns:
-        ``t_rel`` in percent and ``r_rel`` in degrees per 100 m; None if the path is shorter than
-        100 m.
+        ``t_rel`` in percent and ``r_rel`` in degrees per 100 m. The result is None if the path is
+        shorter than 100 m.
     """
     distances = path_length(T_wc_ground_truth)
     starts = np.arange(0, len(distances), _STEP_FRAMES)
@@ -203,21 +207,21 @@ def kitti_drift(
 def read_pair(
     estimate: Path | str, ground_truth: Path | str, times: Path | str | None = None
 ) -> tuple[Trajectory, Trajectory]:
-    """Read an estimate and its ground truth, each in KITTI's or TUM's format.
+    """Read an estimated trajectory and its ground truth, each in the format of KITTI or TUM.
 
     Args:
-        times: file with the time of each frame in seconds, one per line (``times.txt``), for files
-            in KITTI's format, which have no times.
+        times: file with the timestamp of each frame in seconds, one per line (``times.txt``). It is
+            needed for files in KITTI's format, which contain no timestamps.
 
     Raises:
-        InputError: a file is malformed, or the files cannot be matched without times.
+        InputError: a file is malformed, or the files cannot be matched without timestamps.
     """
     timestamps = None if times is None else read_table(times, (1,), "a time in seconds")[:, 0]
     formats = {trajectory_format(estimate), trajectory_format(ground_truth)}
     if timestamps is None and len(formats) == 2:
         raise InputError(
             f"{estimate} and {ground_truth}: one is a KITTI file, which has no times; "
-            "give its times with --times, or name two KITTI files."
+            "give its times with --times, or give two KITTI files."
         )
     pair = read_trajectory(estimate, timestamps), read_trajectory(ground_truth, timestamps)
     if timestamps is None and formats == {"kitti"} and len(pair[0]) != len(pair[1]):
@@ -231,7 +235,7 @@ def read_pair(
 def evo_command(
     estimate: Path | str, ground_truth: Path | str, alignment: str, format_: Literal["kitti", "tum"]
 ) -> str:
-    """The ``evo_ape`` command line that reproduces the ATE of two files of the same format."""
+    """The ``evo_ape`` command that reproduces the ATE of two files of the same format."""
     files = shlex.join([str(ground_truth), str(estimate)])
     return f"evo_ape {format_} {files}{_EVO_FLAGS[alignment]}"
 
@@ -244,7 +248,7 @@ def _associate(estimate: Trajectory, ground_truth: Trajectory) -> tuple[Trajecto
         times, true_times, rtol=0.0, atol=MAX_TIME_DIFFERENCE_S
     ):
         return estimate, ground_truth
-    if len(true_times) > len(times):  # like evo, look up the shorter trajectory in the longer one
+    if len(true_times) > len(times):  # evo also looks up the shorter in the longer
         matched, true = matching_time_indices(times, true_times, MAX_TIME_DIFFERENCE_S)
     else:
         true, matched = matching_time_indices(true_times, times, MAX_TIME_DIFFERENCE_S)

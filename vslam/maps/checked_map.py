@@ -1,4 +1,5 @@
-"""Building a map from the arrays of a file, after checking everything that kernels rely on."""
+"""Construction of a map from the arrays of a file. Everything that kernels rely on is checked
+first."""
 
 from __future__ import annotations
 
@@ -26,10 +27,10 @@ from vslam.maps.checkpoint import ARRAYS as CHECKPOINT_ARRAYS
 from vslam.maps.checkpoint import checked_checkpoint
 from vslam.maps.stored_map import StoredMap, TruthAlignment, observations
 
-# These columns are not in the file. They are computed from its list of observations, which is
-# sorted by landmark, and from keyframe_first_row.
+# These columns are not in the file. They are computed from keyframe_first_row and from the list of
+# observations, which is sorted by landmark.
 _NOT_IN_FILE = ("head", "n_observations", "keyframe", "landmark", "next_row")
-# The columns of the map and their names in the file.
+# The columns of the map, and their names in the file.
 FILE_NAMES = {
     name: f"{prefix}_{name.removeprefix(f'{prefix}_')}"
     for prefix, fields in (
@@ -50,8 +51,8 @@ def _layout(name: str, in_file: str) -> tuple[type, tuple[str | int, ...]]:
     return empty.dtype.type, (size, *empty.shape[1:])
 
 
-# K keyframes, L landmarks, R keypoints, O observations, E loops, F frames of the last drive.
-# K+1 and L+1 are CSR offsets, one more than the items.
+# K keyframes, L landmarks, R keypoints, O observations, E loops, F frames of the last drive. K+1
+# and L+1 are the lengths of CSR offsets, which have one element more than there are items.
 ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "scales": (np.float64, ("levels",)),
     **{in_file: _layout(name, in_file) for name, in_file in FILE_NAMES.items()},
@@ -70,15 +71,15 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "frame_unit_scale": (np.float64, ("F",)),
 }
 _MAY_BE_NAN = {"row_u_right"}
-_MOST = 1e12  # metres, pixels or seconds; products of a few numbers below this are finite
+_MOST = 1e12  # metres, pixels or seconds; the product of a few smaller numbers is finite
 _ROTATION_TOLERANCE = 1e-6
 _MOST_PIXELS = 1e6  # width, height and focal length of a camera
-_MAX_OFFSET = 100.0  # pixels
+_MAX_OFFSET = 100.0  # pixels, of the disparity
 _MAX_SESSION = 2**31  # it must fit into a column of the map
 
 
 class DamagedMapError(Exception):
-    """The arrays of a file do not describe a map."""
+    """The arrays of a file do not describe a valid map."""
 
 
 def _scalars(entry: dict[str, Any]) -> Scalars:
@@ -91,11 +92,11 @@ def _scalars(entry: dict[str, Any]) -> Scalars:
 
 
 def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
-    """Build the map of a file from its arrays and its header, neither of which is trusted.
+    """Build a map from the arrays and the header of a file. Neither of them is trusted.
 
     Raises:
-        DamagedMapError, KeyError, TypeError, ValueError, AttributeError: the file is damaged; the
-            message names the fault in a few words.
+        DamagedMapError, KeyError, TypeError, ValueError, AttributeError: the file is damaged. The
+            message describes the damage in a few words.
     """
     sizes = _check_shapes(data)
     map_ = _build_map(data, sizes)
@@ -132,8 +133,11 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
 
 
 def _check_shapes(data: dict[str, NDArray]) -> dict[str, int]:
-    """Check that every array exists, is finite and has the right type and shape; returns the sizes
-    K, L, R, ... by name."""
+    """Check that every array exists, is finite and has the right type and shape.
+
+    Returns:
+        The sizes K, L, R, ... by name.
+    """
     sizes: dict[str, int] = {}
     for name, (dtype, shape) in ARRAYS.items():
         array = data[name]
@@ -207,7 +211,7 @@ def _check_merges(merged_into: NDArray[np.int32], alive: NDArray[np.bool_]) -> N
     n = len(merged_into)
     _check_ids("landmark_merged_into", merged_into, n, least=NONE)
     _require(bool((merged_into[alive] == NONE).all()), "a merged landmark that is not culled")
-    # Pointer doubling: each round follows twice as many merges as the round before.
+    # This is pointer doubling. Each round follows twice as many merges as the round before.
     reached = np.append(np.where(merged_into >= 0, merged_into, n), n)
     for _ in range(n.bit_length()):
         reached = reached[reached]

@@ -1,4 +1,4 @@
-"""The representation of a checkpoint (``vslam.states.Checkpoint``) in a map file."""
+"""The form of a checkpoint (``vslam.states.Checkpoint``) in a map file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ from vslam.states import (
     VerifierState,
 )
 
-# N features of the last tracked frame; M keyframes with patches, which have R rows in total.
+# N is the number of features of the last tracked frame. M is the number of keyframes with patches,
+# which have R rows in total.
 ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "xy": (np.float32, ("N", 2)),
     "octave": (np.uint8, ("N",)),
@@ -58,8 +59,10 @@ def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
 
 
 def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
-    """The rest of a checkpoint, without its arrays, as a JSON object. JSON preserves float64
-    exactly."""
+    """The rest of a checkpoint, without its arrays, as a JSON object.
+
+    JSON preserves float64 numbers exactly.
+    """
     tracker, closing = checkpoint.tracker, checkpoint.closing
     consistency = closing.consistency
     return {
@@ -86,15 +89,15 @@ def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
 def checked_checkpoint(
     arrays: dict[str, NDArray], entry: dict[str, Any], map_: Map, n_frames: int
 ) -> Checkpoint:
-    """Build the checkpoint of a file from its arrays and its entry, neither of which is trusted.
+    """Build a checkpoint from its arrays and its JSON entry in a file. Neither of them is trusted.
 
     Args:
         map_: the map of the same file, which has been checked.
         n_frames: number of frames of the drive so far.
 
     Raises:
-        KeyError, TypeError, ValueError, OverflowError: the checkpoint is damaged; the message names
-            the fault in a few words.
+        KeyError, TypeError, ValueError, OverflowError: the checkpoint is damaged. The message
+            describes the damage in a few words.
     """
     sizes = {
         "N": len(arrays["landmark"]),

@@ -1,9 +1,9 @@
-"""COLMAP's sparse model, text or binary (https://colmap.github.io/format.html).
+"""Writing of COLMAP's sparse model as text or binary files (https://colmap.github.io/format.html).
 
-As in vslam, COLMAP's poses are ``T_cw`` with x right, y down and z forward. Unlike in vslam, its
-pixel coordinates begin at the corner of the image: the centre of the upper left pixel is
-(0.5, 0.5). The optional files of rigs and frames are not written, so COLMAP treats every image as a
-separate frame.
+COLMAP's poses are ``T_cw`` with x right, y down and z forward, as in vslam. COLMAP's pixel
+coordinates begin at the corner of the image, so the centre of the upper left pixel is (0.5, 0.5).
+In vslam, this centre is (0, 0). The optional files of rigs and frames are not written, so COLMAP
+treats every image as a separate frame.
 """
 
 from __future__ import annotations
@@ -26,8 +26,10 @@ _TRACK = np.dtype([("image", "<u4"), ("point2d", "<u4")])
 
 
 class _Image(NamedTuple):
-    """An image; ``pose`` is ``(7,)`` qw qx qy qz tx ty tz of ``T_cw``, ``points`` has the type
-    ``_POINT2D``."""
+    """An image.
+
+    ``pose`` is ``(7,)`` qw qx qy qz tx ty tz of ``T_cw``. ``points`` has the type ``_POINT2D``.
+    """
 
     id: int
     pose: NDArray[np.float64]
@@ -36,8 +38,10 @@ class _Image(NamedTuple):
 
 
 class _Point(NamedTuple):
-    """A point; ``error`` is the mean reprojection error in pixels, ``track`` has the type
-    ``_TRACK``."""
+    """A point.
+
+    ``error`` is the mean reprojection error in pixels. ``track`` has the type ``_TRACK``.
+    """
 
     id: int
     xyz: NDArray[np.float64]
@@ -54,13 +58,14 @@ def save_colmap(
     *,
     text: bool = False,
 ) -> None:
-    """Write ``cameras.bin``, ``images.bin`` and ``points3D.bin``; with ``text``, ``.txt`` files.
+    """Write ``cameras.bin``, ``images.bin`` and ``points3D.bin``. With ``text``, write ``.txt``
+    files.
 
     Only keypoints that observe a landmark are written.
 
     Args:
         folder: an existing folder, usually ``sparse/0`` of a COLMAP project.
-        names: name of each keyframe's image.
+        names: name of the image of each keyframe.
         colours: ``(L, 3)`` RGB of each landmark.
 
     Raises:
@@ -101,7 +106,7 @@ def _parameters(camera: Camera) -> tuple[float, float, float, float]:
 
 
 def _write_binary(folder: Path, camera: Camera, images: list[_Image], points: list[_Point]) -> None:
-    """Write little-endian files as COLMAP's ``reconstruction_io_binary.cc`` does."""
+    """Write little-endian files in the format of COLMAP's ``reconstruction_io_binary.cc``."""
     (folder / "cameras.bin").write_bytes(
         struct.pack("<QIi2Q", 1, _CAMERA_ID, _PINHOLE, camera.width, camera.height)
         + struct.pack("<4d", *_parameters(camera))
@@ -140,5 +145,5 @@ def _write_text(folder: Path, camera: Camera, images: list[_Image], points: list
 
 
 def _words(values: tuple[float, ...] | list[float]) -> str:
-    """Numbers separated by spaces, with enough digits to be read back exactly."""
+    """Numbers separated by spaces, with so many digits that they can be read back exactly."""
     return " ".join(map(repr, values))

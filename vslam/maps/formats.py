@@ -1,4 +1,4 @@
-"""Maps in the formats of other programs: nerfstudio's data set, pose graphs of g2o, PLY, PNG."""
+"""Writing of maps in the formats of other programs: nerfstudio, g2o, PLY and PNG."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from vslam.maps.reconstruction import PIXEL_CENTRE, Reconstruction
 
 POINTS = "sparse_pc.ply"
-# The axes of nerfstudio's world point right, forward and up as seen from the first camera.
+# The axes of nerfstudio's world frame point right, forward and up, as seen from the first camera.
 T_SAVED_WORLD = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
 T_CAMERA_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-_LUMA = np.array([299, 587, 114])  # ITU-R BT.601, in thousandths
+_LUMA = np.array([299, 587, 114])  # weights of ITU-R BT.601, in thousandths
 
 
 def save_nerfstudio(
@@ -26,18 +26,21 @@ def save_nerfstudio(
     names: list[str],
     colours: NDArray[np.uint8],
 ) -> None:
-    """Write a data set for nerfstudio (https://docs.nerf.studio/quickstart/data_conventions.html):
-    ``transforms.json`` and the landmarks as ``sparse_pc.ply``.
+    """Write a data set for nerfstudio: ``transforms.json``, and the landmarks as ``sparse_pc.ply``.
 
-    Cameras look along -z with y up (OpenGL), ``transform_matrix`` is camera to world, and the
-    world's z axis points up. ``applied_transform`` maps vslam's world to the world of both files.
-    Pixel coordinates begin at the corner of the image, as in COLMAP: nerfstudio's rays go through
-    ``column + 0.5`` (``Cameras.get_image_coords``), although its documentation suggests that the
-    centre of the first pixel is (0, 0).
+    The format is described at https://docs.nerf.studio/quickstart/data_conventions.html.
+
+    Cameras look along -z with y up (OpenGL). ``transform_matrix`` is camera to world, and the z
+    axis of the world frame points up. ``applied_transform`` maps vslam's world frame to the world
+    frame of both files.
+
+    Pixel coordinates begin at the corner of the image, as in COLMAP. The rays of nerfstudio go
+    through ``column + 0.5`` (``Cameras.get_image_coords``), although its documentation suggests
+    that the centre of the first pixel is (0, 0).
 
     Args:
         folder: an existing folder.
-        names: path of each keyframe's image, relative to the folder.
+        names: path of the image of each keyframe, relative to the folder.
         colours: ``(L, 3)`` RGB of each landmark.
 
     Raises:
@@ -74,21 +77,23 @@ def save_g2o(
     T_i_j: NDArray[np.float64],
     sigmas: NDArray[np.float64],
 ) -> None:
-    """Write a pose graph in g2o's text format
-    (https://github.com/RainerKuemmerle/g2o/wiki/File-Format): ``VERTEX_SE3:QUAT`` and
-    ``EDGE_SE3:QUAT`` lines, each with x y z qx qy qz qw. An edge also has the upper triangle of its
-    information matrix, row by row, translation first.
+    """Write a pose graph in g2o's text format.
 
-    The information of rotations is per square radian, as GTSAM, Ceres' examples and SE-Sync expect.
-    g2o itself measures the error of a rotation by qx qy qz, which for small angles is half the
-    angle, and so gives rotations a quarter of the weight.
+    The format is described at https://github.com/RainerKuemmerle/g2o/wiki/File-Format. Lines with
+    ``VERTEX_SE3:QUAT`` and ``EDGE_SE3:QUAT`` contain x y z qx qy qz qw. An edge also has the upper
+    triangle of its information matrix, row by row, with the translation first.
+
+    The information of rotations is per square radian, as GTSAM, the examples of Ceres and SE-Sync
+    expect. g2o itself measures the error of a rotation by qx qy qz. For small angles, this error is
+    half the angle. Therefore, g2o gives rotations a quarter of the weight.
 
     Args:
         ids: ``(N,)`` ids of the vertices.
-        T_wc: ``(N, 4, 4)`` their poses.
-        edges: ``(E, 2)`` ends i and j of each edge, as positions in ``ids``.
+        T_wc: ``(N, 4, 4)`` poses of the vertices.
+        edges: ``(E, 2)`` the two vertices i and j of each edge, as indices into ``ids``.
         T_i_j: ``(E, 4, 4)`` measured pose of j in the frame of i.
-        sigmas: ``(E, 2)`` standard deviations, translation (m) and rotation (rad), of each axis.
+        sigmas: ``(E, 2)`` standard deviations of the translation (m) and of the rotation (rad), for
+            each axis.
 
     Raises:
         OSError: the file cannot be written.
@@ -108,7 +113,7 @@ def save_g2o(
 
 
 def _poses(T: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``(N, 7)`` x y z qx qy qz qw with qw >= 0."""
+    """Convert poses to ``(N, 7)`` rows x y z qx qy qz qw with qw >= 0."""
     from scipy.spatial.transform import Rotation
 
     if not len(T):  # SciPy rejects an empty array
@@ -125,8 +130,13 @@ def _words(values: list[float]) -> str:
 def save_ply(
     path: Path | str, xyz: NDArray[np.float64], colours: NDArray[np.uint8] | None = None
 ) -> None:
-    """Write ``(N, 3)`` points in the world (metres) as binary PLY, with or without their ``(N, 3)``
-    uint8 RGB colours."""
+    """Write points as binary PLY.
+
+    Args:
+        path: the file.
+        xyz: ``(N, 3)`` points in the world frame, in metres.
+        colours: ``(N, 3)`` uint8 RGB colours of the points. None writes no colours.
+    """
     fields = [("xyz", "<f4", 3)]
     properties = [f"property float {axis}\n" for axis in "xyz"]
     if colours is not None:
@@ -165,7 +175,8 @@ def save_image(image: NDArray[np.uint8], path: Path) -> None:
 def landmark_colours(
     reconstruction: Reconstruction, images: Iterable[NDArray[np.uint8]]
 ) -> NDArray[np.uint8]:
-    """``(L, 3)`` uint8 RGB of each landmark, from the observation of median brightness.
+    """``(L, 3)`` uint8 RGB colour of each landmark, from its observation with the median
+    brightness.
 
     Args:
         images: ``(H, W)`` grey or ``(H, W, 3)`` red, green, blue image of each keyframe, in order.
@@ -179,6 +190,6 @@ def landmark_colours(
         colours[seen] = pixels.reshape(len(pixels), -1)
     order = np.lexsort((colours @ _LUMA, r.landmark))
     counts = np.bincount(r.landmark, minlength=len(r.xyz))
-    # The lower median is an observed colour, not the mean of two.
+    # The lower median is a colour that was observed, not the mean of two colours.
     middle = order[np.cumsum(counts) - counts + (counts - 1) // 2]
     return colours[middle]

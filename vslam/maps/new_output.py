@@ -1,4 +1,4 @@
-"""Output files and folders that are either complete or absent."""
+"""Output files and folders that either are complete or do not exist."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from vslam.errors import InputError, ResultsError
 
 @contextmanager
 def new_output(path: Path, *, folder: bool = False) -> Iterator[Path]:
-    """Yield the path of a temporary file to write, or with ``folder`` an empty temporary folder. At
-    the end it is renamed to ``path``; after an error it is removed.
+    """Yield the path of a temporary file to write, or of an empty temporary folder if ``folder``.
+
+    At the end, the file or folder is renamed to ``path``. After an error, it is removed.
 
     Raises:
-        InputError: ``path`` exists already. With ``folder``, an empty folder is accepted.
+        InputError: ``path`` exists already. If ``folder``, an existing empty folder is accepted.
         ResultsError: the output cannot be written, for example because the disk is full.
     """
     empty = path.is_dir() and not path.is_symlink() and not any(path.iterdir())
@@ -31,8 +32,8 @@ def new_output(path: Path, *, folder: bool = False) -> Iterator[Path]:
         part.rename(path)
     except OSError as error:
         raise ResultsError(
-            f"{path}: cannot be written ({error.strerror or error}); free some space or name "
-            "another place with --out."
+            f"{path}: cannot be written ({error.strerror or error}); free some space or give "
+            "another path with --out."
         ) from error
     finally:
         if folder:
@@ -43,8 +44,9 @@ def new_output(path: Path, *, folder: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def replaced_file(path: Path) -> Iterator[BinaryIO]:
-    """Yield a temporary file to write, which is synced to the disk and atomically replaces ``path``
-    at the end. After an error ``path`` is unchanged.
+    """Yield the path of a temporary file to write, which replaces ``path`` atomically at the end.
+
+    The file is synced to the disk before. After an error, ``path`` is unchanged.
 
     Raises:
         OSError: the file cannot be written, for example because the disk is full.
@@ -73,30 +75,35 @@ def replaced_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def require_place(path: Path, option: str) -> None:
-    """Check before a long computation that a file can be written to ``path``, the value of
-    ``option``.
+    """Check before a long computation that a file can be written to a path.
+
+    Args:
+        path: the path.
+        option: the option that gave the path, for error messages.
 
     Raises:
         InputError: ``path`` is a folder, or its parent folder does not exist.
     """
     if path.is_dir():
-        raise InputError(f"{option} {path}: is a folder; name a file.")
+        raise InputError(f"{option} {path}: is a folder; give a file.")
     if not path.absolute().parent.is_dir():
         raise InputError(f"{option} {path}: there is no folder {path.parent}; create it first.")
 
 
 def require_free(path: Path) -> None:
-    """Check that nothing is at ``path``, the value of ``--out``.
+    """Check that ``path``, the value of ``--out``, does not exist.
 
     Raises:
-        InputError: a file or folder exists there.
+        InputError: a file or folder exists at ``path``.
     """
     if os.path.lexists(path):
-        raise InputError(f"{path}: exists already; remove it, or name another place with --out.")
+        raise InputError(f"{path}: exists already; remove it, or give another path with --out.")
 
 
 def _beside(path: Path) -> Path:
-    """A hidden path in the same folder, and thus on the same file system, so that renaming is
-    atomic."""
+    """A hidden path in the same folder.
+
+    It is on the same file system, so that renaming is atomic.
+    """
     path = path.absolute()
     return path.with_name(f".{path.name}.{os.getpid()}.part")

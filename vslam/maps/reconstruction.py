@@ -1,4 +1,4 @@
-"""A map as other programs represent it: posed images, points and their observations."""
+"""A map in the form that other programs use: images with poses, points, and their observations."""
 
 from __future__ import annotations
 
@@ -18,19 +18,20 @@ PIXEL_CENTRE = 0.5
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """Living keyframes and landmarks, numbered without gaps, and their observations.
+    """The living keyframes and landmarks of a map, numbered without gaps, and their observations.
 
-    There are K keyframes, L landmarks and N observations, all of the left camera.
+    There are K keyframes, L landmarks and N observations. All observations are in left images.
 
     Attributes:
-        camera: camera of all keyframes; the centre of the upper left pixel is (0, 0), as in OpenCV.
+        camera: camera of all keyframes. The centre of the upper left pixel is (0, 0), as in OpenCV.
         frames: ``(K,)`` int64, index of the frame that became each keyframe.
         timestamps: ``(K,)`` float64 seconds.
         T_cw: ``(K, 4, 4)`` float64 poses.
-        xyz: ``(L, 3)`` float64 positions in the world; each landmark is observed at least once.
-        keyframe, landmark: ``(N,)`` int64, which keyframe observes which landmark, in ascending
-            keyframe order.
-        xy: ``(N, 2)`` float64 pixels at which the keyframe observes the landmark.
+        xyz: ``(L, 3)`` float64 positions in the world frame. Each landmark is observed at least
+            once.
+        keyframe, landmark: ``(N,)`` int64, the keyframe and the landmark of each observation. They
+            are sorted by keyframe.
+        xy: ``(N, 2)`` float64 position in pixels at which the keyframe observes the landmark.
     """
 
     camera: Camera

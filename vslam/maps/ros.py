@@ -1,13 +1,13 @@
-"""ROS 2 messages made from poses and landmarks, and bags of such messages. ROS is not needed.
+"""ROS 2 messages from poses and landmarks, and bags of such messages. ROS is not needed.
 
-The frames are those of REP 105: ``map`` -> ``odom`` -> ``base_link`` -> ``camera_optical``. Their
-axes are those of REP 103: in ``map``, ``odom`` and ``base_link`` x points forward, y left and z up;
-in ``camera_optical``, as everywhere else in vslam, x points right, y down and z forward.
-``base_link`` is at the left camera; ``map`` and ``odom`` are at the first pose of ``base_link``.
-Lengths are in metres, or in the unit of a monocular map.
+The frames follow REP 105: ``map`` -> ``odom`` -> ``base_link`` -> ``camera_optical``. Their axes
+follow REP 103. In ``map``, ``odom`` and ``base_link``, x points forward, y left and z up. In
+``camera_optical``, x points right, y down and z forward, as everywhere else in vslam. ``base_link``
+is at the left camera. ``map`` and ``odom`` are at the first pose of ``base_link``. Lengths are in
+metres, or in the unit of a monocular map.
 
-The functions take an argument ``types``, which returns the message class for the name of a message:
-a class of rosbags to write files, or a class of ROS for a node (``examples/ros2``).
+The argument ``types`` is a function that returns the message class for the name of a message. Files
+are written with classes of the package rosbags. A node uses classes of ROS (``examples/ros2``).
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ Types = Callable[[str], Any]
 T_BASE_OPTICAL = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
-_LAST_SECOND = 2**31  # builtin_interfaces/Time counts seconds in 32 bits with a sign
+_LAST_SECOND = 2**31  # builtin_interfaces/Time counts seconds as a signed 32-bit number
 _FLOAT32 = 7  # sensor_msgs/PointField
-_VERSION: Literal[8] = 8  # bag version of ROS 2 Humble, which later releases read, too
-# For each topic, its message type, and whether it is latched: it then has a single message, which
-# subscribers that connect later also receive.
+_VERSION: Literal[8] = 8  # bag version of ROS 2 Humble; later releases read it, too
+# The message type of each topic, and whether the topic is latched. A latched topic has a single
+# message, which subscribers that connect later also receive.
 TOPICS = {
     "/tf_static": ("tf2_msgs/msg/TFMessage", True),
     "/map_points": ("sensor_msgs/msg/PointCloud2", True),
@@ -54,7 +54,7 @@ class FramePose:
     Attributes:
         stamp: time of the image in nanoseconds.
         T_odom_camera, T_map_odom: ``(4, 4)`` as in ``TrackResult``.
-        near, covariance: ``(6, 6)`` as in ``PoseUncertainty``; None if unknown.
+        near, covariance: ``(6, 6)`` as in ``PoseUncertainty``. None if they are unknown.
     """
 
     stamp: int
@@ -65,9 +65,11 @@ class FramePose:
 
     @classmethod
     def of(cls, result: TrackResult, stamp: int) -> FramePose:
-        """The pose of a frame, from the result of ``Slam.step``. ``stamp`` is given in nanoseconds,
-        because ROS looks up transforms by exact times, and Unix time in float64 seconds has a
-        resolution of only 0.2 us."""
+        """The pose of a frame, from the result of ``Slam.step``.
+
+        ``stamp`` is given in nanoseconds, because ROS looks up transforms by exact times. Unix time
+        in float64 seconds has a resolution of only 0.2 us.
+        """
         uncertainty, T = result.uncertainty, result.T_odom_camera
         return cls(
             stamp,
@@ -79,20 +81,25 @@ class FramePose:
 
     @property
     def T_odom_base(self) -> Matrix:
-        """``(4, 4)`` the pose of ``base_link``, with the axes of ROS."""
+        """``(4, 4)`` pose of ``base_link`` in ``odom``, with the axes of ROS."""
         return in_ros_axes(self.T_odom_camera)
 
 
 def in_ros_axes(T: Matrix) -> Matrix:
-    """Convert ``(..., 4, 4)`` motions between camera frames to motions between frames with ROS's
-    axes."""
+    """Convert motions between camera frames to motions between frames with the axes of ROS.
+
+    The motions have the shape ``(..., 4, 4)``.
+    """
     result: Matrix = T_BASE_OPTICAL @ T @ T_BASE_OPTICAL.T
     return result
 
 
 def odometry_message(types: Types, pose: FramePose, before: FramePose | None) -> Any:
-    """``nav_msgs/Odometry``: the pose of ``base_link`` in ``odom``, and the mean velocity of
-    ``base_link``, in its own axes, since the frame ``before``; zero if ``before`` is None."""
+    """``nav_msgs/Odometry`` with the pose of ``base_link`` in ``odom``, and its mean velocity.
+
+    The velocity is given in the axes of ``base_link``. It is the mean since the frame ``before``,
+    or zero if ``before`` is None.
+    """
     twist, R = np.zeros(6), T_BASE_OPTICAL[:3, :3]
     if before is not None:
         motion = inverse(before.T_odom_base) @ pose.T_odom_base
@@ -128,7 +135,7 @@ def static_tf_message(types: Types, stamp: int) -> Any:
 
 
 def path_message(types: Types, trajectory: Trajectory) -> Any:
-    """``nav_msgs/Path``: the poses of ``base_link`` in ``map``."""
+    """``nav_msgs/Path`` with the poses of ``base_link`` in ``map``."""
     stamps = [nanoseconds(timestamp) for timestamp in trajectory.timestamps.tolist()]
     poses = [
         types("geometry_msgs/msg/PoseStamped")(
@@ -140,8 +147,10 @@ def path_message(types: Types, trajectory: Trajectory) -> Any:
 
 
 def points_message(types: Types, stamp: int, xyz: NDArray[np.float64]) -> Any:
-    """``sensor_msgs/PointCloud2`` in the frame ``map``, made from ``(N, 3)`` points in the world
-    frame of vslam."""
+    """``sensor_msgs/PointCloud2`` in the frame ``map``.
+
+    ``xyz`` are ``(N, 3)`` points in the world frame of vslam.
+    """
     points = (xyz @ T_BASE_OPTICAL[:3, :3].T).astype("<f4")
     fields = [
         types("sensor_msgs/msg/PointField")(name=name, offset=4 * k, datatype=_FLOAT32, count=1)
@@ -161,7 +170,7 @@ def points_message(types: Types, stamp: int, xyz: NDArray[np.float64]) -> Any:
 
 
 def nanoseconds(timestamp: float) -> int:
-    """Convert a time in seconds to nanoseconds.
+    """Convert a timestamp in seconds to nanoseconds.
 
     Raises:
         InputError: ROS cannot represent the time.
@@ -180,9 +189,9 @@ def save_bag(
     """Write an MCAP file with the topics of ``TOPICS``.
 
     Args:
-        poses: the poses for the topics ``/tf`` and ``/odom``, at least one.
+        poses: the poses for the topics ``/tf`` and ``/odom``. At least one pose is needed.
         trajectory: the poses for the topic ``/path``.
-        xyz: ``(N, 3)`` landmarks in the world of the trajectory.
+        xyz: ``(N, 3)`` landmarks in the world frame of the trajectory.
 
     Raises:
         InputError: rosbags is not installed, or ROS cannot represent a time of the trajectory.
@@ -244,7 +253,7 @@ def frame_poses(
 
     Args:
         odometry, trajectory: ``T_odom_camera`` and ``T_map_camera`` of the same frames.
-        covariances: ``near`` and ``covariance`` by time (``read_covariances``).
+        covariances: ``near`` and ``covariance`` by timestamp (``read_covariances``).
 
     Raises:
         InputError: ROS cannot represent a time.
@@ -260,8 +269,11 @@ def frame_poses(
 
 
 def _covariance(matrix: Matrix | None, R: Matrix) -> NDArray[np.float64]:
-    """``(36,)`` the covariance of ``[x, y, z, rx, ry, rz]`` after rotating the axes by ``R``, row
-    by row. An unknown covariance (None) becomes all zeros, the convention of ``sensor_msgs``."""
+    """``(36,)`` covariance of ``[x, y, z, rx, ry, rz]`` after rotating the axes by ``R``, row by
+    row.
+
+    An unknown covariance (None) becomes all zeros, which is the convention of ``sensor_msgs``.
+    """
     if matrix is None:
         return np.zeros(36)
     both = np.kron(np.eye(2), R)
@@ -271,8 +283,10 @@ def _covariance(matrix: Matrix | None, R: Matrix) -> NDArray[np.float64]:
 
 def _velocity_covariance(pose: FramePose, before: FramePose | None) -> Matrix | None:
     """``(6, 6)`` covariance of the mean velocity between two frames, in the frame of the camera.
-    The errors of the two poses relative to the landmarks are independent, and the common error of
-    the landmarks cancels."""
+
+    The errors of the two poses relative to the landmarks are independent. The error of the
+    landmarks is common to both poses and cancels.
+    """
     if before is None or before.near is None or pose.near is None:
         return None
     A = adjoint(inverse(pose.T_odom_camera) @ before.T_odom_camera)

@@ -1,7 +1,7 @@
-"""The map on disk: an ``.npz`` file that is written atomically and checked when it is read.
+"""Map files: ``.npz`` files that are written atomically and checked when they are read.
 
-Arrays are not compressed: a map consists mostly of descriptors, which do not compress, and should
-load within a second.
+Arrays are not compressed. A map consists mostly of descriptors, which do not compress well, and it
+should load within a second.
 """
 
 from __future__ import annotations
@@ -29,23 +29,24 @@ from vslam.maps.stored_map import StoredMap
 from vslam.untrusted import ARCHIVE_ERRORS, read_json, require_memory
 
 SCHEMA = 8
-_FOREIGN = "not a map of vslam; name a map.npz or the folder of a run"
+_FOREIGN = "not a map of vslam; give a map.npz or the folder of a run"
 
 
 def save_map(path: Path | str, stored: StoredMap, *, resumable: bool = False) -> None:
-    """Write a map; an existing file is replaced.
+    """Write a map. An existing file is replaced.
 
     After an error or a power cut, an existing file is unchanged. The file contains the JSON text
     ``header`` (schema, camera, detector, drives, thresholds, versions), the arrays of ``ARRAYS``,
     and the data of the detector and the images for each keyframe (``PerKeyframe``):
     ``detector_NAME_first``, ``detector_NAME_values``, ``image_first`` and ``image_values``.
-    Observations are sorted by landmark; those of one landmark are in the order of its chain.
+    Observations are sorted by landmark. The observations of one landmark are in the order of its
+    linked list.
 
     Args:
         path: the file.
         stored: the map.
-        resumable: also write the checkpoint, if there is one, and culled keyframes and landmarks;
-            otherwise only living ones are written.
+        resumable: also write culled keyframes and landmarks, and the checkpoint if there is a
+            checkpoint. Otherwise, only living keyframes and landmarks are written.
 
     Raises:
         OSError: the file cannot be written.
@@ -57,23 +58,23 @@ def save_map(path: Path | str, stored: StoredMap, *, resumable: bool = False) ->
 
 
 def load_map(path: Path | str) -> StoredMap:
-    """Read a map, check everything that kernels rely on, and make it compact.
+    """Read a map, check everything that kernels rely on, and remove culled keyframes and landmarks.
 
     Raises:
-        InputError: the file is missing, not a map, damaged, or of another schema.
+        InputError: the file is missing or damaged, is not a map, or has another schema version.
     """
     stored = load_checkpoint(path)
     return stored if stored.checkpoint is None else stored.compact()
 
 
 def load_checkpoint(path: Path | str) -> StoredMap:
-    """Read a map like ``load_map``, but do not compact a map with a checkpoint.
+    """Read a map like ``load_map``, but keep culled entries if the map has a checkpoint.
 
     Args:
-        path: a map file, or the folder of a run that has one.
+        path: a map file, or the folder of a run that has a map file.
 
     Raises:
-        InputError: as ``load_map``.
+        InputError: for the same reasons as in ``load_map``.
     """
     path = map_file_of(path)
     data, header = _read(path)
@@ -153,13 +154,13 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
 
 
 def map_file_of(path: Path | str) -> Path:
-    """The map file in the folder of a run; any other path is returned unchanged."""
+    """The map file in the folder of a run. Any other path is returned unchanged."""
     path = Path(path)
     return path / "map.npz" if path.is_dir() else path
 
 
 class MadeWith(NamedTuple):
-    """The camera, the name of the detector, and the changed thresholds that a map was made with."""
+    """The camera, the name of the detector and the changed thresholds with which a map was made."""
 
     camera: Camera
     detector: str
@@ -167,10 +168,10 @@ class MadeWith(NamedTuple):
 
 
 def made_with(path: Path | str) -> MadeWith:
-    """Read what a map was made with, without reading its arrays.
+    """Read the camera, detector and thresholds of a map without reading its arrays.
 
     Raises:
-        InputError: as ``load_map``.
+        InputError: for the same reasons as in ``load_map``.
     """
     path = Path(path)
     with _opened(path) as (_, header), _damage_reported(path):
@@ -179,14 +180,14 @@ def made_with(path: Path | str) -> MadeWith:
 
 
 def _read(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    """All arrays of a map file, and its header."""
+    """Read all arrays of a map file, and its header."""
     with _opened(path) as (file, header):
         return {name: file[name] for name in file.files if name != "header"}, header
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Open a map file of this schema; yields the archive and the header."""
+    """Open a map file of this schema version. The archive and the header are yielded."""
     try:
         require_memory(path, "a map of vslam")
         with np.load(path, allow_pickle=False) as file:
@@ -207,11 +208,11 @@ def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
     except OSError as error:
         why = error.strerror or error
         raise InputError(
-            f"{path}: cannot be read ({why}); name a map.npz or the folder of a run."
+            f"{path}: cannot be read ({why}); give a map.npz or the folder of a run."
         ) from error
     except BadZipFile as error:
         raise InputError(f"{path}: {_FOREIGN}, or the file is damaged ({error}).") from error
     except (*ARCHIVE_ERRORS, TypeError, AttributeError, MemoryError) as error:
-        # np.load raises ValueError for pickles and for files that are not npz, zipfile raises
-        # RuntimeError for encryption, and a plain array has no ``files``.
+        # np.load raises ValueError for pickles and for files that are not npz. zipfile raises
+        # RuntimeError for encrypted files. A plain array has no attribute ``files``.
         raise InputError(f"{path}: {_FOREIGN}.") from error

@@ -1,4 +1,4 @@
-"""A map with everything that is needed to continue in it, usually without culled entries."""
+"""A map with all data that a later run needs to continue it. It usually has no culled entries."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class TruthAlignment:
     """The transformation of a map into the frame of a ground truth.
 
     Attributes:
-        name: data set and sequence of the ground truth.
-        S_truth_world: ``(4, 4)`` transformation from the map's world frame to that of the ground
-            truth, which aligns the first drive with the ground truth. It is a rigid motion, or a
-            similarity for a monocular map.
+        name: name of the data set and the sequence of the ground truth.
+        S_truth_world: ``(4, 4)`` transformation from the world frame of the map to the world frame
+            of the ground truth. It aligns the first drive with the ground truth. It is a rigid
+            motion, or a similarity for a monocular map.
     """
 
     name: str
@@ -49,19 +49,18 @@ class StoredMap:
     Attributes:
         map: keyframes, landmarks and observations.
         camera: camera of all keyframes.
-        loops: closed loops in the map's present units, without features and landmarks.
-        detector: what the loop detector has stored about the keyframes.
-        images: JPEG files (uint8) of the keyframes that learned descriptors may need; None without
-            learned descriptors.
-        frames: frame poses of the last drive; None if they were not kept.
+        loops: closed loops in the present unit of the map, without features and landmarks.
+        detector: data that the loop detector has stored about the keyframes.
+        images: JPEG files (uint8) of the keyframes whose images learned descriptors may need. None
+            without learned descriptors.
+        frames: frame poses of the last drive. None if they were not kept.
         drives: source of the images of each drive, such as "kitti 06".
-        thresholds: the thresholds of the last drive that differed from the defaults, by dotted
-            name.
-        truth_alignment: the transformation of the map into the frame of a ground truth; None
+        thresholds: thresholds of the last drive that differed from the defaults, by dotted name.
+        truth_alignment: the transformation of the map into the frame of a ground truth. None
             without ground truth.
-        checkpoint: state from which the last drive continues with identical results. The map then
-            includes culled keyframes and landmarks, with unchanged ids. None if the map is compact
-            or there was no checkpoint.
+        checkpoint: state from which the last drive continues with the same results as an
+            uninterrupted run. A map with a checkpoint includes culled keyframes and landmarks, with
+            unchanged ids. None if the map has no culled entries or if no checkpoint was possible.
     """
 
     map: Map
@@ -82,18 +81,18 @@ class StoredMap:
         the first living keyframe that observes them.
 
         Args:
-            copy: if False and all keypoints are kept, the keypoint arrays, which are three quarters
-                of a map, are views instead of copies.
+            copy: if False and if all keypoints are kept, the arrays of keypoints are views instead
+                of copies. These arrays are three quarters of a map.
         """
         return self.select(self.map.living_keyframes(), copy=copy)
 
     def select(self, keyframes: NDArray[np.int64], *, copy: bool = True) -> StoredMap:
-        """Like ``compact``, but with only some living keyframes and the landmarks that they
+        """A copy like that of ``compact``, but with only some keyframes and the landmarks that they
         observe.
 
         Args:
-            keyframes: ``(K,)`` ascending ids of living keyframes. Frame poses are dropped unless
-                all living keyframes are selected.
+            keyframes: ``(K,)`` ids of living keyframes, in ascending order. The frame poses are
+                kept only if all living keyframes are selected.
             copy: as in ``compact``.
         """
         map_ = self.map
@@ -120,10 +119,13 @@ class StoredMap:
 
 
 def selected(map_: Map, keyframes: NDArray[np.int64], *, copy: bool = True) -> Map:
-    """A copy with only some living keyframes, ``(K,)`` ascending ids, and the landmarks that they
-    observe, numbered without gaps.
+    """A copy of a map with only some living keyframes and the landmarks that they observe.
 
-    The parent of a keyframe is its nearest selected ancestor, or else the first selected keyframe.
+    The ids of the keyframes are given as ``(K,)``, in ascending order. In the copy, keyframes and
+    landmarks are numbered without gaps.
+
+    The parent of a keyframe is its nearest selected ancestor. If no ancestor is selected, it is the
+    first selected keyframe.
     """
     a, n = map_.arrays, len(keyframes)
     new_id = np.full(map_.n_keyframes, NONE, np.int64)
@@ -182,9 +184,9 @@ def observations(
     """The columns of ``Arrays`` that represent observations.
 
     Args:
-        rows: ``(O,)`` rows that observe the landmarks, sorted by landmark; each row occurs once.
-        first: ``(L + 1,)`` offsets of each landmark in ``rows``; a culled landmark has no rows.
-        u_right: ``(R,)`` columns in the right image, for all rows; NaN without a stereo match.
+        rows: ``(O,)`` rows that observe the landmarks, sorted by landmark. Each row occurs once.
+        first: ``(L + 1,)`` offset of each landmark in ``rows``. A culled landmark has no rows.
+        u_right: ``(R,)`` columns in the right image, for all rows. NaN without a stereo match.
     """
     count = np.diff(first)
     landmark, next_row = (np.full(len(u_right), NONE, np.int32) for _ in range(2))
@@ -208,7 +210,7 @@ def observations(
 
 
 def appended(one: StoredMap, other: StoredMap) -> StoredMap:
-    """Append a compact map to another one, as a sub-map at an unknown place."""
+    """Append a map to another map, as a sub-map at an unknown place. Neither has culled entries."""
     a, b = one.map, other.map
     n, drives = a.n_keyframes, a.scalars.session + 1
     shift = {
@@ -278,14 +280,14 @@ def _spanning_tree(
 
 
 def _renumbered(frames: FrameTable, map_: Map, new_id: NDArray[np.int64]) -> FrameTable:
-    """Frame poses relative to living keyframes, with their new ids."""
+    """Make frame poses relative to living keyframes, with the new ids of these keyframes."""
     reference = frames.reference.copy()
     T_c_reference, unit = frames.T_c_reference.copy(), frames.unit_scale.copy()
     table = map_.keyframes
     for i, keyframe in enumerate(frames.reference.tolist()):
         if not map_.n_keyframes or map_.arrays.keyframe_alive[keyframe]:
             continue
-        # This replaces the reference without changing the pose that FramePoses.pose returns.
+        # This replaces the reference, but does not change the pose that FramePoses.pose returns.
         T_c_reference[i, :3, 3] *= table.unit_scale[keyframe] / unit[i]
         T_c_reference[i] = orthonormalised(T_c_reference[i] @ table.T_c_parent[keyframe])
         reference[i] = table.parent[keyframe]
@@ -295,14 +297,23 @@ def _renumbered(frames: FrameTable, map_: Map, new_id: NDArray[np.int64]) -> Fra
 
 
 def in_box(map_: Map, box: Sequence[float]) -> NDArray[np.int64]:
-    """Ids of the living keyframes in ``box`` (two x and two z, metres), ascending."""
+    """Ids of the living keyframes in a box, in ascending order.
+
+    ``box`` is the range of x followed by the range of z, in metres.
+    """
     keyframes, xz = _places(map_)
     low, high = np.array(box).reshape(2, 2).T
     return keyframes[((xz >= low) & (xz <= high)).all(axis=1)]
 
 
 def near_point(map_: Map, point: Sequence[float], within: float) -> NDArray[np.int64]:
-    """Ids of the living keyframes within a distance (metres) of a point (x and z), ascending."""
+    """Ids of the living keyframes near a point, in ascending order.
+
+    Args:
+        map_: the map.
+        point: x and z in metres.
+        within: largest distance in metres.
+    """
     keyframes, xz = _places(map_)
     return keyframes[np.linalg.norm(xz - point, axis=1) <= within]
 
@@ -310,8 +321,11 @@ def near_point(map_: Map, point: Sequence[float], within: float) -> NDArray[np.i
 def near_frames(
     map_: Map, drive: int, first: float, last: float, within: float
 ) -> NDArray[np.int64]:
-    """Ids of the living keyframes within a distance (metres) of the keyframes that were made from
-    the frames ``first`` to ``last`` of a drive, ascending."""
+    """Ids of the living keyframes near some frames of a drive, in ascending order.
+
+    A keyframe is included if its distance from a keyframe that was made from the frames ``first``
+    to ``last`` is at most ``within`` metres.
+    """
     from scipy.spatial import cKDTree
 
     keyframes, xz = _places(map_)
@@ -324,6 +338,6 @@ def near_frames(
 
 
 def _places(map_: Map) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Living keyframes, and their x and z ``(N, 2)``."""
+    """Living keyframes, and their ``(N, 2)`` positions x and z."""
     keyframes = map_.living_keyframes()
     return keyframes, inverses(map_.arrays.T_cw[keyframes])[:, [0, 2], 3]

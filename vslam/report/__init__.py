@@ -1,1 +1,2 @@
-"""The report of one run, in its folder: JSON for scripts; Markdown, HTML and PNG for people."""
+"""The report of one run in the folder of the run. JSON is for scripts. Markdown, HTML and PNG are
+for people."""

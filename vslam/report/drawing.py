@@ -1,7 +1,7 @@
-"""The style of all figures of reports, and saving figures as PNG and SVG.
+"""The common style of the figures in reports, and functions that save figures as PNG and SVG.
 
 Every figure is drawn once, in the colours of a light theme. In the SVG, neutral colours become CSS
-variables, so that a figure in the HTML page follows the reader's light or dark theme.
+variables. Therefore, a figure in the HTML page follows the light or dark theme of the reader.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 BLUE, GREEN, AMBER, RED, GREY = "#3b82f6", "#10b981", "#f59e0b", "#ef4444", "#94a3b8"
 VIOLET = "#8b5cf6"
-COMPARED = ("#ec4899", "#f97316", "#06b6d4")  # colours of the detectors of --compare, repeated
+COMPARED = ("#ec4899", "#f97316", "#06b6d4")  # colours of the detectors of --compare
 STATE_COLORS = {
     TrackingState.WEAK: AMBER, TrackingState.LOST: RED, TrackingState.DROPPED: VIOLET,
 }  # fmt: skip
@@ -60,17 +60,18 @@ STYLE = {
     "ytick.color": LINE,
     "ytick.labelcolor": MUTED,
 }
-# Inches, small enough for the text to stay readable where a phone shrinks the figure to its width.
+# Inches. Figures are so small that their text stays readable on a phone, which shrinks them to its
+# width.
 WIDTH, LOW, SQUARE = 4.6, 2.5, 5.4
 DOTS_PER_INCH = 200
-_LEGEND_CHARACTERS = 60  # that fit side by side
-_HANDLE_CHARACTERS = 6  # width of the line or marker of an entry and of the gap to the next entry
+_LEGEND_CHARACTERS = 60  # number of characters that fit side by side
+_HANDLE_CHARACTERS = 6  # width of the marker of an entry and of the gap to the next entry
 
 Drawing = tuple[str, str, Figure]  # name, caption and figure
 
 
 def new_figure(title: str, x_label: str, y_label: str, height: float) -> tuple[Figure, Axes]:
-    """A figure with one plot and its title at the left; ``height`` in inches."""
+    """A figure with one plot. The title is at the left, and ``height`` is in inches."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
@@ -81,13 +82,13 @@ def new_figure(title: str, x_label: str, y_label: str, height: float) -> tuple[F
 
 
 def add_legend(figure: Figure, axes: Axes) -> None:
-    """List all labelled artists below the axes, where a legend never covers data."""
+    """Add a legend of all labelled artists below the axes, where it never covers data."""
     labels = axes.get_legend_handles_labels()[1]
     figure.legend(loc="outside lower center", ncols=_legend_columns(labels), columnspacing=1.2)
 
 
 def _legend_columns(labels: Sequence[str]) -> int:
-    """The largest number of columns that are not wider than the figure."""
+    """The largest number of columns for which the legend is not wider than the figure."""
     lengths = np.array([len(label) + _HANDLE_CHARACTERS for label in labels])
     columns = len(lengths)
     while columns > 1 and (
@@ -112,15 +113,18 @@ def plain_ticks(axis: Axis) -> None:
 
 
 def draw(drawings: Iterable[Drawing]) -> list[page.Figure]:
-    """Save drawings. If ``drawings`` is a generator, its figures are made here, in the style of
-    reports."""
-    # after_reset ignores the user's matplotlibrc, so that equal runs give equal figures.
+    """Save drawings in the style of reports.
+
+    If ``drawings`` is a generator, it makes its figures while this function runs, so that they have
+    this style, too.
+    """
+    # after_reset ignores the user's matplotlibrc. Therefore, equal runs give equal figures.
     with style.context(STYLE, after_reset=True):
         return [save(*drawing) for drawing in drawings]
 
 
 def save(name: str, caption: str, figure: Figure) -> page.Figure:
-    """Save a figure as PNG and SVG; equal figures give equal bytes."""
+    """Save a figure as PNG and SVG. Equal figures give byte-identical files."""
     png, svg = io.BytesIO(), io.StringIO()
     figure.set_dpi(DOTS_PER_INCH)
     if (layout := figure.get_layout_engine()) is not None:
@@ -128,7 +132,8 @@ def save(name: str, caption: str, figure: Figure) -> page.Figure:
         # With a layout engine, even one that does nothing, savefig would draw the figure twice.
         figure.set_layout_engine(None)
     figure.savefig(png, format="png")
-    # The salt makes element ids unique among the figures of a page, and equal in equal runs.
+    # The salt makes the ids of elements unique among the figures of a page. In equal runs, the ids
+    # are equal.
     with mpl.rc_context({"svg.hashsalt": name}):
         figure.savefig(svg, format="svg", metadata={"Date": None}, transparent=True)
     text = svg.getvalue()

@@ -1,7 +1,10 @@
-"""The explorer in a report: pose, state and error of every frame, and images of some keyframes.
+"""The interactive explorer in a report.
 
-A frame adds 47 bytes to the page, an image with its keypoints about 10,000. ``explorer.js`` uses no
-plotting library, because a library (Plotly: 4.7 MB) would be larger than the rest of the page.
+It shows the pose, state and error of every frame, and images of some keyframes.
+
+A frame adds 47 bytes to the page. An image with its keypoints adds about 10,000 bytes.
+``explorer.js`` uses no plotting library, because a library such as Plotly (4.7 MB) would be larger
+than the rest of the page.
 """
 
 from __future__ import annotations
@@ -26,9 +29,9 @@ if TYPE_CHECKING:
 def explorer(
     outcome: RunOutcome, evaluation: Evaluation | None, moments: Collection[Moment]
 ) -> list[Section]:
-    """The section with the explorer; no section if fewer than two frames were tracked.
+    """The section with the explorer. There is no section if fewer than two frames were tracked.
 
-    The arguments are those of :func:`explorer_data`.
+    The arguments are the same as for ``explorer_data``.
     """
     data = explorer_data(outcome, evaluation, moments)
     if data is None:
@@ -42,11 +45,12 @@ def explorer(
 def explorer_data(
     outcome: RunOutcome, evaluation: Evaluation | None, moments: Collection[Moment]
 ) -> dict[str, Any] | None:
-    """Numbers and images for ``explorer.js``, ready for JSON; None if fewer than two frames were
-    tracked.
+    """Numbers and images for ``explorer.js``, in a form that can be written as JSON.
+
+    The result is None if fewer than two frames were tracked.
 
     ``floats`` contains times in seconds, positions in metres, headings in degrees (0 along z, 90
-    along x) and errors in metres, NaN where unknown.
+    along x) and errors in metres. Unknown numbers are NaN.
 
     Args:
         outcome: the run.
@@ -95,5 +99,6 @@ def _encoded(moment: Moment) -> dict[str, Any]:
 
 
 def _packed(values: NDArray[Any], kind: str) -> str:
-    """An array in base64: a third of the size of its numbers in JSON, and it can hold NaN."""
+    """An array in base64. It takes a third of the size of the numbers in JSON, and can contain
+    NaN."""
     return b64encode(values.astype(kind).tobytes()).decode()

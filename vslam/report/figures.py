@@ -40,13 +40,13 @@ if TYPE_CHECKING:
 
 _STAGE_COLORS = [BLUE, AMBER, GREEN, VIOLET, "#ec4899", "#06b6d4", "#84cc16", "#f97316", GREY]
 _MOTION_S = 1.0  # duration of the motions whose errors are drawn
-_MAX_BINS = 240  # in the plot of stacked times, so that a bin is one or two pixels wide
+_MAX_BINS = 240  # in the plot of stacked times; a bin is then one or two pixels wide
 
 
 def draw_figures(
     outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
 ) -> list[page.Figure]:
-    """Draw all figures for which this run has data, in the order of the report.
+    """Draw all figures for which the run has data, in the order of the report.
 
     Args:
         outcome: the run.
@@ -62,20 +62,20 @@ def _drawings(
     if len(outcome.trajectory) and (outcome.n_tracked or not outcome.tracks):
         caption = "Seen from above, at equal scale; z points ahead of the first camera."
         if evaluation is not None and evaluation.alignment != "none":
-            caption += f" Estimate after {evaluation.alignment.upper()} alignment."
+            caption += f" The estimate is shown after {evaluation.alignment.upper()} alignment."
         if outcome.compared:
-            caption += " Dashed: the detectors of --compare, each after its own alignment."
+            caption += " Dashed lines: the detectors of --compare, each after its own alignment."
         yield "top_view", caption, top_view(outcome, evaluation, verdict)
     if (track := outcome.gps_track) is not None:
         caption = (
-            "Seen from above, in metres from the first fix: the trajectory with GPS, and the "
-            "trajectory by vision alone after its alignment with the fixes."
+            "Trajectories seen from above, in metres from the first fix: with GPS, and from "
+            "vision alone after alignment with the fixes."
         )
         yield "gps_map", caption, gps_map(track)
     if outcome.corrections:
         caption = (
-            "Keyframes just before the first loop was closed, and at the end. A dashed line joins "
-            "the two keyframes of a loop as they were before its correction; the length of the "
+            "Keyframes before the first loop was closed, and at the end. A dashed line joins "
+            "the two keyframes of a loop as they were before its correction. The length of the "
             "line is the drift that the correction removed."
         )
         yield "loop_closing", caption, loop_closing(outcome, evaluation)
@@ -91,10 +91,10 @@ def _drawings(
         if len(errors.first) > 1:
             yield (
                 "odometry_error",
-                "Error of the motion over one second by odometry alone (trajectory_odom.tum), and "
-                "twice its standard deviation according to the estimated covariance. About one "
-                "error in twenty should be larger, provided that the ground truth is accurate "
-                "enough over one second (KITTI's is not).",
+                "Error of the motion over one second from odometry alone (trajectory_odom.tum), "
+                "and twice its standard deviation according to the estimated covariance. About one "
+                "error in twenty should be larger than that, if the ground truth is accurate "
+                "enough over one second. KITTI's ground truth is not.",
                 _odometry_error(errors),
             )
     if outcome.tracks:
@@ -107,12 +107,12 @@ def _drawings(
     if stage_names(outcome.tracks):
         yield (
             "stage_times",
-            "Wall time of each stage, stacked; in long runs averaged over a few frames.",
+            "Wall time of each stage, stacked. In long runs, it is averaged over a few frames.",
             _stage_times(outcome),
         )
         yield (
             "stage_distribution",
-            "Boxes contain 50 % and whiskers 90 % of the frames that went through a stage.",
+            "Boxes contain 50 % of the frames that went through a stage, and whiskers 90 %.",
             _stage_distribution(outcome),
         )
 
@@ -195,7 +195,7 @@ def _tracked_points(outcome: RunOutcome) -> Figure:
 
 
 def _usable_features(outcome: RunOutcome) -> tuple[str, list[int]]:
-    """The name of the features that this sensor can turn into landmarks, and their number in each
+    """The name of the features that can become landmarks with this sensor, and their number in each
     frame."""
     sensor = outcome.sequence.camera.sensor
     if sensor == "mono":
@@ -217,7 +217,7 @@ def _stage_times(outcome: RunOutcome) -> Figure:
         np.repeat(mean, 2, axis=0).T,
         labels=names,
         colors=_stage_colors(names),
-        antialiased=False,  # no hairlines between the bands
+        antialiased=False,  # antialiasing would leave thin lines between the bands
         linewidth=0,
     )
     axes.set_ylim(bottom=0)

@@ -1,4 +1,4 @@
-"""Read the folder of a finished run: its map and images."""
+"""The folder of a finished run: its map and its images."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _WITHOUT_IMAGES = "export g2o, euroc or ply --no-colours, which need no images"
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """The content of a run's folder.
+    """The content of the folder of a run.
 
     ``map`` contains no culled keyframes. ``loops`` are the closed loops, with the relative poses
     that verification measured.
@@ -40,15 +40,15 @@ def read_run(folder: Path | str) -> FinishedRun:
     """Read the report and the map of a run.
 
     Raises:
-        InputError: the folder is not that of a run, or its map is missing, empty or of another
-            version of vslam.
+        InputError: the folder is not the folder of a run, or its map is missing, empty or from
+            another version of vslam.
     """
     folder = Path(folder)
     if not (folder / "map.npz").is_file():
-        raise InputError(f"{folder}: no map.npz here; name the folder of a run, like runs/latest.")
+        raise InputError(f"{folder}: no map.npz here; give the folder of a run, like runs/latest.")
     stored = load_map(folder / "map.npz")
     if not stored.map.n_keyframes:
-        raise InputError(f"{folder / 'map.npz'}: the map is empty; name a run that has one.")
+        raise InputError(f"{folder / 'map.npz'}: the map is empty; give a run that has one.")
     return FinishedRun(
         folder, ReportJson.read(folder / "report.json"), stored.map, stored.camera, stored.loops
     )
@@ -62,14 +62,15 @@ def open_images(
     """Open the images of a run again, with the options in its ``run.json``.
 
     Args:
-        data: the location of the data if it has moved; None for the location in ``run.json``.
-        on_render: as in :func:`vslam.datasets.open_sequence`.
+        data: the new location of the data if it has been moved. With None, the location in
+            ``run.json`` is used.
+        on_render: as in ``vslam.datasets.open_sequence``.
 
     Raises:
-        InputError: the images are missing, are of another camera, or came from a live camera, or
+        InputError: the images are missing, belong to another camera or came from a live camera, or
             the map was made from several drives.
     """
-    if set(run.map.sessions) != {run.map.scalars.session}:  # the report is of the last drive
+    if set(run.map.sessions) != {run.map.scalars.session}:  # the report covers only the last drive
         raise InputError(
             f"{run.folder}: the map was made from several drives, whose images cannot be opened "
             f"together; {_WITHOUT_IMAGES}."
@@ -87,10 +88,10 @@ def open_images(
 
 
 def keyframe_frames(run: FinishedRun, source: Source) -> Iterator[TimedFrame]:
-    """The frames of a run's keyframes, in the order of its map.
+    """The frames that became the keyframes of a run, in the order of the map.
 
     Raises:
-        InputError: the times differ from those of the run.
+        InputError: the timestamps differ from the timestamps of the run.
     """
     frames = frames_at(source, run.map.frames.tolist())
     for frame, time in zip_longest(frames, run.map.timestamps.tolist()):
@@ -102,5 +103,5 @@ def keyframe_frames(run: FinishedRun, source: Source) -> Iterator[TimedFrame]:
 def _other_images(run: FinishedRun) -> InputError:
     return InputError(
         f"{run.report.dataset} {run.report.sequence}: the times or the camera differ from those of "
-        f"{run.folder}; use --data to name the data that the run was made on."
+        f"{run.folder}; use --data to give the data that the run was made on."
     )

@@ -1,4 +1,4 @@
-"""The folder of one run: its name, and all results that are written when the run ends."""
+"""The folder of one run: its name, and the results that are written when the run ends."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ def create_run_folder(
 ) -> Path:
     """Create ``out/<YYYYmmdd-HHMMSS>-<dataset>-<sequence>-<perturb>-<detector>``.
 
-    If thresholds differ from the defaults, the first of them is appended, with the number of
-    further ones. If the name is in use, a number is appended. ``out/latest`` becomes a symbolic
-    link to the folder if the file system supports such links.
+    If thresholds differ from the defaults, the first changed threshold and the number of the other
+    changed thresholds are appended. If the name is in use, a number is appended. ``out/latest``
+    becomes a symbolic link to the folder if the file system supports such links.
 
     Raises:
         InputError: the folder cannot be created.
@@ -64,7 +64,7 @@ def create_run_folder(
     except OSError as error:
         raise InputError(
             f"{out}: cannot create a run folder here ({error.strerror}); "
-            "name a writable folder with --out."
+            "give a writable folder with --out."
         ) from error
     with contextlib.suppress(OSError):
         (out / "latest").unlink(missing_ok=True)
@@ -89,28 +89,30 @@ def write_results(
 ) -> ReportJson:
     """Evaluate a complete or interrupted run and write all results.
 
-    The most valuable files are written first. If a file cannot be written, the others still are:
+    The most valuable files are written first. If a file cannot be written, the other files are
+    still written. These are the files:
 
     - trajectories: ``trajectory_kitti.txt``, ``trajectory.tum``, ``ground_truth_kitti.txt``,
-      ``keyframes.tum``, ``trajectory_causal.tum`` (poses as first estimated), ``covariance.csv``
-      (their covariances), ``trajectory_odom.tum`` (poses that never jump),
-      ``trajectory_<detector>.tum`` of each detector of ``--compare``, and with GPS
-      ``trajectory_enu.tum``, ``trajectory_gps.csv`` and ``gps.json``;
+      ``keyframes.tum``, ``trajectory_causal.tum`` (poses at the time of tracking),
+      ``covariance.csv`` (covariances of these poses), ``trajectory_odom.tum`` (poses from odometry,
+      which never jump), and ``trajectory_<detector>.tum`` for each detector of ``--compare``. With
+      GPS, also ``trajectory_enu.tum``, ``trajectory_gps.csv`` and ``gps.json``;
     - maps: ``map.npz``, ``map.ply``;
-    - numbers: ``frames.csv``, ``config.json`` (for ``--config``), ``report.json``;
+    - numbers: ``frames.csv``, ``config.json`` (which ``--config`` can read), ``report.json``;
     - pages: ``figures/*.png``, ``report.md``, ``report.html`` (self-contained).
 
     Args:
-        folder: an existing folder; files of an earlier report are replaced.
-        outcome: the run, which may have lost all frames or have no frames.
+        folder: an existing folder. Files of an earlier report are replaced.
+        outcome: the run. It may have lost all frames, or have no frames.
         moments: images of keyframes for the HTML page.
-        pictures: pictures of closed loops; some become ``figures/loop-<frame>-<frame>.jpg``.
+        pictures: pictures of closed loops. Some of them are written as
+            ``figures/loop-<frame>-<frame>.jpg``.
         pages: whether to write the pages.
         ply: whether to write the landmarks as ``map.ply``.
-        map_file: a second place to write the map to.
+        map_file: a second path to which the map is written.
 
     Raises:
-        ResultsError: some results could not be written; all others were written.
+        ResultsError: some results could not be written. All other results were written.
     """
     written = Results(folder)
     evaluation, remark = _write_data(written, outcome, ply=ply, map_file=map_file)
@@ -128,7 +130,8 @@ def write_results(
 
 
 class Results:
-    """Writes the results of a run, and continues with the others if one cannot be written."""
+    """Writes the results of a run. If a result cannot be written, it continues with the other
+    results."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -136,7 +139,7 @@ class Results:
 
     @contextlib.contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Run a part of the work; record an exception instead of raising it."""
+        """Run a part of the work. An exception is recorded instead of raised."""
         try:
             yield
         except Exception as error:
@@ -144,7 +147,8 @@ class Results:
 
     @contextlib.contextmanager
     def file(self, name: str) -> Iterator[Path]:
-        """Yield the path at which to write a file or folder, which is removed if writing fails."""
+        """Yield the path at which to write a file or folder. If writing fails, the file or folder
+        is removed."""
         path = self.folder / name
         with self.part(name):
             try:
@@ -158,7 +162,7 @@ class Results:
         """Check that all parts have succeeded.
 
         Raises:
-            ResultsError: some parts failed; the message names them and their errors.
+            ResultsError: some parts failed. The message names these parts and their errors.
         """
         if not self._failed:
             return
@@ -172,7 +176,7 @@ class Results:
         elif all((self.folder / name).exists() for name in ("autosave.npz", "run.json")):
             remedy = f"free some space, then vslam run --resume {self.folder}"
         else:
-            remedy = "free some space or name another folder with --out"
+            remedy = "free some space or give another folder with --out"
         raise ResultsError(
             f"{self.folder}: {failed}, all other results were written; {remedy}."
         ) from first
@@ -187,10 +191,10 @@ def _reason(error: Exception) -> str:
 def _write_data(
     written: Results, outcome: RunOutcome, *, ply: bool, map_file: Path | None
 ) -> tuple[Evaluation | None, str | None]:
-    """Write trajectories, maps and tables; return the result of ``evaluate_run``.
+    """Write trajectories, maps and tables, and return the result of ``evaluate_run``.
 
-    The evaluation also gives the transform from the map to the ground truth, which the map file
-    contains.
+    The evaluation also determines the transformation from the map to the ground truth, which is
+    stored in the map file.
     """
     write_trajectories(written, outcome)
     with written.file("keyframes.tum") as file:
@@ -253,9 +257,12 @@ def _config_text(outcome: RunOutcome) -> str:
 
 
 def write_trajectories(written: Results, outcome: RunOutcome) -> None:
-    """Write the final trajectory in both formats, and the ground truth of the same frames. If some
-    frames have no ground truth, it is written only in the TUM format, because only this format has
-    times."""
+    """Write the final trajectory in the formats of KITTI and TUM, and the ground truth of the same
+    frames.
+
+    If some frames have no ground truth, the ground truth is written only in TUM's format, because
+    only this format has timestamps.
+    """
     with written.file("trajectory_kitti.txt") as file:
         write_kitti(file, outcome.trajectory.T_wc)
     with written.file("trajectory.tum") as file:
@@ -293,7 +300,7 @@ def _write_pages(
     moments: Collection[Moment],
     pictures: Collection[LoopPicture],
 ) -> None:
-    """Write the figures, and the pages, which contain the figures that could be drawn."""
+    """Write the figures and the pages. The pages contain the figures that could be drawn."""
     from vslam.report.explorer import explorer
     from vslam.report.figures import draw_figures
     from vslam.report.loop_tables import seen_loops

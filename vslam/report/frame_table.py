@@ -1,4 +1,4 @@
-"""``frames.csv`` and ``covariance.csv``: results of tracking by frame, for scripts."""
+"""``frames.csv`` and ``covariance.csv``: results of tracking for each frame, for scripts."""
 
 from __future__ import annotations
 
@@ -18,12 +18,15 @@ _AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 def write_frames(path: Path, tracks: list[TrackResult]) -> None:
-    """Write a row per frame: time (s), state, counts, whether it became a keyframe, standard
-    deviations of position (m) and orientation (degrees), and milliseconds of each stage.
+    """Write ``frames.csv``, which has a row for each frame.
 
-    The first two deviations are relative to the landmarks around the camera, the other two relative
-    to the start of the drive. Cells of unknown deviations are empty, and so are the cells of stages
-    that a frame did not go through.
+    The columns are the timestamp (s), the state, several counts, whether the frame became a
+    keyframe, standard deviations of position (m) and orientation (degrees), and the milliseconds of
+    each stage.
+
+    The first two deviations are relative to the landmarks around the camera. The other two
+    deviations are relative to the start of the drive. A cell is empty if a deviation is unknown, or
+    if a frame did not go through a stage.
     """
     stages = stage_names(tracks)
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -50,12 +53,14 @@ def _sigmas(track: TrackResult) -> list[str]:
 
 
 def write_covariances(path: Path, tracks: list[TrackResult]) -> None:
-    """Write a row for each frame with known covariances: the time (s), and the upper triangles of
-    two covariances, row by row.
+    """Write ``covariance.csv``, which has a row for each frame with known covariances.
+
+    The columns are the timestamp (s) and the upper triangles of two covariances, row by row.
 
     Both are covariances of ``[x, y, z, rx, ry, rz]`` in metres and radians, in the frame of the
-    camera (``vslam.odometry``). The first is that of the pose relative to the landmarks around the
-    camera (``local``), the second relative to the start of the drive (``drive``).
+    camera (``vslam.odometry``). The first covariance describes the pose relative to the landmarks
+    around the camera (``local``). The second covariance describes the pose relative to the start of
+    the drive (``drive``).
     """
     upper = np.triu_indices(6)
     pairs = [f"{_AXES[row]}_{_AXES[column]}" for row, column in zip(*upper, strict=True)]
@@ -74,8 +79,9 @@ def write_covariances(path: Path, tracks: list[TrackResult]) -> None:
 def read_covariances(
     path: Path,
 ) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Read the two ``(6, 6)`` covariances of each frame that ``write_covariances`` wrote. The keys
-    are the times, as text of the file.
+    """Read the two ``(6, 6)`` covariances of each frame from a file of ``write_covariances``.
+
+    The keys of the result are the timestamps, as they are written in the file.
 
     Raises:
         InputError: the file is missing or damaged.
@@ -92,7 +98,7 @@ def read_covariances(
                 found[time] = both[0], both[1]
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be read ({error.strerror}); name the folder of a run, or repeat it."
+            f"{path}: cannot be read ({error.strerror}); give the folder of a run, or repeat it."
         ) from error
     except (ValueError, csv.Error) as error:
         raise InputError(f"{path}: damaged ({error}); repeat the run.") from error

@@ -1,4 +1,5 @@
-"""Tables and pictures of loops. Their size is limited, even for hundreds of rejected candidates."""
+"""Tables and pictures of loops. Their size is limited, even if there are hundreds of rejected
+candidates."""
 
 from __future__ import annotations
 
@@ -16,14 +17,16 @@ if TYPE_CHECKING:
 
 _MAX_CLOSED = 60
 _MAX_REJECTED = 12
-_MAX_PICTURES = 6  # about 0.5 MB of the page
+_MAX_PICTURES = 6  # they take about 0.5 MB of the page
 _DESCRIPTORS = {"orb": "ORB descriptors", "learned": "learned descriptors"}
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
 def loop_sections(report: ReportJson) -> list[Section]:
-    """Sections on closed loops, revisits, the reasons for rejections, and the rejected candidates
-    with the most inliers."""
+    """Sections about closed loops, revisits, reasons for rejections, and rejected candidates.
+
+    Only the rejected candidates with the most inliers are listed.
+    """
     return [
         Section("Loops closed", [_closed(report)]),
         Section("Revisits", [_revisits(report)], wide=False),
@@ -51,7 +54,7 @@ def _revisits(report: ReportJson) -> Table:
 
 def _closed(report: ReportJson) -> Table:
     closed = [loop for loop in report.loops if loop.accepted]
-    closed.sort(key=lambda loop: loop.right is not False)  # stable: wrong ones come first
+    closed.sort(key=lambda loop: loop.right is not False)  # stable; wrong loops come first
     rows: list[Row] = [
         (
             *_evidence(loop),
@@ -118,7 +121,8 @@ def _evidence(loop: LoopEntry) -> Row:
 
 
 def _shared_reason(loops: list[LoopEntry]) -> str:
-    """One text for reasons that differ only in their numbers, which are replaced by ranges."""
+    """One text for reasons that differ only in their numbers. The numbers are replaced by
+    ranges."""
     columns = zip(*(_NUMBER.findall(loop.reason) for loop in loops), strict=True)
     ends = [(min(column, key=float), max(column, key=float)) for column in columns]
     ranges = iter([low if low == high else f"{low}-{high}" for low, high in ends])
@@ -135,11 +139,11 @@ def _right_share(loops: list[LoopEntry]) -> str:
 
 
 def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[Figure]:
-    """Draw a few closed loops: wrong loops first, then loops verified by learned descriptors.
+    """Draw a few closed loops. Wrong loops come first, then loops verified by learned descriptors.
 
     Args:
         report: the numbers of the run.
-        pictures: the closed loops whose two images were kept.
+        pictures: pictures of the closed loops of which both images were kept.
     """
     closed = {(loop.query_frame, loop.match_frame): loop for loop in report.loops if loop.accepted}
     shown = [
@@ -160,7 +164,7 @@ def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[Fi
 
 
 def seen_note(report: ReportJson, seen: Collection[Figure]) -> str:
-    """A note on what the pictures show, and how many closed loops are shown."""
+    """A note on the content of the pictures, and on the number of closed loops that are shown."""
     note = "Lines connect matched points; at most 60 matches are drawn."
     if len(seen) < report.loops_closed:
         note += f" {len(seen)} of the {report.loops_closed} closed loops are shown."

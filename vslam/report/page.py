@@ -1,7 +1,7 @@
 """A page of results: sections of text, tables and figures.
 
-Every report of vslam is such a page; :mod:`vslam.report.render` writes it as Markdown, as HTML and
-to a terminal. Each format omits the parts that it cannot show, and sections that become empty.
+Every report of vslam is such a page. ``vslam.report.render`` writes it as Markdown, as HTML and to
+a terminal. Each format omits the parts that it cannot show, and the sections that become empty.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ Row = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells. A table without rows is not shown, and neither is its note.
+    """Rows of cells. If a table has no rows, the table and its note are not shown.
 
     Attributes:
         head: a heading for each column.
         rows: rows with a cell for each column.
-        texts: the headings of the columns that contain text, which is aligned to the left.
+        texts: the headings of the columns that contain text. Text is aligned to the left.
         note: explanation below the table.
     """
 
@@ -32,14 +32,14 @@ class Table:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Names with their values."""
+    """Pairs of a name and its value."""
 
     rows: Sequence[tuple[str, str]]
 
 
 @dataclass(frozen=True)
 class Tile:
-    """One number of a summary; ``tone`` is ``good`` (green), ``bad`` (red) or empty."""
+    """One number of a summary. ``tone`` is ``good`` (green), ``bad`` (red) or empty."""
 
     label: str
     value: str
@@ -49,7 +49,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class Tiles:
-    """The numbers of a summary, which readers should see first."""
+    """The numbers of a summary. Readers should see them first."""
 
     tiles: Sequence[Tile]
 
@@ -68,7 +68,7 @@ class Bullets:
 
 @dataclass(frozen=True)
 class Alert:
-    """A warning: what happened, in bold, and what it means."""
+    """A warning. It says what happened, in bold, and what this means."""
 
     what: str
     meaning: str = ""
@@ -76,7 +76,7 @@ class Alert:
 
 @dataclass(frozen=True)
 class Code:
-    """Text to be typed or copied literally."""
+    """Text that the reader types or copies literally."""
 
     text: str
 
@@ -87,11 +87,11 @@ class Figure:
 
     Attributes:
         name: identifier, unique in the page.
-        caption: what it shows.
+        caption: description of the figure.
         image: PNG or JPEG.
-        svg: the drawing as an ``<svg>`` element whose neutral colours are CSS variables; empty for
-            a photograph.
-        file: path of ``image`` relative to the page; Markdown shows only figures with a path.
+        svg: the drawing as an ``<svg>`` element whose neutral colours are CSS variables. It is
+            empty for a photograph.
+        file: path of ``image`` relative to the page. Markdown shows only figures with a path.
     """
 
     name: str
@@ -109,7 +109,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Markup:
-    """Trusted HTML, which is not escaped; other formats omit it."""
+    """Trusted HTML, which is not escaped. Other formats omit it."""
 
     html: str
 
@@ -122,10 +122,10 @@ class Section:
     """Parts under a heading.
 
     Attributes:
-        title: the heading; if it is empty, HTML shows each part in a card of its own.
-        parts: the content; a string is a paragraph.
+        title: the heading. If it is empty, HTML shows each part in its own card.
+        parts: the content. A string is a paragraph.
         folded: whether HTML shows only the heading until the reader opens the section.
-        wide: whether HTML makes the section as wide as the page; others share a row.
+        wide: whether HTML makes the section as wide as the page. Other sections share a row.
     """
 
     title: str
@@ -136,7 +136,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """A whole report; ``about`` is shown in one line below the title."""
+    """A whole report. ``about`` is shown in one line below the title."""
 
     title: str
     about: Sequence[str]
@@ -144,5 +144,5 @@ class Page:
 
 
 def number(value: float | None, form: str = "{}") -> str:
-    """A number as a cell of a table; ``n/a`` for None."""
+    """A number as a cell of a table. None becomes ``n/a``."""
     return "n/a" if value is None else form.format(value)

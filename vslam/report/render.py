@@ -1,4 +1,4 @@
-"""Render pages as Markdown, as HTML and in a terminal, and write files."""
+"""Rendering of pages as Markdown, as HTML and in a terminal, and writing of files."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ _PHONE, _PAD = 48, 2  # width of a phone and the space between two columns, in c
 
 
 def write_files(
-    folder: Path, files: Mapping[str, str | bytes], fix: str = "name another folder"
+    folder: Path, files: Mapping[str, str | bytes], fix: str = "give another folder"
 ) -> None:
     """Write files into a folder, which is created if it does not exist.
 
     Args:
-        folder: where to write.
+        folder: the folder to write to.
         files: text or bytes by file name, in the order in which they are written.
-        fix: what the error message advises the user to do.
+        fix: advice to the user in the error message.
 
     Raises:
         ResultsError: a file cannot be written.
@@ -50,14 +50,14 @@ def write_files(
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:
-    """Rows as comma-separated values; None gives an empty cell."""
+    """Rows as comma-separated values. None becomes an empty cell."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
 
 
 def markdown(page: Page) -> str:
-    """Markdown with aligned tables, which can also be read in a terminal."""
+    """A page as Markdown. Its tables are aligned, so that they can also be read in a terminal."""
     blocks = [f"# {page.title}", " · ".join(filter(None, page.about))]
     for section in page.sections:
         if parts := [text for part in section.parts if (text := _markdown_part(part))]:
@@ -98,12 +98,12 @@ def _markdown_part(part: Part) -> str:
 
 
 def html(page: Page) -> str:
-    """A self-contained HTML page, which loads no other files."""
+    """A page as self-contained HTML, which loads no other files."""
     return fill_template("report.html.jinja", page=page)
 
 
 def fill_template(template: str, **values: object) -> str:
-    """Fill values into a template of this package; text in values is escaped."""
+    """Fill values into a template of this package. Text in the values is escaped."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -121,7 +121,7 @@ def fill_template(template: str, **values: object) -> str:
 
 
 def _heading_lines(name: str) -> list[str]:
-    """The lines of a column heading, which is broken at commas and brackets."""
+    """The lines of a column heading. A heading is broken at commas and brackets."""
     return re.split(r", | (?=\()", name)
 
 
@@ -136,7 +136,7 @@ def _is_shown(part: Part) -> bool:
 
 
 def _is_wide(table: Table) -> bool:
-    """Whether a table does not fit on a phone, although headings and text are broken at spaces."""
+    """Whether a table is too wide for a phone, even if headings and text are broken at spaces."""
     columns = zip(table.head, zip(*table.rows, strict=True), strict=True)
     width = 0
     for name, cells in columns:
@@ -149,7 +149,7 @@ def show(sections: Iterable[Section], console: Console) -> None:
     """Print sections to a terminal.
 
     Sentences are wrapped at the width of the console. Tables and values are not wrapped, because a
-    broken number cannot be read and a broken command cannot be copied.
+    wrapped number cannot be read, and a wrapped command cannot be copied.
     """
 
     def say(text: str, *, style: str = "", indent: str = "") -> None:
@@ -184,7 +184,7 @@ def show(sections: Iterable[Section], console: Console) -> None:
 
 
 def _columns(rows: Sequence[Row]) -> list[str]:
-    """The rows as lines in which each column is as wide as its widest cell."""
+    """The rows as lines of text. Each column is as wide as its widest cell."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
@@ -193,7 +193,7 @@ def _columns(rows: Sequence[Row]) -> list[str]:
 
 
 def rich_table(table: Table, gap: int) -> RichTable:
-    """A ``rich`` table in which no cell is cut off; headings are broken at commas and brackets.
+    """A ``rich`` table in which no cell is cut off. Headings are broken at commas and brackets.
 
     Args:
         table: the cells.

@@ -1,4 +1,4 @@
-"""The page of one run: the numbers of ``report.json``, lost frames first."""
+"""The page of one run with the numbers of ``report.json``. Lost frames come first."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _ALIGNMENTS = {
     "sim3": "Sim3 alignment",
     "none": "not aligned",
 }
-_MANY_LOST = 0.1  # share of the frames
+_MANY_LOST = 0.1  # as a share of the frames
 _COMPARED = (
     ("lost", "lost_frames", "{}"),
     ("ATE", "ate_rmse_m", "{:.3f} m"),
@@ -47,15 +47,16 @@ _COMPARED = (
     ("time", "seconds", "{:.1f} s"),
 )
 _ABOUT_COMPARED = (
-    "All detectors saw the same frames. Time: wall time of tracking and mapping, while the "
-    "detectors share the cores. It excludes reading images and extracting features, which is done "
-    "once for all detectors. To compare costs, time separate runs."
+    "All detectors saw the same frames. The time is the wall time of tracking and mapping. It is "
+    "longer than in separate runs, because the detectors share the cores. It excludes reading "
+    "images and extracting features, which is done once for all detectors. To compare costs, time "
+    "separate runs."
 )
 
 
 def headlines(report: ReportJson) -> list[Tile]:
-    """The summary. Lost frames come first, because the ATE of a run that lost many frames means
-    little."""
+    """The summary. Lost frames come first, because the ATE means little if many frames were
+    lost."""
     lost, mono = report.lost_frames, report.sensor == "mono"
     share = f"{100.0 * lost / report.frames:.1f} % of" if lost else "of"
     alignment = _ALIGNMENTS[report.alignment] if report.alignment else ""
@@ -77,7 +78,7 @@ def headlines(report: ReportJson) -> list[Tile]:
         *_on_earth(report),
         *([Tile("Scale", "arbitrary", "unknown to a single camera")] if mono else []),
         Tile("ATE RMSE", _number(report.ate_rmse_m, "m"), evaluated),
-        Tile("Causal ATE", _number(report.causal_ate_rmse_m, "m"), "poses as first estimated"),
+        Tile("Causal ATE", _number(report.causal_ate_rmse_m, "m"), "poses at the time of tracking"),
         Tile("RPE", _number(report.rpe_m, "m"), f"per frame; rotation {rotation}"),
         Tile("t_rel", _number(report.t_rel_percent, "%"), "KITTI drift over 100-800 m"),
         Tile("r_rel", _number(report.r_rel_deg_per_100m, "°"), "per 100 m"),
@@ -106,15 +107,15 @@ def _before_map(report: ReportJson) -> str:
 
 
 def _together(report: ReportJson) -> str:
-    """A remark that speed and memory cover several detectors; empty for a single detector."""
+    """A remark that speed and memory cover several detectors. It is empty for a single detector."""
     return f", {len(report.detectors)} detectors together" if report.detectors else ""
 
 
 def advice(report: ReportJson) -> str:
-    """What to do if many frames were lost; empty if few were."""
+    """Advice to the user if many frames were lost. It is empty if few frames were lost."""
     if report.lost_frames <= _MANY_LOST * report.frames:
         return ""
-    return "Many frames were lost; vslam doctor checks images, calibration and time stamps."
+    return "Many frames were lost; vslam doctor checks images, calibration and timestamps."
 
 
 def _in_map(report: ReportJson) -> list[Tile]:
@@ -140,8 +141,10 @@ def _on_earth(report: ReportJson) -> list[Tile]:
 
 
 def _latency(report: ReportJson) -> list[Tile]:
-    """The latency of a real-time run. It is marked as bad if frames were dropped, because then the
-    machine is too slow."""
+    """The latency of a real-time run.
+
+    It is marked as bad if frames were dropped, because the machine is then too slow.
+    """
     if report.latency_ms is None:
         return []
     ms, dropped = report.latency_ms, report.dropped_frames
@@ -167,8 +170,10 @@ def _loops(report: ReportJson) -> Tile:
 
 
 def _revisits(report: ReportJson) -> str:
-    """How many revisits were found. If the drive has no revisits, correct loops on shorter
-    stretches are mentioned."""
+    """The number of revisits that were found.
+
+    If the drive has no revisits, the text gives the number of correct loops on shorter stretches.
+    """
     if report.revisit_stretches:
         return f"{report.loops_found} of {counted(report.revisit_stretches, 'revisit')} found"
     none = f"the drive revisits no stretch of {MIN_LENGTH_M:.0f} m or more"
@@ -177,7 +182,9 @@ def _revisits(report: ReportJson) -> str:
 
 
 def detector_section(report: ReportJson) -> Section:
-    """A section with a row for each detector, the run's own first; empty without a comparison.
+    """A section with a row for each detector. The run's own detector comes first.
+
+    The result is empty without a comparison.
 
     Columns without any value are left out. The number of closed loops is shown only if there is no
     ground truth that shows which revisits were found.
@@ -208,7 +215,7 @@ def detector_section(report: ReportJson) -> Section:
 
 
 def _left_out(report: ReportJson) -> str:
-    """Why there is no comparison although one was requested; empty otherwise."""
+    """The reason why a requested comparison is missing. It is empty if nothing is missing."""
     if report.detectors or not report.compare:
         return ""
     return (
@@ -289,7 +296,7 @@ def run_page(
 
 
 def _gps(report: ReportJson) -> Section:
-    """The georeferenced trajectory; empty without GPS."""
+    """The section about the georeferenced trajectory. It is empty without GPS."""
     if (found := report.gps_track) is None:
         return Section("GPS", ())
     latitude, longitude, altitude = found.datum
@@ -316,7 +323,8 @@ def _gps(report: ReportJson) -> Section:
 
 
 def stage_rows(report: ReportJson) -> list[Row]:
-    """Stage, mean, median, 95th and 99th percentile in milliseconds."""
+    """Rows with the name of a stage and its mean, median, 95th and 99th percentile in
+    milliseconds."""
     return [
         (name, f"{ms.mean:.2f}", f"{ms.median:.2f}", f"{ms.p95:.2f}", f"{ms.p99:.2f}")
         for name, ms in report.stage_ms.items()
@@ -324,7 +332,7 @@ def stage_rows(report: ReportJson) -> list[Row]:
 
 
 def option_rows(report: ReportJson) -> list[tuple[str, str]]:
-    """The options of the run by their names on the command line."""
+    """The options of the run, under their names on the command line."""
     names = ("dataset", "sequence", "perturb", "detector", "sensor", "seed", "threads", "start")
     options = [(name, str(getattr(report, name))) for name in (*names, "every")]
     limit = "all" if report.max_frames is None else str(report.max_frames)
@@ -344,7 +352,7 @@ def option_rows(report: ReportJson) -> list[tuple[str, str]]:
 
 
 def machine_rows(report: ReportJson) -> list[tuple[str, str]]:
-    """The machine, the packages and the time of the run."""
+    """Rows that describe the machine, the packages and the time of the run."""
     machine = report.machine
     packages = {name: text for name, text in report.versions.items() if name != "python"}
     return [

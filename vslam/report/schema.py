@@ -16,7 +16,7 @@ from vslam.errors import InputError
 
 
 class Record(BaseModel):
-    """A part of a document; unknown fields are errors."""
+    """A part of a document. Unknown fields are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -31,7 +31,7 @@ class Document(Record):
         """Read a file that ``to_json`` wrote.
 
         Raises:
-            InputError: the file is missing, damaged or of another schema version.
+            InputError: the file is missing or damaged, or has another schema version.
         """
         known = cls.model_fields["schema_version"].default
         try:
@@ -40,7 +40,7 @@ class Document(Record):
             if found == known:
                 return cls.model_validate(content)
         except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-            raise InputError(f"{path}: missing or damaged; name the folder of a run.") from error
+            raise InputError(f"{path}: missing or damaged; give the folder of a run.") from error
         raise InputError(
             f"{path}: report schema {found}, but this version of vslam reads {known}; repeat the "
             "run with this version."
@@ -52,7 +52,7 @@ class Document(Record):
 
 
 class StageTime(Record):
-    """Time of one stage in milliseconds, over the frames that went through it."""
+    """Time of one stage in milliseconds. It covers the frames that went through the stage."""
 
     mean: float
     median: float
@@ -61,15 +61,15 @@ class StageTime(Record):
 
 
 class LoopEntry(Record):
-    """One loop candidate, accepted or rejected, with the frames of this run.
+    """A loop candidate that was accepted or rejected, with frames of this run.
 
-    - ``query_frame``: None for a frame that did not become a keyframe.
-    - ``match_frame``: None for a keyframe of an earlier drive.
-    - ``right``: whether the relative pose agrees with the ground truth; None if unknown.
-    - ``moved_m``: the largest distance by which the correction moved a keyframe; None for rejected
-      candidates.
-    - ``correction_s``: the duration of the correction; None for rejected candidates.
-    - ``matched_by``: the descriptors that gave the relative pose.
+    - ``query_frame``: frame of the query. None for a frame that did not become a keyframe.
+    - ``match_frame``: frame of the match. None for a keyframe of an earlier drive.
+    - ``right``: whether the relative pose agrees with the ground truth. None if this is unknown.
+    - ``moved_m``: the largest distance by which the correction moved a keyframe, in metres or in
+      units of a monocular map. None for rejected candidates.
+    - ``correction_s``: the duration of the correction in seconds. None for rejected candidates.
+    - ``matched_by``: the descriptors from which the relative pose was computed.
     - ``proposed_by``: the detectors that found the candidate, joined by ``+``.
     """
 
@@ -90,8 +90,8 @@ class LoopEntry(Record):
 class RevisitEntry(Record):
     """Frames in which, according to the ground truth, the camera drives along an earlier stretch.
 
-    ``loop_frame`` is the first of these frames in which a correct loop was closed; None if the
-    revisit was missed.
+    ``loop_frame`` is the first of these frames in which a correct loop was closed. It is None if
+    the revisit was missed.
     """
 
     first_frame: int
@@ -103,15 +103,18 @@ class RevisitEntry(Record):
 
 
 class Measures(Record):
-    """The measures of a run, and of each detector that is compared with it.
+    """The results of a run, or of a detector that is compared with the run.
 
-    Errors are None without ground truth, and KITTI's drift also on paths shorter than 100 m.
-    ``causal_ate_rmse_m`` is the ATE of the poses as first estimated (``trajectory_causal.tum``),
-    after their own alignment. ``loops_closed`` is the number of accepted candidates, of which
-    ``loops_wrong`` are wrong. ``loops_found`` and ``loops_missed`` are the numbers of revisited
-    stretches with and without a correct loop. Without ground truth, ``loops_wrong``,
-    ``loops_found`` and ``loops_missed`` are None. ``interrupted`` is the reason why the run ended
-    early; None if it did not.
+    Errors are None without ground truth. KITTI's drift is also None if the path is shorter than 100
+    m. ``causal_ate_rmse_m`` is the ATE of the poses at the time of tracking
+    (``trajectory_causal.tum``), after their own alignment.
+
+    ``loops_closed`` is the number of accepted candidates. ``loops_wrong`` is the number of wrong
+    loops among them. ``loops_found`` is the number of revisited stretches with a correct loop, and
+    ``loops_missed`` is the number of revisited stretches without a correct loop. Without ground
+    truth, ``loops_wrong``, ``loops_found`` and ``loops_missed`` are None.
+
+    ``interrupted`` is the reason why the run ended early. It is None if the run did not end early.
     """
 
     lost_frames: int
@@ -129,7 +132,7 @@ class Measures(Record):
 
 
 class DetectorFigures(Measures):
-    """One of the detectors that were compared on the same frames.
+    """The results of one of the detectors that were compared on the same frames.
 
     ``seconds`` is the wall time of tracking, of waiting for mapping, and of completing the map at
     the end. It excludes reading images and extracting features, which the detectors share.
@@ -140,17 +143,17 @@ class DetectorFigures(Measures):
 
 
 class MapFigures(Record):
-    """How a run was localised in the map that it continued.
+    """The results of localisation in the map that a run continued.
 
     - ``in_map_percent``: share of the frames whose final pose is in the map.
     - ``weak_percent``: share of the frames whose pose is in the map but has few inliers (WEAK).
-    - ``first_fix_s``: time from the first frame to the first localised frame; None if no frame was
-      localised.
+    - ``first_fix_s``: seconds from the first frame to the first localised frame. None if no frame
+      was localised.
     - ``sought``: number of frames at which the whole map was searched.
     - ``found``: number of these searches that succeeded.
-    - ``error_m``: RMSE of the positions in the map. They are aligned as the drives that made the
-      map, so that the error includes an offset of the whole run; None if the map was not aligned
-      with a ground truth.
+    - ``error_m``: RMSE of the positions in the map, in metres. The positions are transformed by the
+      alignment of the map, not by an alignment of their own. Therefore, the error includes an
+      offset of the whole run. None if the map was not aligned with a ground truth.
     """
 
     in_map_percent: float
@@ -162,17 +165,17 @@ class MapFigures(Record):
 
 
 class GpsFigures(Record):
-    """The georeferenced trajectory in numbers, also written as ``gps.json``.
+    """Numbers about the georeferenced trajectory. They are also written as ``gps.json``.
 
-    - ``datum``: origin of the local east-north-up frame, which is the first fix: latitude and
-      longitude in degrees, altitude in metres.
-    - ``antenna``: its position in the frame of the left camera (x right, y down, z forward), in
-      metres.
+    - ``datum``: origin of the local east-north-up frame, as latitude and longitude in degrees and
+      altitude in metres. The origin is the first GPS fix.
+    - ``antenna``: position of the antenna in the frame of the left camera (x right, y down, z
+      forward), in metres.
     - ``fixes``: number of fixes at tracked frames.
     - ``refused``: number of these fixes that failed the chi-square test.
-    - ``residual_m``: root mean square distance of the other fixes from the trajectory.
-    - ``metres_per_unit``: mean scale of the map.
-    - ``ate_rmse_m``: ATE of ``trajectory_enu.tum`` after SE3 alignment; None without ground truth.
+    - ``residual_m``: root mean square distance of the other fixes from the trajectory, in metres.
+    - ``metres_per_unit``: mean scale of the map, in metres per map unit.
+    - ``ate_rmse_m``: ATE of ``trajectory_enu.tum`` after SE3 alignment. None without ground truth.
     - ``level``: False if the drive is so straight that GPS does not determine the rotation about
       its direction.
     """
@@ -188,7 +191,7 @@ class GpsFigures(Record):
 
 
 class Machine(Record):
-    """The machine of the run; ``cores`` is the number of cores that the process may use."""
+    """The machine of the run. ``cores`` is the number of cores that the process may use."""
 
     cpu: str
     cores: int
@@ -199,20 +202,24 @@ class Machine(Record):
 class ReportJson(Measures, Document):
     """One run in numbers.
 
-    - ``frames``: number of processed frames. ``skipped_frames`` of them had an unreadable image;
-      ``dropped_frames`` were replaced by a newer one in a real-time run.
-    - ``lost_before_map``: number of lost frames before the first tracked one, in a run that began a
-      new map. ``longest_loss_s``: the longest time from a lost frame to the next tracked one or to
-      the end.
-    - ``warnings``: sentences about faults of the images or the rig that the run has detected.
-    - ``evaluation_remark``: why no errors were computed, or how many frames they cover.
-    - ``latency_ms``: time from an image to its pose in a real-time run, otherwise None.
-    - ``loops_rejected``: number of rejected candidates. ``revisit_stretches``: the sum of
-      ``loops_found`` and ``loops_missed`` (:mod:`vslam.evaluation.loops`).
-    - ``detectors``: with ``--compare``, all detectors, the run's own first; the speed, CPU time and
-      memory of the run then cover all detectors together. The list is empty in a resumed run,
-      because the maps of the other detectors are not saved.
-    - ``thresholds``: thresholds that differ from the defaults, by dotted name.
+    - ``frames``: number of processed frames. ``skipped_frames`` of these frames had an image that
+      could not be read. In a real-time run, ``dropped_frames`` of them were replaced by a newer
+      frame.
+    - ``lost_before_map``: number of lost frames before the first tracked frame, in a run that began
+      a new map. ``longest_loss_s`` is the longest time in seconds from a lost frame to the next
+      tracked frame, or to the end.
+    - ``warnings``: sentences about problems of the images or the rig that the run has detected.
+    - ``evaluation_remark``: the reason why no errors were computed, or the number of frames that
+      the errors cover.
+    - ``latency_ms``: milliseconds from an image to its pose in a real-time run. None for other
+      runs.
+    - ``loops_rejected``: number of rejected candidates. ``revisit_stretches`` is the sum of
+      ``loops_found`` and ``loops_missed`` (``vslam.evaluation.loops``).
+    - ``detectors``: the results of all detectors of a run with ``--compare``. The run's own
+      detector comes first. The speed, CPU time and memory of such a run cover all detectors
+      together. The list is empty in a resumed run, because the maps of the other detectors are not
+      saved.
+    - ``thresholds``: the thresholds that differ from the defaults, by dotted name.
     """
 
     schema_version: int = 5

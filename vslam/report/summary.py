@@ -1,4 +1,4 @@
-"""Compute the numbers of a report from the outcome of a run."""
+"""Computation of the numbers of a report from the outcome of a run."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _OPTIONS = (
 )  # fmt: skip
 
 _WRONG_SCALE = 1.2  # smallest factor that is reported; drift changes the scale by a few per cent
-_LEFT_OVER = 0.3  # largest share of the error, and of the path's size, left after scaling
+_LEFT_OVER = 0.3  # largest share of the error, and of the size of the path, after scaling
 
 
 def summarize(
@@ -57,7 +57,7 @@ def summarize(
         evaluation: errors of ``outcome.trajectory``; None if they cannot be computed.
         verdict: evaluation of ``outcome.loops``; None if a frame has no ground truth.
         evo_command: command that repeats the evaluation; None if evo cannot evaluate the run.
-        remark: why there is no evaluation, or how many frames it covers.
+        remark: the reason why there is no evaluation, or the number of frames that it covers.
     """
     frames = len(outcome.tracks)
     states = Counter(track.state for track in outcome.tracks)
@@ -108,8 +108,11 @@ def summarize(
 
 
 def _scale_warnings(outcome: RunOutcome, evaluation: Evaluation | None) -> list[str]:
-    """A warning if a trajectory fits the ground truth only after it is scaled, although the sensor
-    measures the scale."""
+    """A warning about a trajectory of wrong scale.
+
+    The warning is given if the trajectory fits the ground truth only after it is scaled, although
+    the sensor measures the scale.
+    """
     camera, ground_truth = outcome.sequence.camera, outcome.ground_truth
     if evaluation is None or ground_truth is None or camera.monocular:
         return []
@@ -152,9 +155,10 @@ def _longest_loss_s(tracks: list[TrackResult]) -> float:
 
 
 def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
-    """The errors of the final trajectory of a run, and a remark; either can be None.
+    """The errors of the final trajectory of a run, and a remark. Both can be None.
 
-    The remark says why there are no errors, or how many frames they cover if not all.
+    The remark gives the reason why there are no errors. If the errors do not cover all frames, it
+    gives the number of frames that they cover.
     """
     ground_truth = outcome.ground_truth
     if ground_truth is None:
@@ -163,7 +167,7 @@ def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
         return None, "no frames"
     try:
         found = evaluate_trajectory(outcome.trajectory, ground_truth, outcome.alignment)
-    except InputError as error:  # too short to align; the other results are still of use
+    except InputError as error:  # it is too short to align; the other results are still useful
         return None, str(error)
     if found.frames == len(outcome.trajectory):
         return found, None
@@ -171,7 +175,7 @@ def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
 
 
 def causal_ate(outcome: RunOutcome) -> float | None:
-    """ATE of the poses as first estimated; None if it cannot be computed."""
+    """ATE of the poses at the time of tracking. None if it cannot be computed."""
     ground_truth = outcome.ground_truth
     if ground_truth is None or not outcome.tracks:
         return None
@@ -185,7 +189,7 @@ def causal_ate(outcome: RunOutcome) -> float | None:
 def _measures(
     outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
 ) -> dict[str, Any]:
-    """The fields of :class:`vslam.report.schema.Measures`."""
+    """The fields of ``vslam.report.schema.Measures``."""
     errors = ("ate_rmse_m", "rpe_m", "rpe_deg", "t_rel_percent", "r_rel_deg_per_100m")
     return {
         "lost_frames": sum(track.state == TrackingState.LOST for track in outcome.tracks),
@@ -202,7 +206,10 @@ def _measures(
 def _detectors(
     outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
 ) -> list[DetectorFigures]:
-    """The detectors that were compared, the run's own first; empty without a comparison."""
+    """The results of the compared detectors. The run's own detector comes first.
+
+    The result is empty without a comparison.
+    """
     if not outcome.compared:
         return []
     judged = [(outcome, evaluation, verdict)]
@@ -234,7 +241,7 @@ def _figures_in_map(outcome: RunOutcome) -> MapFigures | None:
 
 
 def gps_figures(outcome: RunOutcome) -> GpsFigures | None:
-    """The georeferenced trajectory in numbers; None without GPS."""
+    """Numbers about the georeferenced trajectory. None without GPS."""
     if (track := outcome.gps_track) is None:
         return None
     ate, ground_truth = None, outcome.ground_truth
@@ -256,7 +263,7 @@ def gps_figures(outcome: RunOutcome) -> GpsFigures | None:
 
 
 def stage_names(tracks: list[TrackResult]) -> list[str]:
-    """Stages in the order in which the run first went through them."""
+    """Names of the stages, in the order in which the run first went through them."""
     return list(dict.fromkeys(name for track in tracks for name in track.stage_ms))
 
 
@@ -287,7 +294,8 @@ def _loops(outcome: RunOutcome, verdict: LoopEvaluation | None) -> list[LoopEntr
 
 
 def _frame(frames: NDArray[np.int64], keyframe: int) -> int | None:
-    """The frame of this run that became a keyframe; None for -1 and keyframes of earlier drives."""
+    """The frame of this run that became a keyframe. None for -1 and for keyframes of earlier
+    drives."""
     return int(frames[keyframe]) if keyframe >= 0 and frames[keyframe] >= 0 else None
 
 

@@ -1,4 +1,4 @@
-"""The maps of a report, seen from above: the trajectory, and the effect of loop closing on it."""
+"""Figures of the trajectory seen from above, and of the effect of loop closing on it."""
 
 from __future__ import annotations
 
@@ -42,8 +42,11 @@ Points = NDArray[np.float64]
 def top_view(
     outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
 ) -> Figure:
-    """Draw estimate, ground truth, weak and lost frames, closed loops and missed revisits. The
-    trajectories of the detectors of --compare are dashed, each after its own alignment."""
+    """Draw the estimate, the ground truth, weak and lost frames, closed loops and missed revisits.
+
+    The trajectories of the detectors of ``--compare`` are dashed. Each of them is shown after its
+    own alignment.
+    """
     figure, axes = _new_map("Top view", outcome, evaluation)
     path = _aligned(outcome, evaluation, outcome.trajectory.T_wc[:, :3, 3])
     x, z = path[:, 0], path[:, 2]
@@ -52,7 +55,7 @@ def top_view(
     for k, (other, color) in enumerate(zip(outcome.compared, cycle(COMPARED), strict=False)):
         its_own = None if evaluation is None else evaluate_run(other)[0]
         points = _aligned(other, its_own, other.trajectory.T_wc[:, :3, 3])
-        # The dashes of each path are shifted, so that coinciding paths all stay visible.
+        # The dashes of each path are shifted, so that all paths stay visible where they coincide.
         dashes = (2.0 * k, (2.0, 2.0 * len(outcome.compared)))
         axes.plot(
             points[:, 0],
@@ -101,8 +104,8 @@ def top_view(
 def loop_closing(outcome: RunOutcome, evaluation: Evaluation | None) -> Figure:
     """Draw the keyframes before the first correction and at the end.
 
-    Both are transformed to the frame of the ground truth by the alignment of the final trajectory,
-    so that every difference between them is the effect of loop closing.
+    Both are transformed to the frame of the ground truth by the alignment of the final trajectory.
+    Therefore, every difference between them is an effect of loop closing.
     """
     figure, axes = _new_map("Map before and after loop closing", outcome, evaluation)
     before = _aligned(outcome, evaluation, _centres(outcome.corrections[0].T_cw_before))
@@ -134,7 +137,7 @@ def loop_closing(outcome: RunOutcome, evaluation: Evaluation | None) -> Figure:
 
 
 def gps_map(track: GpsTrack) -> Figure:
-    """Draw the trajectory with and without GPS, and the fixes."""
+    """Draw the trajectory with GPS, the trajectory without GPS, and the fixes."""
     figure, axes = new_figure("With GPS", "east (m)", "north (m)", SQUARE)
     used = track.anchored.used
     fixes, refused = track.fixes[used], track.fixes[~used]
@@ -162,7 +165,7 @@ def _centres(T_cw: NDArray[np.float64]) -> Points:
 
 
 def _lines(ends: Points) -> Collection[Points]:
-    """x and z of ``(M, 2, 3)`` lines, as one polyline in which NaN separates the lines."""
+    """x and z of ``(M, 2, 3)`` lines, as one polyline. The lines are separated by NaN."""
     gaps = np.full((len(ends), 1, 3), np.nan)
     points = np.concatenate([ends, gaps], axis=1).reshape(-1, 3)
     return points[:, 0], points[:, 2]
@@ -176,7 +179,8 @@ def _at_frames(outcome: RunOutcome, path: Points, frames: NDArray[np.int64]) -> 
 
 
 def _aligned(outcome: RunOutcome, evaluation: Evaluation | None, points: Points) -> Points:
-    """Transform ``(N, 3)`` points of the estimated world into the frame of the ground truth."""
+    """Transform ``(N, 3)`` points from the estimated world frame to the frame of the ground
+    truth."""
     if evaluation is None:
         return points
     S = truth_alignment_of(outcome, evaluation).S_truth_world

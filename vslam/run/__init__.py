@@ -1,1 +1,2 @@
-"""A run over a sequence: prepare, track and record its frames, and collect the results."""
+"""A run over a sequence. A run prepares, tracks and records the frames, and collects the
+results."""

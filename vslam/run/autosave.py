@@ -1,11 +1,11 @@
 """Save the state of a run at intervals, so that a killed run loses at most a minute of work.
 
-A line with the pose of each tracked frame is appended to ``trajectory_online.tum``. At intervals,
-the map is copied between two frames, if possible while no keyframe is being mapped. A thread then
-writes the data that the report needs about the frames so far (``autosave_progress.npz``) and the
-map (``autosave.npz``, an ordinary map file). Each file replaces the previous one atomically. If a
-run is killed between these two writes, its progress contains a few frames more than its map; a
-resumed run tracks these frames again.
+The pose of each tracked frame is appended to ``trajectory_online.tum`` as a line. At intervals, the
+map is copied between two frames, if possible while no keyframe is being mapped. A thread then
+writes two files. ``autosave_progress.npz`` contains the data about the frames so far that the
+report needs. ``autosave.npz`` contains the map and is an ordinary map file. Each file replaces the
+previous version atomically. If a run is killed between these two writes, the saved progress
+contains a few frames more than the saved map. A resumed run tracks these frames again.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from vslam.trajectory import tum_line
 
 MAP, PROGRESS, ONLINE = "autosave.npz", "autosave_progress.npz", "trajectory_online.tum"
 LOCK = ".lock"
-_DUE = 0.75  # share of the period after which saving is due, which leaves time for writing
+_DUE = 0.75  # share of the period after which saving is due; the rest is for writing
 _DUE_WHILE_ADJUSTING = 0.95  # the same while a global bundle adjustment is running
 _MOST_MISSED = 5  # frames for which saving is postponed because a keyframe is being mapped
 
@@ -40,7 +40,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Unfinished:
-    """The saved state of an interrupted run: its map file, and its progress at the same frame."""
+    """The saved state of an interrupted run: a map file, and the progress at the same frame."""
 
     map: Path
     progress: Progress
@@ -49,7 +49,8 @@ class Unfinished:
 @contextmanager
 def lock_run(folder: Path) -> Iterator[None]:
     """Lock the folder of a run, so that no other process resumes the run while it is in progress.
-    If the lock cannot be created, for example on a full disk, the run continues without it.
+
+    If the lock cannot be created, for example on a full disk, the run continues without a lock.
 
     Raises:
         InputError: another process is running in the folder.
@@ -61,8 +62,10 @@ def lock_run(folder: Path) -> Iterator[None]:
 
 
 def find_unfinished(folder: Path) -> Unfinished:
-    """Find the saved state from which a run can be resumed. Poses of frames that will be tracked
-    again are removed from ``trajectory_online.tum``.
+    """Find the saved state from which a run can be resumed.
+
+    A resumed run tracks the frames after the saved state again. The poses of these frames are
+    removed from ``trajectory_online.tum``.
 
     Raises:
         InputError: nothing was saved, or a file is damaged.
@@ -86,32 +89,36 @@ def _keep_poses(path: Path, frames: int) -> None:
 
 
 class Autosave:
-    """Interface to save a run. This base class saves nothing."""
+    """Interface for saving a run. This base class saves nothing."""
 
     def frame(self, result: TrackResult) -> None:
-        """Append the pose of a tracked frame; called for every frame in order."""
+        """Append the pose of a tracked frame. This method is called for every frame in order."""
 
     def offer(self, slam: Slam, progress: Callable[[], Progress]) -> None:
-        """Save if saving is due; called after ``frame``."""
+        """Save the run if saving is due. This method is called after ``frame``."""
 
     def close(self, slam: Slam, progress: Callable[[], Progress], *, resumable: bool) -> None:
-        """End saving; ``resumable`` says that the run ended early with a complete map."""
+        """End saving.
+
+        ``resumable`` says whether the run ended early with a complete map, so that it can be
+        resumed.
+        """
 
 
 NO_AUTOSAVE = Autosave()
 
 
 class FolderAutosave(Autosave):
-    """Saves into the folder of a run.
+    """Saves the state of a run into the folder of the run.
 
-    If writing fails, for example on a full disk, one warning is logged, the run continues, and
-    saving is tried again the next time.
+    If writing fails, for example on a full disk, one warning is logged and the run continues.
+    Saving is tried again the next time.
     """
 
     def __init__(self, folder: Path, seconds: float, drive: str) -> None:
         """
         Args:
-            seconds: a killed run loses at most the work of this time; 0 saves no map.
+            seconds: a killed run loses at most the work of this time. With 0, no map is saved.
             drive: name of the drive in the map file.
         """
         self._folder, self._seconds, self._drive = folder, seconds, drive
@@ -161,7 +168,7 @@ class FolderAutosave(Autosave):
         stored, done = slam.stored_map(self._drive), progress()
         frames, n_done = stored.frames, len(done.tracks)
         if frames is not None and len(frames.timestamp) > n_done:
-            # A failed step has already added its frame, which must be tracked again.
+            # A step that failed has already added its frame. This frame must be tracked again.
             stored = replace(stored, frames=frames.until(n_done), checkpoint=None)
         try:
             self._writing = self._writer.submit(self._write, _copy(stored), done)
@@ -187,7 +194,9 @@ class FolderAutosave(Autosave):
 
 def remove_autosave(folder: Path) -> None:
     """Remove the files that are needed only to resume a run, and partly written files.
-    Call this after the results are written."""
+
+    Call this function after the results have been written.
+    """
     for name in (MAP, PROGRESS):
         (folder / name).unlink(missing_ok=True)
         for part in folder.glob(f".{name}.*.part"):
@@ -195,7 +204,7 @@ def remove_autosave(folder: Path) -> None:
 
 
 def _copy(stored: StoredMap) -> StoredMap:
-    """A copy of the map without compaction, which the writing thread does later."""
+    """A copy of the map, which is not compacted. The writing thread compacts it later."""
     tables = {
         name: replace(table, first=table.first.copy(), values=table.values.copy())
         for name, table in stored.detector.tables.items()

@@ -17,7 +17,7 @@ from vslam.geometry import inverses
 from vslam.maps.stored_map import StoredMap
 from vslam.trajectory import Trajectory, bridge_gaps
 
-_LONGEST_S = 0.5  # between two frames; over longer intervals, no position is interpolated
+_LONGEST_S = 0.5  # no position is interpolated between two frames with a longer interval
 
 
 @dataclass(frozen=True)
@@ -26,12 +26,15 @@ class GpsTrack:
 
     Attributes:
         trajectory: poses of the frames, camera to ENU, in metres.
-        geodetic: ``(N, 3)`` their latitude and longitude (degrees) and altitude (m).
-        datum: ``(3,)`` latitude, longitude and altitude of the origin, which is the first fix.
-        visual: ``(N, 3)`` the trajectory by vision alone, aligned with the fixes as a whole.
-        fixes: ``(M, 3)`` the fixes at the time of tracked frames, in ENU: positions of the antenna.
+        geodetic: ``(N, 3)`` latitude and longitude (degrees) and altitude (m) of the frames.
+        datum: ``(3,)`` latitude, longitude and altitude of the origin of the frame ENU. The origin
+            is the first GPS fix.
+        visual: ``(N, 3)`` positions of the trajectory without GPS. The whole trajectory is aligned
+            with the fixes by one transformation.
+        fixes: ``(M, 3)`` positions of the antenna in ENU, from the fixes within the time of tracked
+            frames.
         antenna: ``(3,)`` position of the antenna in the frame of the camera, in metres.
-        anchored: the keyframes in ENU, and which fixes were used.
+        anchored: the poses of the keyframes in ENU, and the fixes that were used.
     """
 
     trajectory: Trajectory
@@ -80,13 +83,14 @@ def locate(stored: StoredMap, fixes: Fixes, config: PoseGraphConfig) -> GpsTrack
 def _in_map(
     table: FrameTable, T_kw: NDArray[np.float64], scale: NDArray[np.float64] | None = None
 ) -> Trajectory:
-    """The poses of all frames, derived from the poses of their keyframes; the poses of lost frames
-    are interpolated.
+    """The poses of all frames, computed from the poses of their keyframes.
+
+    The poses of lost frames are interpolated.
 
     Args:
         T_kw: ``(K, 4, 4)`` poses of the keyframes.
-        scale: ``(K,)`` factors by which the translations from each keyframe to its frames are
-            multiplied; None leaves them unchanged.
+        scale: ``(K,)`` factors. The translations from each keyframe to its frames are multiplied by
+            the factor of the keyframe. None leaves the translations unchanged.
     """
     T_ck = table.T_c_reference.copy()
     if scale is not None:
@@ -101,10 +105,11 @@ def _in_map(
 def _positions(
     table: FrameTable, T_kw: NDArray[np.float64], fixes: Fixes
 ) -> tuple[Positions, NDArray[np.float64]]:
-    """The fixes between tracked frames, and the datum.
+    """The fixes that lie between two tracked frames, and the datum.
 
-    Each fix gets the interpolated positions of the camera and the antenna at its time, in the frame
-    of the keyframe to which the previous frame refers.
+    For each fix, the positions of the camera and the antenna are interpolated at the time of the
+    fix. They are given in the frame of a keyframe, which is the keyframe that the pose of the
+    previous frame is relative to.
     """
     at = np.searchsorted(table.timestamp, fixes.times, "right") - 1
     at[fixes.times == table.timestamp[-1]] -= 1

@@ -1,4 +1,4 @@
-"""The picture of a closed loop: its two images side by side, with the matches that verified it."""
+"""Pictures of closed loops. A picture shows both images side by side, with the verified matches."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vslam.loopclosure.learned_localisation import project
 from vslam.loops import LoopEdge
 from vslam.map import NONE, Map
 
-_PANEL_WIDTH, _GUTTER = 640, 8  # pixels of a picture
+_PANEL_WIDTH, _GUTTER = 640, 8  # width of a panel and of the space between panels, in pixels
 _QUALITY = 80
 _SUBPIXEL = 4  # fractional bits of the positions that OpenCV draws
 _WHITE, _INK, _GREEN = (255, 255, 255), (33, 23, 17), (153, 211, 52)  # BGR
@@ -27,8 +27,9 @@ class LoopPicture:
     Attributes:
         query_frame: the frame of this run that closed the loop.
         match_frame: the earlier frame of this run that shows the same place.
-        query_jpeg, match_jpeg: left images of these frames, grey and reduced in size.
-        query_xy, match_xy: ``(N, 2)`` float64 pixels of the same landmarks in the reduced images.
+        query_jpeg, match_jpeg: left images of these frames as JPEG, in grey and reduced in size.
+        query_xy, match_xy: ``(N, 2)`` float64 positions (pixels) of the same landmarks in the two
+            reduced images.
     """
 
     query_frame: int
@@ -42,12 +43,13 @@ class LoopPicture:
 def loop_matches(
     map_: Map, edge: LoopEdge, camera: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The pixels of the same landmarks in the two keyframes of a closed loop.
+    """The positions of the same landmarks in the images of the two keyframes of a closed loop.
 
     After a loop is closed, the inlier features of the query observe the landmarks of the matched
     place. If the matched keyframe itself does not observe such a landmark, the landmark is
     projected into its image. Features that lost their landmark in the bundle adjustment after the
-    loop are left out, and so are landmarks outside the view of the matched keyframe.
+    loop are left out. Landmarks that lie outside the view of the matched keyframe are left out,
+    too.
 
     Args:
         map_: the map after the correction of the loop.
@@ -55,7 +57,8 @@ def loop_matches(
         camera: the camera of both keyframes.
 
     Returns:
-        ``(N, 2)`` float64 pixels in the image of the query, and ``(N, 2)`` in that of the match.
+        ``(N, 2)`` float64 pixels in the image of the query, and ``(N, 2)`` float64 pixels in the
+        image of the match.
     """
     assert edge.features is not None
     a, of_match = map_.arrays, map_.rows(edge.match)
@@ -72,8 +75,15 @@ def loop_matches(
 
 
 def spread(xy: NDArray[np.float64], most: int) -> NDArray[np.int64]:
-    """Choose at most ``most`` of ``(N, 2)`` points that cover the image evenly, by farthest-point
-    sampling; returns their indices."""
+    """Choose points that cover the image evenly, by farthest-point sampling.
+
+    Args:
+        xy: ``(N, 2)`` points.
+        most: largest number of points to choose.
+
+    Returns:
+        The indices of the chosen points.
+    """
     if len(xy) <= most:
         return np.arange(len(xy))
     chosen = [0]
@@ -85,8 +95,11 @@ def spread(xy: NDArray[np.float64], most: int) -> NDArray[np.int64]:
 
 
 def draw_picture(picture: LoopPicture) -> bytes:
-    """Draw a closed loop as a JPEG: the earlier image on the left, the one that closed the loop on
-    the right, and a line for each match."""
+    """Draw a closed loop as a JPEG.
+
+    The earlier image is on the left, and the image that closed the loop is on the right. Each match
+    is a line.
+    """
     left, scale = _panel(picture.match_jpeg)
     right, _ = _panel(picture.query_jpeg)
     gutter = np.full((len(left), _GUTTER, 3), _WHITE, np.uint8)
@@ -110,7 +123,7 @@ def draw_picture(picture: LoopPicture) -> bytes:
 
 
 def _panel(jpeg: bytes) -> tuple[NDArray[np.uint8], float]:
-    """An image scaled to the width of a panel, and the scale factor."""
+    """The image, scaled to the width of a panel, and the scale factor."""
     image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
     assert image is not None
     scale = _PANEL_WIDTH / image.shape[1]

@@ -1,4 +1,4 @@
-"""Small images of keyframes for the report: a sample of the whole run, and the closed loops."""
+"""Small images of keyframes for the report. They show a sample of the run, and the closed loops."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from vslam.run.loop_pictures import LoopPicture, loop_matches, spread
 from vslam.run.recorder import Recorder
 from vslam.trajectory import Trajectory
 
-_MOST = 96  # images, which take about 1 MB of the page
-_WIDTH = 360  # pixels
+_MOST = 96  # images; they take about 1 MB of the page
+_WIDTH = 360  # pixels, of an image
 _QUALITY = 55
 _MOST_POINTS = 400
 
@@ -26,8 +26,8 @@ _MOST_POINTS = 400
 # faster than it scales by other factors. A keyframe of KITTI takes 0.2 ms and 15 kB.
 _LOOP_SCALE = 0.5
 _LOOP_QUALITY = 60
-_MOST_LOOP_IMAGES = 2000  # 30 MB; beyond this, every second image is dropped
-_MOST_MATCHES = 60  # more lines hide the images
+_MOST_LOOP_IMAGES = 2000  # 30 MB; if there are more, every second image is dropped
+_MOST_MATCHES = 60  # more lines would hide the images
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,10 @@ class Moment:
     """A keyframe as the report shows it.
 
     Attributes:
-        frame: index of its frame in the run.
-        jpeg: its left image, 360 pixels wide or less.
-        points: ``(N, 2)`` uint8 keypoints in 255ths of width and height.
+        frame: index of the keyframe's frame in the run.
+        jpeg: left image of the keyframe as JPEG, at most 360 pixels wide.
+        points: ``(N, 2)`` uint8 positions of keypoints. The value 255 corresponds to the width or
+            height of the image.
         tracked: ``(N,)`` bool, whether each keypoint is an inlier match of a landmark.
     """
 
@@ -48,8 +49,10 @@ class Moment:
 
 
 class MomentRecorder(Recorder):
-    """Keeps the images of at most 96 keyframes, spread evenly over a run of any length: when there
-    are more, every second one is dropped."""
+    """Keeps the images of at most 96 keyframes, which are spread evenly over a run of any length.
+
+    When there are more images, every second image is dropped.
+    """
 
     def __init__(self) -> None:
         self.moments: list[Moment] = []
@@ -85,9 +88,9 @@ def _moment(
 class LoopPictureRecorder(Recorder):
     """Keeps a small image of each keyframe, and the data for a picture of each closed loop.
 
-    A loop has no picture if its earlier image was not kept: images of earlier drives and of the
-    part before the run was resumed are not available, and a very long run keeps only every second
-    image.
+    A loop has no picture if its earlier image was not kept. Images of earlier drives are not
+    available. If a run was resumed, images from before the interruption are not available either. A
+    very long run keeps only every second image.
 
     Attributes:
         pictures: pictures of the closed loops, in order.
@@ -95,7 +98,7 @@ class LoopPictureRecorder(Recorder):
 
     def __init__(self) -> None:
         self.pictures: list[LoopPicture] = []
-        self._jpegs: dict[int, bytes] = {}  # by frame
+        self._jpegs: dict[int, bytes] = {}  # image by frame
         self._camera: Camera | None = None
 
     def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None:

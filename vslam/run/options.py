@@ -17,10 +17,13 @@ OPTIONS = "run.json"
 
 
 class RunOptions(SourceOptions):
-    """The options as given on the command line. In ``run.json``, paths are absolute.
+    """The options of ``vslam run`` as they were given on the command line.
+
+    In ``run.json``, paths are absolute.
 
     Attributes:
-        plugins: the package of each plug-in that the other options name; set only in ``run.json``.
+        plugins: the package of each plug-in that the other options use. It is set only in
+            ``run.json``.
     """
 
     perturb: str = "none"
@@ -44,7 +47,7 @@ def write_options(folder: Path, options: RunOptions) -> None:
     """Write ``run.json``.
 
     Raises:
-        InputError: it cannot be written.
+        InputError: the file cannot be written.
     """
     data = Path(options.data)
     changed: dict[str, object] = {
@@ -63,7 +66,7 @@ def write_options(folder: Path, options: RunOptions) -> None:
         (folder / OPTIONS).write_text(text + "\n", encoding="utf-8")
     except OSError as error:
         raise InputError(
-            f"{folder / OPTIONS}: cannot be written ({error.strerror}); use --out to name a folder "
+            f"{folder / OPTIONS}: cannot be written ({error.strerror}); use --out to give a folder "
             "on a disk with free space."
         ) from error
 
@@ -103,7 +106,7 @@ def read_options(folder: Path) -> RunOptions:
         return RunOptions.model_validate_json(path.read_bytes())
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be read ({error.strerror}); name the folder of a run."
+            f"{path}: cannot be read ({error.strerror}); give the folder of a run."
         ) from error
     except ValidationError as error:
         raise InputError(f"{path}: damaged or from another version; start a new run.") from error

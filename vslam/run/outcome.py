@@ -22,46 +22,55 @@ if TYPE_CHECKING:
 
 
 def alignment_of(sensor: str) -> str:
-    """``sim3`` for a monocular trajectory, whose scale is arbitrary, ``se3`` for all others."""
+    """The alignment for a trajectory of a sensor.
+
+    It is ``sim3`` for a monocular trajectory, whose scale is arbitrary, and ``se3`` for all other
+    trajectories.
+    """
     return "sim3" if sensor == "mono" else "se3"
 
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """All data that the report needs.
+    """All data about a run that the report needs.
 
     Attributes:
-        settings: the options of the run, with the canonical name of its perturbation.
-        trajectory: final pose of every processed frame, including lost ones. Without a complete
-            map, these are the poses as they were tracked.
+        settings: the options of the run. The perturbation has its canonical name.
+        trajectory: final pose of every processed frame, including lost frames. If there is no
+            complete map, these are the poses at the time of tracking.
         keyframes: final poses of the keyframes.
-        tracks: one result per frame.
-        warnings: faults of the images and the rig that the run detected, as sentences.
+        tracks: result of tracking each frame.
+        warnings: problems of the images and of the stereo rig that the run detected, as sentences.
         skipped: a message for each frame whose images could not be read.
-        latency_ms: time from the arrival of each tracked frame to its pose, in a real-time run.
-        wall_s, cpu_s: seconds from reading the first frame until the last one is tracked and
-            mapped; if several detectors are compared, for all of them together.
-        step_s: wall seconds that this detector alone took: tracking, waiting for mapping, and
-            completing the map at the end. Reading images and extracting features is excluded.
+        latency_ms: milliseconds from the arrival of each tracked frame to its pose, in a real-time
+            run.
+        wall_s, cpu_s: wall and CPU seconds from reading the first frame until the last frame is
+            tracked and mapped. If several detectors are compared, this is the time for all of them
+            together.
+        step_s: wall seconds of the run with this detector alone. They include tracking, waiting for
+            mapping, and completing the map at the end. They exclude reading images and extracting
+            features.
         startup_s: seconds from the start of the process to the first frame.
-        peak_memory_mb: peak memory of the process.
+        peak_memory_mb: peak memory of the process, in MB.
         n_landmarks, n_keyframes: size of the final map.
-        map: the final map; None for a trajectory from another system or after mapping failed.
-        truth_alignment: transform from the continued map to the world of its ground truth; None if
-            unknown.
-        in_map: ``(N,)`` bool, frames tracked in the map that the run continued or in sub-maps that
-            loops joined to it; None for a run that started a new map.
-        stored: the map with all data needed to continue it; None if the run only localised in it.
-        loops: accepted and rejected loop candidates, in the order in which they were decided.
+        map: the final map. None for a trajectory from another system, or if mapping failed.
+        truth_alignment: transformation from the frame of the continued map to the frame of its
+            ground truth. None if it is unknown.
+        in_map: ``(N,)`` bool, True for frames that were tracked in the map that the run continued,
+            or in sub-maps that loops joined to this map. None for a run that started a new map.
+        stored: the map with all data that a later run needs to continue it. None if the run only
+            localised in the map.
+        loops: accepted and rejected loop candidates, in the order of the decisions.
         corrections: corrections of the map by the accepted loops, in order.
         keyframe_frames: ``(K,)`` int64, the frame of this run that became each keyframe, including
-            culled ones; -1 for keyframes of earlier drives.
-        n_submaps: number of sub-maps that were started, including the first map; 0 without a
-            keyframe.
-        gps_track: the georeferenced drive; None without GPS.
-        interrupted: why the run ended early ("Ctrl-C", a truncated file), or None.
+            culled keyframes. It is -1 for keyframes of earlier drives.
+        n_submaps: number of sub-maps that were started, including the first map. It is 0 if the run
+            has no keyframe.
+        gps_track: the georeferenced drive. None if the run has no GPS.
+        interrupted: the reason why the run ended early, such as "Ctrl-C" or a truncated file. None
+            if the run did not end early.
         compared: the runs of the detectors of ``settings.compare`` on the same frames, without
-            their maps; empty for a resumed run.
+            their maps. It is empty for a resumed run.
     """
 
     settings: RunOptions
@@ -93,18 +102,18 @@ class RunOutcome:
 
     @property
     def alignment(self) -> str:
-        """How the trajectory is aligned with the ground truth before they are compared."""
+        """The alignment of the trajectory with the ground truth, before both are compared."""
         return alignment_of(self.sequence.camera.sensor)
 
     @property
     def n_tracked(self) -> int:
-        """The number of frames whose pose was found in their images."""
+        """Number of frames whose pose was determined from their images."""
         found = (TrackingState.OK, TrackingState.WEAK)
         return sum(track.state in found for track in self.tracks)
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:
-        """The ground truth of the frames of the trajectory; None if there is none."""
+        """The ground truth of the frames of the trajectory. None if there is no ground truth."""
         truth = ground_truth_of(self.sequence)
         if truth is None:
             return None
@@ -113,15 +122,18 @@ class RunOutcome:
 
 
 def causal_trajectory(tracks: list[TrackResult]) -> Trajectory:
-    """The pose of each frame as it was tracked, without later corrections by bundle adjustment or
-    loop closing. A lost or dropped frame has its predicted pose."""
+    """The pose of each frame at the time of tracking.
+
+    Later corrections by bundle adjustment or loop closing are not included. A lost or dropped frame
+    has its predicted pose.
+    """
     times = np.array([track.timestamp for track in tracks], np.float64)
     poses = [track.T_wc for track in tracks]
     return Trajectory(times, np.array(poses, np.float64).reshape(-1, 4, 4))
 
 
 def odometry_trajectory(tracks: list[TrackResult]) -> Trajectory:
-    """The pose of each frame by odometry, which never jumps (``TrackResult.T_odom_camera``)."""
+    """The pose of each frame from odometry, which never jumps (``TrackResult.T_odom_camera``)."""
     known = [track for track in tracks if track.T_odom_camera is not None]
     times = np.array([track.timestamp for track in known], np.float64)
     poses = [track.T_odom_camera for track in known]
@@ -129,7 +141,7 @@ def odometry_trajectory(tracks: list[TrackResult]) -> Trajectory:
 
 
 def ground_truth_of(source: Source) -> Trajectory | None:
-    """The poses of all frames that have ground truth; None if no frame has."""
+    """The poses of all frames that have ground truth. None if no frame has ground truth."""
     if source.ground_truth is None:
         return None
     known = np.flatnonzero(np.isfinite(source.ground_truth).all((1, 2)))

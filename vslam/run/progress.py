@@ -1,7 +1,7 @@
-"""The progress of a run: the data about its frames that the report needs, as arrays in a file.
+"""The progress of a run: arrays in a file with the data about its frames that the report needs.
 
-An interrupted run leaves this file beside its map, and a resumed run continues from it. Each
-tracked frame is appended to arrays, so that saving the progress only copies these arrays.
+An interrupted run leaves this file next to its map. A resumed run continues from both files. Each
+tracked frame is appended to the arrays, so saving the progress only copies them.
 """
 
 from __future__ import annotations
@@ -33,11 +33,12 @@ class TrackTable:
     """Tracking results of N frames, in order.
 
     Attributes:
-        rows: ``(N, 82)`` float64: ``T_wc`` row by row; time, state, features, stereo features,
-            matches, inliers, flags (1 keyframe, 2 relocalised); ``T_odom_camera`` row by row;
-            ``PoseUncertainty.numbers``. Unknown numbers are NaN.
+        rows: ``(N, 82)`` float64. Each row contains ``T_wc`` row by row, then the timestamp, the
+            state, the numbers of features, stereo features, matches and inliers, and flags (1 for a
+            keyframe, 2 for a relocalised frame). ``T_odom_camera`` row by row and
+            ``PoseUncertainty.numbers`` follow. Unknown numbers are NaN.
         stages: names of the timed stages.
-        stage_ms: ``(N, S)`` float64 milliseconds, NaN for a stage that a frame skipped.
+        stage_ms: ``(N, S)`` float64 milliseconds. NaN for a stage that a frame skipped.
     """
 
     rows: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, _POSE + _NUMBERS)))
@@ -49,15 +50,15 @@ class TrackTable:
 
     @property
     def timestamps(self) -> NDArray[np.float64]:
-        """``(N,)`` seconds."""
+        """``(N,)`` timestamps in seconds."""
         return self.rows[:, _POSE]
 
     def until(self, frames: int) -> TrackTable:
-        """The first frames."""
+        """The first ``frames`` frames."""
         return replace(self, rows=self.rows[:frames], stage_ms=self.stage_ms[:frames])
 
     def results(self) -> list[TrackResult]:
-        """The frames as tracking returned them."""
+        """The results of the frames as tracking returned them."""
         return [
             _track(index, row, dict(zip(self.stages, ms, strict=True)))
             for index, (row, ms) in enumerate(zip(self.rows, self.stage_ms.tolist(), strict=True))
@@ -109,8 +110,8 @@ class Progress:
     Attributes:
         tracks: results of the frames.
         skipped, latency_ms, wall_s, cpu_s: see ``RunOutcome``.
-        loops: loops between frames of the run, with frame numbers in place of keyframe numbers; -1
-            stands for a keyframe of an earlier drive.
+        loops: loops between frames of the run, with frame numbers in place of keyframe ids. The
+            number -1 stands for a keyframe of an earlier drive.
         corrections: corrections by the accepted loops, with the same frame numbers.
     """
 
@@ -138,7 +139,7 @@ def _frame_of(message: str) -> int:
 
 
 def frames_of(loops: list[LoopEdge], frames: NDArray[np.int64]) -> list[LoopEdge]:
-    """Loops with frame numbers in place of keyframe numbers, and without features and landmarks.
+    """The loops with frame numbers in place of keyframe ids, and without features and landmarks.
 
     Args:
         frames: ``(K,)`` frame number of each keyframe.
@@ -168,10 +169,10 @@ def in_frames(
 
 
 def write_progress(path: Path, progress: Progress) -> None:
-    """Write an ``.npz``, replacing an existing file.
+    """Write the progress as an ``.npz`` file. An existing file is replaced.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     header = {
         "kind": "vslam progress",
@@ -200,7 +201,7 @@ def write_progress(path: Path, progress: Progress) -> None:
 
 
 def read_progress(path: Path) -> Progress:
-    """Read what ``write_progress`` wrote.
+    """Read a file that ``write_progress`` wrote.
 
     Raises:
         InputError: the file is missing, damaged or from another version.

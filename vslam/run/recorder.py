@@ -1,7 +1,9 @@
-"""The recording of a run, replayed offline in the Rerun viewer (``rerun recording.rrd``) or shown
-live.
+"""The recording of a run for the Rerun viewer.
 
-This is the only module that imports rerun. A :class:`Recorder` is called from one thread.
+A recording is replayed later with ``rerun recording.rrd``, or shown live during the run.
+
+This is the only module that imports rerun. The methods of a ``Recorder`` are called from one thread
+only.
 """
 
 from __future__ import annotations
@@ -39,20 +41,21 @@ from vslam.trajectory import Trajectory
 _log = logging.getLogger(__name__)
 _P = ParamSpec("_P")
 
-# Budget: 50 MB for 1,000 frames. With 350 keyframes of 1241x376 and 2,000 features, images take
-# about 11 MB, keypoints 6 MB, 14 maps 5 MB, and the data of all frames 0.3 MB. A map after each
-# loop, at most one in ten keyframes, can add 35 x 0.36 = 13 MB, and the pictures of those loops
-# 35 x 0.1 = 4 MB.
+# The budget is 50 MB for 1,000 frames. Such a run has about 350 keyframes of 1241x376 pixels and
+# 2,000 features. Their images take about 11 MB, the keypoints 6 MB, 14 maps 5 MB, and the data of
+# all frames 0.3 MB. In addition, a map is recorded after each loop, but at most for one in ten
+# keyframes. This adds up to 35 x 0.36 = 13 MB. The pictures of these loops add up to 35 x 0.1 = 4
+# MB.
 _IMAGE_SCALE = 0.5
 _JPEG_QUALITY = 75
-_MAX_POINTS_PER_MAP = 30_000  # the last map is complete
+_MAX_POINTS_PER_MAP = 30_000  # except for the last map, which is complete
 
-_TRAJECTORY_STEPS = 100  # 0.6 MB for 1,000 frames
-_REJECTED_SHOWN_FRAMES = 20  # after which the lines of rejected loops are hidden
+_TRAJECTORY_STEPS = 100  # they take 0.6 MB for 1,000 frames
+_REJECTED_SHOWN_FRAMES = 20  # the lines of rejected loops are hidden after this many frames
 _VIEWER_PORT, _WEB_PORT = 9876, 9090  # rerun's default ports
 _VIEWER_STARTS_S = 20.0
 _FLUSH_TIMEOUT_S = 5.0
-_RESERVED_BYTES = 64 * 2**20  # left on the disk for the map, the trajectories and the report
+_RESERVED_BYTES = 64 * 2**20  # kept free for the map, the trajectories and the report
 
 _GREEN, _AMBER, _RED = (16, 185, 129), (245, 158, 11), (239, 68, 68)
 _BLUE, _GREY = (59, 130, 246), (148, 163, 184)
@@ -69,7 +72,7 @@ class _Pace:
     Attributes:
         frames: number of frames in a batch.
         keyframes: number of keyframes between two maps.
-        corrected_keyframes: the same after a correction of the map.
+        corrected_keyframes: number of keyframes between two maps after a correction of the map.
     """
 
     frames: int
@@ -78,43 +81,49 @@ class _Pace:
 
 
 _FILE_PACE = _Pace(50, 25, 10)
-_VIEWER_PACE = _Pace(5, 5, 2)  # more often than in a file, because there is no file size to limit
+_VIEWER_PACE = _Pace(5, 5, 2)  # more often than for a file, whose size must be limited
 
 
 class Recorder:
-    """Interface to record a run; this base class records nothing (``--no-record``).
+    """Interface for recording a run. This base class records nothing (``--no-record``).
 
     No method raises an error if a recording cannot be written.
     """
 
     def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None:
-        """Log the data that does not change during a run; called once, before the first frame.
+        """Log the data that does not change during a run.
+
+        This method is called once, before the first frame.
 
         Args:
-            camera: the camera of the images that :meth:`keyframe` gets.
-            ground_truth: poses of the frames of this run, in any world frame; None if unknown.
+            camera: the camera of the images that are given to ``keyframe``.
+            ground_truth: poses of the frames of this run, in any world frame. None if they are
+                unknown.
         """
 
     def frame(self, result: TrackResult) -> None:
-        """Log one frame. Takes 0.1 ms."""
+        """Log one frame. This takes 0.1 ms."""
 
     def keyframe(self, result: TrackResult, image: Image, xy: NDArray, tracked: NDArray) -> None:
-        """Log image and keypoints of a keyframe, after :meth:`frame`.
+        """Log the image and keypoints of a keyframe. This method is called after ``frame``.
 
         Args:
-            result: the result of tracking this frame.
+            result: the result of tracking the frame that became the keyframe.
             image: ``(H, W)`` uint8 left image.
-            xy: ``(N, 2)`` float32 pixels of its features.
+            xy: ``(N, 2)`` float32 positions of its features in pixels.
             tracked: ``(N,)`` bool, whether each feature is an inlier match of a landmark.
         """
 
     def map(self, map_: Map) -> None:
-        """Log the map if enough keyframes were added since the last time. Called after a frame
-        while mapping does not change the map."""
+        """Log the map if enough keyframes were added since the last time.
+
+        This method is called after a frame, while mapping does not change the map.
+        """
 
     def loops(self, edges: Collection[LoopEdge], map_: Map) -> None:
-        """Log new loops, accepted or rejected. Called after :meth:`frame`, while mapping does not
-        change the map.
+        """Log new loops, which may have been accepted or rejected.
+
+        This method is called after ``frame``, while mapping does not change the map.
 
         Args:
             edges: the loops since the last call.
@@ -122,13 +131,17 @@ class Recorder:
         """
 
     def finish(self, trajectory: Trajectory, map_: Map | None) -> None:
-        """Log the final trajectory and the map, if there is one, write all pending data and close
-        the file."""
+        """Log the final trajectory and the map, if there is a map.
+
+        All pending data are written, and the file is closed.
+        """
 
 
 class SeveralRecorders(Recorder):
-    """Forwards every call to several recorders. A recorder that raises an error gets no more
-    calls, and a warning is logged."""
+    """Forwards every call to several recorders.
+
+    If a recorder raises an error, a warning is logged, and the recorder is not called again.
+    """
 
     def __init__(self, recorders: Sequence[Recorder]) -> None:
         self.recorders = list(recorders)
@@ -211,8 +224,11 @@ def open_viewer(kind: str) -> Viewer:
 
 
 def _start_viewer(port: int, options: list[str]) -> subprocess.Popen[bytes]:
-    """Start a viewer that listens only on this machine, unlike the viewers that rerun's functions
-    start. It is started in its own session, so that Ctrl-C ends the run but not the viewer."""
+    """Start a viewer that listens only on this machine.
+
+    The viewers that rerun's own functions start also listen on the network. The viewer is started
+    in its own session, so that Ctrl-C ends the run but not the viewer.
+    """
     command = [_executable(), "--bind=127.0.0.1", f"--port={port}", "--hide-welcome-screen"]
     command += options
     nothing = subprocess.DEVNULL
@@ -226,7 +242,7 @@ def _has_display() -> bool:
 
 
 def _executable() -> str:
-    """The viewer of the installed rerun package, rather than another version on the path."""
+    """The viewer of the installed rerun package. Another version may be on the path."""
     spec = find_spec("rerun_cli")
     folder = Path(spec.origin).parent if spec and spec.origin else Path()
     found = [path for name in ("rerun", "rerun.exe") if (path := folder / name).is_file()]
@@ -253,8 +269,11 @@ def _free_port(wanted: int) -> int:
 def _guarded(
     method: Callable[Concatenate[RerunRecorder, _P], None],
 ) -> Callable[Concatenate[RerunRecorder, _P], None]:
-    """Decorate a method: it does nothing once the recording has ended, and an error ends the
-    recording instead of being raised."""
+    """Decorate a method of the recorder.
+
+    If the method raises an error, the recording ends, and the error is not passed on. After the
+    recording has ended, the method does nothing.
+    """
 
     @functools.wraps(method)
     def call(self: RerunRecorder, *args: _P.args, **kwargs: _P.kwargs) -> None:
@@ -262,49 +281,55 @@ def _guarded(
             return
         try:
             method(self, *args, **kwargs)
-        except Exception as error:  # such as no memory, a full disk, a viewer that was closed
+        except Exception as error:  # such as a full disk or a viewer that was closed
             self._abandon(error)
 
     return call
 
 
 class RerunRecorder(Recorder):
-    """Writes a ``.rrd`` file, or shows the same data live.
+    """Writes a ``.rrd`` file, or shows the same data in a viewer during the run.
 
-    Timelines: ``frame`` (number) and ``time`` (seconds).
+    The timelines are ``frame`` (number of the frame) and ``time`` (seconds).
 
-    Entities:
+    These entities are recorded:
 
     - ``world/camera``: the pose of every frame;
-    - ``world/camera/image`` with ``tracked`` and ``untracked``: images of keyframes at half size,
-      with their keypoints;
-    - ``world/landmarks``, ``world/keyframes``: the map, every 25 keyframes, after a loop and at the
-      end;
-    - ``world/loops/accepted``, ``rejected``: lines in green from the loop on, or in faint red for
-      20 frames;
-    - ``loops/images``: the two images of a closed loop with their matches, until the next loop;
-    - ``world/ground_truth``: static;
+    - ``world/camera/image``: images of keyframes at half size. Its children ``tracked`` and
+      ``untracked`` are the keypoints;
+    - ``world/landmarks``, ``world/keyframes``: the map. It is recorded every 25 keyframes, after
+      each loop and at the end;
+    - ``world/loops/accepted``: green lines, which are shown from the loop to the end;
+    - ``world/loops/rejected``: faint red lines, which are shown for 20 frames;
+    - ``loops/images``: the two images of a closed loop with their matches, shown until the next
+      loop;
+    - ``world/ground_truth``: the ground truth, which does not change;
     - ``world/trajectory``: the final trajectory up to the frame shown;
-    - ``points/*``, ``stage_ms/*``: numbers of keypoints and milliseconds of every frame;
-    - ``state``, ``state/loops``: changes of the tracking state, and each loop with its reason.
+    - ``points/*``: numbers of keypoints in every frame;
+    - ``stage_ms/*``: milliseconds of each stage for every frame;
+    - ``state``: changes of the tracking state;
+    - ``state/loops``: each loop, with the reason why it was accepted or rejected.
 
-    The origin of the world is the estimated pose of the run's first frame: x right, y down, z
-    forward.
+    The world frame is the frame of the camera at the first frame of the run, with x right, y down
+    and z forward.
 
     A recording that cannot be written never ends a run. Rerun writes in its own thread and reports
-    errors only at a later flush, which may then never return. Therefore the recording ends, with a
-    warning in the log, when the disk has less than 64 MB left; everything up to that frame is in
-    the file. If a flush fails or takes longer than 5 s, or the viewer was closed, the recording
-    also ends with a warning, and the last message in the file may be incomplete.
+    errors only at a later flush, and this flush may never return. Therefore, the recording ends
+    with a warning in the log when the disk has less than 64 MB left. Everything up to this frame is
+    in the file. The recording also ends with a warning if a flush fails, if a flush takes longer
+    than 5 s, or if the viewer was closed. In these cases, the last message in the file may be
+    incomplete.
     """
 
     def __init__(self, target: Path | Viewer, pictures: Sequence[LoopPicture] = ()) -> None:
-        """Open a file, replacing an old recording, or connect to a viewer; if that fails, log a
-        warning and record nothing.
+        """Open a file or connect to a viewer.
+
+        An old recording is replaced. If the file cannot be opened or the viewer does not answer, a
+        warning is logged and nothing is recorded.
 
         Args:
-            pictures: pictures of the closed loops to record; another recorder, which is called
-                before this one, appends them to this list.
+            pictures: list of pictures of closed loops to record. Another recorder, which is called
+                before this recorder, appends the pictures to this list.
         """
         import rerun as rr
 
@@ -315,15 +340,15 @@ class RerunRecorder(Recorder):
         self._open = True
         self._state: TrackingState | None = None
         self._points: dict[str, tuple[int, int, int]] = {}  # colour of each curve of points/*
-        self._index = 0  # of the last frame
+        self._index = 0  # index of the last frame
         self._frames: list[TrackResult] = []
-        self._stages: list[str] = []  # those with a colour
+        self._stages: list[str] = []  # stages that have a colour
         self._keyframes = 0
         self._mapped_keyframes = -self._pace.keyframes
         self._accepted: list[LoopEdge] = []
         self._pictures = pictures
-        self._n_pictures = 0  # recorded so far
-        self._hide_rejected_at: int | None = None  # frame
+        self._n_pictures = 0  # number of pictures recorded so far
+        self._hide_rejected_at: int | None = None  # index of a frame
         try:
             # Otherwise, the time of logging would be the viewer's default timeline.
             self._recording.set_log_time_enabled(False)
@@ -361,7 +386,8 @@ class RerunRecorder(Recorder):
             log(f"points/{name}", rr.SeriesLines(colors=[color], names=[name]))
         log("world/trajectory", rr.LineStrips3D.from_fields(colors=[_BLUE], radii=[-1.0]))
         if ground_truth is not None and len(ground_truth):
-            # Move the ground truth from the world of the data set to that of the run.
+            # Move the ground truth from the world frame of the data set to the world frame of the
+            # run.
             T_wc = np.linalg.inv(ground_truth.T_wc[0]) @ ground_truth.T_wc
             log("world/ground_truth", _path(T_wc, _GREY))
 
@@ -369,7 +395,7 @@ class RerunRecorder(Recorder):
     def frame(self, result: TrackResult) -> None:
         import rerun as rr
 
-        # Frames are sent in columns, which is four times faster than a log call for each value.
+        # Frames are sent in columns. This is four times faster than a log call for each value.
         self._frames.append(result)
         self._index = result.index
         if len(self._frames) >= self._pace.frames:
@@ -438,8 +464,8 @@ class RerunRecorder(Recorder):
         self._close()
 
     def _log_trajectory(self, trajectory: Trajectory) -> None:
-        """Log the final trajectory up to each of a hundred frames, so that it grows as the run is
-        replayed."""
+        """Log the final trajectory up to each of a hundred frames, so that it grows during the
+        replay."""
         import rerun as rr
 
         n = len(trajectory)
@@ -484,7 +510,8 @@ class RerunRecorder(Recorder):
         self._recording.log(f"world/loops/{name}", lines)
 
     def _log_pictures(self) -> None:
-        """Log the pictures of new loops; if there are several, the last one stays visible."""
+        """Log the pictures of new loops. If there are several pictures, the last picture stays
+        visible."""
         import rerun as rr
 
         new = self._pictures[self._n_pictures :]
@@ -523,8 +550,8 @@ class RerunRecorder(Recorder):
         self._recording.flush(timeout_sec=_FLUSH_TIMEOUT_S)
 
     def _close(self) -> None:
-        # Disconnect only after a successful flush: disconnecting from a dead writer may never
-        # return.
+        # Disconnect only after a successful flush, because disconnecting from a dead writer may
+        # never return.
         self._flush()
         self._recording.disconnect()
         self._open = False
@@ -534,7 +561,7 @@ class RerunRecorder(Recorder):
 
         _log.warning("%s: recording ends here (%s).", self._name, reason(error))
         # When a stream is deleted, and when the process ends, rerun 0.41 waits forever for its dead
-        # writer. So the stream is never deleted, and rerun's hook at exit is removed.
+        # writer. Therefore, the stream is never deleted, and rerun's exit hook is removed.
         rr.unregister_shutdown()
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._recording))
         self._open = False
@@ -564,7 +591,7 @@ def _description(edge: LoopEdge, map_: Map) -> str:
 
 
 def _half(xy: NDArray[np.floating]) -> NDArray[np.floating]:
-    # The centre of the first pixel is 0 in vslam and 0.5 in rerun.
+    # The centre of the first pixel has the coordinate 0 in vslam and 0.5 in rerun.
     return (xy + 0.5) * _IMAGE_SCALE
 
 

@@ -1,4 +1,4 @@
-"""Detect faults of a stereo rig during a run and describe them in sentences for the report."""
+"""Detection of problems of a stereo rig during a run, and sentences about them for the report."""
 
 from __future__ import annotations
 
@@ -16,29 +16,30 @@ from vslam.frontend.sides import ComparedSides
 from vslam.geometry import compose, inverse, orthonormalised, se3_log
 from vslam.map import Map
 
-_FEWEST = 3  # frames; in fewer, a reflection or a hand in front of the lens may be the cause
+_FEWEST = 3  # frames; fewer may be caused by a reflection or a hand in front of the lens
 _FEWEST_OBSERVATIONS, _MOST_OBSERVATIONS = 3_000, 100_000
 _LARGEST_RESIDUAL_PX = 3.0
 _HUBER_PX = 0.3
 _ROUNDS = 10
-# Least standard deviation of the image speed, in pixels per second: without motion, a delay cannot
+# Least standard deviation of the image speed, in pixels per second. Without motion, a delay cannot
 # be observed.
 _LEAST_IMAGE_SPEED = 50.0
-_LONGEST_GAP_S = 2.0  # between keyframes; the motion over a longer time is unknown
-# Rigs without faults show a delay of at most 0.15 ms and an offset of at most 0.11 pixels. Bundle
-# adjustment absorbs a part of both faults: a delay of 10 ms shows as 1.1 ms, and a rotation by 2
-# arc minutes as 0.29 pixels (docs/research/stress.md).
+_LONGEST_GAP_S = 2.0  # between keyframes; the motion over a longer time is not known
+# For a correct rig, the estimated delay is at most 0.15 ms and the estimated offset at most 0.11
+# pixels. Bundle adjustment absorbs a part of both errors. For a true delay of 10 ms, the estimate
+# is 1.1 ms. For a rotation by 2 arc minutes, the estimated offset is 0.29 pixels
+# (docs/research/stress.md).
 _SUSPECT_DELAY_S, _SUSPECT_OFFSET_PX = 0.4e-3, 0.2
 
 
 @dataclass(frozen=True)
 class RigResiduals:
-    """Systematic errors of the columns in right images, estimated from the final map.
+    """Systematic errors of the columns in the right images, estimated from the final map.
 
     Attributes:
-        delay_s: apparent delay of the right image relative to the left one, which causes residuals
-            proportional to the image speed; NaN if the camera hardly moved.
-        offset_px: constant error of all disparities.
+        delay_s: apparent delay of the right image relative to the left image, in seconds. It causes
+            residuals that are proportional to the image speed. NaN if the camera hardly moved.
+        offset_px: constant error of all disparities, in pixels.
     """
 
     delay_s: float
@@ -46,8 +47,11 @@ class RigResiduals:
 
 
 def measure_rig(map_: Map, camera: Camera) -> RigResiduals | None:
-    """Estimate the delay of the right image and the offset of the disparities from the stereo
-    residuals of a map; None if there are too few observations or the camera is not stereo."""
+    """Estimate the delay of the right image and the offset of the disparities.
+
+    Both are estimated from the stereo residuals of a map. The result is None if there are too few
+    observations or if the camera is not a stereo camera.
+    """
     if camera.sensor != "stereo" or map_.n_keyframes < 3:
         return None
     arrays = map_.arrays
@@ -77,8 +81,15 @@ def measure_rig(map_: Map, camera: Camera) -> RigResiduals | None:
 def fit(
     residual: NDArray[np.float64], speed: NDArray[np.float64], disparity: NDArray[np.float64]
 ) -> tuple[float, float, float]:
-    """Delay (s), offset (px) and relative error of the disparity that minimise the Huber loss of
-    ``(N,)`` residuals in pixels; ``speed`` is the image speed in pixels per second."""
+    """The delay (s), the offset (pixels) and the relative error of the disparity.
+
+    They minimise the Huber loss.
+
+    Args:
+        residual: ``(N,)`` measured minus predicted columns, in pixels.
+        speed: ``(N,)`` image speeds in pixels per second.
+        disparity: ``(N,)`` disparities in pixels.
+    """
     A = np.stack([speed, np.ones_like(speed), disparity], axis=1)
     x = np.zeros(3)
     for _ in range(_ROUNDS):
@@ -88,8 +99,11 @@ def fit(
 
 
 def _twists(map_: Map) -> NDArray[np.float64]:
-    """``(K, 6)`` velocity (twist) of the camera at each keyframe; NaN if the neighbouring keyframes
-    are too far apart in time. Drives are treated separately, because each has its own clock."""
+    """``(K, 6)`` velocity (twist) of the camera at each keyframe.
+
+    It is NaN if the neighbouring keyframes are too far apart in time. Drives are treated
+    separately, because each drive has its own clock.
+    """
     T_cw, times = map_.arrays.T_cw, map_.timestamps
     twists = np.full((map_.n_keyframes, 6), np.nan)
     living = map_.living_keyframes()
@@ -110,7 +124,7 @@ def calibration_warnings(camera: Camera, calib: Sequence[Path], name: str) -> li
 
     Args:
         camera: the calibrated camera.
-        calib: the files of ``--calib``; empty if the calibration is that of the data set.
+        calib: the files of ``--calib``. It is empty if the calibration belongs to the data set.
         name: name of the sequence.
     """
     source = ", ".join(map(str, calib)) or f"the calibration of {name}"
@@ -118,10 +132,11 @@ def calibration_warnings(camera: Camera, calib: Sequence[Path], name: str) -> li
 
 
 def delay_warnings(delay: SideDelay, camera: Camera) -> list[str]:
-    """A warning if the measured delay of the right camera differs from that in the calibration.
+    """A warning if the measured delay of the right camera differs from the delay in the
+    calibration.
 
     Args:
-        delay: the delay, measured by the rows of stereo matches.
+        delay: the delay that was measured from the rows of stereo matches.
     """
     if not delay.is_wrong:
         return []
@@ -129,10 +144,10 @@ def delay_warnings(delay: SideDelay, camera: Camera) -> list[str]:
     side = "right" if delay.seconds > 0 else "left"
     instead = f" instead of {1e3 * known:.1f} ms (right_delay)" if known else ""
     return [
-        f"The cameras are not synchronised: the rows of stereo matches show that the {side} one is "
-        f"{1e3 * abs(delay.seconds):.1f} ms late{instead}. Trigger both by one signal, or write "
-        f"right_delay: {delay.seconds:.4f} (seconds) into the file that --calib names and run "
-        "again; see docs/howto/cameras.md."
+        f"The cameras are not synchronised: the rows of stereo matches show that the {side} "
+        f"camera is {1e3 * abs(delay.seconds):.1f} ms late{instead}. Trigger both by one signal, "
+        f"or write right_delay: {delay.seconds:.4f} (seconds) into the file that --calib names "
+        "and run again; see docs/howto/cameras.md."
     ]
 
 
@@ -144,7 +159,7 @@ def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
     if abs(found.delay_s) > _SUSPECT_DELAY_S:
         side = "right" if found.delay_s > 0 else "left"
         warnings.append(
-            f"The cameras seem not to be synchronised: the {side} one is at least "
+            f"The cameras seem not to be synchronised: the {side} camera is at least "
             f"{1e3 * abs(found.delay_s):.1f} ms late, and usually much more, because bundle "
             "adjustment absorbs most of a delay. Trigger both by one signal."
         )
@@ -159,7 +174,8 @@ def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
 
 
 def rig_warnings(sides: ComparedSides) -> list[str]:
-    """Warnings about a camera whose images were black or darker than the other's during a run."""
+    """Warnings about a camera whose images were black, or darker than the images of the other
+    camera."""
     warnings = []
     for side, other, black in (
         ("left", "right", sides.n_black_left),
@@ -176,7 +192,7 @@ def rig_warnings(sides: ComparedSides) -> list[str]:
         stops = statistics.median(darker)
         side, other = ("right", "left") if stops > 0 else ("left", "right")
         warnings.append(
-            f"The {side} image was {abs(stops):.1f} stops darker than the {other} one in "
+            f"The {side} image was {abs(stops):.1f} stops darker than the {other} image in "
             f"{len(darker)} of {sides.n} frames: the {side} image was brightened to match. Check "
             "exposure, gain and aperture of both cameras."
         )

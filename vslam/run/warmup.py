@@ -1,21 +1,23 @@
 """Compile all kernels before the first frame, so that the time of a run excludes compilation.
 
-Compilation takes most of the time of a first run, and a process compiles one kernel at a time
-because Numba holds a lock. Two processes, ``python -m vslam.run.warmup first`` and
-``python -m vslam.run.warmup second``, therefore share the work through Numba's cache. The process
-of the run then calls ``EVERYTHING``, which loads the compiled kernels. Because it compiles only
-missing ones, it does not need the memory of the compiler. Later runs load a kernel when they first
+Compilation takes most of the time of a first run. A process compiles one kernel at a time, because
+Numba holds a lock. Therefore, two processes share the work through Numba's cache:
+``python -m vslam.run.warmup first`` and ``python -m vslam.run.warmup second``. The process of the
+run then calls ``EVERYTHING``, which loads the compiled kernels. This process compiles only missing
+kernels, so it does not need the memory of the compiler. Later runs load a kernel when they first
 call it.
 
-For new kernels, add a function that calls them to the entry of ``COMPILE_SHARES`` that takes less
-time. Add this function also to ``EVERYTHING`` if ``run_everything`` does not call the kernels, and
-the last kernel of a new module to ``COLD_PROBES``. These commands show how long each share takes:
+When you add kernels, add a function that calls them to the entry of ``COMPILE_SHARES`` that takes
+less time. If ``run_everything`` does not call the kernels, add this function to ``EVERYTHING`` as
+well. If the kernels form a new module, add the last kernel of the module to ``COLD_PROBES``. These
+commands show how long each share takes:
 
     for share in first second; do
         time NUMBA_CACHE_DIR=$(mktemp -d) python -m vslam.run.warmup $share
     done
 
-Monocular runs call no other kernels: their initialisation and similarities use NumPy.
+Monocular runs need no further kernels, because their initialisation and their similarities use
+NumPy.
 
 A kernel that both processes need is compiled by the process that calls it first. Both must call it
 with the same types, because two processes can write to Numba's cache safely only if they write the
@@ -75,17 +77,20 @@ from vslam.workers import Workers
 
 WIDTH, HEIGHT, DISPARITY, STEP, FRAMES = 480, 240, 12, 6, 6
 CAMERA = Camera(240.0, 240.0, WIDTH / 2, HEIGHT / 2, 0.5, WIDTH, HEIGHT)
-# A process that takes longer hangs: even on a slow machine, each share takes less than a minute.
+# A process that takes longer hangs. Even on a slow machine, each share takes less than a minute.
 PATIENCE_S = 300.0
 
 
 def compile_kernels(*, processes: int = 2, load: bool = False) -> None:
-    """Call every kernel once, unless all are compiled; Numba caches what it compiles.
+    """Call every kernel once, so that Numba compiles it and keeps it in its cache.
+
+    Nothing is done if all kernels have been compiled.
 
     Args:
-        processes: with 1, or on a single core, no other process is started.
-        load: load compiled kernels and GTSAM now, which takes 0.3 s, for real-time runs, in which
-            no frame may wait. Otherwise, each kernel is loaded at its first call, in 2 ms.
+        processes: number of processes. With 1, or on a single core, no other process is started.
+        load: load compiled kernels and GTSAM now, which takes 0.3 s. Real-time runs need this,
+            because no frame may wait. Otherwise, each kernel is loaded at its first call, which
+            takes 2 ms.
     """
     if load:
         load_optimiser()
@@ -101,8 +106,11 @@ def compile_kernels(*, processes: int = 2, load: bool = False) -> None:
 
 
 def is_cold() -> bool:
-    """Whether kernels must be compiled, because one of ``COLD_PROBES`` is missing in Numba's cache
-    or is older than its source."""
+    """Whether kernels must be compiled.
+
+    This is the case if one of ``COLD_PROBES`` is missing in Numba's cache or is older than its
+    source.
+    """
     return any(
         all(index.stat().st_mtime < source.stat().st_mtime for index in indexes)
         for source, indexes in map(cached, COLD_PROBES)
@@ -110,8 +118,11 @@ def is_cold() -> bool:
 
 
 def mark_warm() -> None:
-    """Update the dates of the cached kernels, so that ``is_cold`` takes them for compiled. Numba
-    keeps a kernel if only the date of its source has changed, for example by switching branches."""
+    """Update the dates of the cached kernels, so that ``is_cold`` accepts them as compiled.
+
+    This is needed if only the date of a source file has changed, for example by switching branches.
+    Numba then keeps the cached kernel.
+    """
     for _, indexes in map(cached, COLD_PROBES):
         for index in indexes:
             with suppress(OSError):
@@ -129,7 +140,8 @@ def cached(kernel: tuple[ModuleType, str]) -> tuple[Path, list[Path]]:
 def compile_shares() -> None:
     """Run each of ``COMPILE_SHARES`` in its own process and wait for both processes.
 
-    If a process fails, the caller must compile its kernels. An exception such as Ctrl-C ends both.
+    If a process fails, the caller must compile its kernels. An exception such as Ctrl-C ends both
+    processes.
     """
     # The executable of a frozen application is not Python.
     if not sys.executable or getattr(sys, "frozen", False):
@@ -156,9 +168,11 @@ _FEATURES = TrackingConfig(method="orb")
 
 
 def run_everything() -> None:
-    """Run SLAM on a few small images of a camera that moves sideways along a textured wall. Each
-    image becomes a keyframe, so that the run calls all kernels of tracking, triangulation, fusion
-    and bundle adjustment."""
+    """Run SLAM on a few small images of a camera that moves sideways along a textured wall.
+
+    Each image becomes a keyframe. Therefore, the run calls all kernels of tracking, triangulation,
+    fusion and bundle adjustment.
+    """
     every_frame = KeyframeConfig(max_interval_s=0.05, merge_after_frames=1)
     run_slam(Config(keyframes=every_frame, tracking=_FEATURES), FRAMES)
     compile_patches()
@@ -166,7 +180,7 @@ def run_everything() -> None:
 
 
 def compile_tracking() -> None:
-    """Compile extraction, stereo matching and tracking by a SLAM run with one keyframe."""
+    """Compile feature extraction, stereo matching and tracking by a SLAM run with one keyframe."""
     decode_image()
     only_first = KeyframeConfig(max_interval_s=1e9, max_tracked_ratio=1e-6, min_tracked_close=0)
     run_slam(Config(keyframes=only_first, tracking=_FEATURES), 3)
@@ -215,10 +229,12 @@ def compile_local_mapping() -> None:
 def map_synthetic(keyframes: int) -> tuple[Map, Features]:
     """Map a camera that moves sideways past a cloud of points, without images.
 
-    Every keyframe observes all points. The first half of the points have a stereo match; the others
-    must be triangulated. ``redundant_ratio`` is so small that a single landmark makes a keyframe
-    redundant, and the fourth insertion culls a keyframe. Returns the map and the features of the
-    last keyframe.
+    Every keyframe observes all points. The first half of the points have a stereo match. The other
+    points must be triangulated. ``redundant_ratio`` is so small that a single landmark makes a
+    keyframe redundant. Therefore, the fourth insertion culls a keyframe.
+
+    Returns:
+        The map and the features of the last keyframe.
     """
     config = Config(mapping=MappingConfig(redundant_ratio=1e-6))
     verifier = verifier_for(config, CAMERA)
@@ -319,8 +335,9 @@ def compile_bundle_adjustment() -> None:
     adjust(problem, iterations=1)
 
 
-# The second process starts with kernels that the first one does not need. The first process starts
-# with the insertion of keyframes, so that its kernels are cached before the second one calls them.
+# The second process starts with kernels that the first process does not need. The first process
+# starts with the insertion of keyframes, so that the kernels of the insertion are cached before the
+# second process calls them.
 COMPILE_SHARES: dict[str, tuple[Callable[[], None], ...]] = {
     "first": (compile_insertion, compile_tracking, compile_depth, compile_recognition),
     "second": (
@@ -352,7 +369,7 @@ COLD_PROBES: tuple[tuple[ModuleType, str], ...] = (
 
 
 if __name__ == "__main__":
-    # Garbage collection would take 14 % of the time and free little memory.
+    # Garbage collection would take 14 % of the time, but free little memory.
     gc.disable()
     for share in COMPILE_SHARES[sys.argv[1]]:
         share()

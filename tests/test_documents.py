@@ -24,7 +24,7 @@ LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)[^)]*\)")
 SOURCE = re.compile(
     r"`((?:vslam|frontend|backend|loopclosure|tools|tests|docs)/[\w./-]+\.(?:py|md|csv|json|npy|npz|html))"
 )
-IN_HISTORY = re.compile(r"kept in the history\W+commit ([0-9a-f]{7,})")
+IN_HISTORY = re.compile(r"kept in the (?:Git )?history\W+commit ([0-9a-f]{7,})")
 
 
 def name(path: Path) -> str:

@@ -511,7 +511,7 @@ def test_refusals(corridor_run, kitti_tree, tmp_path):
     text = times.read_text()
     times.unlink()
     times.write_text("".join(f"{1.0 + float(line)}\n" for line in text.split()))
-    assert "use --data to name" in refusal(*words, "--data", other)
+    assert "use --data to give" in refusal(*words, "--data", other)
     # A report of another version, and none.
     run = tmp_path / "run"
     run.mkdir()

@@ -84,13 +84,16 @@ def loops_page(report: LoopsJson) -> Page:
 
 
 def title(report: LoopsJson) -> str:
-    """What was compared, in one line."""
+    """One line that says what was compared."""
     return f"Loop detectors: {', '.join(_detectors(report))}"
 
 
 def words(report: LoopsJson) -> list[str]:
-    """Sentences that compare each detector with the first one under each condition, and sentences
-    that name the best detector on each drive."""
+    """Sentences that summarise the comparison.
+
+    They compare each detector with the first one under each condition, and name the best detector
+    on each drive.
+    """
     sentences = _online_words(report.online)
     for first, second in dict.fromkeys((g.first, g.second) for g in report.gains):
         for condition in _conditions(report):
@@ -154,7 +157,7 @@ def _listed(values: Iterable[float | None]) -> str:
     return ", ".join("-" if value is None else f"{value:.3f}" for value in values)
 
 
-# Title, text of a cell, and note of each table that has a column for each detector.
+# Title, text of a cell, and note of each table that has one column for each detector.
 _TABLES: list[tuple[str, Callable[[Score], str], str]] = [
     ("Recall at 100 % precision, precision at 70 % recall", _operating_points, _ABOUT_RECALL),
     ("Best image right, and also verified by ORB, by learned descriptors, by either", _verified,
@@ -203,7 +206,7 @@ def _retrieval_table(
 
 
 def _online_tables(scores: Iterable[OnlineScore]) -> list[Section]:
-    """Recall at 100 % precision, largest F1 and counts."""
+    """Tables with recall at 100 % precision, the largest F1 score, and counts."""
     head = ("drive", "images", "with a match", "window", "verified by")
     texts = ("drive", "window", "verified by")
 
@@ -230,8 +233,12 @@ def _by_detector(
     about: Callable[[_Scored], tuple[str, ...]],
     shown: Callable[[_Scored], str],
 ) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Head and rows of a table with a column for each detector. ``about`` gives the first cells of
-    a row, and ``shown`` the cell of a detector's score."""
+    """Head and rows of a table with one column for each detector.
+
+    Args:
+        about: returns the first cells of a row.
+        shown: returns the cell for the score of a detector.
+    """
     rows: dict[tuple[str, ...], dict[str, str]] = {}
     for score in scores:
         rows.setdefault(about(score), {})[score.detector] = shown(score)
@@ -240,8 +247,10 @@ def _by_detector(
 
 
 def _online_words(scores: Iterable[OnlineScore]) -> list[str]:
-    """Sentences that name, for each drive and verification, the detector with the highest recall
-    without a wrong match."""
+    """Sentences that name the best detector for each drive and each kind of verification.
+
+    The best detector has the highest recall without a wrong match.
+    """
     sentences = []
     for data in dict.fromkeys(s.data for s in scores):
         for by in ("nothing", "both"):

@@ -1,4 +1,4 @@
-"""Write the report of many runs: its page, and its rows as CSV."""
+"""Write the report of many runs, as a page and as a CSV table."""
 
 from __future__ import annotations
 
@@ -46,17 +46,18 @@ def write_overview(
     out: Path,
     baseline: str | None = None,
 ) -> OverviewJson:
-    """Gather finished runs and write ``report.{html,md,json}`` and ``table.csv`` into ``out``.
+    """Collect finished runs, and write ``report.{html,md,json}`` and ``table.csv`` into ``out``.
 
     Args:
         runs: folders that contain runs at any depth.
         trajectories: trajectories of other systems, ``NAME[@SEQUENCE[@PERTURB]]=FILE``.
-        out: folder, created if it does not exist.
-        baseline: the system with which the others are compared; None for the simplest system.
+        out: output folder, which is created if it does not exist.
+        baseline: the system with which the other systems are compared; None for the simplest
+            system.
 
     Raises:
-        InputError: there is no finished run, or no run of the baseline, or a trajectory cannot be
-            read or its sequence is not clear.
+        InputError: there is no finished run, there is no run of the baseline, a trajectory cannot
+            be read, or it is ambiguous to which sequence a trajectory belongs.
         ResultsError: a file cannot be written.
     """
     found = collect(runs, trajectories)
@@ -71,7 +72,7 @@ def write_overview(
 
 
 def overview_page(report: OverviewJson, figures: Collection[Figure]) -> Page:
-    """The page of many runs."""
+    """Make the page of a report of many runs."""
     return Page(
         title(report),
         (f"vslam {report.versions.get('vslam', '')}", f"{report.created:%Y-%m-%d %H:%M %Z}"),
@@ -88,7 +89,7 @@ def overview_page(report: OverviewJson, figures: Collection[Figure]) -> Page:
 
 
 def title(report: OverviewJson) -> str:
-    """The systems and the number of runs, in one line."""
+    """One line with the systems and the number of runs."""
     places = len({(row.drive.dataset, row.drive.place) for row in report.rows})
     return (
         f"{', '.join(report.systems)}: {counted(len(report.runs), 'run')} on "
@@ -97,7 +98,7 @@ def title(report: OverviewJson) -> str:
 
 
 def render_csv(report: OverviewJson) -> str:
-    """A line for each row, with the median, smallest and largest value of each measure."""
+    """The rows as CSV, with the median, the smallest and the largest value of each measure."""
     names = [name for name, *_ in MEASURES]
     head = ["dataset", "sequence", "excerpt", "perturb", "system", "alignment", "runs", "frames"]
     lines: list[list[object]] = [
@@ -115,7 +116,10 @@ def render_csv(report: OverviewJson) -> str:
 
 
 def _results(report: OverviewJson) -> list[Section]:
-    """The results in several tables with the same rows, because one table would be too wide."""
+    """The tables of results.
+
+    There are several tables with the same rows, because one table would be too wide.
+    """
     texts = ("sequence", "perturbation", "system")
 
     def table(name: str, measures: Collection[Measure], note: str, *, aligned: bool) -> Section:

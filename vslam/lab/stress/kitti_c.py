@@ -1,8 +1,9 @@
 """The preset ``kitti-c``: the corruptions of RoboDepth's KITTI-C that vslam can apply.
 
-KITTI-C (Kong et al., NeurIPS 2023) has 18 corruptions in 5 severities, most of them with the
+KITTI-C (Kong et al., NeurIPS 2023) has 18 corruptions with 5 severities each. Most of them have the
 parameters of ImageNet-C (Hendrycks and Dietterich, ICLR 2019). If vslam's perturbation has the same
-parameter, the strengths here are the values of KITTI-C; otherwise, a note describes the difference.
+parameter, the strengths in this module are the values of KITTI-C. Otherwise, a note describes the
+difference.
 """
 
 from __future__ import annotations
@@ -14,8 +15,12 @@ from vslam.datasets.perturbation import parse_perturbation
 
 @dataclass(frozen=True)
 class Corruption:
-    """``specs``: values of ``--perturb``, weakest first; empty if vslam has no such perturbation.
-    ``note``: the difference from KITTI-C."""
+    """One corruption of KITTI-C.
+
+    Attributes:
+        specs: values of ``--perturb``, weakest first; empty if vslam has no such perturbation.
+        note: the difference between vslam's perturbation and the corruption of KITTI-C.
+    """
 
     specs: tuple[str, ...]
     note: str = ""
@@ -30,7 +35,7 @@ def _specs(text: str, values: tuple[float, ...]) -> tuple[str, ...]:
     return tuple(text.format(value) for value in values)
 
 
-_SIGMA = (0.08, 0.12, 0.18, 0.26, 0.38)  # as a fraction of white
+_SIGMA = (0.08, 0.12, 0.18, 0.26, 0.38)  # standard deviation as a fraction of white
 
 CORRUPTIONS: dict[str, Corruption] = {
     "brightness": Corruption(_specs("bias:{:g}", (25.5, 51.0, 76.5, 102.0, 127.5))),

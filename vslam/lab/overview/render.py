@@ -18,25 +18,26 @@ _MOTION = ("rpe_m", "rpe_deg", "t_rel_percent", "r_rel_deg_per_100m")
 _OTHER = ("loops_found", "loops_missed", "loops_wrong", "fps")
 _ABOUT_ERRORS = (
     "Medians over runs, with the smallest and the largest value in brackets. The ATE counts every "
-    "frame, including lost ones, after the alignment in the table: SE3 keeps the scale; Sim3 fits "
-    "it for monocular runs. The causal ATE is that of the poses as they were first estimated. "
-    "Systems with different alignments are not compared."
+    "frame, including lost frames, after the alignment in the table. SE3 keeps the scale. Sim3 "
+    "also fits the scale, for monocular runs. The causal ATE is that of the poses as they were "
+    "first estimated. Systems with different alignments are not compared."
 )
 _ABOUT_MOTION = (
-    "RPE: error of the motion from one frame to the next. t_rel and r_rel: KITTI's drift over 100 "
-    "to 800 m."
+    "RPE is the error of the motion from one frame to the next. t_rel and r_rel are the error "
+    "metrics of KITTI, which measure the drift over 100 to 800 m."
 )
 _ABOUT_OTHERS = (
-    "Loops are judged by the ground truth. fps: frames per second without start-up; runs that "
-    "shared a machine are slower."
+    "Loops are judged by the ground truth. fps is the number of frames per second without the "
+    "start of the program. Runs that shared a machine are slower."
 )
 ALIGNMENTS = {"se3": "SE3", "sim3": "Sim3"}
 _TESTED = (
-    "Better, worse, same: numbers of sequences on which the errors of the system named first are "
-    "smaller, larger or equal. p: two-sided Wilcoxon signed-rank test over sequences, at the level "
-    f"{ALPHA:g}, not corrected for the number of tests. A sequence counts once, because its runs "
-    "are not independent: with the median of its runs, or, over all conditions, with the mean of "
-    "these medians. Comparisons in which all sequences tie are left out."
+    "The columns better, worse and same give the numbers of sequences on which the errors of the "
+    "system named first are smaller, larger or equal. p is the p-value of the two-sided Wilcoxon "
+    f"signed-rank test over sequences, at the level {ALPHA:g}. It is not corrected for the number "
+    "of tests. Each sequence counts once, with the median of its runs, because its runs are not "
+    "independent. Over all conditions, it counts with the mean of these medians. Comparisons in "
+    "which all sequences tie are left out."
 )
 
 

@@ -41,23 +41,23 @@ CORRUPTIONS: dict[str, Corruption] = {
     "brightness": Corruption(_specs("bias:{:g}", (25.5, 51.0, 76.5, 102.0, 127.5))),
     "dark": Corruption(
         _specs("night:{:g}", (0.74, 1.0, 1.32, 1.74, 2.32)),
-        "light times 0.6 to 0.2 with our sensor's noise; theirs also squares the image",
+        "light reduced to 0.6 to 0.2 with vslam's sensor noise; KITTI-C also squares the image",
     ),
     "fog": Corruption(
         _specs("fog:{:g}", (600, 300, 150, 75, 40)),
-        "by distance, visibility 600 to 40 m; theirs is a cloud texture that ignores depth",
+        "fog by distance, visibility 600 to 40 m; KITTI-C uses a cloud texture without depth",
     ),
     "frost": Corruption((), "no law"),
     "snow": Corruption((), "no law"),
     "contrast": Corruption(_specs("contrast:{:g}", (40, 30, 20, 10, 5))),
     "defocus_blur": Corruption(
         _specs("blur:{:g}", (1.0, 1.33, 2.0, 2.67, 3.33)),
-        "Gaussian with the standard deviation of their discs of 3 to 10 pixels",
+        "Gaussian blur with the standard deviation of KITTI-C's discs of 3 to 10 pixels",
     ),
     "glass_blur": Corruption((), "no law"),
     "motion_blur": Corruption(
         _specs("motion:{:g}", (20, 40, 60, 80, 100)),
-        "shutter of 20 to 100 ms at the true rotation; theirs has a fixed direction and length",
+        "exposure of 20 to 100 ms at the true rotation; KITTI-C has a fixed direction and length",
     ),
     "zoom_blur": Corruption((), "no law"),
     "elastic_transform": Corruption((), "no law"),

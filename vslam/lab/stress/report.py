@@ -23,13 +23,13 @@ from vslam.report.page import Bullets, Figure, Page, Row, Section, Table, number
 from vslam.report.render import csv_text, html, markdown, write_files
 
 _ABOUT = (
-    "The weakest strength at which a run fails, found by bisection: the median over seeds, the "
-    "smallest and the largest value in brackets, and the reason of failure for one of the seeds. "
-    "> means that runs do not fail even at the greatest strength."
+    "The weakest strength at which a run fails, as found by bisection. The table gives the median "
+    "over the seeds, the smallest and the largest value in brackets, and the reason for the "
+    "failure with one of the seeds. > means that runs do not fail even at the greatest strength."
 )
 _NOT_MONOTONE = (
-    "Bisection assumes that a system that withstands a strength also withstands all weaker ones. "
-    "These runs failed although a run at a greater strength did not."
+    "Bisection assumes that a system that does not fail at a strength does not fail at weaker "
+    "strengths. These runs failed although a run at a greater strength did not fail."
 )
 
 
@@ -163,9 +163,9 @@ def _preset(report: StressJson) -> list[Section]:
         ("sequence", "corruption", *systems, "law"),
         rows,
         ("sequence", "corruption", "law"),
-        "ATE summed over the five severities, in percent of the sum of the baseline; the mean "
-        "share of lost frames in brackets. The mean is over the corruptions for which every system "
-        "has an ATE.",
+        "The ATE summed over the five severities, in percent of the sum of the baseline. The mean "
+        "share of lost frames is in brackets. The mean in the last row is over the corruptions for "
+        "which every system has an ATE.",
     )
     title = f"Corruption error against {report.baseline}, preset {report.preset}"
     return [Section(title, [table])]

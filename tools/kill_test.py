@@ -1,10 +1,12 @@
 """Kill a run at random times and resume it, to test that little work is lost.
 
-``kill -9`` ends the run after a random number of frames. Every other run is killed during the next
-autosave instead. Then all its files are read, and the run is resumed. The table contains the frame
-at which the run was killed, the number of saved frames, the seconds of work that were lost, and the
-ATE of the whole run. It also tells whether the trajectory is byte-identical to that of the
-undisturbed run.
+``kill -9`` ends the run after a random number of frames. For every other run, the script then waits
+for the next autosave and kills the run while it is being written. Afterwards, all files of the run
+are read, and the run is resumed.
+
+The table contains the frame at which the run was killed, the number of saved frames, the seconds of
+work that were lost, and the ATE of the whole run. It also tells whether the trajectory is
+byte-identical to that of the undisturbed run.
 
     python tools/kill_test.py --kills 10 --autosave 4 -- --dataset synthetic --seq demo
 """
@@ -59,7 +61,7 @@ def kill_at(words: list[str], out: Path, frame: int, saving: bool) -> tuple[Path
     """Start a run and kill it.
 
     Returns:
-        The folder of the run, the number of tracked frames, and their duration in seconds.
+        The folder of the run, the number of tracked frames, and the seconds since the first one.
     """
     process = subprocess.Popen([*RUN, *words, *BRIEF, "--out", str(out)])
     folder, begin = out / "latest", 0.0
@@ -78,7 +80,7 @@ def saved_frames(folder: Path) -> tuple[int, float]:
     """Read all files of a killed run.
 
     Returns:
-        The number of saved frames, and their duration in seconds.
+        The number of saved frames, and the wall time of the run until they were saved, in seconds.
     """
     read_trajectory(folder / ONLINE)
     if not (folder / MAP).exists():

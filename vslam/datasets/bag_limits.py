@@ -15,8 +15,11 @@ from types import SimpleNamespace
 from typing import Any, Protocol
 
 MOST_BYTES = 2**29
-"""Largest size in bytes of a decompressed chunk or message. It is enough for an image of
-`vslam.untrusted.MOST_PIXELS` with four bytes per pixel; recorders write chunks of 0.8 to 4 MB."""
+"""Largest size of a decompressed chunk or message in bytes.
+
+It is enough for an image of `vslam.untrusted.MOST_PIXELS` with four bytes per pixel. Recorders
+write chunks of 0.8 to 4 MB.
+"""
 
 _FREE_BYTES = 2**30  # disk space that must remain free after a whole bag is decompressed
 _log = logging.getLogger(__name__)
@@ -90,7 +93,7 @@ def _limited(make: Callable[[], _Decompressor]) -> Callable[[bytes], bytes]:
 
 
 def _limited_by_size(make: Callable[[], _Decompressor]) -> Callable[[bytes, int], bytes]:
-    """Limit the decompression of a chunk to the size that the bag states for it."""
+    """Limit the decompression of a chunk to the size that the bag states, and to `MOST_BYTES`."""
     return lambda data, size: unpack(make, data, min(size, MOST_BYTES))
 
 

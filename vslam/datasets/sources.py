@@ -1,4 +1,4 @@
-"""Open any source: data sets, folders of images, videos, bags and live cameras."""
+"""Opens all kinds of sources: data sets, folders of images, videos, bags and live cameras."""
 
 from __future__ import annotations
 

@@ -18,12 +18,16 @@ from vslam.datasets.frames import Source
 from vslam.errors import InputError
 
 RandomStream = tuple[int, int]
-"""The user's seed and a number for the law; the seeds of all random generators of the law begin
-with these two numbers."""
+"""The user's seed, and a number for the law.
+
+The seeds of all random generators of the law begin with these two numbers.
+"""
 
 Law = Callable[[int, float, int, Image], Image]
-"""``(frame, t, side, image) -> image`` of the same shape; t is in seconds since the first frame;
-side is 0 for the left and 1 for the right image."""
+"""A function ``(frame, t, side, image) -> image``, which returns an image of the same shape.
+
+t is the time in seconds since the first frame. side is 0 for the left and 1 for the right image.
+"""
 
 
 @dataclass(frozen=True)
@@ -94,7 +98,7 @@ def check_need(law: str, need: Need, scene: Scene) -> None:
     """Check that the source has the data that a law needs.
 
     Raises:
-        InputError: the source does not have these data.
+        InputError: the source does not have this data.
     """
     has = {
         "right": scene.camera.sensor == "stereo",
@@ -114,7 +118,7 @@ class SceneLaw:
     make: Callable[[Scene], PairLaw]
 
     def bound_to(self, scene: Scene) -> PairLaw:
-        """The law for this scene.
+        """Bind the law to a scene.
 
         Raises:
             InputError: the source does not have the data that the law needs.

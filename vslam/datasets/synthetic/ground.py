@@ -1,4 +1,4 @@
-"""The ground: a mesh over the terrain, with a separate texture for each tile."""
+"""The ground of a town, which is a mesh over the terrain with a separate texture for each tile."""
 
 from __future__ import annotations
 

@@ -165,7 +165,7 @@ def _view(
 
 
 def _other_passes(T_wc: Float) -> list[NDArray[np.int64]]:
-    """For each frame, the frames of other passes with a similar position and heading."""
+    """For each frame, the frames of other passes that have a similar position and heading."""
     xz, ahead = T_wc[:, [0, 2], 3], T_wc[:, :3, 2]
     again = []
     for k, near in enumerate(cKDTree(xz).query_ball_point(xz, _TOGETHER)):

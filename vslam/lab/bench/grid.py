@@ -52,7 +52,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Name of the folder that holds the results of this cell. Each cell has another name."""
+        """Name of the folder for the results of this cell. No two cells have the same name."""
         light = self.perturb.replace(":", "").replace(",", "+")
         parts = [self.dataset, self.sequence, light, self.detector, f"seed{self.seed}"]
         parts += [f"{self.max_frames}frames"] if self.max_frames else []

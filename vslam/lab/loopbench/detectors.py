@@ -71,7 +71,7 @@ class Scorer(Protocol):
 
     name: str
     probability: bool
-    """Whether the scores are probabilities p, so that accuracy at p = 0.5 and 0.9 is defined."""
+    """Whether the scores are probabilities, so that the accuracy at p = 0.5 and 0.9 is defined."""
 
     def store(self, gallery: list[DescribedImage]) -> Any:
         """Compute the data of the gallery that the detector compares with queries."""

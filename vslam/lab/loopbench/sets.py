@@ -17,7 +17,10 @@ from vslam.loopclosure.siamese.image_source import UNKNOWN, ImageSource
 from vslam.loopclosure.siamese.source_registry import open_source, split_spec
 
 ProgressBar = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
-"""``(text, number of steps)`` opens a bar and yields a function to be called after each step."""
+"""A function of ``(text, number of steps)`` that returns a context manager with a progress bar.
+
+The context manager yields a function that must be called after each step.
+"""
 
 _GAP = 50  # number of images just before a query of a drive in which no match is searched for
 

@@ -14,7 +14,10 @@ from vslam.lab.stress.search import Boundary, boundary, next_position, strength_
 from vslam.report.schema import ReportJson
 
 Reports = Callable[[Cell], ReportJson | str | None]
-"""Function that gives the report of a cell, the reason why it failed, or None before it has run."""
+"""A function that returns the report of a cell, or the reason why the cell failed.
+
+It returns None if the cell has not run yet.
+"""
 
 
 @dataclass

@@ -1,6 +1,6 @@
-"""Readers of data sets.
+"""Readers of data sets, which provide calibrated frames with time stamps.
 
-Each reader checks its input once. It then provides calibrated frames with time stamps.
+Each reader checks its input once, before it provides the frames.
 """
 
 from __future__ import annotations

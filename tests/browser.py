@@ -1,4 +1,4 @@
-"""Pages as Chromium renders them; tests that use it are skipped without Chromium."""
+"""Renders pages in Chromium. Tests that use this module are skipped if Chromium is missing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 
 
 def chromium() -> str:
-    """The browser; without one the test is skipped."""
+    """The path of the browser. The test is skipped if there is none."""
     found = next(
         filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
     )
@@ -35,7 +35,7 @@ def dumped(
     """The rendered HTML of a page in a folder, which is served locally.
 
     Args:
-        milliseconds: virtual time that its scripts get.
+        milliseconds: virtual time that the scripts of the page get.
         on_request: called with the path of each request.
     """
     flags = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run "

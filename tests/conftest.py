@@ -1,5 +1,7 @@
-"""Fixtures that several test files share: a rendered stereo world, a checker of maps, the command
-line."""
+"""Fixtures that several test files use.
+
+They include a rendered stereo world, a check of maps, and calls of the command line.
+"""
 
 from __future__ import annotations
 
@@ -23,19 +25,19 @@ from vslam.map import Map
 from vslam.trajectory import write_kitti
 
 METRES_PER_TEXEL = 0.02
-PLANES = (  # normal . X = offset, in the world (x right, y down, z forward)
+PLANES = (  # normal . X = offset, in the world frame (x right, y down, z forward)
     (np.array([0.0, 1.0, 0.0]), 1.5),  # ground
     (np.array([1.0, 0.0, 0.0]), -4.0),  # left wall
     (np.array([1.0, 0.0, 0.0]), 4.5),  # right wall
     (np.array([0.0, 0.0, 1.0]), 32.0),  # end wall
 )
 AXES = ((0, 2), (2, 1), (2, 1), (0, 1))  # world axes along each plane's texture
-CEILING = -6.0  # walls end here; above is sky
+CEILING = -6.0  # the walls end at this y; above them is the sky
 
 
 @dataclass(frozen=True)
 class StereoSequence:
-    """``left`` and ``right`` images, ``timestamps`` and true ``T_wc`` of N frames."""
+    """The ``left`` and ``right`` images, the ``timestamps`` and the true ``T_wc`` of N frames."""
 
     camera: Camera
     left: list[np.ndarray]
@@ -48,7 +50,7 @@ class StereoSequence:
 
 
 def corridor_mipmaps(seed: int = 7) -> list[np.ndarray]:
-    """Square blocks of random grey at several sizes, each level half the one before."""
+    """Mipmaps of a texture of square blocks with random grey values and several sizes."""
     rng = np.random.default_rng(seed)
     side = 2048
     texture = np.full((side, side), 128.0, np.float32)
@@ -62,7 +64,7 @@ def corridor_mipmaps(seed: int = 7) -> list[np.ndarray]:
 
 
 def render(mipmaps: list[np.ndarray], camera: Camera, T_wc: np.ndarray) -> np.ndarray:
-    """What a pinhole camera at ``T_wc`` sees of the corridor, ray by ray, without aliasing."""
+    """Render the corridor for a pinhole camera at ``T_wc``, by ray casting without aliasing."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     rays = np.stack(
         [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u, float)], axis=-1
@@ -107,13 +109,16 @@ def render(mipmaps: list[np.ndarray], camera: Camera, T_wc: np.ndarray) -> np.nd
 
 @pytest.fixture(scope="session")
 def corridor() -> StereoSequence:
-    """28 stereo frames at 10 Hz down a textured corridor: 0.35 m a frame, with a slight turn."""
+    """28 stereo frames at 10 Hz along a textured corridor.
+
+    The camera moves by 0.35 m per frame and turns slightly.
+    """
     camera = Camera(240.0, 240.0, 239.5, 79.5, 0.5, 480, 160)
     mipmaps = corridor_mipmaps()
     frames = 28
     T_wc = [np.eye(4)]
     for k in range(1, frames):
-        yaw = 0.012 if 8 <= k < 20 else 0.0  # rad a frame
+        yaw = 0.012 if 8 <= k < 20 else 0.0  # rad per frame
         T_wc.append(T_wc[-1] @ se3_exp(np.array([0.0, 0.0, 0.35, 0.0, yaw, 0.0])))
     poses = np.array(T_wc)
     T_left_right = np.eye(4)
@@ -125,7 +130,7 @@ def corridor() -> StereoSequence:
 
 @pytest.fixture(scope="session")
 def round_the_block(tmp_path_factory):
-    """Once round a block at half the resolution, from noon to midnight: every second frame."""
+    """Every second frame of a drive round a block from noon to midnight, at half resolution."""
     route = built_in_route("block")
     camera = route.camera
     camera = replace(
@@ -144,7 +149,7 @@ def round_the_block(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def kitti_tree(corridor: StereoSequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The corridor as KITTI odometry sequence 00 with ground truth; read only."""
+    """The corridor as KITTI odometry sequence 00 with ground truth. Tests must not change it."""
     root = tmp_path_factory.mktemp("kitti")
     folder = root / "sequences" / "00"
     for side, images in (("image_0", corridor.left), ("image_1", corridor.right)):
@@ -167,7 +172,7 @@ def kitti_tree(corridor: StereoSequence, tmp_path_factory: pytest.TempPathFactor
 
 @pytest.fixture(scope="session")
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run folder as vslam writes it: 150 frames, brightness:1, detector none, seed 3."""
+    """A folder of a run with 150 frames, brightness:1, detector none and seed 3."""
     from test_report import make_outcome, report_of
 
     folder = tmp_path_factory.mktemp("run")
@@ -177,7 +182,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def stub(run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder that steers tests/stub_runner.py."""
+    """The folder whose files control tests/stub_runner.py."""
     folder = tmp_path / "stub"
     folder.mkdir()
     for name in ("report.json", "trajectory.tum", "ground_truth_kitti.txt"):
@@ -188,7 +193,7 @@ def stub(run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
 
 @pytest.fixture(scope="session")
 def check_map() -> Callable[[Map], None]:
-    """Assert every invariant of a map, by walking it in plain Python."""
+    """A function that asserts every invariant of a map in plain Python."""
     return _check_map
 
 
@@ -229,7 +234,7 @@ def _check_map(map_: Map) -> None:
 
 
 def corridor_depth(camera: Camera, T_wc: np.ndarray) -> np.ndarray:
-    """Depth ``(H, W)`` metres of the corridor along the camera's z, 0 where there is sky."""
+    """``(H, W)`` depth of the corridor along the camera's z axis in metres; 0 in the sky."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     rays = np.stack(
         [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u, float)], axis=-1
@@ -247,7 +252,10 @@ def corridor_depth(camera: Camera, T_wc: np.ndarray) -> np.ndarray:
 
 @pytest.fixture
 def call(monkeypatch, capsys, tmp_path):
-    """Run ``vslam`` with the given words in an empty folder: (exit code, stdout, stderr)."""
+    """A function that runs ``vslam`` with the given words in an empty folder.
+
+    It returns the exit code, stdout and stderr.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("KITTI_ROOT", raising=False)
 

@@ -1,9 +1,11 @@
-"""Injection of faults: each part of a run fails once, at a call drawn from a seed.
+"""Injection of faults: each part of a run fails once, at a call that is drawn from a seed.
 
-A run drives along a ring of points (tests/ring.py). Its images only encode the number of the frame,
-from which the features are computed, so that a lap with a closed loop, lost frames and all results
-takes two seconds. Each injection runs the command line's entry point in a fork of a process that
-has loaded everything. ``inject`` judges the messages and files of the run.
+A run drives along a ring of points (tests/ring.py). The images only encode the index of the frame.
+The features are computed from this index. Therefore, a lap with a closed loop, lost frames and all
+results takes only two seconds.
+
+Each injection runs the entry point of the command line in a fork of a process that has loaded
+everything. ``inject`` judges the messages and files of the run.
 """
 
 from __future__ import annotations
@@ -41,33 +43,33 @@ from vslam.run.progress import read_progress
 from vslam.slam import Slam
 from vslam.trajectory import read_trajectory, write_kitti
 
-RING = Ring.create(focal_error=0.015)  # drifts: the loop has something to correct
+RING = Ring.create(focal_error=0.015)  # odometry drifts, so that the loop has an error to correct
 FRAMES = LAP + 31
-DARK = range(60, 63)  # frames without features: the camera is lost, and found again
+DARK = range(60, 63)  # frames without features; tracking is lost there and relocalises afterwards
 PATIENCE_S = 60.0
 FAULTS: dict[str, Callable[[], Exception]] = {
     "RuntimeError": lambda: RuntimeError("injected"),
     "MemoryError": lambda: MemoryError("injected"),
     "disk full": lambda: OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)),
 }
-# What is expected of a run: it goes on to the end without the part that failed; it ends early with
-# all results of the frames done; it ends early without a map; a result is missing, all others are
-# there; it cannot begin.
+# The expected outcomes of a run. ON: the run continues to the end without the part that failed.
+# EARLY: it ends early with all results of the processed frames. MAPLESS: it ends early without a
+# map. MISSING: one result is missing, but all others exist. REFUSED: it cannot start.
 ON, EARLY, MAPLESS, MISSING, REFUSED = "goes on", "ends early", "no map", "one missing", "refused"
 EXIT_CODES = {ON: 0, EARLY: 1, MAPLESS: 1, MISSING: 1, REFUSED: 1}
 
 
 @dataclass(frozen=True)
 class Point:
-    """A place where a run may fail.
+    """A point at which a run may fail.
 
     Attributes:
-        name: of the part, for people.
-        function: dotted path, as it is looked up when it is called.
-        last_call: the call that fails is drawn from the first so many.
+        name: name of the part that fails, for people.
+        function: dotted path of the function, as it is looked up when the function is called.
+        last_call: number of calls from which the failing call is drawn.
         expected: one of the outcomes above.
         costs: results that may be missing.
-        options: more words of the command line.
+        options: additional words of the command line.
     """
 
     name: str
@@ -79,7 +81,7 @@ class Point:
 
 
 REALTIME = ("--realtime", "--max-frames", "12")
-LATER = ("report.json", "report.md", "report.html", "figures")  # made from all that is known
+LATER = ("report.json", "report.md", "report.html", "figures")  # made from all other results
 POINTS = (
     Point("a frame's track", "vslam.frontend.tracker.Tracker.track", 200, EARLY),
     Point("keyframe policy", "vslam.modes.MapBuilding.update_map", 200, EARLY),
@@ -142,11 +144,11 @@ class Row:
     """The outcome of an injection.
 
     Attributes:
-        call: the call that failed.
-        exit_code: of the process; -1 if it hung and was ended.
-        said: its lines on stderr.
-        found: what was on disk.
-        wrong: what was not as promised; empty if all was.
+        call: number of the call that failed.
+        exit_code: exit code of the process; -1 if the process hung and was killed.
+        said: lines that the process wrote to stderr.
+        found: results that were on the disk.
+        wrong: differences from the expected outcome; empty if there are none.
     """
 
     point: str
@@ -159,7 +161,7 @@ class Row:
 
 
 def next_image() -> None:
-    """Called before the source gives a frame."""
+    """Called before the source yields a frame."""
 
 
 def read_image() -> None:
@@ -167,7 +169,7 @@ def read_image() -> None:
 
 
 def on_frame() -> None:
-    """Called when a frame is done."""
+    """Called when a frame has been processed."""
 
 
 def failing(
@@ -176,7 +178,7 @@ def failing(
     fault: Callable[[], Exception],
     set_attribute: Callable[[Any, str, Any], None] = setattr,
 ) -> None:
-    """Let exactly one of the coming calls of a function raise."""
+    """Make exactly one of the next calls of a function raise an error."""
     owner, name = _owner(point.function)
     function = getattr(owner, name)
     calls, lock = [0], threading.Lock()
@@ -193,7 +195,7 @@ def failing(
 
 
 def _owner(path: str) -> tuple[Any, str]:
-    """The module or class that a dotted path names an attribute of."""
+    """The module or class that has the attribute at the end of a dotted path."""
     parts = path.split(".")
     for n in range(len(parts) - 1, 0, -1):
         with contextlib.suppress(ModuleNotFoundError):
@@ -205,7 +207,7 @@ def _owner(path: str) -> tuple[Any, str]:
 
 
 def write_ring(root: Path) -> None:
-    """A KITTI sequence whose images encode the number of the frame."""
+    """Write a KITTI sequence whose images encode the index of the frame."""
     folder = root / "sequences" / "00"
     for side in ("image_0", "image_1"):
         (folder / side).mkdir(parents=True)
@@ -227,8 +229,11 @@ def write_ring(root: Path) -> None:
 
 
 def stage(*, learned: bool) -> None:
-    """Let this process drive along the ring whatever the images show, with a detector that knows
-    the way; ``learned``: learned descriptors may verify its loops."""
+    """Make this process drive along the ring, with a detector that knows the places.
+
+    The contents of the images do not matter. If ``learned`` is set, learned descriptors may verify
+    the loops.
+    """
     from vslam.cli.console import Console
     from vslam.frontend import extraction
     from vslam.loopclosure.registry import create_images
@@ -266,13 +271,15 @@ def stage(*, learned: bool) -> None:
 
 @cache
 def view(k: int) -> Features:
-    """What the camera sees at a frame."""
+    """The features that the camera sees at a frame."""
     return Features.none() if k in DARK else RING.see(float(k), 1)
 
 
 def load_everything() -> None:
-    """Load the modules, kernels and features that forks need, without starting threads, which
-    forks would lack."""
+    """Load the modules, kernels and features that forks need.
+
+    No threads are started, because a fork would not have them.
+    """
     from vslam.cli import main  # noqa: F401
     from vslam.report import explorer, figures, loop_tables, render  # noqa: F401
 
@@ -292,10 +299,10 @@ def run_in_fork(
     """Run ``vslam`` in a fork of this process, after ``fault`` was called there.
 
     Args:
-        log: what it says on stderr.
+        log: file to which stderr is written.
 
     Returns:
-        Its exit code, -1 if it had to be ended.
+        The exit code; -1 if the process had to be killed.
     """
     child = os.fork()
     if child == 0:
@@ -331,19 +338,19 @@ def _run(words: list[str], log: Path, fault: Callable[[], None], *, learned: boo
     except BaseException:
         traceback.print_exc()
         code = 1
-    threading._shutdown()  # what Python does at its end, where it may wait for ever
+    threading._shutdown()  # Python does the same when it ends, and may wait for ever
     atexit._run_exitfuncs()
     sys.stderr.flush()
     return code
 
 
 def inject(root: Path, work: Path, point: Point, fault: str, seed: int, whole: bytes) -> Row:
-    """Let a point fail in a run, and resume the run if that is possible.
+    """Make a point fail in a run, and resume the run if that is possible.
 
     Args:
-        root: what ``write_ring`` wrote.
-        work: a new folder for what the run writes.
-        whole: ``trajectory.tum`` of the run that is not disturbed.
+        root: folder that ``write_ring`` wrote.
+        work: a new folder to which the run writes.
+        whole: ``trajectory.tum`` of the undisturbed run.
     """
     call = random.Random(f"{seed} {point.function} {fault}").randint(1, point.last_call)
     out, log = work / "runs", work / "log"
@@ -351,7 +358,7 @@ def inject(root: Path, work: Path, point: Point, fault: str, seed: int, whole: b
     if not point.function.startswith("vslam.run.recorder"):
         words.append("--no-record")
     pages = fault == "RuntimeError" or point.function.startswith(("vslam.report", "vslam.run"))
-    if not pages:  # to draw the figures takes longer than the run
+    if not pages:  # drawing the figures would take longer than the run
         words.append("--no-report")
     learned = point.function.startswith("vslam.loopclosure.verifier")
     make = FAULTS[fault]
@@ -403,7 +410,7 @@ RESULTS = (
 def _look(
     point: Point, folder: Path, whole: bytes, results: tuple[str, ...]
 ) -> tuple[str, list[str]]:
-    """Load all that a run left; returns what there is, and what is not as it should be."""
+    """Load all results of a run. Returns the results that exist, and what is wrong with them."""
     costs = (*point.costs, *(["map.npz"] if point.expected == MAPLESS else []))
     wrong = [f"no {name}" for name in results if name not in costs and not (folder / name).exists()]
     wrong += [f"a useless {path.name}" for path in folder.glob(".*.part")]

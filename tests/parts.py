@@ -1,4 +1,4 @@
-"""A small world and test doubles for testing one part of SLAM in isolation."""
+"""A small world and test doubles, with which one part of SLAM is tested in isolation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vslam.map_view import LocalMap, MapView
 from vslam.workers import Job, Urgency, Workers
 
 CAMERA = Camera(400.0, 400.0, 320.0, 120.0, 0.5, 640, 240)
-ALL, NOTHING = slice(None), slice(0, 0)  # of the points of a ``Points``
+ALL, NOTHING = slice(None), slice(0, 0)  # all points of a ``Points``, and none of them
 
 
 class InstantWorkers(Workers):
@@ -37,12 +37,12 @@ def frame_of(
     image: np.ndarray | None = None,
     camera: Camera = CAMERA,
 ) -> Frame:
-    """A frame that is not tracked yet."""
+    """Make a frame that is not tracked yet."""
     return Frame.of(Extracted(features), camera, index, timestamp, image)
 
 
 def ahead(metres: float, turn: float = 0.0) -> np.ndarray:
-    """``T_cw`` of a camera that moved forward from the origin and turned right, in radians."""
+    """``T_cw`` of a camera that moved forward from the origin and turned right by ``turn`` rad."""
     return se3_exp(np.array([0.0, 0.0, -metres, 0.0, -turn, 0.0]))
 
 
@@ -61,10 +61,10 @@ class OneKeyframe:
 
 @dataclass(frozen=True)
 class Points:
-    """Points in front of the origin, each with a descriptor of its own. Nothing is noisy, so that
-    whoever looks for them where they are finds every one of them.
+    """Points in front of the origin, each with its own descriptor.
 
-    A point is landmark ``i`` of the views that ``view`` makes.
+    There is no noise, so that a search at the true position of a point finds it. Point ``i`` is
+    landmark ``i`` of the views that ``view`` makes.
     """
 
     xyz: np.ndarray
@@ -79,7 +79,7 @@ class Points:
         return cls(np.stack([x, y, z], axis=1), descriptors)
 
     def see(self, T_cw: np.ndarray, among: slice = ALL) -> Features:
-        """The features of some of the points, in their order; the camera must see them all."""
+        """The features of some of the points, in their order. The camera must see all of them."""
         uvr = CAMERA.project(transform(T_cw, self.xyz[among])).astype(np.float32)
         n = len(uvr)
         return Features(
@@ -105,7 +105,7 @@ class Points:
         return frame
 
     def landmarks(self, among: slice = ALL) -> LocalMap:
-        """Some of the points as tracking sees landmarks."""
+        """Some of the points as the landmarks of a local map."""
         xyz = self.xyz[among]
         distance = np.linalg.norm(xyz, axis=1)
         return LocalMap(
@@ -124,7 +124,11 @@ class Points:
         n_reference: int = 0,
         n_keyframes: int = 20,
     ) -> MapView:
-        """A view of a map in which some points are around, and some in the reference keyframe."""
+        """Make a view of a map.
+
+        The points ``around`` are in the local map, and the points ``nearest`` are in the reference
+        keyframe.
+        """
         return MapView(
             n_keyframes=n_keyframes,
             local_landmarks=self.landmarks(around),

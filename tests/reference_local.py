@@ -1,8 +1,9 @@
-"""The network of the shipped local descriptors in torch, which its ONNX file is compared with.
+"""The network of the shipped local descriptors in torch, with which its ONNX file is compared.
 
-One extractor gives a global descriptor and local ones (HF-Net, Sarlin et al., CVPR 2019). Matches
-are found on a coarse grid and refined to subpixels on a fine one (LoFTR, Sun et al., CVPR 2021).
-The extractor is that of the shipped network and stays fixed; only a small head is trained.
+One extractor computes a global descriptor and local descriptors (HF-Net, Sarlin et al., CVPR 2019).
+Matches are found on a coarse grid and refined to subpixels on a fine grid (LoFTR, Sun et al., CVPR
+2021). The extractor is that of the shipped network and is not trained. Only a small head is
+trained.
 
 Cell ``(row, column)`` of a grid of stride s lies at the pixel ``(s column, s row)``.
 """
@@ -49,8 +50,14 @@ class LocalHead(nn.Module):
         self.fine = nn.Conv2d(_FINE_HIDDEN, FINE_SIZE, 1)
 
     def forward(self, x4: Tensor, x8: Tensor, x16: Tensor) -> tuple[Tensor, Tensor]:
-        """Map features ``(N, C, h, w)`` of each stride to descriptors of length 1: coarse
-        ``(N, 64, h, w)`` and fine ``(N, 32, 4 h, 4 w)``."""
+        """Compute descriptors of length 1 from the features of each stride.
+
+        Args:
+            x4, x8, x16: ``(N, C, h, w)`` features at strides 4, 8 and 16.
+
+        Returns:
+            ``(N, 64, h, w)`` coarse descriptors, and ``(N, 32, 4 h, 4 w)`` fine descriptors.
+        """
         hidden = self.context(self.read16(x16))
         y = self.mix8(self.read8(x8) + doubled(self.down(hidden), x8))
         y = self.mix4(self.read4(x4) + doubled(y, x4))
@@ -61,14 +68,14 @@ class LocalHead(nn.Module):
 
 
 class LocalNetwork(nn.Module):
-    """Image to local descriptors."""
+    """Computes local descriptors of an image."""
 
     def __init__(self, extractor: LiteExtractor, head: LocalHead) -> None:
         super().__init__()
         self.extractor, self.head = extractor, head
 
     def features(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """``(N, 1, H, W)`` float32 in [0, 1] to features at strides 4, 8 and 16."""
+        """Features at strides 4, 8 and 16 of ``(N, 1, H, W)`` float32 images in [0, 1]."""
         x = standardised(image, textured(image))
         x = functional.relu6(self.extractor.stem(x))
         kept = []
@@ -79,15 +86,21 @@ class LocalNetwork(nn.Module):
         return kept[0], kept[1], x
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Grey ``(H, W)`` uint8 to coarse ``(h, w, 64)`` and fine ``(4 h, 4 w, 32)``."""
+        """Compute the descriptors of an ``(H, W)`` uint8 grey image.
+
+        Returns:
+            ``(h, w, 64)`` coarse descriptors, and ``(4 h, 4 w, 32)`` fine descriptors.
+        """
         grey = image.float() / 255.0
         coarse, fine = self.head(*self.features(grey[None, None]))
         return coarse[0].permute(1, 2, 0), fine[0].permute(1, 2, 0)
 
 
 def doubled(x: Tensor, like: Tensor) -> Tensor:
-    """Interpolate ``(N, C, h, w)`` to twice the resolution, so that (i, j) moves to (2 i, 2 j), and
-    crop it to the size of ``like``."""
+    """Interpolate ``(N, C, h, w)`` to twice the resolution, and crop it to the size of ``like``.
+
+    The value at (i, j) moves to (2 i, 2 j).
+    """
     for axis in (2, 3):
         last = x.narrow(axis, x.shape[axis] - 1, 1)
         following = torch.cat([x.narrow(axis, 1, x.shape[axis] - 1), last], axis)

@@ -1,7 +1,7 @@
-"""The paper's routing as it is written: an equation of the paper for each function.
+"""The routing of the paper (Zhou and Sun, Sci Rep 15, 7644 (2025), equations 4 to 7).
 
-Zhou and Sun, Sci Rep 15, 7644 (2025), equations 4 to 7. N images, I primary capsules of A numbers
-in T types at P places (i = t P + p), J output capsules of D numbers.
+Each function implements one equation. There are N images. Each image has I primary capsules of A
+numbers, in T types at P places (i = t P + p), and J output capsules of D numbers.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ def predict(u: Tensor, W: Tensor) -> Tensor:
 
     Args:
         u: ``(N, T, P, A)`` primary capsules.
-        W: ``(J, T, A, D)``, shared by the places of a type.
+        W: ``(J, T, A, D)`` matrices, which all places of a type share.
 
     Returns:
         ``(N, J, I, D)``.
@@ -27,10 +27,10 @@ def predict(u: Tensor, W: Tensor) -> Tensor:
 
 
 def couple(b: Tensor, over: Over = "primary") -> Tensor:
-    """Eq. 6: coupling coefficients, softmax of the logits ``b`` ``(N, J, I)``.
+    """Eq. 6: coupling coefficients, which are the softmax of the logits ``b``, ``(N, J, I)``.
 
-    ``primary``: the sum over i is 1, as the paper writes; ``output``: the sum over j is 1, as in
-    Sabour et al.
+    With ``primary``, the sum over i is 1, as in the paper. With ``output``, the sum over j is 1, as
+    in Sabour et al.
     """
     return torch.softmax(b, dim=2 if over == "primary" else 1)
 
@@ -41,23 +41,23 @@ def combine(c: Tensor, u_hat: Tensor) -> Tensor:
 
 
 def agree(u_hat: Tensor, v: Tensor) -> Tensor:
-    """Eq. 7: ``û_j|i · v_j``, what a logit grows by, ``(N, J, I)``."""
+    """Eq. 7: ``û_j|i · v_j``, ``(N, J, I)``, which is added to the logits."""
     return torch.einsum("njid,njd->nji", u_hat, v)
 
 
 def route(
     u_hat: Tensor, iterations: int = 3, over: Over = "primary", alive: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Dynamic routing as the paper writes it; gradients flow through the last iteration only.
+    """Dynamic routing as in the paper. Gradients flow only through the last iteration.
 
     Args:
         u_hat: ``(N, J, I, D)`` prediction vectors.
-        iterations: at least 1.
-        over: what the coupling coefficients are normalised over.
-        alive: ``(I,)`` bool; a capsule that is not takes no part, as if it were removed.
+        iterations: number of iterations, at least 1.
+        over: the capsules over which the coupling coefficients are normalised.
+        alive: ``(I,)`` bool. A capsule that is not alive is ignored, as if it were removed.
 
     Returns:
-        Output capsules ``v`` ``(N, J, D)`` and the coupling coefficients ``(N, J, I)`` behind them.
+        ``(N, J, D)`` output capsules ``v``, and their ``(N, J, I)`` coupling coefficients.
     """
     n, outputs, primaries, _ = u_hat.shape
     with torch.no_grad():
@@ -71,5 +71,6 @@ def route(
 def _masked_couple(b: Tensor, over: Over, alive: Tensor | None) -> Tensor:
     if alive is None:
         return couple(b, over)
-    # Over outputs, a capsule that takes no part has the softmax of -inf throughout: NaN.
+    # If coefficients are normalised over outputs, all logits of a removed capsule are -inf, and
+    # their softmax is NaN.
     return torch.nan_to_num(couple(b.masked_fill(~alive, -torch.inf), over), nan=0.0)

@@ -1,4 +1,4 @@
-"""Images of a calibration board by a camera of known model."""
+"""Images of a calibration board, as a camera with a known model sees it."""
 
 from __future__ import annotations
 
@@ -8,20 +8,23 @@ import numpy as np
 from vslam.calibration.boards import Board
 from vslam.calibration.models import CameraModel
 
-BIT = 12  # pixels of the texture for a bit of a tag
-FINE = 2  # samples of a pixel in each direction
+BIT = 12  # pixels of the texture per bit of a tag
+FINE = 2  # samples per pixel in each direction
 
 
 def texture(
     board: Board, *, legacy: bool = False, border: int = 2, upright: bool = False
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """The printed board with its margin, pixels per metre, and where the board's origin is.
+    """Draw the printed board with its margin.
 
     Args:
         board: the board.
-        legacy: a ChArUco board of even height begins with a marker, as before OpenCV 4.6.
-        border: bits of black around the tags of an AprilGrid.
-        upright: these tags are not upside down as in Kalibr's AprilGrids.
+        legacy: whether a ChArUco board of even height begins with a marker, as before OpenCV 4.6.
+        border: number of black bits around the tags of an AprilGrid.
+        upright: whether the tags of an AprilGrid are upright. Kalibr prints them upside down.
+
+    Returns:
+        The image, the number of pixels per metre, and the position of the board's origin.
     """
     side = 60
     if board.kind == "charuco":
@@ -46,7 +49,10 @@ def _framed(image: np.ndarray, margin: int, scale: float) -> tuple[np.ndarray, f
 
 
 def _aprilgrid(board: Board, border: int, upright: bool) -> tuple[np.ndarray, float, np.ndarray]:
-    """Row by row from the lower left, with a black square in every corner between tags."""
+    """Draw an AprilGrid.
+
+    The tags are in rows from the lower left. A black square is in every corner between tags.
+    """
     tag = (6 + 2 * border) * BIT
     pitch = round(tag * board.square / board.marker)
     gap = pitch - tag
@@ -67,7 +73,7 @@ def _aprilgrid(board: Board, border: int, upright: bool) -> tuple[np.ndarray, fl
 
 
 class Renderer:
-    """Images of one board by one camera."""
+    """Renders images of one board for one camera."""
 
     def __init__(self, board: Board, model: CameraModel, **printed: bool | int) -> None:
         self.printed, self.scale, self.origin = texture(board, **printed)
@@ -87,7 +93,7 @@ class Renderer:
         self.rays = np.concatenate([plane, np.ones((height, width, 1))], axis=2)
 
     def image(self, T_camera_board: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """What the camera sees, with a little noise; beside the board all is grey."""
+        """Render an image with a little noise. The background of the board is grey."""
         R, t = T_camera_board[:3, :3], T_camera_board[:3, 3]
         directions = self.rays @ R
         start = -R.T @ t
@@ -96,7 +102,8 @@ class Renderer:
         at = start[:2] + depth[..., None] * directions[..., :2]
         at[~(depth > 0)] = 1e3
         at = at * (1, -1) if self.up else at
-        # Board coordinates are borders of texture pixels; the centre of the first is at 0.
+        # Board coordinates refer to the borders of texture pixels, but the centre of the first
+        # pixel is at 0.
         maps = (at * self.scale + self.origin - 0.5).astype(np.float32)
         fine = cv2.remap(
             self.printed, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR,

@@ -1,4 +1,4 @@
-"""A ring road of points, seen as features: loops without rendering a picture."""
+"""A ring road of points, which are observed as features. Loops need no rendered images."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from vslam.loops import DetectorMemory, LoopCandidate
 from vslam.map import Map
 
 CAMERA = Camera(500.0, 500.0, 400.0, 150.0, 0.5, 800, 300)
-RADIUS, STEP = 50.0, 1.5  # metres: of the road, and between frames
-LAP = round(2 * np.pi * RADIUS / STEP)  # frames
+RADIUS, STEP = 50.0, 1.5  # radius of the road, and distance between frames, in metres
+LAP = round(2 * np.pi * RADIUS / STEP)  # number of frames
 
 
 @dataclass(frozen=True)
 class Ring:
-    """Points on both sides of the road, each with a descriptor of its own.
+    """Points on both sides of a ring road, each with its own descriptor.
 
-    The camera is told a focal length that is ``focal_error`` too long: it takes every turn for
-    wider or narrower than it is, and a lap ends off its start. With ``zoom`` a point is found in
-    the octave that its distance asks for, else in octave 0. The right image is taken
-    ``right_delay`` seconds late, at ten frames a second.
+    The calibrated focal length is too long by ``focal_error``. Therefore, turns are estimated with
+    an error, and a lap does not end at its start. With ``zoom``, a point is found in the octave
+    that corresponds to its distance, otherwise in octave 0. The right image is taken
+    ``right_delay`` seconds late. The frame rate is 10 Hz.
     """
 
     points: np.ndarray
@@ -46,7 +46,7 @@ class Ring:
         return cls(points, rng.integers(0, 256, (n, 32), dtype=np.uint8), focal_error, zoom)
 
     def pose(self, k: float) -> np.ndarray:
-        """``T_wc`` at frame k, counter-clockwise seen from below."""
+        """``T_wc`` at frame k. Seen from below, the camera drives counter-clockwise."""
         angle = k * STEP / RADIUS
         forward = np.array([-np.sin(angle), 0.0, np.cos(angle)])
         T = np.eye(4)
@@ -57,7 +57,10 @@ class Ring:
         return T
 
     def see(self, k: float, seed: int) -> Features:
-        """Features at frame k, noise as of real images, six bits of each descriptor wrong."""
+        """The features at frame k.
+
+        They have as much noise as those of real images. Six bits of each descriptor are wrong.
+        """
         rng = np.random.default_rng((seed, round(10 * k)))
         T_cw = inverse(self.pose(k))
         p = self.points @ T_cw[:3, :3].T + T_cw[:3, 3]
@@ -88,7 +91,10 @@ class Ring:
 
 
 class Oracle:
-    """A detector that knows where each frame was: ``frames`` are the places of the run's frames."""
+    """A detector that knows where each frame was taken.
+
+    ``frames`` are the places of the frames of the run.
+    """
 
     name = "oracle"
 

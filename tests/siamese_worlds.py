@@ -1,4 +1,4 @@
-"""Small networks and small sets of images that the tests of the Siamese networks share."""
+"""Small networks and small sets of images, which several tests of the Siamese networks use."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MILD = Augmentation(
 
 
 def small_network(seed: int = 0, **shape: object) -> SiameseNetwork:
-    """A capsule network of 30,000 parameters for images of 64 pixels."""
+    """Make a capsule network with 30,000 parameters for images of 64 pixels."""
     torch.manual_seed(seed)
     return build_network("capsule", SMALL.model_copy(update=shape))
 
@@ -32,7 +32,10 @@ def small_settings(**changes: object) -> TrainSettings:
 
 
 def views(places: int, seed: int = 0) -> Collection:
-    """Two views of each of some places: blobs, the second moved by 3 pixels and darker."""
+    """Make two images of each of some places.
+
+    The images show blobs. In the second image, they are shifted by 3 pixels and darker.
+    """
     rng = np.random.default_rng(seed)
     images = []
     for _ in range(places):

@@ -1,4 +1,4 @@
-"""The same frames written as every kind of source."""
+"""Writes the same frames as every kind of source."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LEFT, RIGHT = "/cam0/image_raw", "/cam1/image_raw"
 def open_from(
     dataset: str, data: Path | str, options: SourceOptions = NO_OPTIONS, **more: object
 ) -> Source:
-    """Open a source as a command does that is given these options."""
+    """Open a source as a command with these options does."""
     given = {"dataset": dataset, "data": str(data), **more}
     return open_source(options.model_copy(update=given))
 
@@ -32,7 +32,7 @@ def open_from(
 def write_calibration(
     path: Path, camera: Camera, *, mono: bool = False, scale: float = 1.0
 ) -> Path:
-    """vslam's own format; JSON is YAML."""
+    """Write a calibration in vslam's own format. It is written as JSON, which is valid YAML."""
     one = {
         "size": [round(scale * camera.width), round(scale * camera.height)],
         "focal": [camera.fx, camera.fy],
@@ -44,7 +44,7 @@ def write_calibration(
 
 
 def write_images(folder: Path, sides: dict[str, list[np.ndarray]], names: list[str]) -> Path:
-    """``folder/SIDE/NAME`` for each side."""
+    """Write the images ``folder/SIDE/NAME`` of each side."""
     for side, images in sides.items():
         (folder / side).mkdir(parents=True, exist_ok=True)
         for name, image in zip(names, images, strict=True):
@@ -55,7 +55,7 @@ def write_images(folder: Path, sides: dict[str, list[np.ndarray]], names: list[s
 def write_video(
     path: Path, images: list[np.ndarray], fps: float = 10.0, codec: str = "FFV1"
 ) -> Path:
-    """Without loss, by the codec FFV1; images in colour are blue, green, red."""
+    """Write a video, which is lossless with the codec FFV1. Colours are blue, green, red."""
     height, width = images[0].shape[:2]
     fourcc, colour = cv2.VideoWriter_fourcc(*codec), images[0].ndim == 3
     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, fps, (width, height), colour)
@@ -67,8 +67,10 @@ def write_video(
 
 
 def encoded(image: np.ndarray, encoding: str) -> np.ndarray:
-    """Grey pixels ``(H, W)`` as those of a ROS image, with the same grey values; depth in mm as of
-    REP 118."""
+    """Convert ``(H, W)`` grey values to the pixels of a ROS image with the same grey values.
+
+    Depth in mm is converted as defined by REP 118.
+    """
     if image.dtype == np.uint16:
         return image if encoding == "16UC1" else (image * np.float32(0.001)).astype("<f4")
     if encoding == "mono16":
@@ -82,10 +84,10 @@ def encoded(image: np.ndarray, encoding: str) -> np.ndarray:
 
 
 def compressed(image: np.ndarray, kind: str) -> tuple[str, np.ndarray]:
-    """Format and bytes of a compressed image, or of depth (mm) as by ``compressed_depth``."""
+    """The format and the bytes of a compressed image, or of depth in mm (``compressed_depth``)."""
     if kind == "png":
         return kind, cv2.imencode(".png", image)[1].ravel()
-    a, b = np.float32(500.0), np.float32(-3.0)  # a / metres + b is what the PNG holds
+    a, b = np.float32(500.0), np.float32(-3.0)  # the PNG contains a / metres + b
     header = np.array([(1, a, b)], [("kind", "<i4"), ("a", "<f4"), ("b", "<f4")])
     if kind.startswith("32FC1"):
         with np.errstate(divide="ignore"):
@@ -110,19 +112,20 @@ def write_bag(
     padding: int = 0,
     compression: str = "",
 ) -> Path:
-    """A bag with one topic for each side; returns what to open.
+    """Write a bag with one topic for each side, and return the path to open.
 
     Args:
         kind: ``ros1``, ``ros2``, ``mcap``, or ``folder`` for a ROS 2 bag of MCAP files.
-        stamps: nanoseconds.
-        encoding: of the images, or ``png`` for compressed ones.
-        depth_encoding: of sides of uint16 (mm): ``16UC1``, ``32FC1``, or with `` png`` behind it.
-        camera: write its camera_info.
-        baseline: it has the baseline, in the right P.
-        calibrated: it is not all zero.
-        lag: nanoseconds that the second side's stamps are late.
-        padding: bytes behind each row.
-        compression: ``bz2`` or ``lz4`` of ROS 1; ``file``, ``message`` or ``storage`` of ROS 2.
+        stamps: time stamps in nanoseconds.
+        encoding: encoding of the images, or ``png`` for compressed images.
+        depth_encoding: encoding of sides with uint16 depth in mm: ``16UC1`` or ``32FC1``. `` png``
+            is appended for compressed depth.
+        camera: camera whose camera_info is written; None writes no camera_info.
+        baseline: whether the camera_info has the baseline, in P of the right camera.
+        calibrated: whether the camera_info is calibrated. Otherwise, it is all zero.
+        lag: delay of the time stamps of the second side in nanoseconds.
+        padding: number of bytes after each row.
+        compression: ``bz2`` or ``lz4`` for ROS 1; ``file``, ``message`` or ``storage`` for ROS 2.
     """
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
@@ -195,7 +198,7 @@ def write_bag(
 
 
 def all_sources(root: Path, corridor, n: int) -> Path:
-    """Every kind of source of the corridor's first frames at 10 Hz, and calibrations of them."""
+    """Write the first frames of the corridor as every kind of source, with calibrations."""
     left, right = corridor.left[:n], corridor.right[:n]
     stamps = [k * 10**8 for k in range(n)]
     names = [f"{k}.png" for k in range(n)]  # 10 comes after 9
@@ -214,13 +217,13 @@ def all_sources(root: Path, corridor, n: int) -> Path:
 
 
 def source_path(root: Path, kind: str) -> Path:
-    """Where `all_sources` has put a kind."""
+    """The path to which `all_sources` wrote a kind of source."""
     files = {"images": "images", "video": "pair.mkv", "ros1": "ros1.bag", "ros2": "ros2",
              "mcap": "mcap/mcap.mcap", "folder": "bag"}  # fmt: skip
     return root / files[kind]
 
 
 def run_source(source, *, threads: int = 2, perturb: str = "none", **more) -> RunOutcome:
-    """Odometry over a whole source; ``more`` goes to the settings."""
+    """Run odometry on a whole source. ``more`` are additional settings."""
     settings = RunOptions(detector="none", perturb=perturb, threads=threads, **more)
     return run_sequence(source, parse_perturbation(perturb, 0), settings, Recorder())

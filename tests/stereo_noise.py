@@ -1,4 +1,4 @@
-"""Noise of stereo observations of the size that the weights of a stereo camera assume."""
+"""Noise of stereo observations, as large as the weights of a stereo camera assume."""
 
 from __future__ import annotations
 
@@ -6,13 +6,19 @@ import numpy as np
 
 from vslam.camera import DISPARITY_WEIGHT
 
-# Turns errors of u, v, u_right into those of u, v and the disparity, in standard deviations.
+# Converts errors of u, v and u_right to errors of u, v and the disparity, in standard deviations.
 WHITENING = np.diag([1.0, 1.0, DISPARITY_WEIGHT]) @ np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 1]])
 
 
 def white_noise(rng: np.random.Generator, stereo: np.ndarray) -> np.ndarray:
-    """``(N, 3)`` errors of u, v, u_right, of one standard deviation at octave 0 each, for ``(N,)``
-    bool whether it is a stereo observation; of u and v alone one pixel otherwise."""
+    """``(N, 3)`` random errors of u, v and u_right.
+
+    The errors of a stereo observation have one standard deviation at octave 0. The errors of u and
+    v of a monocular observation have one pixel.
+
+    Args:
+        stereo: ``(N,)`` bool, whether an observation is a stereo observation.
+    """
     error = rng.normal(size=(len(stereo), 3))
     error[stereo] = error[stereo] @ np.linalg.inv(WHITENING).T
     return error

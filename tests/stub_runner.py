@@ -1,9 +1,16 @@
-"""A stub for ``vslam run`` that quickly writes the folder of a run with invented figures.
+"""A stub for ``vslam run``, which quickly writes the folder of a run with invented figures.
 
-Files in ``$STUB_FOLDER`` change what a run does, NAME being sequence, perturbation, detector and
-seed joined by ``-``: ``fail-NAME``, ``interrupt-NAME``, ``lost-NAME`` (in all frames),
-``unwritten-NAME`` (exit code 1 after the report), ``hold-NAME`` (it waits while that is there).
-Each start adds a line, NAME and the parent's process number, to the file ``started``.
+Files in ``$STUB_FOLDER`` change the behaviour of a run. NAME consists of the sequence, the
+perturbation, the detector and the seed, joined by ``-``:
+
+- ``fail-NAME``: the run fails.
+- ``interrupt-NAME``: the run is interrupted.
+- ``lost-NAME``: all frames are lost.
+- ``unwritten-NAME``: the run exits with 1 after it has written the report.
+- ``hold-NAME``: the run waits as long as this file exists.
+
+Each start of a run adds a line to the file ``started``. The line contains NAME and the process
+number of the parent.
 """
 
 from __future__ import annotations
@@ -19,14 +26,14 @@ COMMAND = (sys.executable, str(Path(__file__).resolve()))
 
 
 def started(stub: Path) -> list[tuple[str, int]]:
-    """NAME and parent of each start so far, in order."""
+    """NAME and the parent's process number of each start so far, in order."""
     file = stub / "started"
     lines = [line.split() for line in file.read_text().splitlines()] if file.exists() else []
     return [(name, int(parent)) for name, parent in lines]
 
 
 def wait_for(condition: Callable[[], object], seconds: float = 120.0) -> None:
-    """Until it is true; fails the test if that takes too long."""
+    """Wait until a condition is true. The test fails if that takes too long."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "waited in vain"

@@ -1,4 +1,7 @@
-"""Sub-pixel alignment: exact on patches of a known scene, silent where nothing agrees."""
+"""Sub-pixel alignment is exact on patches of a known scene.
+
+Patches without a match are rejected.
+"""
 
 from dataclasses import replace
 

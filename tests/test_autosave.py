@@ -1,4 +1,7 @@
-"""A run that is killed loses little: what it saved loads, and the run goes on at the next frame."""
+"""A killed run loses little work.
+
+Its autosave can be loaded, and the run resumes at the next frame.
+"""
 
 from __future__ import annotations
 

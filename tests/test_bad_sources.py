@@ -1,4 +1,7 @@
-"""Unreadable sources are refused in one sentence; a source that ends early keeps its frames."""
+"""Sources that cannot be read are rejected with one sentence.
+
+A source that ends early keeps its frames.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Compressed bags: read like others, and refused where a small one unpacks to much."""
+"""Compressed bags are read like other bags.
+
+They are rejected if they decompress to too much data.
+"""
 
 from __future__ import annotations
 

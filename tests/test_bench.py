@@ -1,4 +1,4 @@
-"""The grid of runs: its cells, what becomes of them, and that none is lost."""
+"""The grid of a benchmark: its cells, their results, and that no cell is lost."""
 
 from __future__ import annotations
 

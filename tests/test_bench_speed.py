@@ -1,4 +1,4 @@
-"""The arithmetic and the tables of tools/bench_speed.py, without ORB-SLAM3."""
+"""The calculations and the tables of tools/bench_speed.py, without ORB-SLAM3."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sparse block Cholesky against NumPy on dense copies of the same systems."""
+"""Sparse block Cholesky, compared with NumPy on dense copies of the same systems."""
 
 from __future__ import annotations
 

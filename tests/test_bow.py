@@ -1,4 +1,4 @@
-"""The bag-of-words detector: its indices, its choice of candidates, and real images."""
+"""The bag-of-words detector: its indices, its candidates, and its results on real images."""
 
 from __future__ import annotations
 

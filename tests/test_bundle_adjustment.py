@@ -1,4 +1,4 @@
-"""Bundle adjustment against GTSAM on the same problem, and where it could break."""
+"""Bundle adjustment, compared with GTSAM on the same problem, and its difficult cases."""
 
 from __future__ import annotations
 

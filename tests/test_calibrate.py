@@ -1,4 +1,4 @@
-"""``vslam calibrate`` on rendered boards of known truth."""
+"""``vslam calibrate`` on rendered boards with known ground truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Camera models against OpenCV's, and images rectified by them."""
+"""Camera models, compared with OpenCV's, and images that are rectified with them."""
 
 from __future__ import annotations
 

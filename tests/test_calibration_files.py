@@ -1,4 +1,4 @@
-"""Each calibration format, written for one pair of cameras, gives the same calibration."""
+"""All calibration formats, written for the same pair of cameras, give the same calibration."""
 
 from __future__ import annotations
 

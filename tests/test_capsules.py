@@ -1,4 +1,4 @@
-"""Capsules, routing, pruning and the contract of the Siamese networks."""
+"""Capsules, routing, pruning and the interface of the Siamese networks."""
 
 from __future__ import annotations
 

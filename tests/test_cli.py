@@ -1,4 +1,4 @@
-"""The command line: quick help, plain refusals with exit code 2, and how a run is put together."""
+"""The command line: fast help, clear errors with exit code 2, and how a run is set up."""
 
 from __future__ import annotations
 

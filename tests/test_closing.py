@@ -1,4 +1,4 @@
-"""Loops closed, lost cameras found and sub-maps joined, on a ring of points (tests/ring.py)."""
+"""Loop closing, relocalisation and joining of sub-maps, on a ring of points (tests/ring.py)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The grid on a Dask cluster on loopback: a worker is killed, and no cell is lost."""
+"""The grid on a local Dask cluster: one worker is killed, and no cell is lost."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two detectors as one: candidates in turn, one for each keyframe."""
+"""Two combined detectors propose candidates in turn, and each place only once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When candidates persist, and when verified loops agree."""
+"""When candidates are consistent over several keyframes, and when verified loops agree."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""Who may import whom (docs/explanation/design.md, section 2), read from the source.
+"""Which module may import which (docs/explanation/design.md, section 2), read from the source.
 
-Every folder and module has a level; an import may lead down or stay on its level, and no modules
-import each other in a circle. Beside that a few libraries belong to one place each.
+Every folder and module has a level. A module may import modules of its own level and of lower
+levels. There are no circular imports. In addition, a few libraries may only be imported in one
+place each.
 """
 
 from __future__ import annotations

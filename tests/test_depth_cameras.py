@@ -1,4 +1,4 @@
-"""Depth cameras, in place of which small fakes of their packages play recorded frames."""
+"""Depth cameras, which are replaced by small fakes of their packages that play recorded frames."""
 
 from __future__ import annotations
 

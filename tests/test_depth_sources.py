@@ -1,4 +1,4 @@
-"""Depth out of bags and folders: the same frames give the same run, whatever holds them."""
+"""Depth from bags and folders. The same frames give the same run from every kind of source."""
 
 from __future__ import annotations
 

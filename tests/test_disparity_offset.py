@@ -1,4 +1,4 @@
-"""The common offset of all disparities, estimated from the camera's own motion."""
+"""The common offset of all disparities is estimated from the motion of the camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Each planted fault is found, and nothing else; clean sequences have none."""
+"""``vslam doctor`` finds every planted fault and nothing else.
+
+It finds no fault in clean sequences.
+"""
 
 from __future__ import annotations
 

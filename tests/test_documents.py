@@ -1,4 +1,4 @@
-"""Documents name what exists, and hold no path of a machine."""
+"""The documents name only things that exist, and contain no paths of a machine."""
 
 from __future__ import annotations
 

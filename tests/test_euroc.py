@@ -1,4 +1,4 @@
-"""The reader of EuRoC's layout: pairs, ground truth, rectification, bad input."""
+"""The reader of EuRoC's layout: pairs, ground truth, rectification and invalid input."""
 
 from __future__ import annotations
 

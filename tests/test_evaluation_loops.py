@@ -1,4 +1,4 @@
-"""Revisits and right loops on paths whose geometry is known."""
+"""Revisits and correct loops on paths with known geometry."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trajectories with a known error must be given just that error."""
+"""The evaluation computes exactly the error of trajectories whose error is known."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The explorer of a report, and the page of all runs: in a browser, at phone width."""
+"""The explorer of a report and the page of all runs, in a browser and at the width of a phone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Maps in the formats of other programs, read back and projected by their conventions."""
+"""Maps in the formats of other programs, which are read and projected by their conventions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every part of a run fails once: nothing computed is lost, and one sentence says what failed."""
+"""Every part of a run fails once. No result is lost, and one sentence says what failed."""
 
 from __future__ import annotations
 

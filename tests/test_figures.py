@@ -1,4 +1,4 @@
-"""Tables and figures of the documents: made by ``make figures``, stamped, compared with pages."""
+"""Tables and figures of the documents: they are made, stamped, and compared with the pages."""
 
 from __future__ import annotations
 

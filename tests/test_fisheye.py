@@ -1,4 +1,4 @@
-"""The rendered fisheye pair: after rectification by its calibration, it equals a pinhole pair."""
+"""The rendered fisheye pair, rectified with its calibration, equals a pinhole pair."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A frame: what its images gave, and one pose whichever camera of the pair saw it."""
+"""A frame: the data from its images, and its pose, seen from either camera of the pair."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames follow the keyframes that they are placed by, in today's unit."""
+"""Frames follow their reference keyframes, in the current unit of the map."""
 
 from __future__ import annotations
 

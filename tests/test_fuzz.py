@@ -1,6 +1,6 @@
-"""Damaged files end in one sentence: a little of what ``python tools/fuzz.py`` does at length.
+"""Damaged files are rejected with one sentence. This is a short version of ``tools/fuzz.py``.
 
-``VSLAM_FUZZ_INPUTS=1000`` tries more of each reader.
+``VSLAM_FUZZ_INPUTS=1000`` tries more inputs for each reader.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""SE(3) algebra against scipy, over all angles, and rotations that stay rotations."""
+"""SE(3) algebra, compared with scipy over all angles. Rotations stay orthogonal."""
 
 from __future__ import annotations
 

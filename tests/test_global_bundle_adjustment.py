@@ -1,4 +1,7 @@
-"""Global bundle adjustment against the dense one and GTSAM, and its merging into a map."""
+"""Global bundle adjustment is compared with dense optimisation and GTSAM.
+
+Its result is merged into a map.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""A snapshot of the map, and its solution merged while the map has gone on."""
+"""Global bundle adjustment optimises a snapshot.
+
+Its solution is merged into a map that has changed.
+"""
 
 from __future__ import annotations
 

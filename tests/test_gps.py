@@ -1,4 +1,4 @@
-"""GPS: fixes are read and tested, and a drive with them lies on the Earth and does not drift."""
+"""GPS fixes are read and checked. A drive with GPS is georeferenced and does not drift."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Videos as telephones and cameras write them: H.264 in MP4, at rates that vary, cut off."""
+"""Videos as phones and cameras write them: H.264 in MP4, at variable frame rates, or truncated."""
 
 from __future__ import annotations
 

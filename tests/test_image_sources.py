@@ -1,4 +1,4 @@
-"""What the networks learn from: readers, division, pairs."""
+"""The images from which the networks learn: readers, splits and pairs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Homography or fundamental matrix, and the motion that follows (frontend/initialization.py)."""
+"""The choice of homography or fundamental matrix, and the resulting motion."""
 
 from __future__ import annotations
 

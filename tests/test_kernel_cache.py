@@ -1,4 +1,4 @@
-"""Kernels out of the cache: what is left out when they are loaded, and what is not."""
+"""Kernels from the cache: what is skipped when they are loaded, and what is not."""
 
 from __future__ import annotations
 

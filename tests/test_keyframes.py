@@ -1,4 +1,4 @@
-"""Each clause of the keyframe decision, and its threshold from both sides; the policy alone."""
+"""Each condition of the keyframe decision is tested from both sides of its threshold."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The KITTI reader: every kind of bad input is refused in one sentence that names file and fix."""
+"""The KITTI reader rejects invalid input. One sentence names the file and the fix."""
 
 from __future__ import annotations
 

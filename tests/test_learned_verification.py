@@ -1,4 +1,4 @@
-"""Loops verified by learned local descriptors: a wall again, from elsewhere, in another light."""
+"""Loops are verified by learned local descriptors, from another viewpoint and in other light."""
 
 from __future__ import annotations
 

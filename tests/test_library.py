@@ -1,5 +1,4 @@
-"""What a program meets that uses vslam as a library: paths as strings, cameras and images that
-cannot be."""
+"""vslam as a library: paths may be strings, and impossible cameras and images are rejected."""
 
 from __future__ import annotations
 

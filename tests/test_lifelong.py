@@ -1,4 +1,4 @@
-"""Driving known streets does not grow the map."""
+"""Driving along known streets does not make the map grow."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The extractor that starts from ImageNet weights."""
+"""The feature extractor that starts from ImageNet weights."""
 
 from __future__ import annotations
 

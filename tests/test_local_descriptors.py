@@ -1,4 +1,4 @@
-"""The shipped network of local descriptors, and the images of keyframes that it reads."""
+"""The shipped network of local descriptors, and the images of keyframes that it uses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Local mapping on a synthetic world: random points, each with a descriptor of its own."""
+"""Local mapping in a synthetic world of random points, each of which has its own descriptor."""
 
 from __future__ import annotations
 

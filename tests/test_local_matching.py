@@ -1,4 +1,4 @@
-"""Coarse-to-fine matching of local descriptors, on synthetic fields of descriptors."""
+"""Coarse-to-fine matching of local descriptors, on synthetic grids of descriptors."""
 
 from __future__ import annotations
 

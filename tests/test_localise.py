@@ -1,4 +1,4 @@
-"""Going on in a map: found again, extended, resumed, or only localised in."""
+"""Continuing in a saved map: relocalisation, extension, resuming, and localisation only."""
 
 from __future__ import annotations
 

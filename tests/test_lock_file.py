@@ -1,4 +1,4 @@
-"""A folder is written to by one process at a time."""
+"""Only one process at a time writes to a folder."""
 
 from __future__ import annotations
 

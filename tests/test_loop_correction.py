@@ -1,4 +1,4 @@
-"""Keyframes that move take their landmarks along."""
+"""Landmarks move together with their keyframes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of closed loops: the right pixels of both images, of the right frames, in few bytes."""
+"""Pictures of closed loops show the right pixels of the right frames, and their files are small."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tables that tools/loop_tables.py writes of a comparison of loop detectors."""
+"""The tables that tools/loop_tables.py writes from a comparison of loop detectors."""
 
 from __future__ import annotations
 

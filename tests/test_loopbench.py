@@ -1,4 +1,4 @@
-"""Loop detectors compared on images: conditions, test sets, figures, report, command."""
+"""The comparison of loop detectors on images: conditions, sets, figures, report and command."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The map under random operations, its growth, and what is derived from the observations."""
+"""The map under random operations, its growth, and the data derived from its observations."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Every column of the map's tables survives copying, saving, merging and other transfers.
 
-The tests find the columns by themselves, so that a new column needs no new test.
+The tests find the columns automatically, so that a new column needs no new test.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Map files: complete, whole or not there, read in a second, and trusted in nothing."""
+"""Map files are complete, are written atomically, load within a second, and are not trusted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Maps of several drives made one, and parts of maps."""
+"""Maps of several drives are merged into one map, and parts of maps are extracted."""
 
 from __future__ import annotations
 

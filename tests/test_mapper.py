@@ -1,4 +1,4 @@
-"""The owner of the map alone: when it merges, what follows the map, and what a failure leaves."""
+"""The mapper in isolation: when it merges, what follows the map, and its state after a failure."""
 
 from __future__ import annotations
 

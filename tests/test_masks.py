@@ -1,4 +1,7 @@
-"""Masks: what they hide gives no feature, no patch and no place, and costs nothing without one."""
+"""Masked pixels give no feature, no patch and no place.
+
+Runs without masks have no additional cost.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Matching kernels against plain Python on random data."""
+"""Matching kernels, compared with plain Python on random data."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The method's version changes with the trajectories of three reference clips: a corridor by stereo
-and by RGB-D, and a drive round a block whose loop is closed by night.
+"""The version of the method changes whenever the trajectory of a reference clip changes.
 
-After a change of the method, raise ``METHOD_VERSION`` in ``vslam/method.py`` and write the
-references again with ``make method``.
+There are three reference clips: a corridor with stereo, the same corridor with RGB-D, and a drive
+round a block whose loop is closed by night. After a change of the method, raise ``METHOD_VERSION``
+in ``vslam/method.py`` and write the references again with ``make method``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The two modes alone: one builds the map, the other leaves it alone."""
+"""The two modes in isolation: one builds the map, the other does not change it."""
 
 from __future__ import annotations
 

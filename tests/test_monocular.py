@@ -1,4 +1,4 @@
-"""Monocular SLAM on a ring of points (tests/ring.py): the map has a unit of its own."""
+"""Monocular SLAM on a ring of points (tests/ring.py). The map has an arbitrary unit."""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
-"""The point of the whole system, end to end: a loop that closes by night with the shipped network,
-and does not with the bag of words."""
+"""A loop at night is closed by the shipped network, but not by the bag of words.
+
+This is the purpose of the whole system, tested from end to end.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The notebooks of the documentation run from top to bottom and come out as they say."""
+"""The notebooks of the documentation run without errors and give the results that they state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Odometry beside the map: poses that never jump, and covariances that hold what they promise."""
+"""Odometry beside the map: its poses never jump, and its covariances are consistent."""
 
 from __future__ import annotations
 

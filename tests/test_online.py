@@ -1,4 +1,4 @@
-"""The protocol online: windows, decisions, curves, figures, report, command."""
+"""The online protocol: windows, decisions, curves, figures, report and command."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ORB extraction against OpenCV: corners pixel for pixel, descriptors bit for bit (nearly)."""
+"""ORB extraction is compared with OpenCV. Corners are identical, and nearly all descriptors are."""
 
 from __future__ import annotations
 

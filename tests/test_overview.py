@@ -1,4 +1,4 @@
-"""The report of many runs: what it counts, what it claims, and how it looks in a browser."""
+"""The report of many runs: its counts, its statements, and how it looks in a browser."""
 
 from __future__ import annotations
 

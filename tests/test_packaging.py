@@ -1,4 +1,4 @@
-"""The wheel is the same bytes whoever builds it, says all about itself, and containers exist."""
+"""The wheel is reproducible, has complete metadata, and container files exist."""
 
 from __future__ import annotations
 

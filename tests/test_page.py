@@ -1,4 +1,4 @@
-"""Pages of reports: what each form shows of each part, and files of results."""
+"""Pages of reports: what each format shows of each part, and files of results."""
 
 from __future__ import annotations
 

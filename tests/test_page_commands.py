@@ -1,5 +1,6 @@
-"""Every command on the pages runs on the corridor of the tests, shortened; what does not run here
-is named with the reason.
+"""Every command on the pages runs, in a shortened form, on the corridor of the tests.
+
+Commands that do not run here are listed with the reason.
 
 Commands are the lines of shell blocks, and those with arguments in tables. The tutorials run in
 ``test_site.py``, the pages of plug-ins in ``test_plugins.py``.

@@ -1,4 +1,4 @@
-"""Tracking by patches: the pose by sparse image alignment, then by the patches of landmarks."""
+"""Tracking by patches, first by sparse image alignment, then by the patches of landmarks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each law does what its unit says."""
+"""Each perturbation has the effect that its unit states."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The main job end to end: from images on disk to trajectory, report, map and recording."""
+"""A complete run, from images on the disk to trajectory, report, map and recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Plug-ins: the package of docs/howto/plugins.md, installed and used, and broken packages."""
+"""Plug-ins: the package of docs/howto/plugins.md is installed and used.
+
+Broken packages are rejected.
+"""
 
 from __future__ import annotations
 

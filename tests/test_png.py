@@ -1,4 +1,4 @@
-"""Our PNG decoder gives OpenCV's pixels, or hands the file on."""
+"""vslam's PNG decoder gives the same pixels as OpenCV, or leaves the file to OpenCV."""
 
 from __future__ import annotations
 

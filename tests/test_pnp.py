@@ -1,4 +1,4 @@
-"""P3P against known poses, and RANSAC around it with outliers."""
+"""P3P, compared with known poses, and RANSAC with outliers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Motion-only optimisation: exact without noise, robust to outliers, the same as GTSAM."""
+"""Motion-only optimisation is exact without noise, robust to outliers, and equal to GTSAM."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pose graph: closed forms, what makes up the essential graph, and which loops it refuses."""
+"""The pose graph: closed-form solutions, the edges of the essential graph, and rejected loops."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Precision and recall, against scikit-learn."""
+"""Precision and recall, compared with scikit-learn."""
 
 from __future__ import annotations
 

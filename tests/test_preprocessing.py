@@ -1,4 +1,4 @@
-"""Unrolled images: what a turned camera sees is moved, not bent."""
+"""Cylindrical images: a rotation of the camera moves their contents, but does not distort them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The profile of a frame names functions that are there."""
+"""The profile of a frame names functions that exist."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A sequence played in real time: no frame comes early, and late consumers miss frames."""
+"""A sequence in real time: no frame comes too early, and a slow consumer misses frames."""
 
 from __future__ import annotations
 

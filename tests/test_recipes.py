@@ -1,4 +1,4 @@
-"""Every recipe of docs/howto/python.md runs, one after the other, as a reader would type them."""
+"""The recipes of docs/howto/python.md run one after the other, as a reader would type them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings are valid, small, and never the end of a run."""
+"""Recordings are valid and small, and a failing recorder does not end a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The relocaliser alone: what it finds and moves, and that it changes nothing else."""
+"""The relocaliser in isolation: what it finds and moves, and that it changes nothing else."""
 
 from __future__ import annotations
 

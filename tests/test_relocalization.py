@@ -1,4 +1,4 @@
-"""A lost frame of a simulated street is found, or left as it was."""
+"""A lost frame of a simulated street is relocalised, or stays unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reports of runs in every state of completion."""
+"""Reports of complete and incomplete runs."""
 
 from __future__ import annotations
 

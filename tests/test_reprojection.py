@@ -1,4 +1,4 @@
-"""The chi-square test and the residual against NumPy."""
+"""The chi-square test and the residual, compared with NumPy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""RGB-D: depth as a virtual right image, TUM's layout, and runs from it."""
+"""RGB-D: depth as a virtual right image, TUM's layout, and runs with it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The corrections of a stereo pair, each applied to a frame once."""
+"""The corrections of a stereo pair. Each of them is applied to a frame once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs as messages of ROS 2, read back by Foxglove's library; the example's conversions."""
+"""Runs as ROS 2 messages, read by Foxglove's library, and the conversions of the example."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of other people: nothing in them is executed, and nothing small becomes huge."""
+"""Files from untrusted people are not executed, and small files cannot use much memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The plug-in that makes a Siamese network a loop detector, its commands and its export."""
+"""The plug-in that makes a Siamese network a loop detector, with its commands and its export."""
 
 from __future__ import annotations
 

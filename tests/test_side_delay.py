@@ -1,5 +1,7 @@
-"""The delay of the right image is measured from the rows of stereo matches, and a delay given in
-the calibration costs a drive little."""
+"""The delay of the right image is measured from the rows of stereo matches.
+
+A drive with a delay that the calibration states is nearly as accurate as one without a delay.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""RANSAC on landmarks of two cameras: exact fits, outliers, degenerate sets."""
+"""RANSAC on the landmarks of two cameras: exact fits, outliers, and degenerate sets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pose graph with scale: closed forms, a drifted lap, and what the correction does to a map."""
+"""The pose graph with scale: closed-form solutions, a lap with drift, and a corrected map."""
 
 from __future__ import annotations
 

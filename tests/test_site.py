@@ -1,4 +1,4 @@
-"""The documentation site: it builds without a warning, asks no other host, and tells the truth."""
+"""The documentation site builds without warnings, needs no other host, and is correct."""
 
 from __future__ import annotations
 

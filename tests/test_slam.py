@@ -1,4 +1,4 @@
-"""The whole pipeline on a rendered corridor: accuracy, determinism, and what goes wrong in cars."""
+"""The whole pipeline on a rendered corridor: accuracy, determinism, and typical faults in cars."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sources of frames, whether they can seek or not: selection, first frames, frames by number."""
+"""Frames of stored sources and of streams: selection, first frames, and frames by index."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Folders, videos, bags and cameras: the same frames give the same run, whatever holds them."""
+"""Folders, videos, bags and cameras.
+
+The same frames give the same run from every kind of source.
+"""
 
 from __future__ import annotations
 

@@ -1,9 +1,10 @@
-"""Guards against changes that make a method ten times as slow, for example a kernel that compiles
-at each call, or work that grows with the square of the map.
+"""Guards against changes that make a method ten times slower.
 
-The CPU time of this thread is measured relative to a fixed kernel, alternately, so that a slower or
-busier machine slows both. The ratio differs by a factor of two or three between processors, for
-which the limit leaves room; `tools/bench_speed.py` measures finer differences.
+Examples are a kernel that is compiled at each call, or work that grows with the square of the map.
+
+The CPU time of this thread is measured alternately for the method and for a fixed kernel. A slower
+or busier machine slows both of them. Their ratio differs by a factor of two or three between
+processors, which the limit allows. `tools/bench_speed.py` measures smaller differences.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The starter alone: with which frames a map, or a sub-map, begins."""
+"""The starter in isolation: the frames with which a map or a sub-map begins."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stereo matching on a random texture shifted by known amounts."""
+"""Stereo matching on a random texture that is shifted by known amounts."""
 
 from __future__ import annotations
 

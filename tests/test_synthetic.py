@@ -1,4 +1,4 @@
-"""The rendered towns: exact geometry, reproducible bytes, bad input."""
+"""The rendered towns: exact geometry, reproducible images, and invalid input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""docs/reference/thresholds.md says what vslam/config.py says."""
+"""docs/reference/thresholds.md agrees with vslam/config.py."""
 
 from __future__ import annotations
 

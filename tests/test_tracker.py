@@ -1,4 +1,4 @@
-"""The tracker alone, on views that are made by hand: no map, no thread, no ``Slam``."""
+"""The tracker in isolation, on hand-made views of a map, without a map, threads or ``Slam``."""
 
 from __future__ import annotations
 

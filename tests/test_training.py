@@ -1,4 +1,4 @@
-"""Training: it learns, it resumes bit for bit, and it stops where it must."""
+"""Training reduces the loss, resumes exactly after an interruption, and stops when it must."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Loop candidates on a simulated street that is driven twice, with drift in between."""
+"""Loop candidates on a simulated street that is driven twice, with drift between the two passes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Networks that read an image as several views, and images that are no squares."""
+"""Networks that divide an image into several views, and images that are not square."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The vocabulary tree: words, training, scores, files, and its commands."""
+"""The vocabulary tree: words, training, scores, files and commands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compiling in two processes: the shares cover everything, and nothing depends on them."""
+"""Compilation in two processes: together they compile everything, and no result depends on it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Noise is taken out and faint contrast raised, and nothing is done to other images."""
+"""Noise is removed and low contrast is increased. Other images stay unchanged."""
 
 from __future__ import annotations
 

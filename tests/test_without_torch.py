@@ -1,4 +1,4 @@
-"""Without the extra ``train``, an installation does everything except training."""
+"""Without the extra ``train``, vslam can do everything except training."""
 
 from __future__ import annotations
 

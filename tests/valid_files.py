@@ -1,6 +1,7 @@
-"""A small valid file of each kind that vslam reads; ``tools/fuzz.py`` damages them.
+"""Writes a small valid file of each kind that vslam reads. ``tools/fuzz.py`` damages these files.
 
-Each function writes into a folder. Imports are local: the process that only watches loads nothing.
+Each function writes into a folder. Imports are inside the functions, so that the process that only
+supervises the readers does not load the packages.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ def images(folder: Path) -> None:
 
 
 def other_images(folder: Path) -> None:
-    """One image of each kind of file, time stamps in their names."""
+    """Write an image in each file format. The file names are time stamps."""
     import cv2
     from source_files import write_calibration
 
@@ -229,7 +230,7 @@ def map_file(folder: Path) -> None:
 
 
 def _drive(places: range, seed: int) -> Slam:
-    """SLAM in a ring of landmarks, after a drive through these places."""
+    """Make a ``Slam`` in a ring of landmarks, after a drive through these places."""
     from ring import CAMERA
 
     from vslam.slam import Slam
@@ -243,7 +244,7 @@ def _drive(places: range, seed: int) -> Slam:
 def drive_on(slam: Slam, places: range, seed: int, start: float) -> None:
     from vslam.features import Extracted, Features
 
-    camera = slam.context.camera  # that of a map may be another one
+    camera = slam.context.camera  # the camera of a map may differ
     for i, place in enumerate(places):
         seen = _ring().see(place, seed)
         inside = (seen.xy < (camera.width, camera.height)).all(1)
@@ -259,7 +260,7 @@ def _ring() -> Ring:
 
 
 def drives(folder: Path) -> None:
-    """A map with a checkpoint, a loop and a place in the world, and one that meets it."""
+    """Write a map with a checkpoint, a loop and a GPS position, and a map that overlaps with it."""
     from vslam.loops import LoopEdge
     from vslam.maps.storage import save_map
     from vslam.maps.stored_map import TruthAlignment

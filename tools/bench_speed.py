@@ -5,18 +5,18 @@
         [--orbslam3-python PY --vocabulary voc.txt]
 
 A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run
-alternately, one at a time; the first round is not counted. In each round, vslam runs
+alternately, one at a time. The first round is not counted. In each round, vslam runs
 
 - with its report,
 - with ``--no-report``,
 - with ``--no-report`` and each detector of ``--also`` instead of ``bow``,
 - in the last round, with ``--realtime``, which takes as long as the drive.
 
-The hand-written parts of the page, at its beginning and from "Limits" on, are kept.
+The beginning of the page and the section "Limits" are written by hand. They are kept.
 
-Wall time, CPU time and peak memory are those of the whole process, as the operating system reports
-them. vslam.evaluation.trajectories computes the errors of both systems from their trajectory files.
-vslam/lab/stress/orbslam3.py runs ORB-SLAM3, as in ``vslam stress``.
+The script measures the wall time, CPU time and peak memory of whole processes, as reported by the
+operating system. vslam.evaluation.trajectories computes the errors of both systems from their
+trajectory files. vslam/lab/stress/orbslam3.py runs ORB-SLAM3, as in ``vslam stress``.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ print(time.process_time() - start)
 """
 
 
-MEASURES = (  # key of figures, title with an arrow to the better side, format
+MEASURES = (  # key of the figure, title with an arrow towards better values, format
     ("process_fps", "frames/s, whole process ↑", ".1f"),
     ("loop_fps", "frames/s, frame loop ↑", ".1f"),
     ("process_cpu_ms", "CPU ms/frame, whole process ↓", ".1f"),
@@ -104,15 +104,17 @@ class Case(NamedTuple):
 
 
 class OrbSlam3(NamedTuple):
-    """The interpreter that has pyorbslam3, and its vocabulary."""
+    """The Python interpreter for which pyorbslam3 is installed, and the vocabulary."""
 
     python: Path
     vocabulary: Path
 
 
 class Process(NamedTuple):
-    """A process that has ended: its output, and the resources that it and its children used.
-    ``held``: its memory over time, as pairs (s, MB)."""
+    """The output of a finished process, and the resources that it and its children used.
+
+    ``held`` is its memory over time, as pairs (s, MB).
+    """
 
     output: str
     wall_s: float
@@ -122,9 +124,12 @@ class Process(NamedTuple):
 
 
 class Run(NamedTuple):
-    """One run. ``report``: the system's own report, with at least ``frames``, ``fps`` and
-    ``cpu_ms_per_frame`` of the frame loop. ``trajectory``: a file in KITTI's or TUM's format, which
-    is deleted with the folder of the run."""
+    """One run of a system.
+
+    ``report`` is the report of the system itself. It has at least the ``frames``, ``fps`` and
+    ``cpu_ms_per_frame`` of the frame loop. ``trajectory`` is a file in KITTI's or TUM's format,
+    which is deleted together with the folder of the run.
+    """
 
     process: Process
     report: dict[str, Any]
@@ -134,16 +139,19 @@ class Run(NamedTuple):
 
 
 def measure(command: list[str], folder: Path) -> Process:
-    """Run a command and measure it. No large package may be imported before the call, because the
-    peak memory of a child process starts at that of its parent."""
+    """Run a command and measure it.
+
+    No large package may be imported before the call, because the peak memory of a child process
+    starts at that of its parent.
+    """
     log = folder / "output.txt"
-    # Let Python keep compiled modules, as pip does when it installs them.
+    # Let Python store compiled modules, as pip does when it installs a package.
     environment = {key: os.environ[key] for key in os.environ if key != "PYTHONDONTWRITEBYTECODE"}
     start = time.perf_counter()
     with log.open("wb") as output:
         child = subprocess.Popen(
             command, cwd=folder, env=environment, stdout=output, stderr=subprocess.STDOUT,
-            stdin=subprocess.PIPE,  # ORB-SLAM3's script ends when it closes
+            stdin=subprocess.PIPE,  # the script of ORB-SLAM3 ends when this pipe is closed
         )  # fmt: skip
         ended, held = threading.Event(), []
         watch = threading.Thread(target=sample_memory, args=(child.pid, ended, start, held))
@@ -151,7 +159,7 @@ def measure(command: list[str], folder: Path) -> Process:
         try:
             _, status, usage = os.wait4(child.pid, 0)
             wall = time.perf_counter() - start
-        finally:  # also after Ctrl-C
+        finally:  # this is also executed after Ctrl-C
             ended.set()
             watch.join()
         child.returncode = os.waitstatus_to_exitcode(status)
@@ -195,7 +203,7 @@ def sides(case: Case) -> list[Path]:
 
 
 def reading_ms(case: Case, system: str) -> float:
-    """CPU time in milliseconds for decoding both images of a frame in one thread."""
+    """CPU time for decoding both images of a frame in one thread, in milliseconds."""
     files = [str(path) for side in sides(case) for path in sorted(side.iterdir())[: case.frames]]
     reader = "opencv" if system == ORBSLAM3 else "vslam"
     command = [sys.executable, "-c", READING, reader]
@@ -206,8 +214,11 @@ def reading_ms(case: Case, system: str) -> float:
 
 
 def run_vslam(case: Case, folder: Path, *words: str) -> Run:
-    """Run vslam, with ``words`` added to its command line. With --no-report, vslam gets no ground
-    truth, because ORB-SLAM3 does not evaluate its trajectory either."""
+    """Run vslam. ``words`` are added to its command line.
+
+    With --no-report, vslam gets no ground truth, because ORB-SLAM3 does not evaluate its trajectory
+    either.
+    """
     data = case.data
     if "--no-report" in words:
         data = folder / "data"
@@ -235,13 +246,18 @@ def run_orbslam3(case: Case, system: OrbSlam3, folder: Path) -> Run:
 def measure_case(
     case: Case, orbslam3: OrbSlam3 | None, repeats: int, also: list[str], scratch: str
 ) -> dict[str, list[Run]]:
-    """Run all systems on a case, each run in its own folder in ``scratch``; returns the counted
-    runs of each system."""
+    """Run all systems on a case.
+
+    Each run has its own folder in ``scratch``.
+
+    Returns:
+        The runs of each system, without the first round.
+    """
     runs: dict[str, list[Run]] = {FULL: [], ORBSLAM3: [], LEAN: [], LIVE: []}
     words = {FULL: (), LEAN: ("--no-report",), LIVE: ("--no-report", "--realtime")}
     for name in also:
         runs[title := f"{LEAN} --detector {name}"] = []
-        # This option replaces the --detector of run_vslam, because the last one counts.
+        # This option replaces the --detector of run_vslam, because the last --detector counts.
         words[title] = ("--no-report", "--detector", name)
     if orbslam3 is None:
         del runs[ORBSLAM3]
@@ -263,7 +279,7 @@ def measure_case(
 
 
 def figures(run: Run, case: Case, reading: float) -> dict[str, float]:
-    """Every measure of one run, NaN if unknown."""
+    """The value of each measure for one run; NaN if it is unknown."""
     import numpy as np
 
     from vslam.datasets import open_sequence
@@ -299,7 +315,7 @@ def figures(run: Run, case: Case, reading: float) -> dict[str, float]:
 
 
 def comparison(measured: dict[str, list[dict[str, float]]]) -> str:
-    """A table of medians, with the ratios to ORB-SLAM3 if it ran."""
+    """A table of medians. If ORB-SLAM3 ran, the table also has the ratios to it."""
     ours = [system for system in measured if system != ORBSLAM3]
     columns = ours + [ORBSLAM3] * (ORBSLAM3 in measured)
     head = [
@@ -318,14 +334,17 @@ def comparison(measured: dict[str, list[dict[str, float]]]) -> str:
 
 
 def spread(values: list[float], form: str) -> str:
-    """``median (least - greatest)``, or only the median if least and greatest look the same."""
+    """A text such as ``median (smallest - largest)``.
+
+    It contains only the median if the smallest and the largest value are printed alike.
+    """
     low, high = format(min(values), form), format(max(values), form)
     median = format(statistics.median(values), form)
     return median if low == high else f"{median} ({low} - {high})"
 
 
 def latency(runs: dict[str, list[Run]], case: Case) -> str:
-    """A table of the time from an image to its pose, and of the tracking times of ORB-SLAM3."""
+    """A table of the latency from an image to its pose, and of ORB-SLAM3's tracking times."""
     ours = [run.report for run in runs[LIVE]]
     values = [
         spread([report["latency_ms"][key] for report in ours], ".0f")
@@ -353,8 +372,11 @@ def rate(case: Case) -> float:
 
 
 def stages(report: dict[str, Any]) -> str:
-    """A table of the wall time of each stage. Stages in the thread pool overlap with other stages,
-    so the times do not add up to the time of a frame."""
+    """A table of the wall time of each stage.
+
+    Stages in the thread pool overlap with other stages. Therefore, the times do not add up to the
+    time of a frame.
+    """
     lines = ["| stage, ms | mean | p50 | p95 | p99 |", "|---|---|---|---|---|"]
     for name, ms in report["stage_ms"].items():
         cells = [f"{ms[key]:.1f}" for key in ("mean", "median", "p95", "p99")]
@@ -363,8 +385,11 @@ def stages(report: dict[str, Any]) -> str:
 
 
 def memory(run: Run) -> str:
-    """A sentence on the memory per keyframe: the growth from the first frame to the peak, divided
-    by the number of keyframes."""
+    """A sentence about the memory per keyframe.
+
+    The memory per keyframe is the growth from the first frame to the peak, divided by the number of
+    keyframes.
+    """
     before = [mb for seconds, mb in run.process.held if seconds <= run.report["startup_s"]]
     if not before or not run.report["keyframes"]:
         return "The run was too short to measure the memory of a keyframe."
@@ -380,7 +405,7 @@ def memory(run: Run) -> str:
 def measures(
     case: Case, runs: dict[str, list[Run]], reading: dict[str, float]
 ) -> dict[str, list[dict[str, float]]]:
-    """Every measure of the runs of each system, except those in real time."""
+    """The values of all measures for the runs of each system, except the runs in real time."""
     return {
         s: [figures(run, case, reading[ORBSLAM3 if s == ORBSLAM3 else FULL]) for run in runs[s]]
         for s in runs
@@ -405,7 +430,10 @@ def section(
 
 
 def profile(case: Case) -> str:
-    """A table of the CPU time per frame by stage; empty on failure, so that the rest is kept."""
+    """A table of the CPU time per frame by stage.
+
+    It is empty if profiling fails, so that the other results are kept.
+    """
     tool = str(Path(__file__).with_name("profile_frame.py"))
     command = [sys.executable, tool, str(case.data), case.seq, str(case.frames)]
     done = subprocess.run(command, capture_output=True, text=True)
@@ -415,7 +443,7 @@ def profile(case: Case) -> str:
 
 
 def orbslam3_of(options: argparse.Namespace) -> OrbSlam3 | None:
-    """The ORB-SLAM3 that the options name; None if they name none."""
+    """The installation of ORB-SLAM3 that the options name; None if they name none."""
     given = (options.orbslam3_python, options.vocabulary)
     if not any(given):
         return None
@@ -445,7 +473,10 @@ def parse_options() -> argparse.Namespace:
 
 
 def setting_of(report: dict[str, Any], system: OrbSlam3 | None, repeats: int) -> str:
-    """A paragraph with the machine, the versions and the number of runs, from a report of vslam."""
+    """A paragraph with the machine, the versions and the number of runs.
+
+    The machine and the versions are taken from a report of vslam.
+    """
     ask = f"from importlib.metadata import version; print(version('{PACKAGE}'))"
     version = ""
     if system is not None:
@@ -470,7 +501,7 @@ def anonymous(command: str) -> str:
 
 
 def written(page: Path) -> tuple[str, str]:
-    """The hand-written parts of a page: before ``BEGIN``, and from ``END`` on."""
+    """The hand-written parts of a page: the text before ``BEGIN``, and the text from ``END``."""
     text = page.read_text(encoding="utf-8") if page.exists() else ""
     above, begin, rest = text.partition(BEGIN)
     _, end, below = rest.partition(END)
@@ -478,7 +509,10 @@ def written(page: Path) -> tuple[str, str]:
 
 
 def write_table(path: Path, cases: dict[str, dict[str, list[dict[str, float]]]]) -> None:
-    """Write a row for each case and system: median, least and greatest value of each measure."""
+    """Write a table with a row for each case and system.
+
+    A row has the median, the smallest and the largest value of each measure.
+    """
     endings = {"": statistics.median, "_least": min, "_greatest": max}
     names = [f"{key}{ending}" for key, *_ in MEASURES for ending in endings]
     with path.open("w", newline="", encoding="utf-8") as file:

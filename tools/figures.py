@@ -4,16 +4,17 @@
     python tools/figures.py --check                    # make figures-check
     python tools/figures.py --adopt [VERSION]          # stamp files that were made by other means
 
-``figures.toml`` lists every table and figure with the commands that make it. bash runs a command in
-the root of the repository. The command writes the files, under their names, into the folder
-``$OUT``; ``$TOWNS`` is the folder of rendered towns. Each version of the method has its own
-``$OUT`` in ``runs/figures``, which is kept, so that an interrupted command can continue.
+``figures.toml`` lists every table and figure with the command that makes it. The command is run by
+bash in the root of the repository. It writes the files, under their names, into the folder
+``$OUT``. ``$TOWNS`` is the folder of rendered towns. Each version of the method has its own
+``$OUT`` in ``runs/figures``. This folder is kept, so that an interrupted command can be resumed.
 
-The files are then copied to their places, or to ``build/figures`` with ``--quick``. For each file,
-``docs/stamps.json`` in the same place gets a stamp: commit, version of the method, machine, seed,
-command and digest. Files with a valid stamp of this version are not made again.
+The files are then copied to their places in the repository. With ``--quick``, they are copied to
+``build/figures`` instead. For each file, a stamp is written to ``docs/stamps.json`` there. A stamp
+contains the commit, the version of the method, the machine, the seed, the command and the digest of
+the file. Files that have a valid stamp of the current version are not made again.
 
-sources.py explains how a page names the file from which its numbers come.
+sources.py explains how a page names the file from which its numbers are taken.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from vslam import METHOD_VERSION
 
 ROOT = Path(__file__).resolve().parents[1]
 STAMPS = "docs/stamps.json"
-KINDS = {".csv", ".json", ".svg", ".png", ".jpg"}  # of files below docs/ that need a stamp
+KINDS = {".csv", ".json", ".svg", ".png", ".jpg"}  # suffixes of files in docs/ that need a stamp
 
 
 @dataclass(frozen=True)
@@ -48,14 +49,16 @@ class Entry:
     """Files that are made together.
 
     Attributes:
-        files: paths; with a ``history``, also patterns.
-        run, quick: bash commands that make the files and short variants of them.
-        needs: environment variables that must name a path.
+        files: paths of the files. An entry with a ``history`` may also have patterns.
+        run: bash command that makes the files.
+        quick: bash command that makes short variants of the files.
+        needs: environment variables that must be set to a path.
         reads: files of other entries that the commands read.
         seed: seed of the random numbers.
         trajectories: whether the files depend on the version of the method.
         tested: the test that compares the files with the code. Such files need no stamp.
-        history: how the files of a finished experiment were made, if no command makes them again.
+        history: text that says how the files of a finished experiment were made, if there is no
+            command for them.
     """
 
     files: tuple[str, ...]
@@ -69,14 +72,14 @@ class Entry:
     history: str = ""
 
     def paths(self, root: Path) -> list[str]:
-        """The paths of the files; patterns are replaced by the files that match them."""
+        """The paths of the files. Patterns are replaced by the files that match them."""
         found = [sorted(root.glob(one)) if "*" in one else [root / one] for one in self.files]
         return [path.relative_to(root).as_posix() for path in chain(*found)]
 
 
 @dataclass(frozen=True)
 class Stamp:
-    """How a file was made. A field is None if git's history does not tell it for an older file."""
+    """How a file was made. A field is None if it is unknown, as for some older files."""
 
     digest: str
     commit: str
@@ -88,9 +91,12 @@ class Stamp:
 
 
 class Report(NamedTuple):
-    """The result of a check, as sentences: ``faults`` must be repaired, ``older`` names files that
-    are missing or were made by another version of the SLAM method (``vslam.METHOD_VERSION``), and
-    ``typed`` names pages with tables without a source."""
+    """The result of a check, as sentences.
+
+    ``faults`` must be repaired. ``older`` names files that are missing, or that were made by
+    another version of the SLAM method (``vslam.METHOD_VERSION``). ``typed`` names pages that have
+    tables without a source.
+    """
 
     faults: list[str]
     older: list[str]
@@ -98,7 +104,7 @@ class Report(NamedTuple):
 
 
 def read_entries(root: Path = ROOT) -> list[Entry]:
-    """The entries of figures.toml, ordered so that inputs come first."""
+    """The entries of figures.toml. An entry comes after the entries whose files it reads."""
     tables = tomllib.loads((root / "tools" / "figures.toml").read_text())["figure"]
     entries = [
         Entry(**{k: tuple(v) if isinstance(v, list) else v for k, v in one.items()})
@@ -129,12 +135,12 @@ def digest_of(path: Path) -> str:
 
 
 def is_older(stamp: Stamp, entry: Entry) -> bool:
-    """Whether a file depends on the method and another version of it made the file."""
+    """Whether a file depends on the method, and was made by another version of the method."""
     return entry.trajectories and stamp.method != METHOD_VERSION
 
 
 def make(root: Path, *, quick: bool, only: str = "") -> int:
-    """Make the files that are missing or older, and print a sentence for each entry.
+    """Make the files that are missing or outdated, and print a sentence for each entry.
 
     Args:
         root: root of the repository.
@@ -186,7 +192,7 @@ def _is_done(entry: Entry, target: Path, command: str) -> bool:
 
 
 def _run(entry: Entry, command: str, root: Path, target: Path) -> bool:
-    """Run the command of an entry, and copy and stamp its files; returns whether it succeeded."""
+    """Run the command of an entry, and copy and stamp its files. Returns whether it succeeded."""
     from vslam.datasets.synthetic.site import Variation
     from vslam.datasets.synthetic.store import cache_folder, folder_name
 
@@ -228,7 +234,7 @@ def _stamp(path: Path, entry: Entry, command: str, root: Path, method: int) -> S
 
 
 def _commit(root: Path) -> str:
-    """The commit that is checked out, with a remark if files outside docs/ were changed since."""
+    """The commit that is checked out, with a remark if files outside of docs/ were changed."""
     head = _git(root, "rev-parse", "--short", "HEAD")
     changed = _git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs")
     return f"{head} with changes" if changed else head
@@ -244,8 +250,9 @@ def adopt(root: Path, method: int | None = None) -> list[str]:
 
     Args:
         root: root of the repository.
-        method: version of the method with which the commands of figures.toml made the files on this
-            machine; None if unknown, so that a stamp contains only the commit that wrote the file.
+        method: version of the method, if the commands of figures.toml made the files on this
+            machine. None if it is unknown. A stamp then contains only the commit that wrote the
+            file.
     """
     stamps, adopted = read_stamps(root), []
     entries = {file: entry for entry in read_entries(root) for file in entry.paths(root)}
@@ -254,7 +261,7 @@ def adopt(root: Path, method: int | None = None) -> list[str]:
             continue
         if file in stamps and stamps[file].digest == digest_of(root / file):
             continue
-        # A commit that only moved the file did not write it.
+        # Commits that only moved the file are skipped.
         words = ("log", "-1", "--follow", "--diff-filter=AM", "--format=%h %as", "--", file)
         commit, _, date = _git(root, *words).partition(" ")
         stamps[file] = (
@@ -268,7 +275,7 @@ def adopt(root: Path, method: int | None = None) -> list[str]:
 
 
 def check(root: Path) -> Report:
-    """Check that all files have valid stamps, and that the tables of pages agree with the files."""
+    """Check that all files have valid stamps, and that tables on pages agree with their files."""
     entries = {file: entry for entry in read_entries(root) for file in entry.paths(root)}
     stamps, report = read_stamps(root), Report([], [], [])
     below = (path for path in (root / "docs").rglob("*") if path.suffix in KINDS)
@@ -301,28 +308,32 @@ def check(root: Path) -> Report:
 
 
 def pages(root: Path) -> list[Path]:
-    """README and the pages of the documentation, except pages that are generated from the code."""
+    """README and the pages of the documentation, without pages that are generated from the code."""
     below = sorted((root / "docs").rglob("*.md"))
     made = root / "docs" / "reference"
     return [root / "README.md", *(page for page in below if made not in page.parents)]
 
 
 def used(page: Path, text: str, root: Path) -> set[str]:
-    """The files that a page links to, shows or names as a source."""
+    """The files to which a page links, or which it shows or names as a source."""
     links = re.findall(r"\]\(([^)#\s:]+)\)", text)
     named = {os.path.relpath(os.path.normpath(page.parent / link), root) for link in links}
     return named.union(*map(sources.files_of, sources.COMMENT.findall(text)))
 
 
 def origin(stamp: Stamp) -> str:
-    """The origin of a file, for example ``version 1, commit 0123abc, 2026-11-25``."""
+    """The origin of a file as a text, for example ``version 1, commit 0123abc, 2026-11-25``."""
     version = "before version 1" if stamp.method is None else f"version {stamp.method}"
     return f"{version}, commit {stamp.commit}, {stamp.date[:10]}"
 
 
 def mark_older(page: Path, text: str, root: Path) -> str:
-    """The text of a page with marks for the files that another version of the method made: a line
-    before each table with such a source, and a list of these files at the end."""
+    """Mark the files on a page that were made by another version of the method.
+
+    Returns:
+        The text of the page, with a line before each table from such a file, and with a list of
+        these files at the end.
+    """
     stamps = read_stamps(root)
     older = {
         file: origin(stamps[file])

@@ -1,8 +1,9 @@
-"""Fuzz every reader with damaged files: it must quickly return a result or raise an `InputError`.
+"""Fuzz every reader with damaged files.
 
-Each input is a small valid file, changed by a seeded mutation. Failures are any other exception, a
-crash, and more than SECONDS of CPU time or MEGABYTES of memory. Readers run in a separate process,
-so that a crash is recorded like any other failure.
+A reader must quickly return a result or raise an `InputError`. Each input is a small valid file
+that is changed by a seeded mutation. A failure is any other exception, a crash, more than SECONDS
+of CPU time, or more than MEGABYTES of memory. Readers run in a separate process, so that a crash is
+recorded like any other failure.
 
 usage: python tools/fuzz.py [--inputs 1000] [--seed 0] [--readers kitti,video] [--keep FOLDER]
 """
@@ -39,8 +40,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import valid_files
 
 SECONDS, MEGABYTES = 20, 600
-WALL_SECONDS = 300  # for readers that hang without using CPU time, even on a busy machine
-ADDRESS_SPACE = 8 * 2**30  # bytes; a reader that wants more gets a MemoryError
+WALL_SECONDS = 300  # limit for readers that hang without using CPU time, even on a busy machine
+ADDRESS_SPACE = 8 * 2**30  # bytes; a reader that allocates more gets a MemoryError
 _NUMBERS = ["nan", "inf", "-inf", "1e999", "-1", "0", "1e-320", "9" * 30, "2147483648", "0x10", ""]
 _SPECIAL = [0, 1, 0x7F, 0xFF, 0x7FFFFFFF, 0xFFFFFFFF, 0x80000000, 0x7FFFFFFFFFFFFFFF]
 
@@ -53,8 +54,8 @@ class Reader:
         write: writes valid files into a folder.
         read: reads the files in a folder.
         changed: pattern of the files to mutate, one file at a time.
-        mutation: function of content, random generator and file name that returns the changed
-            content; None for `mutate`.
+        mutation: function of the content, a random generator and the file name, which returns the
+            changed content. None uses `mutate`.
     """
 
     write: Callable[[Path], object]
@@ -67,7 +68,7 @@ class Reader:
 
 
 def _use(source) -> None:
-    """Read every frame of a source; frames that cannot be read are skipped, as in a run."""
+    """Read every frame of a source. Frames that cannot be read are skipped, as in a run."""
     from vslam.errors import InputError, UnreadableImageError
 
     try:
@@ -81,7 +82,7 @@ def _use(source) -> None:
 
 
 def _each(read: Callable[[str], object], names: Iterable[str]) -> None:
-    """Read all files; if some were refused, raise one of the errors at the end."""
+    """Read all files. If some of them were rejected, raise one of the errors at the end."""
     from vslam.errors import InputError
 
     refused = None
@@ -136,8 +137,11 @@ def _read_map(folder: Path) -> None:
 
 
 def _use_map(folder: Path) -> None:
-    """Use a map in every way: export it, resume its drive, continue it with a new drive, localise
-    in it, and merge it with another map."""
+    """Use a map in every way.
+
+    It is exported, its drive is resumed, and it is continued with a new drive. Images are localised
+    in it, and it is merged with another map.
+    """
     with tempfile.TemporaryDirectory(dir=folder) as out:
         _use_map_in(folder / "map.npz", folder / "other.npz", Path(out))
 
@@ -243,8 +247,10 @@ _HEADER_VALUES = [
 
 
 def _mutate_meaning(data: bytes, rng: np.random.Generator, name: str) -> bytes:
-    """Change one or two values in arrays or in the header, but not the types and shapes of the
-    arrays."""
+    """Change one or two values in arrays or in the header of a map.
+
+    The types and shapes of the arrays stay unchanged.
+    """
     with np.load(io.BytesIO(data)) as file:
         arrays = {name: file[name].copy() for name in file.files}
     for _ in range(int(rng.integers(1, 3))):
@@ -329,7 +335,7 @@ READERS: dict[str, Reader] = {
 
 
 def mutate(data: bytes, rng: np.random.Generator, name: str) -> bytes:
-    """Apply one to four changes to a file, or sometimes a single change specific to its format."""
+    """Apply one to four changes to a file. Sometimes, apply one change specific to its format."""
     if name.endswith(".npz") and rng.random() < 0.6:
         return _mutate_npz(data, rng)
     if data[:8] == b"\x89PNG\r\n\x1a\n" and rng.random() < 0.3:
@@ -343,7 +349,10 @@ def mutate(data: bytes, rng: np.random.Generator, name: str) -> bytes:
 
 
 def _place(data: bytes, rng: np.random.Generator) -> int:
-    """A random position; with probability one half, in the first 256 bytes, where headers are."""
+    """A random position in the data.
+
+    With a probability of one half, it is in the first 256 bytes, because headers are there.
+    """
     return int(rng.integers(min(len(data), 256) if rng.random() < 0.5 else len(data)))
 
 
@@ -388,7 +397,7 @@ def _lines(data: bytes, rng: np.random.Generator) -> bytes:
 def _nest(data: bytes, rng: np.random.Generator) -> bytes:
     """Insert deeply nested brackets, or YAML aliases that grow exponentially."""
     way = int(rng.integers(6))
-    if way == 5:  # a list becomes a growing one
+    if way == 5:  # replace a list by one that grows exponentially
         return _GROWING + b"\n" + re.sub(rb"\[[^]]*\]", b"*a8", data, count=1)
     bombs = (
         b"[" * 20_000,
@@ -408,7 +417,7 @@ _GROWING = b"\n".join(
 
 
 def _mutate_npz(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change the values, shape or type of an array, or claim a size of 100 GB in a header."""
+    """Change the values, shape or type of an array, or state a size of 100 GB in a header."""
     with np.load(io.BytesIO(data)) as file:
         arrays = dict(file)
     name = str(rng.choice(sorted(arrays)))
@@ -425,7 +434,7 @@ def _mutate_npz(data: bytes, rng: np.random.Generator) -> bytes:
     elif way == 4 and array.size and array.dtype.kind in "biuf":
         arrays[name] = array.copy()
         _change(arrays[name].reshape(-1), rng, len(array.reshape(-1)))
-    np.savez(out, **arrays)  # in the other cases without the array
+    np.savez(out, **arrays)  # in the other cases, the array is missing
     if way == 5:
         header = {"descr": "<f8", "fortran_order": False, "shape": (12_500_000_000,)}
         np.lib.format.write_array_header_1_0(claim, header)
@@ -459,8 +468,11 @@ def _reset_peak() -> None:
 
 
 def _work(name: str, first: int, inputs: int, seed: int, scratch: Path) -> None:
-    """Try inputs. Print a JSON line with the number of each input before it is read, and a line
-    with the outcome afterwards."""
+    """Try inputs.
+
+    A JSON line with the number of each input is printed before it is read, and a line with the
+    outcome afterwards.
+    """
     from vslam.errors import InputError
 
     logging.disable(logging.CRITICAL)
@@ -471,7 +483,7 @@ def _work(name: str, first: int, inputs: int, seed: int, scratch: Path) -> None:
     valid.mkdir(parents=True, exist_ok=True)
     if not any(valid.iterdir()):
         reader.write(valid)
-    reader.read(valid)  # must succeed; also imports and compiles everything that is needed
+    reader.read(valid)  # this must succeed; it also imports and compiles everything that is needed
     files = sorted(p for p in valid.glob(reader.changed) if p.is_file())
     for number in range(first, inputs):
         print(json.dumps({"begin": number}), flush=True)
@@ -510,7 +522,7 @@ def _work(name: str, first: int, inputs: int, seed: int, scratch: Path) -> None:
 
 
 def fuzz(name: str, inputs: int, seed: int, keep: Path | None = None) -> dict[str, object]:
-    """Fuzz a reader and return the numbers of inputs read and refused, and all failures."""
+    """Fuzz a reader, and return the numbers of read and of rejected inputs, and the failures."""
     tried, read, refused, slowest, most = 0, 0, 0, 0.0, 0.0
     failures: list[dict[str, object]] = []
     with tempfile.TemporaryDirectory(prefix="vslam-fuzz-") as scratch:

@@ -1,9 +1,12 @@
-"""Kill a run at random moments, every other time during an autosave, and resume it.
+"""Kill a run at random times and resume it, to test that little work is lost.
 
-``kill -9`` ends the run after a random number of frames, every other time only during the next
-autosave. Then all its files are read, and the run is resumed. The table gives the frame of the
-kill, the number of saved frames, the seconds of work that were lost, the ATE of the whole run, and
-whether the trajectory is identical, byte for byte, to that of the undisturbed run.
+``kill -9`` ends the run after a random number of frames. For every other run, the script then waits
+for the next autosave and kills the run while it is being written. Afterwards, all files of the run
+are read, and the run is resumed.
+
+The table contains the frame at which the run was killed, the number of saved frames, the seconds of
+work that were lost, and the ATE of the whole run. It also tells whether the trajectory is
+byte-identical to that of the undisturbed run.
 
     python tools/kill_test.py --kills 10 --autosave 4 -- --dataset synthetic --seq demo
 """
@@ -55,7 +58,11 @@ def is_saving(folder: Path) -> bool:
 
 
 def kill_at(words: list[str], out: Path, frame: int, saving: bool) -> tuple[Path, int, float]:
-    """Start a run and kill it; return its folder, and number and duration (s) of tracked frames."""
+    """Start a run and kill it.
+
+    Returns:
+        The folder of the run, the number of tracked frames, and the seconds since the first one.
+    """
     process = subprocess.Popen([*RUN, *words, *BRIEF, "--out", str(out)])
     folder, begin = out / "latest", 0.0
     while process.poll() is None:
@@ -70,7 +77,11 @@ def kill_at(words: list[str], out: Path, frame: int, saving: bool) -> tuple[Path
 
 
 def saved_frames(folder: Path) -> tuple[int, float]:
-    """Read all files of a killed run; return number and duration (s) of saved frames."""
+    """Read all files of a killed run.
+
+    Returns:
+        The number of saved frames, and the wall time of the run until they were saved, in seconds.
+    """
     read_trajectory(folder / ONLINE)
     if not (folder / MAP).exists():
         return 0, 0.0

@@ -12,8 +12,10 @@ TABLE = Path(__file__).parents[1] / "docs" / "howto" / "laws.csv"
 
 
 def table() -> str:
-    """A CSV table with a row for each kind of perturbation, including the weakest and the strongest
-    value of a search by ``vslam stress``."""
+    """A CSV table with a row for each kind of perturbation.
+
+    It includes the weakest and the strongest value that ``vslam stress`` tries.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(

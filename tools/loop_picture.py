@@ -1,4 +1,6 @@
-"""Draw the first loop that a run closed: its two images with their matches, and the map from above.
+"""Draw the first loop that a run closed.
+
+The picture shows the two images of the loop with their matches, and the map from above.
 
 python tools/loop_picture.py RUN OUT.jpg
 """
@@ -19,7 +21,7 @@ from vslam.geometry import inverses
 from vslam.maps.storage import load_map
 from vslam.maps.stored_map import StoredMap
 
-INCHES, DOTS_PER_INCH = (6.44, 2.7), 200  # size of the map, as wide as the picture of a loop
+INCHES, DOTS_PER_INCH = (6.44, 2.7), 200  # size of the map, which is as wide as the loop's picture
 MARGIN = 20.0  # metres around the path
 BAR = 20.0  # length of the scale bar in metres
 DARK, LIGHT, GREEN = "#111721", "#e8ebf0", "#34d399"
@@ -27,7 +29,7 @@ TIME = LinearSegmentedColormap.from_list("time", ["#fbbf24", "#fb923c", "#6366f1
 
 
 def draw(run: Path) -> NDArray[np.uint8]:
-    """``(H, W, 3)`` uint8 BGR: the picture of the loop above the map."""
+    """Draw the picture of the loop, with the map below it, as ``(H, W, 3)`` uint8 BGR."""
     stored = load_map(run / "map.npz")
     ends = [stored.loops[0].match, stored.loops[0].query]
     match, query = stored.map.frames[ends]
@@ -36,7 +38,7 @@ def draw(run: Path) -> NDArray[np.uint8]:
 
 
 def _draw_map(stored: StoredMap, ends: list[int], names: tuple[str, str]) -> NDArray[np.uint8]:
-    """Draw landmarks and path, coloured by time; the z axis of the map points to the right."""
+    """Draw the landmarks and the path, coloured by time. The z axis of the map points right."""
     arrays = stored.map.arrays
     path = inverses(arrays.T_cw)[:, [2, 0], 3]
     figure = Figure(INCHES, DOTS_PER_INCH, facecolor=DARK)

@@ -35,8 +35,10 @@ def main() -> None:
 
 
 def tables(report: LoopsJson) -> dict[str, list[Row]]:
-    """The rows of every table, by the name of the table. A table has no rows if the report has
-    no results for it."""
+    """The rows of every table, by the name of the table.
+
+    A table has no rows if the report has no results for it.
+    """
     cells = report.cells
     ordered = [cell for cell in cells if cell.sequence_right is not None]
     return {
@@ -58,7 +60,7 @@ def _share(value: float | None) -> str:
 
 
 def _wide(cells: Iterable[Score], columns: Callable[[Score], Row]) -> list[Row]:
-    """A row for each set of images and condition; each detector has its own columns."""
+    """Make a row for each set of images and condition. Each detector has its own columns."""
     rows: dict[tuple[str, str], Row] = {}
     for cell in cells:
         row = rows.setdefault(

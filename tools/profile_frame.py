@@ -1,11 +1,14 @@
-"""Profile the CPU time of a run: a Markdown table with the milliseconds per frame of each stage.
+"""Profile the CPU time of a run, and print a Markdown table with the time per frame of each stage.
 
     python tools/profile_frame.py DATA SEQ FRAMES [--detector bow] [--report]
 
-DATA is a folder in KITTI's format. One thread does all the work, so that its CPU clock measures
-every stage. If a stage calls another stage, the time counts only for the inner stage. The total is
-that of the process, from the start of Python to the last file written. Run the script twice, so
-that the kernels come from Numba's cache; loading a kernel counts for the first stage that calls it.
+DATA is a folder in KITTI's format. The table is in milliseconds. The run has only one thread, so
+that the CPU clock of this thread measures every stage. If a stage calls another stage, the time
+counts only for the inner stage. The total is that of the process, from the start of Python to the
+last written file.
+
+Run the script twice, so that the kernels are loaded from Numba's cache the second time. The time to
+load a kernel counts for the first stage that calls it.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-# Stages and their functions: the module, and the name or Class.name in it.
+# The functions of each stage: their module, and their name or Class.name in it.
 STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
     ("start: vocabulary", (("vslam.run.pipeline", "detector_with_images"),)),
     ("read images", (("vslam.datasets.image_files", "read_grey"),)),
@@ -65,7 +68,7 @@ STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
 
 
 class StageClock:
-    """CPU seconds of this thread by stage, without the time of inner stages."""
+    """Measures the CPU seconds of this thread by stage, without the time of inner stages."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
@@ -86,7 +89,7 @@ class StageClock:
         return call
 
     def measure(self, stage: str, module_name: str, name: str) -> None:
-        """Replace a function in its module or class by a timed one."""
+        """Replace a function in its module or class by a function that is timed."""
         owner: Any = importlib.import_module(module_name)
         *classes, last = name.split(".")
         for each in classes:

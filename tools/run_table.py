@@ -26,11 +26,14 @@ def main() -> None:
 
 
 def row_of(run: RunEntry) -> dict[str, object]:
-    """The cells of a run: drive, system, seeds of the perturbation and of the town, measures."""
+    """The cells of a run: its drive, its system, the two seeds, and the measures.
+
+    The seeds are those of the perturbation and of the town.
+    """
     measures = {
         name: "" if run.measures[name] is None else f"{run.measures[name]:.{decimals}f}"
         for name, decimals in DECIMALS.items()
-        if name != "fps"  # depends on what else runs; docs/research/performance.csv has the speed
+        if name != "fps"  # it depends on the load; docs/research/performance.csv has the speed
     }
     named = {"system": run.system, "seed": run.seed, "town": run.town, "alignment": run.alignment}
     return run.drive.model_dump() | named | {"frames": run.frames} | measures

@@ -1,23 +1,24 @@
 """Compare the numbers on pages with the CSV files from which they come.
 
 A table in Markdown names its source in a comment before it. Each line of the comment describes one
-row of the table, and the last line also all further rows::
+row of the table. The last line describes all further rows, too::
 
     <!-- from: docs/x.csv | drive=$1, light=clean | | ate_m (system=ours) | found; missed -->
 
 The fields of a line, separated by ``|``, are:
 
-- the CSV file;
-- a filter that selects a row of the file. ``$1`` stands for the text of the first cell of the
-  table's row, or for the part of it in backticks; ``$0`` stands for the head of the column;
-- a field for each further cell of the table's row: the columns of the file whose values the cell
-  must show, rounded as in the cell. The last field also applies to all further cells. A cell with
-  an empty field is not compared. A filter in parentheses applies to the columns before it.
-  ``mean x``, ``median x`` and ``sum x`` stand for the mean, median and sum of column x over all
+- The CSV file.
+- A filter that selects a row of the file. ``$1`` stands for the text of the first cell of the
+  table's row. If a part of this text is in backticks, ``$1`` stands for that part. ``$0`` stands
+  for the head of the column.
+- A field for each further cell of the table's row. It lists the columns of the file whose values
+  the cell must show, rounded as in the cell. The last field also applies to all further cells. A
+  cell with an empty field is not compared. A filter in parentheses applies to the columns before
+  it. ``mean x``, ``median x`` and ``sum x`` stand for the mean, median and sum of column x over all
   selected rows.
 
-The line ``-`` skips a row. Before a paragraph, the comment names columns whose values the paragraph
-must mention.
+The line ``-`` skips a row. A comment may also stand before a paragraph. It then names columns whose
+values the paragraph must mention.
 """
 
 from __future__ import annotations
@@ -47,14 +48,16 @@ def files_of(comment: str) -> set[str]:
 
 
 def untraced(text: str) -> tuple[int, int]:
-    """The number of tables that contain decimal numbers but name no source, and the number of all
-    tables."""
+    """The number of tables without a source, and the number of all tables.
+
+    Only tables that contain decimal numbers need a source.
+    """
     tables = TABLE.findall(text)
     return sum(not comment and bool(DECIMAL.search(body)) for comment, body in tables), len(tables)
 
 
 def compare(text: str, root: Path) -> Iterator[str]:
-    """A sentence for each value on a page that differs from its source."""
+    """Yield a sentence for each value on a page that differs from its source."""
     for found in COMMENT.finditer(text):
         lines, after = lines_of(found[1]), text[found.end() :].partition("\n\n")[0]
         try:
@@ -115,8 +118,11 @@ def _is_rounded(shown: str, value: float) -> bool:
 
 
 def _values(path: Path, filters: str, column: str, row: list[str]) -> list[float | str]:
-    """The numbers and texts of the CSV file that a cell must show. ``row`` contains the head of the
-    column of the cell, then all cells of the row."""
+    """The numbers and texts of the CSV file that a cell must show.
+
+    Args:
+        row: the head of the column of the cell, followed by all cells of the row.
+    """
     with path.open(newline="", encoding="utf-8") as file:
         table = list(csv.DictReader(file))
     found: list[float | str] = []

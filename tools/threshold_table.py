@@ -1,7 +1,8 @@
 """Write docs/reference/thresholds.md: every threshold of vslam/config.py with its unit and source.
 
-The docstring below a field ends with its source in brackets: paper, section and status of the
-value, as in "[OS1 V-D, customary]", or "[own]" if neither rule nor value comes from a paper.
+The docstring below a field ends with the source of the field in brackets. The source has the paper,
+the section and the status of the value, as in "[OS1 V-D, customary]". The source is "[own]" if
+neither the rule nor the value comes from a paper.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ The other numbers of the method are constants in the code. They are mathematical
 
 
 class Row(NamedTuple):
-    """One threshold: dotted name, default, meaning with unit, source."""
+    """One threshold: its dotted name, its default, its meaning with the unit, and its source."""
 
     name: str
     default: str
@@ -62,7 +63,7 @@ class Row(NamedTuple):
 
 
 def descriptions(model: type[BaseModel]) -> dict[str, str]:
-    """The docstring below each field of a class, as one line; "" for a field without docstring."""
+    """The docstring below each field of a class, as one line; empty if there is no docstring."""
     (definition,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
     assert isinstance(definition, ast.ClassDef)
     found = {}

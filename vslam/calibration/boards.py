@@ -1,9 +1,11 @@
-"""Calibration boards: their geometry, the detection of their corners, and the recognition of a
-board that differs from the expected one.
+"""Calibration boards: their geometry, the detection of their corners, and their recognition.
+
+Recognition finds out which board the images show, for an error message if it is not the expected
+board.
 
 A board lies in the plane z = 0 of its frame. The frame of a checkerboard or ChArUco board has x to
-the right, y down and z away from the viewer; that of an AprilGrid is Kalibr's, with y up and z
-towards the viewer.
+the right, y down and z away from the viewer. The frame of an AprilGrid is that of Kalibr, with x to
+the right, y up and z towards the viewer.
 """
 
 from __future__ import annotations
@@ -27,20 +29,23 @@ from vslam.errors import InputError
 
 Kind = Literal["checkerboard", "charuco", "aprilgrid"]
 
-_FEWEST_CORNERS = 8  # in a view; a homography needs four
+_FEWEST_CORNERS = 8  # that a view must have; a homography needs four
 _FEWEST_TAGS = 4
-_LARGEST_M = 0.5  # side of a square; a larger number is usually in millimetres
+_LARGEST_M = 0.5  # largest side of a square; a larger number is usually meant in millimetres
 _TAGS = "APRILTAG_36H11"
 _BORDERS = (2, 1)  # black bits around a tag: Kalibr prints 2, most other programs 1
-_SEARCHED_PX = 960  # longer side of the image in which a checkerboard is searched
+_SEARCHED_PX = 960  # longer side of the reduced image in which a checkerboard is searched
 _REACH_PX = (2, 6)  # least and greatest half width of the window in which a corner is refined
 
-# An unknown board is recognised by at least this many tags, or by the same checkerboard in two
-# images, because images of houses often give a few false tags and a small false checkerboard.
+# An unknown board counts as recognised if this many tags are found, or if two images show the same
+# checkerboard. Fewer are not enough: in images of houses, a few false tags and a small false
+# checkerboard are often found.
 _RECOGNISED_TAGS = 6
-# The family of a dictionary is found by its first tags, many times faster than by all of them.
+# The family of a dictionary is recognised by its first tags only. This is many times faster than
+# searching for all of its tags.
 _TRIED_TAGS = 50
-# Numbers of tags of a family's dictionaries; each dictionary begins with the tags of the smaller.
+# Numbers of tags of the dictionaries of one family. Each dictionary begins with the tags of the
+# next smaller one.
 _SIZES = (50, 100, 250, 1000)
 # The largest dictionary of each family, and the black bits around its tags.
 _FAMILIES = tuple((f"{n}X{n}_1000", 1) for n in (4, 5, 6, 7))
@@ -57,11 +62,13 @@ class Board:
 
     Attributes:
         kind: the pattern.
-        columns, rows: inner corners of a checkerboard, squares of a ChArUco board, tags of an
-            AprilGrid.
-        square: side of a square in metres; for an AprilGrid, distance from one tag to the next.
+        columns, rows: numbers of inner corners of a checkerboard, of squares of a ChArUco board, or
+            of tags of an AprilGrid.
+        square: side of a square in metres. For an AprilGrid, it is the distance from one tag to the
+            next.
         marker: side of the black marker or tag in metres; 0 for a checkerboard.
-        dictionary: OpenCV's name of a ChArUco board's markers, without ``DICT_``, in capitals.
+        dictionary: dictionary of a ChArUco board's markers: OpenCV's name without ``DICT_``, in
+            capitals.
 
     Raises:
         InputError: a size is impossible, or the dictionary is unknown or has too few markers.
@@ -107,9 +114,9 @@ class View:
     """The corners of a board that are visible in one image.
 
     Attributes:
-        name: the image, in messages.
-        ids: ``(N,)`` int64, rows of `board_points`.
-        xy: ``(N, 2)`` float64 pixels.
+        name: name of the image, for messages.
+        ids: ``(N,)`` int64 numbers of the corners, which are rows of `board_points`.
+        xy: ``(N, 2)`` float64 positions of the corners in pixels.
     """
 
     name: str
@@ -121,7 +128,8 @@ def read_board(path: Path) -> Board:
     """Read a target file of Kalibr: an ``aprilgrid`` or a ``checkerboard``.
 
     Raises:
-        InputError: the file is of another kind, a key is missing, or a size is impossible.
+        InputError: the file describes another kind of board, a key is missing, or a size is
+            impossible.
     """
     document = read_document(path)
     kind = document.text("target_type")
@@ -145,30 +153,30 @@ def read_board(path: Path) -> Board:
 
 
 def board_points(board: Board) -> Array:
-    """``(N, 3)`` float64, the corners of a board in its frame, in metres."""
-    first = 1 if board.kind == "charuco" else 0  # the origin is a ChArUco board's outer corner
+    """``(N, 3)`` float64 positions of the corners in the frame of the board, in metres."""
+    first = 1 if board.kind == "charuco" else 0  # a ChArUco board's origin is its outer corner
     x, y = np.meshgrid(np.arange(first, board.columns), np.arange(first, board.rows))
     points = np.stack([x, y, np.zeros(x.shape)], axis=-1).reshape(-1, 3) * board.square
     if board.kind == "aprilgrid":
-        # OpenCV's order of a tag's corners starts at the lower right of a tag as Kalibr prints it.
+        # OpenCV's first corner of a tag is at the lower right of a tag that Kalibr has printed.
         tag = np.array([[1, 0, 0], [0, 0, 0], [0, 1, 0], [1, 1, 0]]) * board.marker
         points = (points[:, None] + tag).reshape(-1, 3)
     return np.asarray(points, np.float64)
 
 
 def find_corners(board: Board, image: Image, name: str = "") -> View | None:
-    """Find a board in an ``(H, W)`` uint8 image; None if too few corners are visible."""
+    """Find a board in an ``(H, W)`` uint8 image. Returns None if too few corners are visible."""
     find = {"checkerboard": _checkerboard, "charuco": _charuco, "aprilgrid": _aprilgrid}[board.kind]
     found = find(board, image)
     return None if found is None else _refined(board, image, View(name, *found))
 
 
 def same_order(board: Board, left: View, right: View) -> View:
-    """The right view, with its corners numbered like those of the left one.
+    """Number the corners of the right view like those of the left view.
 
-    The corners of a checkerboard that looks the same upside down may be numbered from either end.
-    With the correct numbering, the distances between corresponding corners of the two images vary
-    least.
+    Some checkerboards look the same upside down, so that their corners may be numbered from either
+    end. With the correct numbering, the offsets between corresponding corners of the two images
+    vary least.
     """
     if board.kind != "checkerboard":
         return right
@@ -179,8 +187,10 @@ def same_order(board: Board, left: View, right: View) -> View:
 
 
 def other_board(board: Board, images: Sequence[Image]) -> str:
-    """A clause for an error message that names the board in ``images`` and the options that
-    describe it; empty if the images show ``board``, or if no board is recognised."""
+    """Text for an error message that names the board in ``images`` and the options for it.
+
+    The text is empty if the images show ``board``, or if no board is recognised.
+    """
     small = [_reduced(image)[0] for image in images]
     found = _recognised_tags(small) or _recognised_checkerboard(small)
     if found is None:
@@ -188,7 +198,7 @@ def other_board(board: Board, images: Sequence[Image]) -> str:
     if found.kind == board.kind and found.columns == board.columns:  # some rows may be out of view
         found = replace(found, rows=max(found.rows, board.rows))
     given, tags = (_dictionary(each.dictionary).bytesList for each in (board, found))
-    # The dictionary of ``board`` is right if it begins with the tags of the recognised one.
+    # The dictionary of ``board`` is right if it begins with the tags of the recognised dictionary.
     if found.kind != "charuco" or np.array_equal(given[: len(tags)], tags):
         found = replace(found, dictionary=board.dictionary)
     ratio = found.marker / found.square
@@ -213,8 +223,11 @@ def _checkerboard(board: Board, image: Image) -> tuple[NDArray[np.int64], Array]
 
 
 def _reduced(image: Image) -> tuple[Image, float]:
-    """The image at a size at which a checkerboard is found quickly, and the factor by which it was
-    reduced."""
+    """Reduce an image to a size at which a checkerboard is found quickly.
+
+    Returns:
+        The reduced image, and the factor by which it was reduced.
+    """
     times = max(1.0, max(image.shape) / _SEARCHED_PX)
     small = cv2.resize(image, None, None, 1 / times, 1 / times, cv2.INTER_AREA)
     return cast("Image", small), times
@@ -224,14 +237,15 @@ def _charuco(board: Board, image: Image) -> tuple[NDArray[np.int64], Array] | No
     size, markers = (board.columns, board.rows), _dictionary(board.dictionary)
     layout = cv2.aruco.CharucoBoard(size, board.square, board.marker, markers)
     ids, xy = np.empty(0, np.int64), np.empty((0, 2))
-    # OpenCV before 4.6 began boards of even height with a marker. The wrong layout fits fewer tags.
+    # Boards of even height that OpenCV printed before version 4.6 begin with a marker. The layout
+    # that fits more tags is the correct one.
     for legacy in (False, True)[: 2 - board.rows % 2]:
         layout.setLegacyPattern(legacy)
         at, numbers, _, _ = cv2.aruco.CharucoDetector(layout).detectBoard(image)
         if numbers is not None and len(numbers) > len(ids):
             ids, xy = numbers.ravel().astype(np.int64), at.reshape(-1, 2).astype(np.float64)
     if len(ids) < _FEWEST_CORNERS or not np.ptp(board_points(board)[ids, :2], axis=0).all():
-        return None  # corners in one line have no pose
+        return None  # corners on one line do not determine the pose of the board
     return ids, xy
 
 
@@ -243,7 +257,7 @@ def _aprilgrid(board: Board, image: Image) -> tuple[NDArray[np.int64], Array] | 
             ids = (4 * numbers[known, None] + np.arange(4)).ravel()
             at, plane = xy[known].reshape(-1, 2), np.add(board_points(board), [0, 0, 1])
             # Most programs print the tags upright. Kalibr turns them, which swaps corners 0 and 2.
-            # The correct order is the one with which an affine map fits the image better.
+            # With the correct order of corners, an affine map fits the image better.
             error = [np.linalg.lstsq(plane[each], at)[1].sum() for each in (ids, ids ^ 2)]
             return ids if error[0] <= error[1] else ids ^ 2, at
     return None
@@ -252,9 +266,15 @@ def _aprilgrid(board: Board, image: Image) -> tuple[NDArray[np.int64], Array] | 
 def _find_tags(
     image: Image, dictionary: str, border: int, most: int | None = None
 ) -> tuple[NDArray[np.int64], Array]:
-    """Find tags of a dictionary in an image; returns their numbers ``(N,)`` and corners
-    ``(N, 4, 2)`` in pixels. With ``most``, only the first ``most`` tags of the dictionary are
-    searched for."""
+    """Find tags of a dictionary in an image.
+
+    Args:
+        border: number of black bits around a tag.
+        most: search only for the first ``most`` tags of the dictionary; None searches for all.
+
+    Returns:
+        ``(N,)`` numbers of the tags, and ``(N, 4, 2)`` positions of their corners in pixels.
+    """
     tags, parameters = _dictionary(dictionary), cv2.aruco.DetectorParameters()
     tags.bytesList, parameters.markerBorderBits = tags.bytesList[:most], border
     corners, numbers, _ = cv2.aruco.ArucoDetector(tags, parameters).detectMarkers(image)
@@ -272,11 +292,11 @@ def _dictionary(name: str) -> Any:
 
 
 def _refined(board: Board, image: Image, view: View) -> View | None:
-    """Move corners to the intersection of their edges, and drop those that moved far.
+    """Refine the corners to the intersections of their edges, and drop those that move far.
 
     The window around a corner is so small that it contains no other edges.
     """
-    share = {  # of the distance between neighbouring corners
+    share = {  # half width of the window as a fraction of the distance between neighbouring corners
         "checkerboard": 0.3,
         "charuco": 0.4 * (1.0 - board.marker / board.square),
         "aprilgrid": min(0.4, 0.12 * board.marker / (board.square - board.marker)),
@@ -288,13 +308,13 @@ def _refined(board: Board, image: Image, view: View) -> View | None:
     moved = cv2.cornerSubPix(image, start, (reach, reach), (-1, -1), criteria)
     xy = np.asarray(moved, np.float64).reshape(-1, 2)
     kept = np.linalg.norm(xy - view.xy, axis=1) <= reach
-    if board.kind == "checkerboard":  # its numbering needs every corner
+    if board.kind == "checkerboard":  # the numbers are only correct if no corner is missing
         return replace(view, xy=np.where(kept[:, None], xy, view.xy))
     return View(view.name, view.ids[kept], xy[kept]) if kept.sum() >= _FEWEST_CORNERS else None
 
 
 def _recognised_checkerboard(images: Sequence[Image]) -> Board | None:
-    """The checkerboard that at least two images show, with squares of 0.1 m."""
+    """The checkerboard that at least two images show. Its squares are assumed to be 0.1 m wide."""
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
     sizes: Counter[tuple[int, int]] = Counter()
     for image in images:
@@ -305,7 +325,10 @@ def _recognised_checkerboard(images: Sequence[Image]) -> Board | None:
 
 
 def _recognised_tags(images: Sequence[Image]) -> Board | None:
-    """The ChArUco board or AprilGrid in the image with the most tags, with squares of 0.1 m."""
+    """The ChArUco board or AprilGrid in the image with the most tags.
+
+    Its squares are assumed to be 0.1 m wide.
+    """
     counts = [
         (len(_find_tags(image, *family, _TRIED_TAGS)[0]), image, family)
         for image, family in product(images, _FAMILIES)
@@ -327,8 +350,13 @@ def _recognised_tags(images: Sequence[Image]) -> Board | None:
 def _layout(
     kind: Kind, first: int, columns: int, family: str, numbers: NDArray[np.int64], xy: Array
 ) -> tuple[int, Board | None]:
-    """Fit a board with this number of columns, and with tag 0 in column ``first`` of the first row.
-    Returns the number of tags that fit and the board; 0 and None if too few tags fit."""
+    """Fit a board of a given number of columns to tags.
+
+    Tag 0 is in column ``first`` of the first row.
+
+    Returns:
+        The number of tags that fit, and the board; 0 and None if too few tags fit.
+    """
     step = 2 if kind == "charuco" else 1  # a ChArUco board has a tag on every other square
     squares = np.indices((step * numbers.max() // columns + 2, columns)).sum(axis=0)
     at = np.argwhere(squares % step == first)[numbers, ::-1].astype(np.float64)

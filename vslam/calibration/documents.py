@@ -1,8 +1,8 @@
-"""The YAML of calibration files: typed access to its values, with errors of one sentence.
+"""YAML of calibration files, with typed access to its values.
 
 OpenCV's dialect is accepted: the header ``%YAML:1.0``, ``!!opencv-matrix``, and brackets directly
-after a colon. Scalars are read as text and converted on access, because OpenCV writes the number
-``1e-05``, which YAML 1.1 takes for text.
+after a colon. Scalars are read as text and converted on access. This is necessary because OpenCV
+writes numbers such as ``1e-05``, which YAML 1.1 defines as text.
 """
 
 from __future__ import annotations
@@ -18,17 +18,18 @@ from vslam.calibration.models import Array
 from vslam.errors import InputError
 
 _HEADER = re.compile(r"\A\ufeff?%YAML[: ]1\.\d.*\n?")
-_MOST_BYTES = 100_000  # takes two seconds to parse; a calibration file has about 5,000 bytes
-_MOST_STEPS = 10_000  # lists and numbers at one key
+# A file of this size takes two seconds to parse. A calibration file has about 5,000 bytes.
+_MOST_BYTES = 100_000
+_MOST_STEPS = 10_000  # largest number of lists and numbers at one key
 _NO_SPACE = re.compile(r"^(\s*[\w.]+):(?=\[)", re.MULTILINE)
 
 
 @dataclass(frozen=True)
 class Document:
-    """A mapping of a YAML file.
+    """A mapping in a YAML file.
 
     Attributes:
-        source: the file and the section in it, for error messages.
+        source: name of the file and of the section in it, for error messages.
         values: text, lists and mappings by key.
     """
 
@@ -39,7 +40,7 @@ class Document:
         return key in self.values
 
     def section(self, key: str) -> Document:
-        """The mapping below a key."""
+        """The mapping at a key."""
         values = self._value(key)
         if not isinstance(values, Mapping):
             raise InputError(f"{self.source}: {key} must be a section with keys of its own.")
@@ -57,8 +58,10 @@ class Document:
         return self._numbers(key, "one number", 1)[0]
 
     def numbers(self, key: str, *counts: int) -> tuple[float, ...]:
-        """The numbers at a key, flattened. If ``counts`` are given, there must be as many numbers
-        as one of them."""
+        """The numbers at a key, as a flat tuple.
+
+        If ``counts`` are given, the number of values must be one of them.
+        """
         wanted = " or ".join(map(str, counts))
         return self._numbers(key, f"{wanted} numbers" if counts else "numbers", *counts)
 
@@ -87,7 +90,7 @@ class Document:
 
 
 def read_document(path: Path) -> Document:
-    """Read a YAML file whose top is a mapping.
+    """Read a YAML file whose top level is a mapping.
 
     Raises:
         InputError: the file is missing, unreadable, too large or not YAML.
@@ -135,8 +138,8 @@ def read_document(path: Path) -> Document:
 def _flat(value: object) -> list[str]:
     """Flatten nested lists of text.
 
-    Nested YAML aliases can expand a few lines into gigabytes or form a cycle. A list with more
-    items than any matrix therefore becomes "no number", which the caller refuses.
+    Nested YAML aliases can expand a few lines into gigabytes, or form a cycle. Therefore, a list
+    with more items than any matrix is replaced by the text "no number", which the caller rejects.
     """
     found: list[str] = []
     waiting = [value]

@@ -1,4 +1,7 @@
-"""Reads calibration files, whose format is recognised by their keys, and writes vslam's own."""
+"""Reads calibration files in several formats, and writes vslam's own format.
+
+The format of a file is recognised by its keys.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +22,8 @@ from vslam.calibration.models import Calibration, CameraModel
 from vslam.errors import InputError, write_file
 
 _Reader = Callable[[Sequence[Document], Size | None], Calibration]
-# For each format: keys by which it is recognised, its reader, and the largest number of files. The
-# first format whose keys are all in one file is used.
+# For each format: the keys by which it is recognised, its reader, and the largest number of files.
+# The first format whose keys are all in one file is used.
 _FORMATS: tuple[tuple[set[str], _Reader, int], ...] = (
     ({"left"}, read_own, 1),
     ({"cam0"}, read_kalibr, 1),
@@ -49,11 +52,11 @@ def read_calibration(files: Sequence[Path | str], size: Size | None = None) -> C
 
     Args:
         files: one file, one file for each camera (left first), or a folder that contains them.
-        size: width and height of the images, for files that do not give them.
+        size: width and height of the images, for files that do not contain them.
 
     Raises:
-        InputError: a file or key is missing, the format or model is unknown, or no camera can have
-            the numbers.
+        InputError: a file or key is missing, the format or the camera model is unknown, or a number
+            is impossible for a camera.
     """
     paths = [
         found
@@ -78,7 +81,7 @@ def read_calibration(files: Sequence[Path | str], size: Size | None = None) -> C
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
-    """Write the camera or the stereo pair in vslam's own format.
+    """Write the calibration of a camera or of a stereo pair in vslam's own format.
 
     Raises:
         ResultsError: the file cannot be written.

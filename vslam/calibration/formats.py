@@ -1,9 +1,12 @@
 """Readers of the calibration formats that docs/howto/cameras.md describes.
 
-The formats are documented in Kalibr's wiki (yaml formats), OpenCV's samples ``stereo_calib.cpp``
-and ``camera_calibration.cpp``, the ASL dataset format of EuRoC (Burri et al., IJRR 2016), ROS's
-``sensor_msgs/CameraInfo``, the settings files of ORB-SLAM2 and ``Calibration_Tutorial.pdf`` of
-ORB-SLAM3.
+The formats are documented in:
+
+- Kalibr's wiki, page "yaml formats";
+- OpenCV's samples ``stereo_calib.cpp`` and ``camera_calibration.cpp``;
+- the ASL dataset format of EuRoC (Burri et al., IJRR 2016);
+- ROS's ``sensor_msgs/CameraInfo``;
+- the settings files of ORB-SLAM2, and ``Calibration_Tutorial.pdf`` of ORB-SLAM3.
 """
 
 from __future__ import annotations
@@ -39,13 +42,16 @@ _PAIR_KEYS = ("T_left_right", "baseline", "right_delay")
 _DEPTH_KEYS = ("depth_scale", "virtual_baseline")
 _OWN_KEYS = {"left", "right", *_PAIR_KEYS, *_DEPTH_KEYS}
 _OWN_CAMERA_KEYS = {"lens", "size", "focal", "centre", "distortion"}
-_ROUNDED = 1e-3  # tolerance of rotations, whose numbers are rounded in files
-_LONGEST_DELAY_S = 0.1  # between the two images of a pair
+_ROUNDED = 1e-3  # tolerance for rotation matrices, whose numbers are rounded in files
+_LONGEST_DELAY_S = 0.1  # longest delay between the two images of a pair
 
 
 def read_own(documents: Sequence[Document], size: Size | None) -> Calibration:
-    """Read vslam's own format: ``left``, ``right``, ``T_left_right`` or ``baseline``,
-    ``right_delay``, ``depth_scale`` and ``virtual_baseline``."""
+    """Read vslam's own format.
+
+    Its keys are ``left``, ``right``, ``T_left_right`` or ``baseline``, ``right_delay``,
+    ``depth_scale`` and ``virtual_baseline``.
+    """
     (document,) = documents
     _refuse_unknown(document, _OWN_KEYS)
     _refuse_contradictions(document)
@@ -69,7 +75,7 @@ def read_own(documents: Sequence[Document], size: Size | None) -> Calibration:
 
 
 def _right_delay(document: Document) -> float:
-    """Seconds by which the right image is taken later than the left one; 0 if the file has none."""
+    """Delay of the right image after the left image in seconds; 0 if the file has none."""
     if "right_delay" not in document:
         return 0.0
     delay = document.number("right_delay")
@@ -83,7 +89,11 @@ def _right_delay(document: Document) -> float:
 
 
 def _refuse_contradictions(document: Document) -> None:
-    """Check that a pair has one transformation and no depth, and a single camera no pair's keys."""
+    """Reject keys that contradict each other.
+
+    A stereo pair must have exactly one transformation and no keys of depth. A single camera must
+    not have keys of a pair.
+    """
     of_pair, of_depth = ([k for k in keys if k in document] for keys in (_PAIR_KEYS, _DEPTH_KEYS))
     if {"T_left_right", "baseline"} <= set(of_pair):
         raise InputError(
@@ -103,7 +113,10 @@ def _refuse_contradictions(document: Document) -> None:
 
 
 def read_kalibr(documents: Sequence[Document], size: Size | None) -> Calibration:
-    """Read Kalibr's ``camchain.yaml``: ``cam0`` is left, and ``cam1``, if present, right."""
+    """Read Kalibr's ``camchain.yaml``.
+
+    ``cam0`` is the left camera. If there is ``cam1``, it is the right camera.
+    """
     (document,) = documents
     sections = [document.section(key) for key in ("cam0", "cam1") if key in document]
     models = [_named_camera(section, "distortion_coeffs", size) for section in sections]
@@ -118,8 +131,10 @@ def read_kalibr(documents: Sequence[Document], size: Size | None) -> Calibration
 
 
 def read_euroc(documents: Sequence[Document], size: Size | None) -> Calibration:
-    """Read EuRoC's ``sensor.yaml`` of one or two cameras; ``T_BS`` maps points of the camera to the
-    body."""
+    """Read EuRoC's ``sensor.yaml`` of one or two cameras.
+
+    ``T_BS`` maps points from the camera frame to the body frame.
+    """
     models = [_named_camera(document, "distortion_coefficients", size) for document in documents]
     if len(models) == 1:
         return Calibration(models[0], source=documents[0].source)
@@ -128,8 +143,10 @@ def read_euroc(documents: Sequence[Document], size: Size | None) -> Calibration:
 
 
 def read_ros(documents: Sequence[Document], size: Size | None) -> Calibration:
-    """Read ROS's ``camera_info`` of one or two cameras: a printed message or a file of
-    ``camera_calibration``."""
+    """Read ROS's ``camera_info`` of one or two cameras.
+
+    The file may be a printed message, or a file that ``camera_calibration`` wrote.
+    """
     found = [_ros_names(document) for document in documents]
     models = [_matrix_camera(d, d.source, "K", "D", _lens(d, "none"), size) for d in found]
     if len(models) == 1:
@@ -147,9 +164,12 @@ def read_ros(documents: Sequence[Document], size: Size | None) -> Calibration:
 
 
 def read_opencv(documents: Sequence[Document], size: Size | None) -> Calibration:
-    """Read what OpenCV's samples write: ``camera_matrix``, or ``M1 D1 M2 D2 R T`` in one file or
-    two. The names ``K1``, or ``cameraMatrix1`` and ``distCoeffs1`` as in OpenCV's manual, are also
-    accepted."""
+    """Read the files that OpenCV's samples write.
+
+    The key of a single camera is ``camera_matrix``. The keys of a stereo pair are ``M1 D1 M2 D2 R
+    T``, in one file or in two. The names ``K1``, or ``cameraMatrix1`` and ``distCoeffs1`` as in
+    OpenCV's manual, are also accepted.
+    """
     source = _sources(documents)
     document = Document(source, {k: v for each in documents for k, v in each.values.items()})
     lens: Lens = "fisheye" if _flag(document, "fisheye_model") else "pinhole"
@@ -166,7 +186,7 @@ def read_opencv(documents: Sequence[Document], size: Size | None) -> Calibration
 
 
 def read_orbslam(documents: Sequence[Document], size: Size | None) -> Calibration:
-    """Read the settings of ORB-SLAM2 or ORB-SLAM3: monocular, stereo or RGB-D."""
+    """Read the settings file of ORB-SLAM2 or ORB-SLAM3 for a monocular, stereo or RGB-D camera."""
     (document,) = documents
     source = document.source
     if "LEFT.K" in document:
@@ -215,7 +235,7 @@ def _own_camera(document: Document, size: Size | None) -> CameraModel:
 
 
 def _named_camera(document: Document, distortion: str, size: Size | None) -> CameraModel:
-    """A camera of Kalibr's or EuRoC's files, which name the camera and distortion models."""
+    """Read a camera of Kalibr's or EuRoC's files, which name the camera and distortion models."""
     if (kind := document.text("camera_model")) != "pinhole":
         raise InputError(
             f"{document.source}: camera_model {kind} is unknown; known is pinhole, with one of "
@@ -234,7 +254,7 @@ def _named_camera(document: Document, distortion: str, size: Size | None) -> Cam
 def _matrix_camera(
     document: Document, source: str, K: str, D: str, lens: Lens, size: Size | None
 ) -> CameraModel:
-    """A camera given by a camera matrix and a vector of distortion coefficients."""
+    """Read a camera that is given by a camera matrix and a vector of distortion coefficients."""
     matrix = document.matrix(K, 3, 3)
     numbers = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
     if "image_width" in document or size is None:
@@ -288,7 +308,10 @@ def _ros_names(document: Document) -> Document:
 
 
 def _lens(document: Document, unnamed: str = "") -> Lens:
-    """The lens of the distortion model that a file names, or of ``unnamed`` if it names none."""
+    """The lens of the distortion model that a file names.
+
+    If the file names no model, the model ``unnamed`` is used.
+    """
     word = document.text("distortion_model") or unnamed
     if word not in _LENSES:
         raise InputError(
@@ -299,7 +322,7 @@ def _lens(document: Document, unnamed: str = "") -> Lens:
 
 
 def _size_of(document: Document, size: Size | None, *keys: str) -> Size:
-    """Width and height at one key or two, or ``size`` if the file has none."""
+    """Width and height at one or two keys. If the file has no such key, ``size`` is returned."""
     if keys[0] not in document and size is not None:
         return size
     width, height = document.numbers(keys[0], 2) if len(keys) == 1 else map(document.number, keys)
@@ -358,8 +381,13 @@ def _pair(source: str, left: CameraModel, right: CameraModel, T_left_right: Arra
 
 
 def _unrectified(R_left: Array, R_right: Array, P: Array, source: str) -> Array:
-    """``T_left_right`` from the rotations into the rectified frames and the right camera's
-    projection matrix."""
+    """Compute ``T_left_right`` of the cameras before rectification.
+
+    Args:
+        R_left: ``(3, 3)`` rotation of the left camera into the rectified frame.
+        R_right: ``(3, 3)`` rotation of the right camera into the rectified frame.
+        P: projection matrix of the rectified right camera.
+    """
     if P[0, 0] <= 0 or P[0, 3] == 0:
         raise InputError(
             f"{source}: the projection matrix contains no baseline; its fourth number must be the "

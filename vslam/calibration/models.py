@@ -1,8 +1,8 @@
 """Camera models: pinhole with radial-tangential distortion, and equidistant (Kannala-Brandt).
 
-Camera frame: x right, y down, z forward. The centre of the upper left pixel is (0, 0). The formulas
-are those of OpenCV's documentation of ``calib3d`` (radial-tangential) and of ``fisheye``, the
-latter after Kannala and Brandt, PAMI 2006, equation 6.
+In the camera frame, x points right, y down and z forward. The centre of the upper left pixel is
+(0, 0). The formulas are those of OpenCV's documentation of ``calib3d`` (radial-tangential) and of
+``fisheye`` (equidistant; Kannala and Brandt, PAMI 2006, equation 6).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Lens = Literal["pinhole", "fisheye"]
 
 N_COEFFICIENTS: dict[Lens, tuple[int, ...]] = {"pinhole": (0, 4, 5, 8), "fisheye": (4,)}
 _NEWTON_STEPS = 30
-_OUTWARD = np.linspace(0.0, 1.0, 17)  # fractions of the way from the axis to a ray
+_OUTWARD = np.linspace(0.0, 1.0, 17)  # fractions of the way from the optical axis to a ray
 _SOLVED_PX = 1e-3  # largest distance between a pixel and the projection of its unprojected ray
 
 
@@ -31,8 +31,8 @@ class CameraModel:
         cx, cy: principal point in pixels.
         width, height: image size in pixels.
         lens: ``pinhole`` or ``fisheye`` (equidistant).
-        distortion: pinhole: none, or ``k1 k2 p1 p2``, which ``k3`` and ``k4 k5 k6`` may follow
-            (OpenCV's order); fisheye: ``k1 k2 k3 k4``.
+        distortion: coefficients in OpenCV's order. A pinhole has none, or ``k1 k2 p1 p2``, which
+            may be followed by ``k3``, or by ``k3 k4 k5 k6``. A fisheye has ``k1 k2 k3 k4``.
     """
 
     fx: float
@@ -55,15 +55,15 @@ class Calibration:
     """One camera or a stereo pair, as described by a calibration file.
 
     Attributes:
-        left: the left camera, or the only one.
+        left: the left camera, or the only camera.
         right: the right camera; None for a single camera.
-        T_left_right: ``(4, 4)`` float64, maps points of the right camera to the left one; None
-            without a right camera.
-        depth_scale: value of a depth pixel at one metre; None if the file has none.
-        virtual_baseline: baseline in metres by which depth is converted to disparity; None if the
+        T_left_right: ``(4, 4)`` float64. It maps points from the right camera's frame to the left
+            camera's frame. None if there is no right camera.
+        depth_scale: depth image units per metre; None if the file has none.
+        virtual_baseline: baseline in metres with which depth is converted to disparity; None if the
             file has none.
-        right_delay: seconds by which the right image is taken later than the left one.
-        source: file or files that it was read from, for error messages.
+        right_delay: delay of the right image after the left image, in seconds.
+        source: the file or files from which the calibration was read, for error messages.
     """
 
     left: CameraModel
@@ -80,10 +80,10 @@ class Calibration:
 
 
 def project(model: CameraModel, rays: Array) -> Array:
-    """Project ``(N, 3)`` points in the camera frame to pixels ``(N, 2)`` float64.
+    """Project ``(N, 3)`` points in the camera frame to ``(N, 2)`` float64 pixels.
 
-    Points without a projection give NaN: those behind a pinhole camera, and those on the negative z
-    axis of a fisheye camera.
+    The result is NaN for points that have no projection. These are points behind a pinhole camera,
+    and points on the negative z axis of a fisheye camera.
     """
     x, y, z = rays.T
     if model.lens == "fisheye":
@@ -100,10 +100,11 @@ def project(model: CameraModel, rays: Array) -> Array:
 
 
 def unproject(model: CameraModel, xy: Array) -> Array:
-    """Unit rays ``(N, 3)`` float64 of ``(N, 2)`` pixels.
+    """Viewing rays of ``(N, 2)`` pixels, as ``(N, 3)`` float64 unit vectors in the camera frame.
 
-    The ray of a pixel is NaN if the distortion cannot be inverted there: Newton's method does not
-    converge, or the distortion folds the image between the principal point and the pixel.
+    The ray of a pixel is NaN if the distortion cannot be inverted there. This happens if Newton's
+    method does not converge. It also happens if the distortion folds the image between the
+    principal point and the pixel.
     """
     plane = (xy - (model.cx, model.cy)) / (model.fx, model.fy)
     if model.lens == "fisheye":
@@ -121,8 +122,7 @@ def unproject(model: CameraModel, xy: Array) -> Array:
 
 
 def without_zeros(lens: Lens, distortion: tuple[float, ...]) -> tuple[float, ...]:
-    """The same distortion with the fewest coefficients that the lens model allows: without trailing
-    zeros."""
+    """Remove trailing zeros from distortion coefficients, as far as the lens model allows it."""
     for n in N_COEFFICIENTS[lens]:
         if n <= len(distortion) and not any(distortion[n:]):
             return distortion[:n]
@@ -166,7 +166,11 @@ def _undistorted(distortion: tuple[float, ...], wanted: Array) -> Array:
 
 
 def _bent(distortion: tuple[float, ...], angle: Array) -> Array:
-    """Distance from the principal point, in focal lengths, of rays at ``angle`` to the axis."""
+    """Distance of a ray's pixel from the principal point, in focal lengths.
+
+    Args:
+        angle: angle between the ray and the optical axis in radians.
+    """
     k1, k2, k3, k4 = distortion
     a2 = angle * angle
     return angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))
@@ -185,5 +189,9 @@ def _unbent(distortion: tuple[float, ...], radius: Array) -> Array:
 
 
 def _folds(reach: list[Array]) -> NDArray[np.bool_]:
-    """Whether the distance from the image centre ever decreases as the angle to the axis grows."""
+    """Whether the distance from the principal point decreases anywhere towards larger angles.
+
+    Args:
+        reach: distances from the principal point for increasing angles to the optical axis.
+    """
     return np.any(~(np.diff(reach, axis=0) >= 0.0), axis=0)

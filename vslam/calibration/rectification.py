@@ -1,10 +1,13 @@
 """Rectification: warping images to those of an undistorted pinhole camera or aligned stereo pair.
 
-The rectified pair looks in the mean direction of the two cameras, turned so that its x axis is the
-baseline. It shows the largest rectangle that both images cover, without black pixels, because
-features on a black border would not move with the scene. (``cv2.stereoRectify`` estimates that
-rectangle from a 9x9 grid, ``cv2.fisheye.stereoRectify`` from four points; both can leave black
-corners.)
+The x axis of the rectified pair is the baseline. Its viewing direction is as close as possible to
+the mean direction of the two cameras. The rectified images show the largest rectangle that both
+original images cover. They have no black pixels, because features on a black border would not move
+with the scene.
+
+OpenCV's functions are not used for this, because they can leave black corners.
+``cv2.stereoRectify`` estimates the rectangle from a 9x9 grid, and ``cv2.fisheye.stereoRectify``
+estimates it from four points.
 """
 
 from __future__ import annotations
@@ -23,11 +26,11 @@ from vslam.errors import InputError
 Pixels = TypeVar("Pixels", bound=NDArray[np.generic])
 
 # Largest half field of view of a rectified image. At 60 degrees off the axis, a pinhole image is
-# stretched four times as much as at its centre; a wider view would enlarge the border and shrink
+# stretched four times as much as at its centre. A wider view would enlarge the border and shrink
 # the centre even more.
 _MAX_HALF_VIEW = np.tan(np.radians(60.0))
 _FARTHEST_M = 20.0  # longest baseline
-_SAME = 1e-5  # radians; rows then agree to 0.02 px at focal lengths below 2000 px
+_SAME = 1e-5  # radians; at focal lengths below 2000 px, rows then agree to 0.02 px
 _SAME_PX = 1e-3
 
 
@@ -37,14 +40,15 @@ class Rectification:
 
     Attributes:
         camera: the rectified camera or pair.
-        R_left_rectified: ``(3, 3)`` float64, maps directions from the rectified left camera to the
-            original one; both have the same centre.
-        left, right: map ``(H, W)`` uint8 images of the calibrated size to rectified ones of the
-            left camera's size, bilinearly. Images that need no rectification are returned
-            unchanged; without a right camera, ``right`` returns every image unchanged.
-        left_depth: the same for depth images of any type, by nearest neighbour. It is valid only if
-            rectification does not turn the camera, because depth is measured along the camera's
-            axis.
+        R_left_rectified: ``(3, 3)`` float64. It maps directions from the frame of the rectified
+            left camera to the frame of the original left camera. Both frames have the same origin.
+        left: rectifies a left image, ``(H, W)`` uint8 of the calibrated size, by bilinear
+            interpolation. The result has the size of the left camera's images. An image that needs
+            no rectification is returned unchanged.
+        right: the same for a right image. Without a right camera, images are returned unchanged.
+        left_depth: the same for a depth image of any type, by nearest neighbour. It is valid only
+            if rectification does not rotate the camera, because depth is measured along the
+            camera's axis.
         identity: whether images are returned unchanged.
     """
 
@@ -57,10 +61,10 @@ class Rectification:
 
 
 def rectify(calibration: Calibration) -> Rectification:
-    """Compute the rectification; its functions may be called from several threads.
+    """Compute the rectification. Its functions may be called from several threads.
 
     Raises:
-        InputError: the cameras are not side by side or look in different directions, they are
+        InputError: the cameras are not side by side, they look in different directions, they are
             swapped, or a distortion cannot be inverted within the image.
     """
     left, right, source = calibration.left, calibration.right, calibration.source
@@ -120,8 +124,11 @@ def _is_rectified(
 
 
 def _between(R_left_right: Array, centre: Array, source: str) -> Array:
-    """``R_left_rectified``: x along the baseline, z as close as possible to the mean viewing
-    direction of the two cameras."""
+    """Compute ``R_left_rectified``.
+
+    The x axis of the rectified frame is along the baseline. The z axis is as close as possible to
+    the mean viewing direction of the two cameras.
+    """
     import cv2
 
     turn = cv2.Rodrigues(R_left_right)[0].ravel()
@@ -157,7 +164,10 @@ def _between(R_left_right: Array, centre: Array, source: str) -> Array:
 
 
 def _common_view(source: str, cameras: list[tuple[CameraModel, Array]], baseline: float) -> Camera:
-    """The pinhole camera, of the left image's size, with the widest view that all images cover."""
+    """The pinhole camera with the widest view that all images cover.
+
+    Its image size is that of the left camera.
+    """
     bounds = np.array([_inner_rectangle(model, R, source) for model, R in cameras])
     (x0, y0), (x1, y1) = bounds[:, 0].max(axis=0), bounds[:, 1].min(axis=0)
     if x0 >= x1 or y0 >= y1:
@@ -177,11 +187,11 @@ def _common_view(source: str, cameras: list[tuple[CameraModel, Array]], baseline
 
 
 def _inner_rectangle(model: CameraModel, R_own_rectified: Array, source: str) -> Array:
-    """A rectangle on the plane z = 1 of the rectified camera that the image covers: each side
-    touches a border of the image at the pixel nearest to the centre.
+    """The rectangle on the plane z = 1 of the rectified camera that the image covers.
 
-    The distortion polynomial of a wide lens may fold the corners of the image, so pixels in the
-    corners that cannot be unprojected are ignored.
+    Each side of the rectangle touches a border of the image, at the border pixel nearest to the
+    centre. The distortion polynomial of a wide lens may fold the corners of the image. Therefore,
+    pixels that cannot be unprojected are ignored.
 
     Returns:
         ``[[x0, y0], [x1, y1]]``, two opposite corners of the rectangle.
@@ -200,7 +210,7 @@ def _inner_rectangle(model: CameraModel, R_own_rectified: Array, source: str) ->
 
 
 def _check_view(model: CameraModel, R_own_rectified: Array, camera: Camera, source: str) -> None:
-    """Refuse a rectified view if the image shows a part of it twice or not at all."""
+    """Reject a rectified view if the original image shows a part of it twice or not at all."""
     xy = np.concatenate(_borders(camera.width, camera.height))
     rays = camera.backproject(xy, np.ones(len(xy))) @ R_own_rectified.T
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -210,7 +220,7 @@ def _check_view(model: CameraModel, R_own_rectified: Array, camera: Camera, sour
 
 
 def _borders(width: int, height: int) -> tuple[Array, ...]:
-    """Pixels ``(N, 2)`` of the left, upper, right and lower border of an image."""
+    """``(N, 2)`` pixels of the left, upper, right and lower border of an image."""
     across, down = np.arange(float(width)), np.arange(float(height))
     top, left = np.zeros(width), np.zeros(height)
     return (
@@ -229,7 +239,7 @@ def _folded(source: str) -> InputError:
 
 
 def _maps(model: CameraModel, R_own_rectified: Array, camera: Camera) -> NDArray[np.float32]:
-    """``(H, W, 2)`` float32, the position of each rectified pixel in the original image."""
+    """``(H, W, 2)`` float32 position of each rectified pixel in the original image, in pixels."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     rays = np.stack(
         [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1
@@ -239,7 +249,10 @@ def _maps(model: CameraModel, R_own_rectified: Array, camera: Camera) -> NDArray
 
 
 def _linear(maps: NDArray[np.float32]) -> Callable[[Image], Image]:
-    """Interpolate bilinearly in fixed point (1/32 pixel), three times as fast as floating point."""
+    """Make a function that interpolates bilinearly with a resolution of 1/32 pixel.
+
+    This fixed-point interpolation is three times as fast as interpolation in floating point.
+    """
     import cv2
 
     fixed, weights = cv2.convertMaps(maps[..., 0], maps[..., 1], cv2.CV_16SC2)

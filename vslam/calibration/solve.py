@@ -1,4 +1,4 @@
-"""Estimation of cameras, and of the transformation between two, from views of a board.
+"""Estimation of one or two cameras, and of the transformation between them, from views of a board.
 
 OpenCV estimates the cameras. This module selects views, drops those that do not fit, and measures
 residuals with vslam's own camera models.
@@ -21,15 +21,15 @@ from vslam.errors import InputError, counted
 from vslam.geometry import inverse, orthonormalised, se3_exp, transform
 
 Size = tuple[int, int]
-Frame = tuple[View | None, ...]  # the view of each camera; None if it does not see the board
+Frame = tuple[View | None, ...]  # the view of each camera; None for a camera that sees no board
 _Fit = TypeVar("_Fit", "CameraFit", "PairFit")
 
 _MOST_FRAMES = 60
-_FEWEST_VIEWS = 3  # for 8 unknowns of the camera and 6 of each view
-_OUTLIER = 3.0  # times the median error of all views
-_NO_FIT = 0.01  # in image widths; with a larger RMS error, the corners are those of another board
-_FEWEST_COMMON = 6  # corners that both images of a pair show
-_SAME_VIEW = 0.02  # in image sizes; the board is at rest if its outline moves less
+_FEWEST_VIEWS = 3  # the unknowns are 8 of the camera and 6 of each view
+_OUTLIER = 3.0  # error above which a view is dropped, as a multiple of the median error
+_NO_FIT = 0.01  # RMS error in image widths; if it is larger, the corners are those of another board
+_FEWEST_COMMON = 6  # corners that both images of a pair must show
+_SAME_VIEW = 0.02  # in image sizes; if the outline moves less, the board is at rest
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,9 @@ class CameraFit:
     Attributes:
         model: the camera.
         views: the V views.
-        residuals: for each view, ``(N, 2)`` float64 pixels: the corners in the image minus the
-            projected corners of the board.
-        T_camera_board: ``(V, 4, 4)`` float64.
+        residuals: for each view, the ``(N, 2)`` float64 corners in the image minus the projected
+            corners of the board, in pixels.
+        T_camera_board: ``(V, 4, 4)`` float64 pose of the board in each view.
         dropped: names of views that do not fit, with their RMS errors in pixels.
     """
 
@@ -53,7 +53,7 @@ class CameraFit:
 
     @property
     def errors(self) -> Array:
-        """``(V,)`` float64, the RMS error of each view in pixels."""
+        """``(V,)`` float64 RMS error of each view in pixels."""
         return np.array([rms(residuals) for residuals in self.residuals])
 
 
@@ -62,9 +62,10 @@ class PairFit:
     """The transformation between two cameras, estimated from P pairs of views.
 
     Attributes:
-        T_left_right: ``(4, 4)`` float64, maps points of the right camera to the left one.
-        errors: ``(P,)`` float64, for each pair the RMS distance in pixels between the corners in
-            the right image and those predicted from the left image.
+        T_left_right: ``(4, 4)`` float64. It maps points from the right camera's frame to the left
+            camera's frame.
+        errors: ``(P,)`` float64 RMS distance between the corners in the right image and the corners
+            predicted from the left image, for each pair, in pixels.
         dropped: names of pairs that do not fit, with their errors.
     """
 
@@ -75,14 +76,17 @@ class PairFit:
 
 @dataclass(frozen=True)
 class Estimate:
-    """One camera, or the two of a stereo pair (left first) and the transformation between them."""
+    """One camera, or the two cameras of a stereo pair and the transformation between them.
+
+    The left camera is the first one.
+    """
 
     cameras: tuple[CameraFit, ...]
     pair: PairFit | None = None
 
     @property
     def calibration(self) -> Calibration:
-        """The cameras without the data that they were estimated from."""
+        """The calibration, without the data from which it was estimated."""
         left, right = self.cameras[0].model, self.cameras[-1].model
         if self.pair is None:
             return Calibration(left)
@@ -98,12 +102,14 @@ def estimate(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], lens:
     """Estimate one camera, or a stereo pair if there are two ``sizes``.
 
     Args:
-        frames: the views in every image or pair of images. In a pair, the corners must be numbered
-            alike (`vslam.calibration.boards.same_order`).
+        board: the board that the images show.
+        frames: the view in every image, or the two views in every pair of images. The corners of
+            the two views must have the same numbers (`vslam.calibration.boards.same_order`).
         sizes: width and height of each camera's images.
+        lens: kind of lens.
 
     Raises:
-        InputError: a camera does not see the board, or as for `fit_camera` and `fit_pair`.
+        InputError: a camera does not see the board, or `fit_camera` or `fit_pair` fails.
     """
     seen = [sum(views[side] is not None for views in frames) for side in range(len(sizes))]
     if not any(seen):
@@ -126,11 +132,11 @@ def estimate(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], lens:
 
 
 def diverse(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], n: int) -> list[Frame]:
-    """Select at most ``n`` frames in which the places of the board differ most.
+    """Select at most ``n`` frames in which the positions of the board differ most.
 
-    Farthest-point selection: the next frame is the one whose outlines of the board differ most from
-    those of all frames selected before. A board at rest is selected once, and frames without the
-    board are left out.
+    The frames are selected one after the other (farthest-point selection). The next frame is always
+    the one in which the outline of the board differs most from that in all selected frames. If the
+    board is at rest, only one frame is selected. Frames without the board are left out.
     """
     frames = [views for views in frames if any(views)]
     outlines = np.array(
@@ -145,8 +151,11 @@ def diverse(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], n: int
 
 
 def _outline(board: Board, view: View | None, size: Size) -> Array:
-    """The four corners of the board's outline, ``(8,)`` in image sizes, from a homography, because
-    some may be out of view. They are clipped to half an image size beyond the image."""
+    """The four corners of the board's outline, as ``(8,)`` coordinates in image sizes.
+
+    They are computed by a homography, because some of them may be out of view. They are clipped to
+    half an image size beyond the image.
+    """
     points = board_points(board)[:, :2]
     H = None if view is None else cv2.findHomography(points[view.ids], view.xy)[0]
     if H is None:
@@ -156,12 +165,15 @@ def _outline(board: Board, view: View | None, size: Size) -> Array:
 
 
 def fit_camera(board: Board, views: Sequence[View], size: Size, lens: Lens) -> CameraFit:
-    """Estimate a camera, with distortion ``k1 k2 p1 p2`` (pinhole) or ``k1 k2 k3 k4`` (fisheye).
+    """Estimate a camera.
 
-    Views whose error exceeds three times the median are dropped, and the estimate is repeated.
+    The distortion of a pinhole camera has the coefficients ``k1 k2 p1 p2``, and that of a fisheye
+    camera ``k1 k2 k3 k4``. Views whose error exceeds three times the median are dropped, and the
+    estimate is repeated.
 
     Raises:
-        InputError: the views are too few or too similar, or the corners are not of this board.
+        InputError: the views are too few or too similar, or the corners are not those of this
+            board.
     """
     points = board_points(board)
     calibrate: Any = cv2.calibrateCamera
@@ -175,7 +187,7 @@ def fit_camera(board: Board, views: Sequence[View], size: Size, lens: Lens) -> C
         own = [points[views[k].ids][None].astype(dtype) for k in kept]
         xy = [views[k].xy[None].astype(dtype) for k in kept]
         threads = cv2.getNumThreads()
-        cv2.setNumThreads(1)  # threads sum in varying order, and equal images must give equal files
+        cv2.setNumThreads(1)  # equal images must give equal files; threads add in varying order
         try:
             _, K, D, turns, shifts = calibrate(own, xy, size, None, None, flags=flags)
         except cv2.error as error:
@@ -213,12 +225,12 @@ def fit_camera(board: Board, views: Sequence[View], size: Size, lens: Lens) -> C
 
 
 def fit_pair(board: Board, left: CameraFit, right: CameraFit) -> PairFit:
-    """Estimate the transformation between two cameras from their views of the same name.
+    """Estimate the transformation between two cameras from their views with the same name.
 
-    Pairs are dropped like the views of `fit_camera`.
+    Pairs with large errors are dropped, as `fit_camera` drops views.
 
     Raises:
-        InputError: fewer than three pairs are left.
+        InputError: fewer than three pairs remain.
     """
     points = board_points(board)
     in_left = {v.name: (v, T) for v, T in zip(left.views, left.T_camera_board, strict=True)}
@@ -231,8 +243,8 @@ def fit_pair(board: Board, left: CameraFit, right: CameraFit) -> PairFit:
                 both = View(view.name, view.ids[common], view.xy[common])
                 pairs.append((both, T_left_board, T_right_board @ inverse(T_left_board)))
 
-    # cv2.fisheye.stereoCalibrate is not used, because it needs the same number of corners in every
-    # view, and the board may be partly out of view.
+    # cv2.fisheye.stereoCalibrate is not used. It needs the same number of corners in every view,
+    # but the board may be partly out of view.
     def fit(kept: Sequence[int]) -> PairFit:
         def residuals(T_right_left: Array) -> list[Array]:
             return [
@@ -259,11 +271,12 @@ def fit_pair(board: Board, left: CameraFit, right: CameraFit) -> PairFit:
 def _without_outliers(
     names: Sequence[str], fit: Callable[[Sequence[int]], _Fit], found_in: str, fix: str
 ) -> _Fit:
-    """Fit the named views, and repeat the fit without the views with large errors until no error is
-    large.
+    """Fit all views, and repeat the fit without the views whose error is large.
+
+    The fit is repeated until no error is large.
 
     Raises:
-        InputError: too few views are left; ``found_in`` and ``fix`` are parts of the message.
+        InputError: too few views remain. ``found_in`` and ``fix`` are parts of the message.
     """
     kept = list(range(len(names)))
     dropped: list[tuple[str, float]] = []

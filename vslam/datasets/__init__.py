@@ -1,4 +1,7 @@
-"""Readers of data sets: each checks its input once and then provides calibrated, timed frames."""
+"""Readers of data sets, which provide calibrated frames with time stamps.
+
+Each reader checks its input once, before it provides the frames.
+"""
 
 from __future__ import annotations
 
@@ -28,14 +31,17 @@ def open_sequence(
     depth_scale: float | None = None,
     on_render: Callable[[int, int], None] | None = None,
 ) -> Source:
-    """Open a sequence and check the frames that ``start``, ``every``, ``max_frames`` select.
+    """Open a sequence and check the selected frames.
 
     Args:
-        dataset: one of `DATASETS`, or a data set of a plug-in.
-        root: folder of the data set; ignored for rendered towns, which are rendered into the
+        dataset: one of `DATASETS`, or the name of a data set that a plug-in reads.
+        root: folder of the data set. It is ignored for rendered towns, which are rendered into the
             user's cache on first use.
-        name: name of the sequence; None opens 00 of KITTI or of the rendered towns, or the only
-            sequence in ``root`` of EuRoC or TUM.
+        name: name of the sequence. None opens sequence 00 of KITTI or of the rendered towns. For
+            EuRoC and TUM, None opens the only sequence in ``root``.
+        start: index of the first frame to read.
+        every: read only every ``every``-th frame.
+        max_frames: largest number of frames to read; None reads all.
         monocular: read only the left camera.
         calib: calibration files (docs/howto/cameras.md), which replace the data set's own.
         depth_scale: depth image units per metre, for RGB-D data only.

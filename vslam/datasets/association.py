@@ -1,4 +1,8 @@
-"""Association by time: pairing images, and interpolating ground truth at the times of frames."""
+"""Association by time.
+
+This module pairs images that were taken at nearly the same time, and interpolates the ground truth
+at the times of frames.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +21,9 @@ _log = logging.getLogger(__name__)
 # (TUM), 200 Hz (EuRoC) or 10 Hz (vehicles). At an acceleration of 2 m/s^2, linear interpolation is
 # off by 6 mm in the middle of this gap.
 _MAX_GAP_S = 0.15
-# Shares of images without a partner. A recording that begins or ends between the two images of a
-# pair loses one; TUM's sequences lose up to 7 %.
+# Shares of images without a partner: above the first one, a warning is shown; above the second one,
+# `Pairing.is_poor` is true. A recording that begins or ends between the two images of a pair leaves
+# one image without a partner. In TUM's sequences, up to 7 % of the images have no partner.
 _FEW, _MANY = 0.01, 0.1
 
 
@@ -30,10 +35,13 @@ def associate(
     The closest pairs are formed first, and each time is used at most once.
 
     Args:
-        first, second: ``(N,)`` and ``(M,)`` seconds, increasing.
+        first: ``(N,)`` seconds, increasing.
+        second: ``(M,)`` seconds, increasing.
+        max_difference: seconds.
 
     Returns:
-        ``(P,)`` increasing indices into ``first``, and ``(P,)`` indices into ``second``.
+        The indices of the P pairs: ``(P,)`` increasing indices into ``first``, and ``(P,)`` indices
+        into ``second``.
     """
     low = np.searchsorted(second, first - max_difference, side="right")
     high = np.searchsorted(second, first + max_difference, side="left")
@@ -51,19 +59,19 @@ def associate(
 
 @dataclass
 class Pairing:
-    """The images that a reader pairs by time, and those that it leaves out.
+    """Counts of the images that a reader pairs by time, and of the images that it leaves out.
 
-    The reader of a stream counts while it reads. Readers do not log the warnings: the summary and
-    the report of a run, ``vslam doctor`` and ``vslam calibrate`` show them.
+    The reader of a stream counts the images while it reads them. Readers do not log the warnings.
+    The summary and the report of a run, ``vslam doctor`` and ``vslam calibrate`` show them.
 
     Attributes:
         source: file or folder that messages name.
         partner: what each image is paired with, such as ``depth image``.
-        within_s: largest difference between the times of a pair (s).
+        within_s: largest difference between the times of a pair, in seconds.
         fix: what the user can do if images are left out.
         n_pairs: number of pairs.
-        left_out: times (s) of the images without a partner.
-        seconds: times (s) of all images that could be partners.
+        left_out: times of the images without a partner, in seconds.
+        seconds: times of all possible partners, in seconds.
     """
 
     source: Path
@@ -76,7 +84,7 @@ class Pairing:
 
     @property
     def measured(self) -> str:
-        """How many images are left out, and why."""
+        """Text that says how many images are left out, and why."""
         n = len(self.left_out)
         said = f"{n} of {n + self.n_pairs} images are left out"
         if not n:
@@ -95,12 +103,14 @@ class Pairing:
 
     @property
     def is_poor(self) -> bool:
-        """Whether so many images are left out that tracking suffers."""
+        """Whether more than a tenth of the images are left out, so that tracking suffers."""
         return len(self.left_out) > _MANY * (len(self.left_out) + self.n_pairs)
 
     def warnings(self) -> list[str]:
-        """A sentence with the number of images left out, the reason and the fix, if it is more
-        than a hundredth of the images."""
+        """A warning if more than a hundredth of the images are left out, otherwise an empty list.
+
+        The warning states how many images are left out, the reason, and what the user can do.
+        """
         if len(self.left_out) <= _FEW * (len(self.left_out) + self.n_pairs):
             return []
         return [f"{self.source}: {self.measured}; {self.fix}."]
@@ -111,23 +121,26 @@ class Pairing:
         """Count all images of a stored sequence.
 
         Args:
-            times: ``(N,)`` seconds, of the images.
+            times: ``(N,)`` times of the images, in seconds.
             paired: ``(P,)`` indices of the images that have a partner.
-            seconds: ``(M,)`` seconds, of the possible partners.
+            seconds: ``(M,)`` times of the possible partners, in seconds.
         """
         self.n_pairs = len(paired)
         self.left_out = np.delete(times, paired).tolist()
         self.seconds = seconds.tolist()
 
     def restart(self) -> None:
-        """Begin to count anew, because a stream is read from its beginning."""
+        """Reset all counts. The reader of a stream calls this when it starts from the beginning."""
         self.n_pairs = 0
         self.left_out.clear()
         self.seconds.clear()
 
     def _gaps(self) -> NDArray[np.float64]:
-        """Seconds between each image that is left out and the nearest possible partner, which may
-        be paired with another image; infinite if there is none."""
+        """Time between each image that is left out and the nearest possible partner, in seconds.
+
+        The nearest possible partner may be paired with another image. The time is infinite if there
+        are no possible partners.
+        """
         times = np.array(self.left_out)
         if not self.seconds:
             return np.full(len(times), np.inf)
@@ -147,8 +160,9 @@ def poses_at(
         times: ``(N,)`` seconds.
 
     Returns:
-        ``(N, 4, 4)`` float64 ``T_wc``, NaN outside the measured time and in gaps longer than
-        0.15 s. None, with a warning, if no time has a pose.
+        ``(N, 4, 4)`` float64 ``T_wc``. Poses are NaN before the first measurement, after the last
+        one, and in gaps longer than 0.15 s. If no time has a pose, a warning is logged and None is
+        returned.
     """
     from scipy.spatial.transform import Rotation, Slerp
 

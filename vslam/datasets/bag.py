@@ -1,9 +1,12 @@
 """ROS 1 bags, ROS 2 bags and MCAP files, read by the library rosbags.
 
-Images are ``sensor_msgs/Image`` or ``CompressedImage`` messages with the time stamps of their
-headers. The images of two topics that are nearest in time form a pair if their stamps differ by at
-most 5 ms, or 20 ms for an image and its depth; images without a partner are skipped. The
-calibration is read from the ``camera_info`` of the image topics, if the bag has it.
+Images are ``sensor_msgs/Image`` or ``CompressedImage`` messages. Their time stamps are taken from
+the message headers.
+
+The images of two topics are paired by time. The two images of a stereo pair are at most 5 ms apart.
+An image and its depth are at most 20 ms apart. Images without a partner are skipped.
+
+If the bag has ``camera_info`` topics, the calibration is read from them.
 """
 
 from __future__ import annotations
@@ -45,13 +48,14 @@ Bag = Any  # rosbags.highlevel.AnyReader
 _FIX_TYPE = "sensor_msgs/msg/NavSatFix"
 _MOST_METADATA = 1_000_000  # bytes; a hundred topics need 100,000
 _TOLERANCE_NS = 5_000_000
-_DEPTH_TOLERANCE_NS = 20_000_000  # as in TUM's associate.py; a Kinect alternates image and depth
+# As in TUM's associate.py. A Kinect takes images and depth alternately.
+_DEPTH_TOLERANCE_NS = 20_000_000
 _NEEDED = {
     "mono": "an image topic",
     "stereo": "two image topics",
     "rgbd": "an image topic and one of depth",
 }
-_MOST_WAITING = 32  # images of one side that wait for a partner
+_MOST_WAITING = 32  # images of one topic that are kept while they wait for a partner
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,8 +64,8 @@ class BagSource(RawSource):
 
     Attributes:
         path: the bag's file or folder.
-        topics: the topic of the left images, and the topic of the right images or the depth, if
-            they are used.
+        topics: the topic of the left images. If right images or depth are used, their topic is
+            second.
     """
 
     path: Path
@@ -79,16 +83,16 @@ def open_bag(
 
     Args:
         path: ``.bag``, ``.mcap`` or ``.db3``, or the folder of a ROS 2 bag.
-        topics: the topic of the left images, and the topic of the right images or the depth. If
-            empty, the bag must have exactly as many image topics as are needed; the first one in
-            alphabetical order is the left.
-        sensor: ``stereo``, ``rgbd`` or ``mono`` (only the first of two topics is read); None
-            chooses by the content of the topics.
+        topics: the topic of the left images, followed by the topic of the right images or of the
+            depth. If empty, the bag must have exactly as many image topics as the sensor needs. The
+            left images are then those of the first topic in alphabetical order.
+        sensor: ``stereo``, ``rgbd`` or ``mono``. With ``mono``, only the first topic is read. None
+            chooses the sensor by the content of the topics.
         depth_scale: depth image units per metre; None derives it from the encoding.
 
     Raises:
         InputError: rosbags is not installed, the bag is missing or truncated, topics are missing,
-            or the images have no time stamps, cannot be decoded or form no pairs.
+            the images have no time stamps, they cannot be decoded, or they form no pairs.
     """
     path = Path(path)
     if not path.exists():
@@ -180,8 +184,8 @@ def find_calibration(source: BagSource) -> Calibration | None:
     """Read the calibration from the ``camera_info`` topics that belong to the image topics.
 
     Returns:
-        The calibration; None if such a topic is missing, or has no focal length because the camera
-        is not calibrated.
+        The calibration. None if a ``camera_info`` topic is missing, or if its focal length is 0
+        because the camera is not calibrated.
 
     Raises:
         InputError: a ``camera_info`` cannot be read, or is not a valid calibration.
@@ -209,8 +213,9 @@ def read_fixes_of_bag(path: Path) -> NDArray[np.float64]:
     """Read the GPS fixes (``sensor_msgs/NavSatFix``) of a bag.
 
     Returns:
-        ``(M, 7)`` float64 seconds, latitude, longitude, altitude, and the standard deviations east,
-        north and up (NaN if unknown).
+        ``(M, 7)`` float64. Each row contains the time (s), latitude and longitude (degrees),
+        altitude (m), and the standard deviations east, north and up (m). Unknown standard
+        deviations are NaN.
 
     Raises:
         InputError: rosbags is not installed, the bag is damaged, it does not have exactly one topic
@@ -253,7 +258,7 @@ def _opened(path: Path) -> Iterator[Bag]:
         _check_metadata(path / "metadata.yaml")
         bag = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
         bag.open()
-    except Exception as error:  # for damaged files, rosbags and its parsers raise many kinds
+    except Exception as error:  # rosbags and its parsers raise many kinds for damaged files
         raise InputError(
             f"{path}: cannot be read as a bag ({_reason(error)}); if the recording was cut off, "
             "repair it with 'rosbag reindex', 'ros2 bag reindex' or 'mcap recover'."
@@ -265,7 +270,9 @@ def _opened(path: Path) -> Iterator[Bag]:
 
 
 def _check_metadata(file: Path) -> None:
-    """Reject a large file, because rosbags needs 30 us and 300 bytes of memory for each byte of it.
+    """Reject a large metadata file.
+
+    For each byte of the file, rosbags needs 30 us and 300 bytes of memory.
 
     Raises:
         ValueError: the file is too large.
@@ -284,7 +291,7 @@ def _messages(bag: Bag, path: Path, topics: tuple[str, ...]) -> Iterator[tuple[s
     try:
         for connection, _, data in bag.messages(connections=connections):
             yield connection.topic, bag.deserialize(data, connection.msgtype)
-    except Exception as error:  # see _opened
+    except Exception as error:  # many kinds, as in _opened
         raise BrokenSourceError(
             f"{path}: the bag is damaged or cut off ({_reason(error)}); copy it again."
         ) from error
@@ -301,10 +308,10 @@ def _tolerance(depth: bool) -> int:
 def _synchronised(
     messages: Iterator[tuple[str, Message]], topics: tuple[str, ...], pairing: Pairing
 ) -> Iterator[tuple[Message, ...]]:
-    """Yield groups of one message of each topic whose stamps are near in time, and count in
-    ``pairing`` the messages that have a partner.
+    """Yield one message of each topic at a time, paired by their time stamps.
 
-    A message is paired only when no later message of the other topic can be nearer in time.
+    Messages with and without a partner are counted in ``pairing``. A message is paired only when no
+    later message of the other topic can be nearer in time.
     """
     pairing.restart()
     if len(topics) == 1:
@@ -345,7 +352,7 @@ def _synchronised(
 def _choose_topics(
     path: Path, bag: Bag, topics: tuple[str, ...], sensor: str | None
 ) -> tuple[tuple[str, ...], bool]:
-    """The topics of the first and second images, and whether the second images are depth."""
+    """The topics to read, and whether the second one contains depth."""
     there = sorted({c.topic for c in bag.connections if c.msgtype in IMAGE_TYPES})
     listed = f"image topics are {', '.join(there)}" if there else "there are no image topics"
     for topic in topics:

@@ -1,7 +1,7 @@
 """Limits on the decompressed size of bags, because rosbags itself sets none.
 
 A few kilobytes can decompress to gigabytes. rosbags looks up its decompression functions in tables
-of its modules; here, functions that stop at a limit replace the entries of these tables.
+of its modules. This module replaces the entries of these tables by functions that stop at a limit.
 """
 
 from __future__ import annotations
@@ -15,10 +15,13 @@ from types import SimpleNamespace
 from typing import Any, Protocol
 
 MOST_BYTES = 2**29
-"""Largest size in bytes of a decompressed chunk or message. It is enough for an image of
-`vslam.untrusted.MOST_PIXELS` with four bytes per pixel; recorders write chunks of 0.8 to 4 MB."""
+"""Largest size of a decompressed chunk or message in bytes.
 
-_FREE_BYTES = 2**30  # of disk space that must remain when a whole bag is decompressed
+It is enough for an image of `vslam.untrusted.MOST_PIXELS` with four bytes per pixel. Recorders
+write chunks of 0.8 to 4 MB.
+"""
+
+_FREE_BYTES = 2**30  # disk space that must remain free after a whole bag is decompressed
 _log = logging.getLogger(__name__)
 
 
@@ -30,7 +33,10 @@ class _Decompressor(Protocol):
 
 
 def limit_bags() -> None:
-    """Make rosbags reject chunks, messages and files beyond the limits. Later calls do nothing."""
+    """Make rosbags reject chunks, messages and files that exceed the limits.
+
+    Only the first call has an effect.
+    """
     import lz4.frame
     from rosbags.rosbag1 import reader as ros1
     from rosbags.rosbag2 import reader, storage_mcap
@@ -63,7 +69,7 @@ def limit_bags() -> None:
 
 
 def unpack(make: Callable[[], _Decompressor], data: bytes, most: int) -> bytes:
-    """Decompress data that consists of one or more compressed frames to at most ``most`` bytes.
+    """Decompress one or more concatenated compressed frames, to at most ``most`` bytes.
 
     Raises:
         ValueError: the result exceeds ``most`` bytes, or the data is truncated.
@@ -87,7 +93,7 @@ def _limited(make: Callable[[], _Decompressor]) -> Callable[[bytes], bytes]:
 
 
 def _limited_by_size(make: Callable[[], _Decompressor]) -> Callable[[bytes, int], bytes]:
-    """Limit the decompression of chunks that state their size, which rosbags checks."""
+    """Limit the decompression of a chunk to the size that the bag states, and to `MOST_BYTES`."""
     return lambda data, size: unpack(make, data, min(size, MOST_BYTES))
 
 

@@ -1,7 +1,7 @@
 """Images, calibrations and GPS fixes from ROS messages.
 
-Fields and encodings: ``sensor_msgs/Image``, ``CompressedImage``, ``CameraInfo``, ``NavSatFix`` and
-``sensor_msgs/image_encodings.hpp`` of ROS.
+The fields are defined by ROS in ``sensor_msgs/Image``, ``CompressedImage``, ``CameraInfo`` and
+``NavSatFix``, and the image encodings in ``sensor_msgs/image_encodings.hpp``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _DEPTH_ENCODINGS = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
-# Number of channels, and name of the colour space in OpenCV's constants.
+# The number of channels, and the name of the colour space in OpenCV's constants.
 _ENCODINGS: dict[str, tuple[int, str | None]] = {
     "mono": (1, None),
     "bgr": (3, "BGR"),
@@ -38,14 +38,19 @@ _ALIASES = {"8UC1": "mono8", "16UC1": "mono16", "8UC3": "bgr8", "8UC4": "bgra8"}
 
 
 def stamp_of(message: Message) -> int:
-    """Time stamp of the header in nanoseconds, 0 if it was not set."""
+    """Time stamp of the message header in nanoseconds; 0 if the driver did not set it."""
     stamp = message.header.stamp
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
 def nav_sat_fix(message: Message) -> tuple[float, ...]:
-    """Seconds, latitude, longitude, altitude and three standard deviations (east, north, up) of a
-    ``NavSatFix``. The position is NaN if the receiver had no fix; unknown deviations are NaN."""
+    """Convert a ``NavSatFix`` to seven numbers.
+
+    Returns:
+        Time (s), latitude and longitude (degrees), altitude (m), and the standard deviations east,
+        north and up (m). The position is NaN if the receiver had no fix. Unknown standard
+        deviations are NaN.
+    """
     status, covariance = message.status.status, np.asarray(message.position_covariance)
     position = (message.latitude, message.longitude, message.altitude)
     if status < 0:  # STATUS_NO_FIX
@@ -57,17 +62,24 @@ def nav_sat_fix(message: Message) -> tuple[float, ...]:
 
 
 def grey_of(message: Message) -> Image:
-    """Decode an ``Image`` or ``CompressedImage`` to ``(H, W)`` uint8; 16-bit values keep their
-    upper eight bits.
+    """Decode an ``Image`` or ``CompressedImage`` to ``(H, W)`` uint8 grey values.
+
+    Of 16-bit values, the upper eight bits are kept.
 
     Raises:
-        ValueError: the image cannot be decoded, for the given reason.
+        ValueError: the image cannot be decoded. The message of the error states the reason.
     """
     return _decoded(message, "GRAY")
 
 
 def colour_of(message: Message) -> NDArray[np.uint8]:
-    """Decode as `grey_of`, but to ``(H, W, 3)`` red, green, blue if the message has colours."""
+    """Decode an image to ``(H, W, 3)`` uint8 red, green, blue.
+
+    A grey image is decoded to ``(H, W)``, as by `grey_of`.
+
+    Raises:
+        ValueError: as `grey_of`.
+    """
     return _decoded(message, "RGB")
 
 
@@ -102,8 +114,10 @@ def _decoded(message: Message, wanted: str) -> NDArray[np.uint8]:
 
 
 def is_depth(message: Message, topic: str) -> bool:
-    """Whether an image message contains depth. A 16-bit image counts as depth only if the name of
-    its topic contains ``depth``, otherwise as grey values."""
+    """Whether an image message contains depth.
+
+    A 16-bit image counts as depth only if the name of its topic contains ``depth``.
+    """
     if not hasattr(message, "encoding"):
         return _COMPRESSED_DEPTH in message.format
     is_16_bit_depth = message.encoding == "16UC1" and "depth" in topic.lower()
@@ -111,11 +125,14 @@ def is_depth(message: Message, topic: str) -> bool:
 
 
 def depth_of(message: Message, scale: float | None) -> DepthImage:
-    """Decode an ``Image``, or a ``CompressedImage`` by image_transport's plug-in
-    ``compressed_depth``, to ``(H, W)`` float32 metres, 0 where unknown.
+    """Decode a depth image to ``(H, W)`` float32 metres, 0 where the depth is unknown.
+
+    The message is an ``Image``, or a ``CompressedImage`` that image_transport's plug-in
+    ``compressed_depth`` made.
 
     Args:
-        scale: image units per metre; None follows REP 118: 1000 for 16 bits, 1 for 32 bits.
+        scale: image units per metre. None follows REP 118, which defines 1000 for 16-bit images and
+            1 for 32-bit images.
 
     Raises:
         ValueError: as `grey_of`.
@@ -131,8 +148,12 @@ def depth_of(message: Message, scale: float | None) -> DepthImage:
 
 
 def _compressed_depth(message: Message, scale: float | None) -> DepthImage:
-    """Decode ``compressed_depth_image_transport``: the PNG holds 16-bit depth, or, for 32-bit
-    depth, the inverse depth quantised by two numbers of the header (``ConfigHeader``)."""
+    """Decode an image of ``compressed_depth_image_transport``.
+
+    The PNG file in the message holds the values of a 16-bit depth image. For a 32-bit depth image,
+    it holds the quantised inverse depth. The two parameters of this quantisation are in the header
+    (``ConfigHeader``).
+    """
     import cv2
 
     from vslam.datasets.png import decode_with_opencv
@@ -177,11 +198,12 @@ def _pixels(message: Message, channels: int, bits: int, kind: str = "u") -> NDAr
 def camera_info(message: Message, source: str, rectified: bool) -> Document | None:
     """Convert a ``CameraInfo`` to the input of `vslam.calibration.formats.read_ros`.
 
-    Returns None for an uncalibrated camera: ``CameraInfo`` defines that its K is all zero.
+    Returns None if the camera is not calibrated. ROS defines that K is then all zero.
 
     Args:
-        source: bag and topic to name in error messages.
-        rectified: whether the images are rectified, so that the projection matrix applies.
+        source: bag and topic, for error messages.
+        rectified: whether the images are rectified. If they are, the projection matrix P describes
+            them.
     """
     # The fields are K, D, R and P in ROS 1 and k, d, r and p in ROS 2.
     K, D, R, P = (

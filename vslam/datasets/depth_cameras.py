@@ -1,4 +1,4 @@
-"""Live depth cameras, whose images and calibration come from the packages of their makers."""
+"""Live depth cameras. The packages of their makers deliver the images and the calibration."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class Grabbed:
 
     Attributes:
         timestamp: seconds.
-        left: left or colour image, ``(H, W)`` uint8, or ``(H, W, 3)`` uint8 red, green, blue.
-        second: right image, ``(H, W)`` uint8, or depth, ``(H, W)`` uint16; None if only the left
-            camera is used.
+        left: left image, ``(H, W)`` uint8; or colour image, ``(H, W, 3)`` uint8 red, green, blue.
+        second: right image, ``(H, W)`` uint8; or depth image, ``(H, W)`` uint16; or None if only
+            the left camera is used.
     """
 
     timestamp: float
@@ -45,8 +45,9 @@ class DepthCamera:
         dataset: kind of source.
         name: serial number.
         calibration: calibration of the delivered images, read from the device. If it has a
-            ``depth_scale``, the second images are the depth of the first images' pixels.
-        grab: waits for the next images; None after a timeout, or if the device is gone.
+            ``depth_scale``, the second image contains the depth of the pixels of the first image.
+        grab: waits for the next images and returns them. Returns None after a timeout, or if the
+            device was unplugged.
         stop: stops the device.
     """
 
@@ -97,7 +98,7 @@ def _play(device: DepthCamera) -> Iterator[TimedFrame]:
             yield TimedFrame(grabbed.timestamp, partial(_read, grabbed, scale), colour=colour)
             n += 1
     finally:
-        with suppress(RuntimeError):  # the device may be gone
+        with suppress(RuntimeError):  # the device may have been unplugged
             device.stop()
     raise BrokenSourceError(
         f"{device.dataset} {device.name}: stopped after {n} images; check its cable and its power."

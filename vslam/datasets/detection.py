@@ -20,12 +20,12 @@ _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 
 
 def _within(folder: Path) -> tuple[Path, ...]:
-    """A folder and its subfolders, because a data set may hold several sequences."""
+    """A folder and its subfolders, which may be the folders of sequences."""
     return (folder, *(path for path in folder.glob("*") if path.is_dir()))
 
 
-# The first kind that fits is chosen. The order matters, because the folders of data sets also
-# contain images.
+# The first kind whose test succeeds is chosen. The order matters: the folders of data sets also
+# contain images, so that folders of images must come last.
 _KINDS: tuple[tuple[str, str, Callable[[Path], bool]], ...] = (
     (
         "kitti",
@@ -53,7 +53,7 @@ _KINDS: tuple[tuple[str, str, Callable[[Path], bool]], ...] = (
 
 
 def detect_dataset(data: str) -> str:
-    """Find the value of ``--dataset`` for a folder, a file, the number of a device or a URL.
+    """Detect the value of ``--dataset`` for a folder, a file, a device number or a URL.
 
     Raises:
         InputError: there is no such file or folder, or its kind is not recognised.
@@ -93,7 +93,7 @@ def _kind_of(path: Path) -> str | None:
 
 
 def _nearest(path: Path) -> str:
-    """A hint for a folder that is one level too high or too low."""
+    """A hint for an error message if the user named the parent or a subfolder of a data set."""
     if path.resolve().name == "sequences":
         return f", but {path.resolve().parent} looks like kitti (name that folder)"
     for inside in sorted(path.glob("*")):

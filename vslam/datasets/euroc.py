@@ -1,8 +1,10 @@
-"""EuRoC MAV data, and all data in its ASL layout [Burri et al., IJRR 2016].
+"""EuRoC MAV data, and other data in the same layout (ASL) [Burri et al., IJRR 2016].
 
-FOLDER/mav0/cam0/{data.csv,sensor.yaml,data/}    left camera: times (ns) and files, calibration
-FOLDER/mav0/cam1/...                             right camera
-FOLDER/mav0/state_groundtruth_estimate0/         optional: ground truth of the body
+FOLDER/mav0/cam0/data.csv                  times (ns) and file names of the left camera's images
+FOLDER/mav0/cam0/sensor.yaml               calibration of the left camera
+FOLDER/mav0/cam0/data/                     images of the left camera
+FOLDER/mav0/cam1/...                       the same for the right camera
+FOLDER/mav0/state_groundtruth_estimate0/   optional: ground truth of the body
 """
 
 from __future__ import annotations
@@ -28,8 +30,8 @@ from vslam.errors import InputError
 from vslam.trajectory import Trajectory
 
 _HOME = "https://projects.asl.ethz.ch/datasets/euroc-mav/"
-_MOST_APART_NS = 5_000_000  # of the images of a pair, which are triggered together
-_POSE_COLUMNS = 8  # time, position, quaternion; velocities and biases may follow
+_MOST_APART_NS = 5_000_000  # between the images of a pair, which are triggered together
+_POSE_COLUMNS = 8  # time, position and quaternion; further columns are ignored
 
 
 def open_euroc(
@@ -42,23 +44,24 @@ def open_euroc(
     monocular: bool = False,
     calib: Several[Path | str] = (),
 ) -> Source:
-    """Open a sequence; its images are rectified as they are read.
+    """Open a sequence. Its images are rectified when they are read.
 
-    A frame consists of a left image and the nearest right image, at most 5 ms apart; left images
-    without a partner are skipped. The ground truth is interpolated, see
-    `vslam.datasets.association.poses_at`.
+    A frame consists of a left image and the right image that is nearest in time. Left images
+    without a right image within 5 ms are skipped. The ground truth is interpolated at the times of
+    the frames by `vslam.datasets.association.poses_at`.
 
     Args:
-        root: folder of the sequence, or of several sequences.
-        name: name of the sequence in ``root``; None opens ``root`` itself, or the only sequence in
-            it.
-        start, every, max_frames: read every ``every``-th pair from pair ``start`` on, at most
-            ``max_frames``.
+        root: folder of the sequence, or a folder that contains several sequences.
+        name: name of the sequence in ``root``. None opens ``root`` itself or, if it is not a
+            sequence, the only sequence in it.
+        start: index of the first pair to read.
+        every: read only every ``every``-th pair.
+        max_frames: largest number of pairs to read; None reads all.
         monocular: read only the left camera.
         calib: calibration files, which replace the cameras' ``sensor.yaml``.
 
     Raises:
-        InputError: data is missing or malformed, there are no pairs, or the calibration is
+        InputError: data is missing or malformed, no images form a pair, or the calibration is
             unusable.
         UnreadableImageError: the first pair cannot be decoded.
     """
@@ -80,8 +83,10 @@ def open_raw_euroc(
     max_frames: int | None = None,
     monocular: bool = False,
 ) -> RawSource:
-    """Open the unrectified images of a sequence, without calibration and ground truth; see
-    `open_euroc`."""
+    """Open the unrectified images of a sequence, without its calibration and ground truth.
+
+    The arguments are those of `open_euroc`.
+    """
     _, found, stamps, files, pairing = _select(root, name, start, every, max_frames, monocular)
     times = stamps.astype(np.float64) * 1e-9
     return checked_files("euroc", found, times, None, files, None, pairing)
@@ -100,8 +105,12 @@ def _select(
     max_frames: int | None,
     monocular: bool,
 ) -> tuple[Path, str, NDArray[np.int64], list[tuple[Path, ...]], Pairing | None]:
-    """Folder with ``cam0``, the sequence's name, times (ns) and files of the chosen frames, and the
-    pairing of all frames."""
+    """Find a sequence and select frames of it.
+
+    Returns:
+        The folder that contains ``cam0``, the name of the sequence, the times (ns) and the files of
+        the selected frames, and the pairing of all frames.
+    """
     base, found = _find(Path(root), name)
     cameras = [base / f"cam{side}" for side in range(1 if monocular else 2)]
     listed = [_read_list(camera) for camera in cameras]
@@ -117,7 +126,7 @@ def _select(
 
 
 def _find(root: Path, name: str | None) -> tuple[Path, str]:
-    """Folder with ``cam0``, and the sequence's name."""
+    """The folder that contains ``cam0``, and the name of the sequence."""
     if root.resolve().name == "mav0":  # the parent folder has the name of the sequence
         root = root.resolve().parent
     folder = find_sequence(root, name, is_euroc)
@@ -131,7 +140,7 @@ def _find(root: Path, name: str | None) -> tuple[Path, str]:
 
 
 def _read_list(camera: Path) -> tuple[list[int], list[str]]:
-    """Times (ns, increasing) and file names of a camera's images."""
+    """The times (ns, increasing) and the file names of a camera's images."""
 
     def parsed(line: str) -> tuple[int, str]:
         stamp, _, name = map(str.strip, line.partition(","))
@@ -144,7 +153,14 @@ def _read_list(camera: Path) -> tuple[list[int], list[str]]:
 
 
 def _pair(cameras: list[Path], times: list[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """``(N, cameras)`` int64 indices of the images of each frame, from ``(M,)`` times (ns)."""
+    """Pair the images of the cameras by time.
+
+    Args:
+        times: for each camera, the ``(M,)`` times of its images in nanoseconds.
+
+    Returns:
+        ``(N, cameras)`` int64 indices of the images of each frame.
+    """
     left, right = times[0], times[-1]
     rows = np.arange(len(left))
     if len(times) == 1:
@@ -195,7 +211,7 @@ def _read_ground_truth(base: Path, stamps: NDArray[np.int64]) -> NDArray[np.floa
 
 
 def _read_states(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """``(N,)`` times (ns), and ``(N, 7)`` positions and quaternions (w first)."""
+    """``(N,)`` times (ns), and ``(N, 7)`` positions (m) and quaternions (w first)."""
     times, rows = [], []
     for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
         if not line.strip() or line.startswith("#"):

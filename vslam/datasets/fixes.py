@@ -1,8 +1,10 @@
-"""GPS fixes recorded during a drive, and their local east-north-up (ENU) frame.
+"""GPS fixes that were recorded during a drive, and their local east-north-up (ENU) frame.
 
 Fixes are read from a CSV file, from the folder ``oxts`` of KITTI raw (Geiger et al., IJRR 2013), or
-from the ``sensor_msgs/NavSatFix`` messages of a ROS bag. pymap3d, in the extra ``gps``, converts
-between WGS84 coordinates and metres.
+from the ``sensor_msgs/NavSatFix`` messages of a ROS bag.
+
+The package pymap3d converts between WGS84 coordinates and metres. The extra ``gps`` of vslam
+installs it.
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ from vslam.datasets.frames import Source
 from vslam.errors import InputError
 from vslam.trajectory import read_table
 
-DEFAULT_SIGMA_M = 2.0  # for receivers that do not state their error; typical under an open sky
+# Standard deviation for receivers that do not state one. It is typical under an open sky.
+DEFAULT_SIGMA_M = 2.0
 _NAMES = {
     "time": ("time", "timestamp", "t"),
     "latitude": ("latitude", "lat"),
@@ -37,7 +40,7 @@ class Fixes:
     """M GPS fixes in the order of their times.
 
     Attributes:
-        times: ``(M,)`` seconds, by the clock of the images.
+        times: ``(M,)`` seconds, by the same clock as the images.
         geodetic: ``(M, 3)`` latitude and longitude in degrees and altitude in metres.
         sigma: ``(M, 3)`` standard deviations east, north and up, in metres.
         antenna: ``(3,)`` position of the antenna in the frame of the left camera (x right, y down,
@@ -53,11 +56,11 @@ class Fixes:
         return len(self.times)
 
     def between(self, first: float, last: float) -> Fixes:
-        """The fixes from one time to another, both included."""
+        """The fixes between two times in seconds, both included."""
         return self.select((self.times >= first) & (self.times <= last))
 
     def select(self, chosen: NDArray[np.bool_]) -> Fixes:
-        """The fixes where the ``(M,)`` bool ``chosen`` is True."""
+        """The fixes for which the ``(M,)`` bool array ``chosen`` is True."""
         return replace(
             self,
             times=self.times[chosen],
@@ -70,11 +73,11 @@ def read_fixes(path: Path, antenna: Sequence[float] | None = None) -> Fixes:
     """Read all fixes of a file or folder.
 
     Args:
-        path: one of: a CSV file with the columns ``time`` (s), ``latitude``, ``longitude``
-            (degrees), ``altitude`` (m) and optionally ``sigma`` (m), named in its first line;
-            KITTI's folder ``oxts``, whose times begin at 0; a bag.
-        antenna: position of the antenna as in ``Fixes``. If None, it is read from the calibration
-            of KITTI raw, or assumed to be that of the camera if there is none.
+        path: a CSV file, the folder ``oxts`` of KITTI raw, or a bag. The first line of a CSV file
+            names its columns: ``time`` (s), ``latitude`` and ``longitude`` (degrees), ``altitude``
+            (m) and optionally ``sigma`` (m). The times of KITTI raw are counted from the first fix.
+        antenna: position of the antenna as in `Fixes`. If None, it is read from the calibration of
+            KITTI raw. If there is no such calibration, the antenna is assumed to be at the camera.
 
     Raises:
         InputError: pymap3d is not installed, the file is missing or malformed, it contains no fix
@@ -112,10 +115,12 @@ def read_fixes(path: Path, antenna: Sequence[float] | None = None) -> Fixes:
 
 
 def require_overlap(fixes: Fixes, source: Source, path: Path) -> None:
-    """Check that some fixes were taken during the images; the end of a stream is unknown.
+    """Check that at least one fix was recorded while the images were taken.
+
+    The time of the last image of a stream is unknown, and is taken to be infinite.
 
     Raises:
-        InputError: the source is a live camera, or no fix was taken during its images.
+        InputError: the source is a live camera, or no fix was recorded while its images were taken.
     """
     if source.live:
         raise InputError(
@@ -135,15 +140,22 @@ def require_overlap(fixes: Fixes, source: Source, path: Path) -> None:
 
 
 def to_enu(geodetic: NDArray[np.float64], datum: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Convert ``(N, 3)`` latitude, longitude (degrees) and altitude (m) to ``(N, 3)`` metres east,
-    north and up of the datum, whose ``(3,)`` latitude, longitude and altitude are given."""
+    """Convert WGS84 coordinates to metres in the east-north-up frame of a datum.
+
+    Args:
+        geodetic: ``(N, 3)`` latitude and longitude (degrees) and altitude (m).
+        datum: ``(3,)`` latitude, longitude and altitude of the origin.
+
+    Returns:
+        ``(N, 3)`` metres east, north and up.
+    """
     from pymap3d import geodetic2enu
 
     return np.column_stack(geodetic2enu(*geodetic.T, *datum))
 
 
 def to_geodetic(enu: NDArray[np.float64], datum: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Invert `to_enu`."""
+    """Convert metres east, north and up to WGS84 coordinates. This is the inverse of `to_enu`."""
     from pymap3d import enu2geodetic
 
     return np.column_stack(enu2geodetic(*enu.T, *datum))
@@ -190,7 +202,7 @@ def _read_csv(path: Path) -> NDArray[np.float64]:
 
 
 def _read_oxts(folder: Path) -> NDArray[np.float64]:
-    """Rows as `_read_csv` returns them. As in KITTI odometry, times count from the first packet."""
+    """Rows as `_read_csv` returns them. As in KITTI odometry, the first packet has the time 0."""
     files = sorted((folder / "data").glob("*.txt"))
     if not files:
         raise InputError(f"--gps {folder}: no data/*.txt; name the folder oxts of KITTI raw.")
@@ -213,10 +225,11 @@ def _read_oxts(folder: Path) -> NDArray[np.float64]:
 
 
 def _antenna_of_kitti(folder: Path) -> Sequence[float] | None:
-    """The position that OXTS packets refer to (the inertial unit's) in the left grey camera, by the
-    calibration in the folder of a day of KITTI raw; None if there is none.
+    """Position of the inertial unit in the frame of the left grey camera.
 
-    The rotation of the rectification is left out: it is less than a degree.
+    OXTS packets refer to this position. It is read from the calibration in the folder of a day of
+    KITTI raw. None if there is no calibration. The rotation by which the images were rectified is
+    ignored, because it is less than a degree.
     """
     paths = [folder / name for name in ("calib_imu_to_velo.txt", "calib_velo_to_cam.txt")]
     if not all(path.is_file() for path in paths):

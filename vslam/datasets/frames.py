@@ -1,8 +1,10 @@
-"""Sources of frames: readers open them, and runs take their images from them.
+"""Sources of frames, which readers open and from which runs take their images.
 
 Every source yields its frames in the order of their times. Image files can also be read in any
-order; a video, a bag or a camera cannot seek. Readers return a `RawSource` if the images still have
-to be rectified (`vslam.datasets.rectified`), else a `Source`.
+order. A video, a bag or a camera is a stream, whose frames can only be read in order.
+
+A reader returns a `RawSource` if the images still have to be rectified (by
+`vslam.datasets.rectified`), and a `Source` if they are rectified already.
 """
 
 from __future__ import annotations
@@ -37,22 +39,23 @@ class TimedFrame:
 
     Attributes:
         timestamp: seconds.
-        read: decodes the left and the second image; safe to call in any thread. The left image is
-            ``(H, W)`` uint8. The second one is the right image, ``(H, W)`` uint8; or the depth of
-            the left image's pixels, ``(H, W)`` float32 metres, 0 if unknown; or None (monocular).
-            The argument is a map function (`vslam.camera.ImageMap`), which may decode both images
-            in parallel. Raises UnreadableImageError if a file is damaged or its size differs from
-            the calibration.
-        sides: two functions, of which one decodes only the left image of ``read`` and the other one
-            only the right image; they raise the errors of ``read``. None if both images are decoded
-            together, or if there is no right image.
-        file: file of the left image if its pixels need no rectification, else None.
+        read: decodes and returns the left and the second image. It can be called in any thread. The
+            left image is ``(H, W)`` uint8. The second one is the right image, ``(H, W)`` uint8; or
+            the depth of the left image's pixels, ``(H, W)`` float32 metres, 0 where unknown; or
+            None for a monocular source. The argument is a map function (`vslam.camera.ImageMap`),
+            which may decode both images in parallel. Raises UnreadableImageError if a file is
+            damaged or its size differs from the calibration.
+        sides: two functions. The first one decodes only the left image, the second one only the
+            right image. They raise the same errors as ``read``. None if both images can only be
+            decoded together, or if there is no right image.
+        file: file of the left image. None if the image has no file of its own, or if it has to be
+            rectified.
         colour: decodes the left image in colour, ``(H, W, 3)`` uint8 red, green, blue, or
-            ``(H, W)`` if it is grey; None if the source has no colours. Raises the errors of
-            ``read``.
-        name: file name of the left image; None if it is not in a file of its own.
-        mask: reads the mask of the left image, ``(H, W)`` uint8, 0 for pixels to ignore; None if
-            all pixels are used. Raises UnreadableImageError.
+            ``(H, W)`` if the image is grey. Raises the same errors as ``read``. None if the source
+            has no colours.
+        name: file name of the left image; None if the image has no file of its own.
+        mask: reads the mask of the left image, ``(H, W)`` uint8, which is 0 at pixels to ignore.
+            Raises UnreadableImageError. None if all pixels are used.
     """
 
     timestamp: float
@@ -93,12 +96,14 @@ class _Frames:
         return self.play is None
 
     def frames(self) -> Iterator[TimedFrame]:
-        """Yield all frames in order, from the first one on unless the source is live.
+        """Yield all frames in order.
 
-        Only the images of the current frame are held in memory.
+        Each call starts from the first frame, unless the source is live. Only the images of the
+        current frame are held in memory.
 
         Raises:
-            BrokenSourceError: after the last good frame of a truncated file or unplugged device.
+            BrokenSourceError: a file is truncated or a device was unplugged. The frames before the
+                fault are yielded first.
             InputError: the stream ends before the first selected frame.
         """
         return iter(self.stored) if self.play is None else self.play()
@@ -116,7 +121,7 @@ class _Frames:
         return len(self._stored())
 
     def read(self, index: int, image_map: ImageMap = map) -> Images:
-        """Read the left and the second image of one frame, see ``TimedFrame.read``.
+        """Read the left and the second image of one frame, as described for ``TimedFrame.read``.
 
         Raises:
             UnreadableImageError: a file is damaged, or its size differs from the calibration.
@@ -137,19 +142,18 @@ class Source(_Frames):
     Attributes:
         dataset: kind of source, for example ``kitti`` or ``video``.
         name: name of the sequence, file or device.
-        camera: calibration; ``camera.sensor`` tells which images the frames have.
-        stored: N frames that can be read in any order; see `stored_frames`.
-        play: yields the frames of a stream, which cannot seek; None if they are stored.
-        n_expected: the number of frames, approximate for a stream; None if unknown.
-        live: whether frames arrive in real time and are lost if they are not read, as from a
-            camera.
-        ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames without a pose; None without
-            ground truth.
-        pairing: how many images have no second image of the same time and are left out, in the
-            whole sequence or as far as a stream has been read; None if images are not paired by
-            time.
-        rectify_mask: rectifies an ``(H, W)`` uint8 mask of the original left images; None if the
-            images are not rectified by vslam.
+        camera: calibration. ``camera.sensor`` tells which images each frame has.
+        stored: N frames that can be read in any order; empty for a stream. See `stored_frames`.
+        play: yields the frames of a stream; None if the frames are stored.
+        n_expected: number of frames. It is approximate for a stream, and None if unknown.
+        live: whether frames arrive in real time, as from a camera, and are lost if they are not
+            read in time.
+        ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames without a pose. None if there
+            is no ground truth.
+        pairing: numbers of images with and without a second image of the same time. For a stream,
+            it counts only the images that have been read. None if images are not paired by time.
+        rectify_mask: rectifies an ``(H, W)`` uint8 mask of the original left images. None if vslam
+            does not rectify the images.
 
     Raises:
         InputError: the times of stored frames do not increase.
@@ -162,12 +166,15 @@ class Source(_Frames):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RawSource(_Frames):
-    """A source of unrectified images; see `Source` for the other attributes.
+    """A source of unrectified images.
+
+    The attributes that are not listed here have the same meaning as those of `Source`.
 
     Attributes:
-        sizes: width and height of each camera's images; one entry if the second images are depth.
-        depth: whether the second images are the depth of the first images' pixels.
-        ground_truth: poses of the left camera before rectification.
+        sizes: width and height of each camera's images. It has only one entry if the second image
+            contains depth.
+        depth: whether the second image contains the depth of the first image's pixels.
+        ground_truth: poses of the left camera as it was before rectification.
     """
 
     sizes: tuple[Size, ...]
@@ -180,11 +187,11 @@ _AnySource = TypeVar("_AnySource", Source, RawSource)
 def stored_frames(
     timestamps: NDArray[np.float64], read: Callable[[int, ImageMap], Images]
 ) -> tuple[TimedFrame, ...]:
-    """Make stored frames from a function that reads the images of any of them.
+    """Make stored frames from a function that reads the images of a given frame.
 
     Args:
         timestamps: ``(N,)`` float64 seconds, increasing.
-        read: decodes the images of the frame with a given index, see `TimedFrame`.
+        read: decodes the images of the frame with the given index, as ``TimedFrame.read`` does.
     """
     return tuple(TimedFrame(time, partial(read, k)) for k, time in enumerate(timestamps.tolist()))
 
@@ -202,7 +209,12 @@ def _call(decode: Callable[[], Image | DepthImage]) -> Image | DepthImage:
 def selected(
     source: _AnySource, *, start: int = 0, every: int = 1, max_frames: int | None = None
 ) -> _AnySource:
-    """Select every ``every``-th frame of a source from frame ``start`` on, at most ``max_frames``.
+    """Select frames of a source.
+
+    Args:
+        start: index of the first frame to read.
+        every: read only every ``every``-th frame.
+        max_frames: largest number of frames to read; None reads all.
 
     Raises:
         InputError: an option is out of range, or ``start`` is beyond the last frame.
@@ -236,7 +248,10 @@ def _play_selected(source: Source | RawSource, chosen: slice) -> Iterator[TimedF
 
 
 def _increasing(frames: Iterator[TimedFrame], name: str) -> Iterator[TimedFrame]:
-    """Skip frames that are not later than the last one yielded, with a warning for each."""
+    """Yield the frames, but skip those that are not later than the frame before.
+
+    A warning is logged for each skipped frame.
+    """
     last = None
     for frame in frames:
         if last is not None and frame.timestamp <= last:
@@ -252,9 +267,10 @@ def _increasing(frames: Iterator[TimedFrame], name: str) -> Iterator[TimedFrame]
 
 
 def frames_at(source: Source, indices: Several[int]) -> Iterator[TimedFrame]:
-    """Yield the frames with these increasing indices; a stream is read up to the last of them.
+    """Yield the frames with these increasing indices.
 
-    Fewer frames are yielded if the source ends early.
+    A stream is read up to the last of these frames. Fewer frames are yielded if the source ends
+    earlier.
     """
     if source.seekable:
         yield from (source.stored[k] for k in indices if k < len(source))
@@ -267,8 +283,8 @@ def frames_at(source: Source, indices: Several[int]) -> Iterator[TimedFrame]:
 def first_frames(source: Source) -> Source:
     """Load the first frames of a stream into memory, so that they can be read in any order.
 
-    A source that can seek is returned unchanged. A frame that cannot be decoded raises its
-    UnreadableImageError whenever it is read.
+    A source that can seek is returned unchanged. If a frame cannot be decoded, its
+    UnreadableImageError is raised later, whenever the frame is read.
 
     Raises:
         InputError: the stream has no frames.
@@ -288,7 +304,7 @@ def first_frames(source: Source) -> Source:
 
 
 def _preloaded(frame: TimedFrame) -> TimedFrame:
-    """Decode a frame now, and keep its images or the error that decoding raised."""
+    """Decode a frame now, and keep its images in memory, or the error that decoding raised."""
     images: Images | UnreadableImageError
     try:
         images = frame.read(map)

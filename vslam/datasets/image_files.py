@@ -1,4 +1,4 @@
-"""Code that the readers of image files share: finding files, and decoding images and depth."""
+"""Functions that the readers of image files share: they find files, and decode images and depth."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from vslam.datasets.frames import RawSource, Size, TimedFrame, decoded
 from vslam.errors import InputError, UnreadableImageError
 from vslam.untrusted import MOST_PIXELS, require_utf8
 
-# Distance in metres from a Kinect's projector to its camera (ORB-SLAM2, section III-A).
+# Distance in metres between the projector and the camera of a Kinect (ORB-SLAM2, section III-A).
 _VIRTUAL_BASELINE = 0.08
 _Time = TypeVar("_Time", int, float)
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
@@ -34,12 +34,17 @@ def checked_files(
     depth_scale: float | None = None,
     pairing: Pairing | None = None,
 ) -> RawSource:
-    """Make a source of image files: check that no file is empty, and decode the first images.
+    """Make a source of image files.
+
+    This function checks that no file is empty, and decodes the images of the first frame.
 
     Args:
+        dataset: kind of source.
+        name: name of the sequence.
         timestamps: ``(N,)`` float64 seconds.
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of the left camera; None without ground truth.
-        sides: N left images, optionally followed by N right images or N depth images.
+        sides: the list of the N left images. A second list may contain the N right images or the N
+            depth images.
         depth_scale: depth image units per metre; None if there are no depth images.
         pairing: see `vslam.datasets.frames.Source`.
 
@@ -114,13 +119,15 @@ def is_image(path: Path) -> bool:
 def read_image_list(
     path: Path, parsed: Callable[[str], tuple[_Time, str]], time: str, instead: str
 ) -> tuple[list[_Time], list[str]]:
-    """Read the times and file names of images from the lines of a file; # begins a comment.
+    """Read the times and file names of images from a text file with one image per line.
+
+    Lines that begin with # are comments.
 
     Args:
-        parsed: returns the time and the file name in a line; raises ValueError if the line is
+        parsed: returns the time and the file name in a line. It raises ValueError if the line is
             malformed.
-        time: what error messages call the time, such as "a time in seconds".
-        instead: what the user can do without the file, for error messages; may be empty.
+        time: description of the time for error messages, such as "a time in seconds".
+        instead: what the user can do without the file, for error messages. It may be empty.
 
     Raises:
         InputError: the file is missing, empty or malformed, or the times do not increase.
@@ -155,10 +162,13 @@ def read_image_list(
 
 
 def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bool]) -> Path | None:
-    """Find the folder of a sequence: ``root`` or a folder in it; None if there is no sequence.
+    """Find the folder of a sequence, which is ``root`` or a subfolder of it.
+
+    Returns None if there is no sequence.
 
     Args:
-        name: name of the sequence's folder; None finds ``root`` itself, or the only sequence in it.
+        name: name of the sequence's folder. None finds ``root`` itself or, if it is not a sequence,
+            the only sequence in it.
         is_sequence: returns whether a folder contains a sequence.
 
     Raises:
@@ -186,10 +196,14 @@ def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bo
 def select_frames(
     source: Path, n: int, start: int, every: int, max_frames: int | None
 ) -> NDArray[np.int64]:
-    """Indices of the frames that ``start``, ``every`` and ``max_frames`` select from n > 0 frames.
+    """Indices of the frames that ``start``, ``every`` and ``max_frames`` select.
 
     Args:
-        source: folder to name in error messages.
+        source: folder of the frames, for error messages.
+        n: number of frames, at least 1.
+        start: index of the first frame to read.
+        every: read only every ``every``-th frame.
+        max_frames: largest number of frames to read; None reads all.
 
     Raises:
         InputError: an option is out of range, or ``start`` is beyond the last frame.
@@ -205,7 +219,7 @@ def check_not_empty(path: Path) -> None:
     """Check that a file has contents.
 
     Raises:
-        UnreadableImageError: the file is missing, empty, or a dangling link.
+        UnreadableImageError: the file is missing or empty, or it is a link to a missing file.
     """
     try:
         empty = path.stat().st_size == 0
@@ -218,7 +232,8 @@ def check_not_empty(path: Path) -> None:
 def read_grey(path: Path) -> Image:
     """Decode an image file to ``(H, W)`` uint8.
 
-    Colours are converted to grey by ITU-R BT.601; 16-bit values keep their upper eight bits.
+    Colours are converted to grey as defined by ITU-R BT.601. Of 16-bit values, the upper eight bits
+    are kept.
 
     Raises:
         UnreadableImageError: the file is missing, damaged or larger than `MOST_PIXELS`.
@@ -280,8 +295,11 @@ def size_text(shape: tuple[int, ...]) -> str:
 
 
 def with_depth(camera: Camera, calibration: Calibration) -> Camera:
-    """The camera for RGB-D images, with the virtual baseline of the calibration if there is one,
-    otherwise with the baseline of a Kinect."""
+    """The camera for RGB-D images, with a virtual baseline.
+
+    The baseline is that of the calibration. If the calibration has none, the baseline of a Kinect
+    is used.
+    """
     baseline = calibration.virtual_baseline or _VIRTUAL_BASELINE
     return replace(camera, baseline=baseline, depth=True)
 

@@ -1,17 +1,20 @@
 """Folders of images: one folder for a single camera, two for a stereo pair or images with depth.
 
-The two folders of a stereo pair, or of images and depth, lie in one folder and are named as in
-`PAIRS` or `DEPTH_PAIRS`, or the second one is given by ``--right`` or ``--depth``. Images with the
-same name belong together. If the two folders have no name in common but the same number of images,
-their images are matched in order. Depth images whose names are times are matched with images less
-than 20 ms apart. The times of the images come from the first of these that exists:
+The two folders of a pair have a common parent folder and are named as in `PAIRS` or `DEPTH_PAIRS`.
+Otherwise, the second folder is given by ``--right`` or ``--depth``.
 
-1. ``--fps``;
-2. ``times.txt`` or ``timestamps.txt`` in the folder of the images or its parent, with the time of
-   one image in seconds on each line;
-3. file names that are times since 1970: seconds with a decimal point, or integers in s, ms, us or
-   ns, which are told apart by their magnitude; smaller integers count as frame numbers;
-4. ``DateTimeOriginal`` with ``SubSecTimeOriginal`` in the images' EXIF.
+Images with the same name belong together. If the two folders have no name in common but the same
+number of images, their images are matched in order. If the names of images and depth images are
+times, they are paired by time, and the times of a pair are less than 20 ms apart.
+
+The times of the images are taken from the first of these sources that exists:
+
+1. ``--fps``.
+2. ``times.txt`` or ``timestamps.txt`` in the folder of the images or in its parent. Each line
+   contains the time of one image in seconds.
+3. File names that are times since 1970. A name with a decimal point is in seconds. The magnitude
+   of an integer tells whether it is in s, ms, us or ns. Smaller integers are frame numbers.
+4. ``DateTimeOriginal`` with ``SubSecTimeOriginal`` in the EXIF data of the images.
 """
 
 from __future__ import annotations
@@ -44,12 +47,14 @@ PAIRS = (
     ("cam0/data", "cam1/data"),
 )
 DEPTH_PAIRS = (("rgb", "depth"), ("color", "depth"), ("colour", "depth"), ("image", "depth"))
-_LONGEST_INTERVAL_S = 10.0  # between images; longer intervals suggest that times have a wrong unit
+# Longest median interval between images. A longer one suggests that the times are not in seconds.
+_LONGEST_INTERVAL_S = 10.0
 _NEAR_S = 0.02  # as in TUM's associate.py
 _TIME_FILES = ("times.txt", "timestamps.txt")
 _EXIF = 0x8769  # tags of EXIF 2.32
 _DATE_TIME_ORIGINAL, _SUB_SEC_TIME_ORIGINAL = 0x9003, 0x9291
-# Smallest integer of each unit, and units per second. 1e9 s is in the year 2001.
+# Smallest integer that is read as ns, us, ms and s, and number of these units per second. 1e9 s is
+# in the year 2001.
 _UNITS = ((1e17, 10**9), (1e14, 10**6), (1e11, 10**3), (1e9, 1))
 
 
@@ -61,14 +66,14 @@ def has_images(folder: Path) -> bool:
 
 @dataclass(frozen=True)
 class ImageFolders:
-    """Files of a folder or of a pair of folders, in the order of their times.
+    """The image files of a folder or of a pair of folders, in the order of their times.
 
     Attributes:
         name: name of the folder.
         timestamps: ``(N,)`` float64 seconds, increasing.
-        sides: lists of N image files: those of the left and the right camera, those of the images
-            and the depth, or those of a single camera.
-        depth: whether the second side is the depth of the first one.
+        sides: one or two lists of N image files. The first list has the images of the only or the
+            left camera. The second list has the images of the right camera, or the depth images.
+        depth: whether the second list has depth images.
         size: width and height of the first image.
         pairing: see `vslam.datasets.frames.Source`.
     """
@@ -116,17 +121,18 @@ def open_images(
 
     Args:
         folder: folder of the images, or the folder that contains both folders of a pair.
-        right: folder of the right images; ``folder`` then contains the left images.
-        depth: folder of the depth images; ``folder`` then contains the images.
+        right: folder of the right images. If it is given, ``folder`` contains the left images.
+        depth: folder of the depth images. If it is given, ``folder`` contains the images.
         fps: frames per second, which replace the images' time stamps.
-        start, every, max_frames: read every ``every``-th frame from frame ``start`` on, at most
-            ``max_frames``.
-        sensor: ``stereo``, ``rgbd`` or ``mono`` (only the left images are read); None reads all
-            images that are found.
+        start: index of the first frame to read.
+        every: read only every ``every``-th frame.
+        max_frames: largest number of frames to read; None reads all.
+        sensor: ``stereo``, ``rgbd`` or ``mono``. With ``mono``, only the left images are read. None
+            reads all images that are found.
 
     Raises:
-        InputError: there are no images or no second images, the sides do not match, or there are
-            no usable times.
+        InputError: there are no images or no second images, the images of the two folders do not
+            match, or there are no usable times.
         UnreadableImageError: the first image cannot be decoded.
     """
     folder = Path(folder)
@@ -151,7 +157,7 @@ def open_images(
 def _find_sides(
     folder: Path, right: Path | None, depth: Path | None, sensor: str | None
 ) -> tuple[list[Path], bool]:
-    """Folders of the first and second images, and whether the second ones are depth."""
+    """The folders of the first and second images, and whether the second images are depth."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; name a folder of images with --data.")
     if right is not None and depth is not None:
@@ -179,8 +185,10 @@ def _find_sides(
 
 
 def _near_miss(folder: Path) -> str:
-    """A hint, for an error message, if the user named one side of a pair or has only one side;
-    otherwise empty."""
+    """A hint for an error message if only one folder of a pair exists or was named.
+
+    The text is empty if neither is the case.
+    """
     above = folder.resolve().parent
     for names in PAIRS + DEPTH_PAIRS:
         if all(list_images(above / name) for name in names) and folder.resolve().name in names:
@@ -193,8 +201,11 @@ def _near_miss(folder: Path) -> str:
 
 
 def _sorted_images(folder: Path) -> dict[str, Path]:
-    """Images by stem, sorted by time if all names are times, otherwise by the numbers in the names
-    (2 before 10)."""
+    """Images of a folder by stem.
+
+    They are sorted by time if all names are times. Otherwise they are sorted by the numbers in
+    their names, so that 2 comes before 10.
+    """
     images = list_images(folder)
     if not images:
         raise InputError(f"{folder}: no images in this folder; name another.")
@@ -230,7 +241,10 @@ def _matched(
 def _near_in_time(
     first: dict[str, Path], second: dict[str, Path]
 ) -> tuple[list[list[Path]], Pairing] | None:
-    """Files of both folders, paired by the times in their names; None if these are not times."""
+    """Pair the files of two folders by the times in their names.
+
+    Returns None if the names are not times.
+    """
     files = [list(side.values()) for side in (first, second)]
     times = [[_time_of_name(path) for path in side] for side in files]
     if any(time is None for side in times for time in side):
@@ -292,7 +306,7 @@ def _time_of_name(path: Path) -> float | None:
 
 
 def _time_of_exif(path: Path) -> float | None:
-    """Seconds since 1970 by the camera's clock; None if the image has no such EXIF tags."""
+    """Seconds since 1970 by the camera's clock; None if the EXIF data have no time."""
     from PIL import Image as PillowImage
 
     try:

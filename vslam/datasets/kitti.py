@@ -1,8 +1,12 @@
 """Grey stereo sequences of KITTI odometry [Geiger et al., CVPR 2012].
 
-root/sequences/NN/{image_0,image_1}/000000.png   left and right camera, rectified; .jpg, .webp too
-root/sequences/NN/{calib.txt,times.txt}
-root/poses/NN.txt                                ground truth, for 00 to 10
+root/sequences/NN/image_0/000000.png   rectified images of the left camera
+root/sequences/NN/image_1/000000.png   rectified images of the right camera
+root/sequences/NN/calib.txt            calibration
+root/sequences/NN/times.txt            times in seconds
+root/poses/NN.txt                      ground truth, for the sequences 00 to 10
+
+The images may also have other formats, such as JPEG or WebP.
 """
 
 from __future__ import annotations
@@ -34,25 +38,26 @@ def open_kitti(
     monocular: bool = False,
     calib: Several[Path | str] = (),
 ) -> Source:
-    """Open a sequence; only the selected frames must be complete.
+    """Open a sequence. Only the selected frames must be complete.
 
     The k-th row of ``times.txt`` and of the poses belongs to the k-th image. If a file has more
-    rows than there are images, an image belongs to the row with the number in its file name, so
-    that an excerpt of a sequence works with the files of the whole sequence.
+    rows than there are images, the number in the file name of an image selects its row. Therefore,
+    an excerpt of a sequence works with the files of the whole sequence.
 
     Args:
-        root: folder that contains ``sequences`` (or ``dataset/sequences``, as in KITTI's archives)
-            and, optionally, ``poses``.
+        root: folder that contains ``sequences`` and, optionally, ``poses``. As in KITTI's archives,
+            it may contain ``dataset/sequences`` instead.
         name: name of the sequence, for example ``00``.
-        start, every, max_frames: read every ``every``-th of the existing frames from frame
-            ``start`` on, at most ``max_frames``.
-        monocular: read only the left camera; the right camera's images need not exist.
-        calib: calibration files, which replace ``calib.txt``; the images are then rectified as they
-            are read.
+        start: index of the first frame to read, among the existing frames.
+        every: read only every ``every``-th frame.
+        max_frames: largest number of frames to read; None reads all.
+        monocular: read only the left camera. The right camera's images need not exist.
+        calib: calibration files, which replace ``calib.txt``. With them, the images are rectified
+            when they are read.
 
     Raises:
-        InputError: data is missing, an image lacks its partner, or calibration, times or poses are
-            unusable.
+        InputError: data is missing, an image has no partner, or the calibration, the times or the
+            poses are unusable.
         UnreadableImageError: the first pair cannot be decoded.
     """
     base = _find_root(root)
@@ -91,7 +96,7 @@ def open_kitti(
 
 
 def list_kitti(root: Path | str) -> list[tuple[str, int, int]]:
-    """The name of each sequence in ``root``, and its numbers of left and right images.
+    """List the name, the number of left images and the number of right images of each sequence.
 
     Raises:
         InputError: ``root`` holds no KITTI data.
@@ -105,11 +110,14 @@ def list_kitti(root: Path | str) -> list[tuple[str, int, int]]:
 def read_calibration(
     path: Path | str, *, width: int, height: int, monocular: bool = False
 ) -> Camera:
-    """Read P0 and P1 of ``calib.txt``, with or without the ``P0:`` at the beginning of the line.
+    """Read the projection matrices P0 and P1 from ``calib.txt``.
+
+    Lines may begin with the name of the matrix, such as ``P0:``.
 
     Args:
-        width, height: image size in pixels, which the file does not state.
-        monocular: read only P0; P1 may be missing.
+        width: image width in pixels. The file does not state the image size.
+        height: image height in pixels.
+        monocular: read only P0. The file need not contain P1.
 
     Raises:
         InputError: the file is missing or malformed, or its values do not describe a rectified
@@ -182,7 +190,7 @@ def _check_frames(
     """The files of each camera that have these stems.
 
     Raises:
-        InputError: a camera has no images, or a frame lacks one of its images.
+        InputError: a camera has no images, or an image of a frame is missing.
     """
     for side, images in enumerate(sides):
         if not images:
@@ -217,7 +225,7 @@ def _read_times(path: Path) -> NDArray[np.float64]:
 
 
 def _row_numbers(path: Path, stems: list[str], n_rows: int) -> NDArray[np.int64]:
-    """``(N,)`` row of ``times.txt`` or of the poses for each image."""
+    """``(N,)`` index of the row of ``times.txt`` or of the poses for each image."""
     fix = "take the file of this sequence from KITTI's archives"
     if n_rows < len(stems):
         raise InputError(f"{path}: only {n_rows} rows for {len(stems)} images; {fix}.")

@@ -1,4 +1,4 @@
-"""Masks that select which pixels of the left images of a source are used.
+"""Masks of the left images of a source. A mask selects the pixels that are used.
 
 As in COLMAP and OpenCV, a mask is black (0) at pixels to ignore and white (255) elsewhere. It has
 the size of the original images and is rectified together with them.
@@ -26,15 +26,16 @@ def with_masks(source: Source, path: Path, *, start: int = 0, every: int = 1) ->
     """Add masks to the frames of a source.
 
     Args:
-        path: one mask for all images, or a folder with a mask for each image. The mask of the image
-            ``7.jpg`` has the same stem and any suffix (``7.png``) or a second suffix
-            (``7.jpg.png``). For a video or bag, the name of a mask is the number of its frame.
-        start, every: the options with which the frames were selected.
+        path: one mask for all images, or a folder with a mask for each image. For the image
+            ``7.jpg``, the mask may be named ``7.png`` (with any suffix) or ``7.jpg.png``. For a
+            video or bag, the name of a mask is the number of its frame.
+        start: index of the first frame that was selected from the source.
+        every: step with which the frames were selected.
 
     Raises:
         InputError: there is no such file or folder, or a frame has no mask.
-        UnreadableImageError: the only or the first mask is not black and white, has another size
-            than the images or hides all of them. Other masks raise this error when they are read.
+        UnreadableImageError: the first mask is not black and white, its size differs from that of
+            the images, or it hides all pixels. The other masks are checked when they are read.
     """
     if not path.exists():
         raise InputError(f"--mask {path}: no such file or folder; name a mask or a folder of them.")

@@ -1,8 +1,10 @@
 """OAK-D cameras, read by depthai (version 3).
 
-A stereo pair consists of the two grey images; the device undistorts them, and vslam rectifies them
-with the device's calibration. RGB-D consists of the colour image and the depth from the device's
-stereo matching, which the device registers to the colour image.
+A stereo pair consists of the two grey images. The device undistorts them, and vslam rectifies them
+with the device's calibration.
+
+An RGB-D frame consists of the colour image and the depth. The device computes the depth by stereo
+matching, and registers it to the colour image.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ def open_oakd(serial: str, sensor: str | None) -> DepthCamera:
     """Open a camera and read its calibration.
 
     Args:
-        serial: serial number of the device; empty for the first one found.
+        serial: serial number of the device. If empty, the first device that is found is used.
         sensor: ``stereo``, ``rgbd`` or ``mono``; None means ``stereo``.
 
     Raises:
@@ -54,7 +56,7 @@ def open_oakd(serial: str, sensor: str | None) -> DepthCamera:
     def grab() -> Grabbed | None:
         try:
             images = queue.get(timedelta(seconds=TIMEOUT_S))
-        except (RuntimeError, dai.MessageQueue.QueueException):  # the device is gone
+        except (RuntimeError, dai.MessageQueue.QueueException):  # the device was unplugged
             return None
         if images is None:
             return None
@@ -70,7 +72,7 @@ def open_oakd(serial: str, sensor: str | None) -> DepthCamera:
 
 
 def _queue(dai: Any, pipeline: Any, sensor: str) -> Any:
-    """A queue of synchronised images ``left`` and ``second``, which keeps only the newest ones."""
+    """Make a queue of synchronised images ``left`` and ``second``, which keeps the newest ones."""
     create, node, socket = pipeline.create, dai.node, dai.CameraBoardSocket
 
     def output(side: Any, kind: Any = None, *, undistorted: bool = False) -> Any:
@@ -101,7 +103,7 @@ def _queue(dai: Any, pipeline: Any, sensor: str) -> Any:
 
 
 def _calibration(dai: Any, device: Any, images: Any, sensor: str) -> Calibration:
-    """The calibration, from the first images and the memory of the device."""
+    """Read the calibration from the memory of the device and from its first images."""
     socket, memory = dai.CameraBoardSocket, device.readCalibration()
     source = f"the calibration in oakd {device.getDeviceId()}"
     left = _model(images["left"], source)

@@ -1,4 +1,7 @@
-"""Sources that plug-ins of other packages read, with the same checks as vslam's own sources."""
+"""Sources that are read by plug-ins, that is, by readers in other Python packages.
+
+Their frames are checked in the same way as those of vslam's own sources.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,8 @@ def open_plugin(
 ) -> Source:
     """Let a plug-in open a source, and select frames of it.
 
-    If the plug-in fails later, a frame of a source that can seek is skipped, but a stream ends.
+    The plug-in may fail later, when a frame is read. If the source can seek, this frame is skipped.
+    If the source is a stream, the stream ends.
 
     Raises:
         InputError: the plug-in rejects its input, fails, or returns no valid `Source`.
@@ -54,7 +58,7 @@ def open_plugin(
 
 
 def _wrong_source(raw: object) -> str:
-    """What is wrong with the object that a plug-in returned; empty if nothing is."""
+    """Text that says why the object that a plug-in returned is not valid; empty if it is valid."""
     if not isinstance(raw, Source):
         return f"returned {type(raw).__name__}, not vslam.datasets.frames.Source"
     if not isinstance(raw.camera, Camera):
@@ -84,8 +88,10 @@ def _play(plugin: PlugIn, raw: Source, checked: partial[TimedFrame]) -> Iterator
 
 
 def _checked(plugin: PlugIn, root: Path, camera: Camera, frame: TimedFrame, at: str) -> TimedFrame:
-    """The same frame; whenever its images are read, their sizes and types are compared with those
-    of the camera's images."""
+    """Return the same frame, but check its images whenever they are read.
+
+    Their sizes and types must be those of the camera's images.
+    """
 
     def read(image_map: ImageMap) -> Images:
         try:
@@ -104,7 +110,7 @@ def _checked(plugin: PlugIn, root: Path, camera: Camera, frame: TimedFrame, at: 
 
 
 def _wrong_images(left: Image, second: Image | DepthImage | None, camera: Camera) -> str:
-    """The types and shapes of images that do not fit the camera; empty if they fit."""
+    """Text with the types and shapes of images that do not fit the camera; empty if they fit."""
     kinds: list[np.dtype[Any]] = [np.dtype(np.uint8)]
     if not camera.monocular:
         kinds.append(np.dtype(np.float32 if camera.depth else np.uint8))

@@ -1,9 +1,13 @@
 """Fast decoding of 8-bit grey PNG files without interlacing, as in rectified stereo sequences.
 
-OpenCV's decoder spends as much time on undoing the line filters as on decompression, because every
-pixel depends on the one on its left. Here 32 lines are decoded at once (a wavefront): each line is
-one pixel behind the line above, and a vector register holds one pixel of each line. If no pixel is
-predicted from two others, as in all files that OpenCV writes, decoding line by line is faster.
+PNG predicts every pixel from its neighbours above and on the left and stores the difference (a
+line filter). OpenCV's decoder spends as much time on undoing these filters as on decompression,
+because every pixel depends on the pixel on its left.
+
+This decoder decodes blocks of 32 lines at once (a wavefront). Each line is one pixel behind the
+line above it, and a vector register holds one pixel of each line. If no pixel of a block is
+predicted from two or more neighbours, as in all files that OpenCV writes, the block is decoded line
+by line, which is then faster.
 """
 
 from __future__ import annotations
@@ -20,19 +24,19 @@ from vslam.untrusted import MOST_PIXELS
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 GREY_8_BITS = (8, 0, 0, 0, 0)  # depth, colour type, compression, filter method, no interlacing
-# Chunks that do not change pixels. Files with other chunks are not decoded here, because these may
-# change pixels (transparency, orientation, animation).
+# Chunks that do not change pixels. Files with other chunks are not decoded here, because such a
+# chunk may change pixels (transparency, orientation, animation).
 WITHOUT_EFFECT = {b"gAMA", b"cHRM", b"sRGB", b"pHYs", b"tIME", b"tEXt", b"bKGD"}
 LANES = 32  # lines decoded at once
 _CHECK_SUM, _CHUNK, _NEXT_CHUNK = map(struct.Struct, (">I", ">I4s", ">II4s"))
-_WIDEST = 1 << 15  # pixels per line; the buffers need 65 bytes per pixel of a line
+_WIDEST = 1 << 15  # largest number of pixels per line; the buffers need 65 bytes for each of them
 
 
 def decode_png(data: bytes) -> NDArray[np.uint8] | None:
     """Decode a PNG file of 8-bit grey levels to ``(H, W)`` uint8, exactly as libpng does.
 
-    Returns None if the file is of another kind, interlaced, or damaged according to its checksums.
-    The caller can then try another decoder.
+    Returns None if the file has another format, is interlaced, or is damaged according to its
+    checksums. The caller can then try another decoder.
     """
     import deflate
 
@@ -53,7 +57,7 @@ def _contents(data: bytes) -> tuple[tuple[int, int], bytes]:
     """Height and width, and the compressed image data.
 
     Raises:
-        ValueError, struct.error: the file is of another kind, or damaged.
+        ValueError, struct.error: the file has another format, or is damaged.
     """
     chunks = _chunks(data)
     kind, header = next(chunks, (b"", b""))
@@ -72,7 +76,7 @@ def _contents(data: bytes) -> tuple[tuple[int, int], bytes]:
 
 
 def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
-    """Yield the kind and the contents of every chunk but the last one.
+    """Yield the kind and the contents of every chunk except the last one.
 
     Raises:
         ValueError, struct.error: the file is truncated, or a checksum is wrong.
@@ -114,8 +118,9 @@ def is_cut_off(data: bytes) -> bool:
 
 
 def decode_with_opencv(data: bytes, flags: int) -> NDArray[Any] | None:
-    """Decode a file of any format by ``cv2.imdecode``; None if it cannot be decoded, or is a
-    truncated PNG file (`is_cut_off`).
+    """Decode a file of any format by ``cv2.imdecode``.
+
+    Returns None if the file cannot be decoded, or if it is a truncated PNG file (`is_cut_off`).
 
     Raises:
         cv2.error: the image is too large, or the file is empty.
@@ -127,13 +132,14 @@ def decode_with_opencv(data: bytes, flags: int) -> NDArray[Any] | None:
 
 @kernel
 def unfilter(lines, image):
-    """Undo the filters of ``(H, W + 1)`` uint8 lines, each of which begins with its filter number.
+    """Undo the line filters of a decompressed image.
 
-    Lane l of step s decodes pixel s - l of the l-th line of a block. The pixels that it depends on
-    are decoded by then: the left one by the same lane one step earlier, and the one above and its
-    left neighbour by the previous lane one and two steps earlier.
+    The lines are decoded in blocks of `LANES`. Each step decodes one pixel of every line of the
+    block, and each line is one pixel behind the line above it. Therefore, the neighbours that
+    predict a pixel are always decoded in earlier steps.
 
     Args:
+        lines: ``(H, W + 1)`` uint8. Each line begins with the number of its filter.
         image: ``(H, W)`` uint8, output.
 
     Returns:
@@ -142,8 +148,9 @@ def unfilter(lines, image):
     height, width = image.shape
     n = np.uintp(width)
     steps = width + LANES - 1
-    # Both arrays hold the lanes of each step side by side. ``decoded`` has an additional first lane
-    # with the line above the block, and begins with two steps of zeros for the pixels left of the
+    # A lane is the part of a vector register that decodes one line of the block. Both arrays store
+    # the lanes of each step side by side. ``decoded`` has an additional first lane, which contains
+    # the line above the block. It begins with two steps of zeros, which are the pixels left of the
     # image.
     coded = np.zeros(steps * LANES, np.uint8)
     decoded = np.zeros((steps + 2) * (LANES + 1), np.uint8)
@@ -206,8 +213,12 @@ def add_prediction(line, line_above, out, is_first):
 def choose_filter(number, lane, left, above, corner, is_average):
     """Set the masks of a lane for a filter of the PNG specification, section 9.2.
 
-    With zeros for the pixels above, Paeth's predictor is the left pixel (Sub); with zeros for the
-    left pixels, it is the pixel above (Up).
+    The masks select which neighbours Paeth's predictor uses, because the filters Sub and Up are
+    special cases of it. If the pixels above are set to zero, the predictor is the left pixel (Sub).
+    If the left pixels are set to zero, it is the pixel above (Up).
+
+    Returns:
+        Whether the filter is known.
     """
     left[lane] = 255 if number == 1 or number == 4 else 0
     above[lane] = 255 if number == 2 or number == 4 else 0
@@ -218,7 +229,7 @@ def choose_filter(number, lane, left, above, corner, is_average):
 
 @inner_kernel
 def advance(coded, decoded, left, above, corner, is_average, steps):
-    """Decode all steps of a block."""
+    """Decode a block of lines. Each step decodes one pixel of every line, see `unfilter`."""
     lanes, row, one = np.uintp(LANES), np.uintp(LANES + 1), np.uintp(1)
     for step in range(np.uintp(steps)):
         before = decoded[step * row : (step + one) * row]  # two steps ago

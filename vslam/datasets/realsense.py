@@ -1,9 +1,10 @@
 """RealSense cameras of the D400 series, read by pyrealsense2.
 
-RGB-D consists of the colour image and the depth that the device measures with its pattern
-projector; librealsense registers the depth to the colour image. A stereo pair consists of the two
-infrared images, which the device rectifies; the projector is then off, because its dots would move
-with the camera.
+An RGB-D frame consists of the colour image and the depth that the device measures with its pattern
+projector. librealsense registers the depth to the colour image.
+
+A stereo pair consists of the two infrared images, which the device rectifies. The projector is
+switched off for stereo, because its dots would move with the camera.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ def open_realsense(serial: str, sensor: str | None) -> DepthCamera:
     """Open a camera and read its calibration.
 
     Args:
-        serial: serial number of the device; empty for the first one found.
+        serial: serial number of the device. If empty, the first device that is found is used.
         sensor: ``stereo``, ``rgbd`` or ``mono``; None means ``rgbd``.
 
     Raises:
@@ -75,7 +76,7 @@ def open_realsense(serial: str, sensor: str | None) -> DepthCamera:
                     break
             left, *second = (np.array(image.get_data()) for image in images)
             return Grabbed(images[0].get_timestamp() / 1000, left, second[0] if second else None)
-        except RuntimeError:  # the device is gone
+        except RuntimeError:  # the device was unplugged
             return None
 
     return DepthCamera("realsense", serial, calibration, grab, pipeline.stop)
@@ -120,8 +121,9 @@ def _calibration(rs: Any, profile: Any, depth_sensor: Any, sensor: str, serial: 
 def _model(rs: Any, intrinsics: Any, source: str) -> CameraModel:
     """The camera model of a stream.
 
-    Both Brown-Conrady models of librealsense project as OpenCV's model does, except for
-    second-order terms of the "inverse" one, which amount to 0.01 px for the lens of a D455.
+    Both Brown-Conrady models of librealsense are treated as OpenCV's distortion model. The model
+    named "inverse" differs from it by second-order terms, which amount to 0.01 px for the lens of a
+    D455.
     """
     i = intrinsics
     known = rs.distortion.brown_conrady, rs.distortion.inverse_brown_conrady

@@ -1,4 +1,4 @@
-"""Rectification of the images of a source as they are decoded."""
+"""Rectification of the images of a source when they are decoded."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from vslam.datasets.frames import Images, RawSource, Size, Source, TimedFrame, d
 from vslam.datasets.image_files import with_depth
 from vslam.errors import InputError
 
-# What an encoder has cut off, by the number of missing columns and rows.
+# Words for the columns and rows that an encoder has cut off, by their numbers.
 _MISSING = {(1, 0): "column", (0, 1): "row", (1, 1): "column and row"}
 
 
 def rectified(raw: RawSource, calibration: Calibration) -> Source:
-    """Rectify the images of a source as they are read.
+    """Rectify the images of a source when they are read.
 
     The rectification maps are computed once. Images that are already rectified stay unchanged.
 
@@ -38,7 +38,7 @@ def rectified(raw: RawSource, calibration: Calibration) -> Source:
         rectification = _rectification_for(calibration, raw.sizes)
     frame = partial(_rectified_frame, rectification)
     T_wc = raw.ground_truth
-    if T_wc is not None:  # the poses follow the left camera, which rectification rotates
+    if T_wc is not None:  # rectification rotates the left camera, and its poses with it
         T_wc = T_wc.copy()
         T_wc[:, :3, :3] = T_wc[:, :3, :3] @ rectification.R_left_rectified
     return Source(
@@ -99,7 +99,7 @@ def _rectified_frame(rectification: Rectification, frame: TimedFrame) -> TimedFr
 
 
 def _read(rectification: Rectification, frame: TimedFrame, image_map: ImageMap) -> Images:
-    """Read and rectify the images of a frame; depth is not interpolated between pixels."""
+    """Read and rectify the images of a frame. Depth is taken from the nearest pixel."""
     left, second = frame.read(image_map)
     sides: list[Callable[[], Image | DepthImage]] = [partial(rectification.left, left)]
     if second is not None and rectification.camera.depth:

@@ -1,4 +1,4 @@
-"""Open any source: data sets, folders of images, videos, bags and live cameras."""
+"""Opens all kinds of sources: data sets, folders of images, videos, bags and live cameras."""
 
 from __future__ import annotations
 
@@ -27,24 +27,25 @@ class SourceOptions(BaseModel):
 
     Attributes:
         data: folder, file, device number or URL. For a depth camera, it is the serial number, or
-            empty for the first one found. It is ignored for rendered towns.
-        dataset: one of `vslam.datasets.DATASETS` or of `SOURCES`, or a data set of a plug-in; None
-            detects it from ``data``.
+            empty to use the first camera that is found. It is ignored for rendered towns.
+        dataset: one of `vslam.datasets.DATASETS` or of `SOURCES`, or the name of a data set that a
+            plug-in reads. None detects the data set from ``data``.
         seq: name of the sequence of a data set, see `vslam.datasets.open_sequence`.
         calib: calibration files, see `vslam.calibration.files.read_calibration`.
         right: folder of the right images.
         depth: folder of the depth images.
         fps: frames per second, which replace the source's time stamps.
         side_by_side: whether each frame contains the left and the right image side by side.
-        topics: for a bag, the topic of the left images and the topic of the right images or the
-            depth, separated by a comma.
+        topics: for a bag, the topic of the left images, or two topics separated by a comma. The
+            second topic is that of the right images or of the depth.
         depth_scale: depth image units per metre.
-        sensor: ``stereo``, ``rgbd`` or ``mono`` (only the left images are read); None reads all
-            images of the source.
+        sensor: ``stereo``, ``rgbd`` or ``mono``. With ``mono``, only the left images are read. None
+            reads all images of the source.
         mask: mask of the left images, or folder with a mask for each image, see
             `vslam.datasets.masks.with_masks`.
-        start, every, max_frames: read every ``every``-th frame from frame ``start`` on, at most
-            ``max_frames``.
+        start: index of the first frame to read.
+        every: read only every ``every``-th frame.
+        max_frames: largest number of frames to read; None reads all.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -80,15 +81,17 @@ _NOT_MONOCULAR = ("right", "depth", "depth_scale")
 def open_source(
     options: SourceOptions, on_render: Callable[[int, int], None] | None = None
 ) -> Source:
-    """Open a data set, or images of any camera. The latter are rectified with the user's
-    calibration.
+    """Open a data set, or images of any camera.
+
+    Images of a camera are rectified with the user's calibration.
 
     Args:
         on_render: see `vslam.datasets.open_sequence`.
 
     Raises:
-        InputError: an option does not apply to this source, the source has another sensor, the
-            calibration is missing or does not fit the images, or the reader rejects the data.
+        InputError: an option does not apply to this source, the source does not have the images of
+            ``sensor``, the calibration is missing or does not fit the images, or the reader rejects
+            the data.
     """
     o = options
     dataset = o.dataset or detect_dataset(o.data)
@@ -129,14 +132,14 @@ def _open_images(dataset: str, options: SourceOptions) -> Source:
 
 
 def open_raw(options: SourceOptions) -> RawSource:
-    """Open unrectified images to calibrate their cameras; times are not used.
+    """Open unrectified images to calibrate their cameras. The times of the images are not used.
 
-    Without ``sensor``, a video or live camera is monocular unless ``side_by_side`` is set, and a
+    If ``sensor`` is None, a video or live camera is monocular unless ``side_by_side`` is set. A
     folder that directly contains images is monocular unless ``right`` is given.
 
     Raises:
-        InputError: an option does not apply to this source, the source has no unrectified images of
-            one camera or a pair, or the reader rejects the data.
+        InputError: an option does not apply to this source, the source does not have unrectified
+            images of one camera or of a stereo pair, or the reader rejects the data.
     """
     o = options
     dataset = o.dataset or detect_dataset(o.data)
@@ -171,7 +174,7 @@ def open_raw(options: SourceOptions) -> RawSource:
 def _open_stream(
     dataset: str, options: SourceOptions, monocular: bool
 ) -> tuple[RawSource, Calibration | None]:
-    """Open a video, bag or camera, and read the calibration stored in a bag or depth camera."""
+    """Open a video, bag or camera, and read the calibration if a bag or depth camera stores it."""
     o = options
     raw: RawSource
     own: Calibration | None = None

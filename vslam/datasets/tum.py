@@ -1,9 +1,12 @@
 """TUM's RGB-D sequences, and all data in their layout [Sturm et al., IROS 2012].
 
-FOLDER/rgb.txt, depth.txt    a time in seconds and an image file on each line
-FOLDER/groundtruth.txt       optional: t tx ty tz qx qy qz qw
-FOLDER/calibration.yaml      optional: the camera (docs/howto/cameras.md). Without it, the name of
-                             the folder must contain that of TUM's camera: freiburg1, 2 or 3.
+FOLDER/rgb.txt             a time in seconds and the file of a colour image on each line
+FOLDER/depth.txt           the same for the depth images
+FOLDER/groundtruth.txt     optional: t tx ty tz qx qy qz qw
+FOLDER/calibration.yaml    optional: calibration of the camera (docs/howto/cameras.md)
+
+If there is no calibration, the name of the folder must contain the name of one of TUM's cameras:
+freiburg1, freiburg2 or freiburg3.
 """
 
 from __future__ import annotations
@@ -56,27 +59,29 @@ def open_tum(
     calib: Several[Path | str] = (),
     depth_scale: float | None = None,
 ) -> Source:
-    """Open a sequence; its images are undistorted as they are read.
+    """Open a sequence. Its images are undistorted when they are read.
 
-    A frame consists of a colour image and a depth image less than 20 ms apart. They are paired like
-    in TUM's ``associate.py`` (`vslam.datasets.association.associate`). The ground truth is
-    interpolated (`vslam.datasets.association.poses_at`).
+    A frame consists of a colour image and a depth image that are less than 20 ms apart. They are
+    paired by `vslam.datasets.association.associate`, in the same way as by TUM's ``associate.py``.
+    The ground truth is interpolated by `vslam.datasets.association.poses_at`.
 
     Args:
-        root: folder of the sequence, or of several sequences.
-        name: name of the sequence in ``root``; None opens ``root`` itself, or the only sequence in
-            it.
-        start, every, max_frames: read every ``every``-th pair from pair ``start`` on, at most
-            ``max_frames``.
-        monocular: read only the colour images; depth images need not exist.
-        calib: calibration file, which replaces the folder's own and those of TUM's cameras.
-        depth_scale: depth image units per metre; None takes the calibration's value, or 5000.
+        root: folder of the sequence, or a folder that contains several sequences.
+        name: name of the sequence in ``root``. None opens ``root`` itself or, if it is not a
+            sequence, the only sequence in it.
+        start: index of the first pair to read.
+        every: read only every ``every``-th pair.
+        max_frames: largest number of pairs to read; None reads all.
+        monocular: read only the colour images. Depth images need not exist.
+        calib: calibration file, which replaces that of the folder and those of TUM's cameras.
+        depth_scale: depth image units per metre. None uses the value of the calibration or, if it
+            has none, 5000.
 
     Raises:
-        InputError: data is missing or malformed, there are no pairs, or the calibration or the
+        InputError: data is missing or malformed, no images form a pair, or the calibration or the
             ground truth is unusable.
-        UnreadableImageError: a file is empty, or the first pair cannot be decoded or differs in
-            size.
+        UnreadableImageError: a file is empty, the first pair cannot be decoded, or its two images
+            differ in size.
     """
     root = Path(root)
     folder = find_sequence(root, name, is_tum)
@@ -126,7 +131,7 @@ def is_tum(folder: Path) -> bool:
 
 
 def _read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
-    """Times (s, increasing) and image files."""
+    """The times (s, increasing) and the files of the images in a list."""
 
     def parsed(line: str) -> tuple[float, str]:
         time, _, name = line.strip().partition(" ")

@@ -1,6 +1,7 @@
-"""Video files and live cameras, read by OpenCV: monocular, or stereo pairs side by side.
+"""Video files and live cameras, read by OpenCV.
 
-Frames of a live camera are stamped with the machine's monotonic clock when they arrive.
+Each frame is one monocular image, or a stereo pair side by side. The time stamp of a live camera's
+frame is the time of the machine's monotonic clock when the frame arrives.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from vslam.untrusted import MOST_PIXELS
 _log = logging.getLogger(__name__)
 
 Capture = Any  # cv2.VideoCapture, which has no types
-_TIMEOUT_MS = 10_000  # of a camera at a URL
+_TIMEOUT_MS = 10_000  # for a camera at a URL
 _DEVICES = Path("/dev")
 _CONVERT = "convert the video, for example with ffmpeg -i VIDEO -c:v libx264 -crf 12 NEW.mp4"
 _SAME_RATE = 0.02  # relative; 30 and 29.97 frames per second count as the same rate
-# Share of the frames that may be missing at the end without an error, because containers only
-# estimate their number of frames.
+# Share of the frames that may be missing at the end without an error. The number of frames that a
+# container states is only an estimate.
 _MISSING_SHARE = 0.05
 
 
@@ -43,7 +44,8 @@ def open_capture(source: str | int, *parameters: int) -> Capture | None:
     """
     import cv2
 
-    # Otherwise, messages of FFmpeg and OpenCV would break the progress bar in the terminal.
+    # The messages of FFmpeg and OpenCV are suppressed, because they would break the progress bar in
+    # the terminal.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -66,10 +68,11 @@ def sizes_of(image: NDArray[np.uint8], side_by_side: bool, monocular: bool) -> t
 def read_sides(
     image: NDArray[np.uint8], side_by_side: bool, monocular: bool, image_map: ImageMap
 ) -> tuple[Image, Image | None]:
-    """Grey images of a frame: the frame itself, or with ``side_by_side`` its left and right half.
+    """Convert a frame to one or two grey images.
 
     Args:
         image: ``(H, W, 3)`` uint8 blue, green, red, or ``(H, W)`` grey.
+        side_by_side: whether the frame contains the left and the right image side by side.
         monocular: return only the left image.
     """
     width = image.shape[1] // 2
@@ -133,7 +136,7 @@ def open_video(
             cv2.CAP_PROP_FPS,
         )
     )
-    # Checked before the decoder allocates the memory that the header asks for.
+    # This is checked before the decoder allocates memory for the size in the header.
     if width * height > MOST_PIXELS:
         raise InputError(
             f"{path}: frames of {width:.0f}x{height:.0f} exceed the limit of "
@@ -164,8 +167,7 @@ def open_video(
 
 
 def _check_sides(source: str, side_by_side: bool, monocular: bool) -> None:
-    """Check that stereo is requested only with images side by side, because the frames of a video
-    have one image each."""
+    """Reject stereo without images side by side, because each frame of a video is one image."""
     if not side_by_side and not monocular:
         raise InputError(
             f"{source} has one image per frame; use --side-by-side if each frame holds both "
@@ -203,7 +205,7 @@ def _open(path: Path) -> Capture:
 
 
 def _images(capture: Capture) -> Iterator[tuple[float, Image]]:
-    """Yield the time in seconds and the image of each frame; then close the capture."""
+    """Yield the time in seconds and the image of each frame, and close the capture at the end."""
     import cv2
 
     try:
@@ -218,9 +220,9 @@ def _images(capture: Capture) -> Iterator[tuple[float, Image]]:
 
 
 def open_camera(device: str, *, side_by_side: bool = False, monocular: bool = False) -> RawSource:
-    """Open a camera and take a first image; its frames can be read only once.
+    """Open a camera and take a first image. The frames of the source can be read only once.
 
-    The source is named after the device number, or the URL without user name and password.
+    The name of the source is the device number, or the URL without user name and password.
 
     Args:
         device: a number, or a URL.

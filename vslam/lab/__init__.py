@@ -1,5 +1,5 @@
-"""Experiments: benchmarks of many runs, stress tests, comparisons of loop detectors on images.
+"""Experiments: benchmarks of many runs, stress tests, and comparisons of loop detectors on images.
 
-Running SLAM does not need this package; only the command line imports it
-(tests/test_dependencies.py).
+SLAM does not need this package. Only the command line imports it, which
+tests/test_dependencies.py checks.
 """

@@ -1,11 +1,11 @@
-"""Switch off the pieces of the method one at a time, and compare the errors on the same drives.
+"""Switch off the parts of the method one at a time, and compare the errors on the same drives.
 
 python tools/experiments/ablation/switch_off.py --source "--dataset synthetic --seqs demo" \\
     --perturb none,noise --out FOLDER
 
-Each ``--source`` holds the options of ``vslam bench`` that choose drives. The runs are kept in the
-folder, so that the same command continues. The table ``ablation.csv`` in it has a row for each
-piece, data set and perturbation.
+Each ``--source`` contains the options of ``vslam bench`` that choose drives. The runs are kept in
+the output folder, so that the same command resumes an interrupted experiment. The table
+``ablation.csv`` in the folder has a row for each part, data set and perturbation.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from vslam.lab.overview.schema import OverviewJson
 
 
 class Variant(NamedTuple):
-    """One piece of the method, and how to run without it.
+    """One part of the method, and how to run without it.
 
-    ``thresholds``: values of ``--config`` that switch the piece off. ``detector``: the loop
-    detector of the run. ``reference``: the variant that the run is compared with.
+    ``thresholds`` are the values of ``--config`` that switch the part off. ``detector`` is the loop
+    detector of the run. ``reference`` is the variant with which the run is compared.
     """
 
     piece: str
@@ -71,7 +71,7 @@ Measures = dict[str, float | None]
 def run(
     variant: Variant, source: str, perturb: str, arguments: list[str], out: Path
 ) -> dict[Drive, Measures]:
-    """Measure the variant on the drives of a source; finished runs in the folder are kept."""
+    """Measure a variant on the drives of a source. Finished runs in the folder are kept."""
     command = ["vslam", "bench", *shlex.split(source), *arguments]
     if variant.thresholds:
         command += ["--config", variant.thresholds]
@@ -81,7 +81,7 @@ def run(
     report = OverviewJson.model_validate_json((out / "report.json").read_bytes())
 
     def applied(perturbs: str) -> str:
-        """The perturbation of the images, without changes of the town, such as moving cars."""
+        """The perturbation of the images. Changes of the town, such as moving cars, are removed."""
         for one in perturb.split(","):
             if one != "none" and perturbs.endswith(one.replace("+", ",")):
                 return one
@@ -99,9 +99,11 @@ def row_of(
     runs: dict[Drive, Measures],
     reference: dict[Drive, Measures],
 ) -> dict[str, object]:
-    """A row of the table: errors without the piece divided by those with it, and loops.
+    """Make a row of the table.
 
-    ``condition``: data set and ``--perturb`` of the drives that the row is about.
+    It has the errors without the part divided by the errors with it, and the numbers of loops.
+
+    ``condition`` is the data set and the ``--perturb`` of the drives of this row.
     """
     drives = [drive for drive in runs if condition == (drive[0], drive[2])]
 

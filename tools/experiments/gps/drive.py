@@ -2,17 +2,17 @@
 
     python tools/experiments/gps/drive.py RUN [RUN ...] --seeds 5
 
-The script simulates a receiver along the ground truth of finished runs: one fix per second, with
-white noise, a bias that follows a random walk, gaps, and jumps by 20 m that last ten seconds. It
-prints the RMSE of the positions, as a mean over the seeds:
+The script simulates a GPS receiver along the ground truth of finished runs. The receiver gives one
+fix per second. The fixes have white noise, a bias that follows a random walk, gaps, and jumps by
+20 m that last ten seconds. The script prints the RMSE of these positions, as a mean over the seeds:
 
-- of the run without GPS, after the alignment for its sensor;
-- of the fixes;
-- of the fixes interpolated at the times of the frames, with and without SE3 alignment;
-- of the run with GPS, with and without SE3 alignment;
-- with ``--antenna``, of the run with GPS if the antenna is taken to be at the camera.
+- the run without GPS, after the alignment for its sensor;
+- the fixes;
+- the fixes interpolated at the times of the frames, with and without SE3 alignment;
+- the run with GPS, with and without SE3 alignment;
+- with ``--antenna``, the run with GPS if the antenna is assumed to be at the camera.
 
-Then it prints the median CPU time that adding the fixes took after the drive.
+Finally, it prints the median CPU time that was needed to add the fixes after the drive.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from vslam.run.outcome import alignment_of
 from vslam.trajectory import Trajectory, read_trajectory
 
 DATUM = np.array([49.0, 8.4, 115.0])
-# The axes x, y and z of the ground truth point right, down and ahead of the first camera, which is
-# assumed to look north-east.
+# The axes x, y and z of the ground truth point right, down and ahead of the camera at the first
+# frame. It is assumed that this camera looks north-east.
 R_ENU_TRUTH = np.array([[1, 0, 1], [0, 2**0.5, 0], [-1, 0, 1]])[[0, 2, 1]] / 2**0.5
 R_ENU_TRUTH[2] *= -1.0
 
@@ -69,7 +69,7 @@ def main() -> None:
 
 
 def measure(run: Path, options: argparse.Namespace) -> None:
-    """Print the rows of a run: means over the seeds."""
+    """Print the rows of a run. The values are means over the seeds."""
     visual = read_trajectory(run / "trajectory.tum")
     truth = read_trajectory(run / "ground_truth_kitti.txt", visual.timestamps)
     truth = Trajectory(truth.timestamps, truth.T_wc.copy())
@@ -97,7 +97,7 @@ def measure(run: Path, options: argparse.Namespace) -> None:
             assert len(track.anchored.used) == len(fixes)
             wrongly = float(np.mean(~track.anchored.used[~is_jump]))
             missed = int(np.sum(track.anchored.used & is_jump))
-            # The datum of a run is its first fix.
+            # The first fix is the datum of a run.
             placed = to_enu(to_geodetic(track.trajectory.T_wc[:, :3, 3], track.datum), DATUM)
             rows[name].append((*errors(placed, truth), wrongly, missed))
     alignment = alignment_of(stored.camera.sensor)
@@ -115,7 +115,7 @@ def measure(run: Path, options: argparse.Namespace) -> None:
 
 
 def errors(positions: NDArray[np.float64], truth: Trajectory) -> tuple[float, float]:
-    """RMSE of ``(N, 3)`` positions in metres, after SE3 alignment and without."""
+    """RMSE of ``(N, 3)`` positions in metres, with and without SE3 alignment."""
     T_wc = truth.T_wc.copy()
     T_wc[:, :3, 3] = positions
     aligned = evaluate_trajectory(Trajectory(truth.timestamps, T_wc), truth, "se3").ate_rmse_m
@@ -126,7 +126,10 @@ def errors(positions: NDArray[np.float64], truth: Trajectory) -> tuple[float, fl
 def antenna_at(
     times: NDArray[np.float64], truth: Trajectory, antenna: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """``(M, 3)`` true positions of the antenna at ``(M,)`` times, by its place at the camera."""
+    """``(M, 3)`` true positions of the antenna at ``(M,)`` times.
+
+    ``antenna`` is the position of the antenna in the camera frame.
+    """
     points = truth.T_wc[:, :3, :3] @ antenna + truth.T_wc[:, :3, 3]
     return np.column_stack([np.interp(times, truth.timestamps, x) for x in points.T])
 
@@ -134,7 +137,7 @@ def antenna_at(
 def simulated(
     truth: Trajectory, options: argparse.Namespace, seed: int
 ) -> tuple[Fixes, NDArray[np.bool_]]:
-    """Fixes along the ground truth, and whether each fix lies in a jump."""
+    """Simulate fixes along the ground truth. Returns them, and whether each fix lies in a jump."""
     rng = np.random.default_rng(seed)
     first, last = truth.timestamps[[0, -1]]
     times = np.arange(first, last, 1.0 / options.hertz)

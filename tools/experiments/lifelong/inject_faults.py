@@ -1,6 +1,7 @@
 r"""Make every part of a run fail once, and record the run's messages and results.
 
-tests/faults.py defines the faults and where they are injected, and it judges the outcomes.
+tests/faults.py defines the faults and the points at which they are injected. It also judges the
+outcomes.
 
     python tools/experiments/lifelong/inject_faults.py --out docs/research/lifelong/faults.csv
 """
@@ -18,7 +19,7 @@ from collections.abc import Collection
 from dataclasses import astuple, fields
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads do not survive a fork
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # a forked process has no other threads
 sys.path.insert(0, str(Path(__file__).parents[3] / "tests"))
 from faults import FAULTS, POINTS, Row, inject, load_everything, run_in_fork, write_ring
 
@@ -61,7 +62,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="CSV table of all injections")
     options = parser.parse_args()
-    work = Path(tempfile.mkdtemp())  # a fork would delete a TemporaryDirectory when it ends
+    work = Path(tempfile.mkdtemp())  # a forked process would delete a TemporaryDirectory at its end
     try:
         rows = inject_all(work, options.points, options.faults, options.seed, once=options.once)
     finally:

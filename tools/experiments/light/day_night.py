@@ -3,11 +3,12 @@
     python tools/experiments/light/day_night.py DATASET SEQ[=MAP_FRAMES] ... --out TABLE.csv
 
 The map is made from the first MAP_FRAMES frames and saved. Then each later left image is localised
-in the map, without use of the other images. Without MAP_FRAMES, the map is made from the whole
-drive, and the images of this drive except its keyframes are localised. A pose is right if it is
-within 2 m and 15 degrees of the ground truth, as in AirSLAM's experiment on the reuse of maps (Xu
-et al., T-RO 2025, section VII-D). Poses are compared relative to the nearest frame of the map, so
-that the drift of the map does not count.
+in the map, without using the other images. If MAP_FRAMES is not given, the map is made from the
+whole drive. In this case, all images of the drive except its keyframes are localised.
+
+A pose counts as right if it is within 2 m and 15 degrees of the ground truth. These limits are
+those of AirSLAM's experiment on the reuse of maps (Xu et al., T-RO 2025, section VII-D). Poses are
+compared relative to the nearest frame of the map, so that the drift of the map does not count.
 """
 
 from __future__ import annotations
@@ -47,9 +48,9 @@ class Day:
     """A saved map.
 
     Attributes:
-        path: its file.
+        path: file of the map.
         T_wc: ``(N, 4, 4)`` poses of the N frames from which the map was made.
-        keyframes: numbers of the frames that are keyframes.
+        keyframes: indices of the frames that are keyframes.
     """
 
     path: Path
@@ -84,8 +85,11 @@ class Localiser:
     """Searches a saved map for single images."""
 
     def __init__(self, day: Day, detector: str, candidates: int) -> None:
-        """``candidates``: number of keyframes with which an image is compared, both by ORB and by
-        learned descriptors."""
+        """Load the map.
+
+        ``candidates`` is the number of keyframes with which an image is compared. It applies to ORB
+        and to learned descriptors.
+        """
         config = as_config(
             {
                 "relocalization": {"max_candidates": candidates},
@@ -100,7 +104,7 @@ class Localiser:
         self._relocaliser = Relocaliser(slam.context, places.locate, recognise)
 
     def pose(self, image: Image) -> Matrix | None:
-        """``(4, 4)`` pose T_wc in the world of the map; None if localisation fails."""
+        """``(4, 4)`` pose ``T_wc`` in the world frame of the map; None if localisation fails."""
         extracted = FrameImages(image, lambda: None, self._context).extracted
         frame = Frame.of(extracted, self._context.camera, image=image)
         lost = Found(TrackingState.LOST)
@@ -109,11 +113,11 @@ class Localiser:
 
 
 def is_right(T_wc: Matrix, k: int, day: Day, truth: Matrix) -> bool:
-    """Whether a pose is within the limits of the ground truth.
+    """Whether a pose is near enough to the ground truth.
 
     Args:
-        T_wc: ``(4, 4)`` in the world of the map.
-        k: number of the image's frame.
+        T_wc: ``(4, 4)`` pose in the world frame of the map.
+        k: index of the frame to which the image belongs.
         truth: ``(N, 4, 4)`` true poses of all frames.
     """
     away = np.linalg.norm(truth[: len(day.T_wc), :3, 3] - truth[k, :3, 3], axis=1)
@@ -124,7 +128,7 @@ def is_right(T_wc: Matrix, k: int, day: Day, truth: Matrix) -> bool:
 
 
 def rows_of(source: Source, n_map: int | None, options: argparse.Namespace) -> Iterator[list]:
-    """A row for each detector, number of candidates and perturbation."""
+    """Yield a row for each detector, number of candidates and perturbation."""
     n = len(source.timestamps)
     for detector in options.detectors:
         with tempfile.TemporaryDirectory() as folder:

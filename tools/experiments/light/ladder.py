@@ -1,4 +1,4 @@
-"""Write a table of the runs of ``vslam bench`` that shows which runs fail by AirSLAM's rules.
+"""Write a table that shows which runs of ``vslam bench`` fail by AirSLAM's rules.
 
 vslam bench ... --perturb none,dark:1,dark:2 --out FOLDER
 python tools/experiments/light/ladder.py FOLDER TABLE.csv

@@ -2,14 +2,17 @@
 
     python tools/experiments/local_descriptors/image_test.py PHOTOS multiview webcams
 
-PHOTOS is a folder of sets, SET/PLACE/*. Every image is a query, which is paired with a right image
-and with two wrong images. The right image is the most similar image of the same place, by the
-capsule network. The view of a webcam never changes; its right image is of another hour, and the
-query is warped. The wrong images are the two most similar images of other places.
+PHOTOS is a folder of sets of photographs, with the images in SET/PLACE/. Every image is a query. It
+is paired with a right image and with two wrong images. The similarity of images is that of the
+capsule network.
 
-The script prints the share of right and of wrong pairs that pass each test. Both tests count the
-matches of coarse cells that one homography explains: by share, they must cover 18 % of the image;
-by number, there must be 90 of them.
+- The right image is the most similar image of the same place. The view of a webcam never changes.
+  Therefore, the right image of a webcam was taken at another hour, and the query is warped.
+- The wrong images are the two most similar images of other places.
+
+The script prints the share of right pairs and the share of wrong pairs that pass each test. Both
+tests count the matches of coarse cells that fit one homography. In the test by share, the matches
+must cover 18 % of the image. In the test by number, there must be 90 matches.
 """
 
 from __future__ import annotations
@@ -48,7 +51,12 @@ def main() -> None:
 
 
 def measure(folder: Path, of_place: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """``(N, 2)`` bool: whether each right and each wrong pair passes by share and by number."""
+    """Test the pairs of a set.
+
+    Returns:
+        ``(N, 2)`` bool for the right pairs, and the same for the wrong pairs: whether a pair passes
+        the test by share, and whether it passes the test by number.
+    """
     gallery, places = [], []
     for place in sorted(path for path in folder.iterdir() if path.is_dir()):
         files = sorted(place.iterdir())
@@ -75,7 +83,7 @@ def measure(folder: Path, of_place: int) -> tuple[NDArray[np.bool_], NDArray[np.
 
 
 def warped(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """The image under a homography that moves its corners by up to 12 % of its size."""
+    """Warp an image by a homography that moves its corners by up to 12 % of its size."""
     height, width = image.shape
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
     moved = corners + rng.uniform(-0.12, 0.12, (4, 2)) * [width, height]

@@ -2,9 +2,9 @@
 
     python tools/experiments/masks/hood.py --data TOWNS --seq kitti07 --rows 0.2 0.35
 
-A hood with a random texture is painted over the lower part of the images of a stereo drive: an arc
-that stays in place while the street moves. The script prints lost frames, inliers and ATE of the
-drive without the hood, with the hood, and with the hood and a mask.
+A hood with a random texture is painted over the lower part of the images of a stereo drive. The
+hood stays in place while the street moves. The script prints the lost frames, the inliers and the
+ATE of the drive without the hood, with the hood, and with the hood and a mask.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from vslam.frontend.masks import Mask
 from vslam.slam import Slam
 from vslam.trajectory import Trajectory
 
-DISPARITY = 90  # of the hood, in pixels; large, because the hood is near
+DISPARITY = 90  # disparity of the hood in pixels; it is large because the hood is near
 
 
 def main() -> None:
@@ -63,7 +63,7 @@ def main() -> None:
 
 
 def draw_hood(height: int, width: int, rows: float) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """``(H, W)`` texture of a hood, and its mask: 0 on the hood, 255 elsewhere.
+    """Draw the ``(H, W)`` texture of a hood, and its mask (0 on the hood, 255 elsewhere).
 
     The upper edge of the hood is an arc. In the middle column of the image, the hood covers the
     share ``rows`` of all rows.

@@ -1,5 +1,7 @@
 """Print the boundaries of two systems side by side, from a ``boundaries.csv`` of ``vslam stress``.
 
+The boundary of a system is the strength of a perturbation at which it fails.
+
 python tools/experiments/stress/boundary_table.py docs/research/stress/kitti00.csv bow orbslam3
 """
 
@@ -15,10 +17,10 @@ NAMES = {"bow": "vslam", "orbslam3": "ORB-SLAM3"}
 
 
 def table(path: Path, ours: str, theirs: str) -> str:
-    """A Markdown table with a row for each law under which one of the systems was run."""
+    """A Markdown table with a row for each law under which at least one of the systems was run."""
     with path.open(newline="") as file:
         rows = {(row["law"], row["system"]): row for row in csv.DictReader(file)}
-    # Compared with another system, the detector bow stands for vslam.
+    # In a comparison with another system, the detector bow is called vslam.
     known = NAMES if theirs in NAMES else {}
     names = [known.get(system, f"`{system}`") for system in (ours, theirs)]
     columns = [f"{name} {what}" for name in names for what in ("holds to", "fails at")]

@@ -2,9 +2,9 @@
 
     python tools/experiments/uncertainty/costs.py --data "$KITTI_ROOT" --seq 06 --frames 51
 
-The script runs a stereo drive alternately without a mask and with a mask that hides nothing, so
-that both runs otherwise do the same work, and prints the medians of CPU times. It fails if the
-trajectories of any two runs differ.
+The script runs a stereo drive alternately without a mask and with a mask that hides nothing. Apart
+from the mask, both runs do the same work. The script prints the medians of the CPU times. It fails
+if the trajectories of any two runs differ.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=51)
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()
-    n, camera = options.repeats, run(options, None).sequence.camera  # compiles the kernels
+    n, camera = options.repeats, run(options, None).sequence.camera  # this compiles the kernels
     spent: dict[str, list[float]] = defaultdict(list)
     for owner, name in (
         (tracking, "pose_covariance"), (tracking, "offset_effect"), (Odometry, "move")
@@ -78,7 +78,7 @@ def run(options: argparse.Namespace, mask: Path | None) -> RunOutcome:
 
 
 def timed(function: Callable[..., Any], times: list[float]) -> Callable[..., Any]:
-    """The same function, which also appends the CPU seconds of each call to ``times``."""
+    """Wrap a function, so that the CPU seconds of each call are appended to ``times``."""
 
     def called(*args: Any, **more: Any) -> Any:
         start = time.thread_time()

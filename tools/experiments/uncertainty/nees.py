@@ -2,11 +2,11 @@
 
     python tools/experiments/uncertainty/nees.py DATA SEQ[:START[:FRAMES]] ... [--perturb LAW ...]
 
-DATA is a folder in KITTI's format with exact ground truth, for example of rendered drives. Every
+DATA is a folder in KITTI's format with exact ground truth, for example with rendered drives. Every
 drive is run under every perturbation. The script prints the normalised estimation error squared
 (NEES; Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, 2001, 5.4) of the
-motion over 1 s and 10 s, divided by its six degrees of freedom. Its mean is 1 if the covariances
-are consistent, and larger if they are too small.
+motion over 1 s and over 10 s. The NEES is divided by the six degrees of freedom. Its mean is 1 if
+the covariances are consistent, and larger if they are too small.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from vslam.slam import Slam
 from vslam.trajectory import Trajectory
 
 INTERVALS_S = (1.0, 10.0)
-SKIPPED = 20  # frames at the start, when the map is new
-EVERY = 7  # frames between the starts of intervals; fewer would give nearly the same errors again
+SKIPPED = 20  # frames at the start that are left out, because the map is still new
+EVERY = 7  # frames between the starts of intervals; overlapping intervals have nearly equal errors
 
 
 def results_of(source: Source, law: str, seed: int) -> list[TrackResult]:

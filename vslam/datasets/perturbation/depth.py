@@ -1,4 +1,4 @@
-"""Dense depth of an image for laws that depend on distance, by semi-global matching."""
+"""Dense depth of an image by semi-global matching, for perturbations that depend on distance."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera, DepthImage, Image
 
-_SHRINK = 2  # matching at half size takes a fifth of the time, and fog needs no finer edges
+_SHRINK = 2  # matching at half size takes a fifth of the time and is accurate enough for fog
 _BLOCK = 5
 _NEAREST_M = 3.0  # nearest depth in the search range
 
@@ -15,15 +15,21 @@ _NEAREST_M = 3.0  # nearest depth in the search range
 def dense_depths(
     camera: Camera, left: Image, second: Image | DepthImage | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """``(H, W)`` depth along z (m) of the left image's pixels, and of the right image's pixels
-    (None without a right image). It is infinite where it is very large or unknown, for example in
-    the sky.
+    """Estimate the depth of all pixels.
+
+    If the second image is a right image, it is matched with the left one (SGBM; Hirschmueller,
+    PAMI 2008).
 
     Args:
         camera: calibration of the images.
         left: ``(H, W)`` uint8.
-        second: the right image, which is matched with the left one (SGBM; Hirschmueller, PAMI
-            2008), or the depth of the left image's pixels, 0 where unknown.
+        second: right image, ``(H, W)`` uint8; or the depth of the left image's pixels, ``(H, W)``
+            float32 metres, 0 where unknown.
+
+    Returns:
+        ``(H, W)`` depth along z of the left image's pixels in metres, and the same for the right
+        image, or None if there is no right image. The depth is infinite where it is very large or
+        unknown, for example in the sky.
     """
     if second is not None and second.dtype != np.uint8:
         depth = np.asarray(second, np.float32)
@@ -38,8 +44,15 @@ def dense_depths(
 def disparity(
     camera: Camera, image: Image, other: Image, *, mirrored: bool = False
 ) -> NDArray[np.float32]:
-    """``(H, W)`` float32 disparities, in pixels, of the pixels of ``image``, which is the left
-    image of a pair or, with ``mirrored``, the right one. They are 0 in rows without any match."""
+    """Disparities of the pixels of ``image``.
+
+    Args:
+        image: ``(H, W)`` uint8, the left image of a pair, or the right image if ``mirrored``.
+        other: ``(H, W)`` uint8, the other image of the pair.
+
+    Returns:
+        ``(H, W)`` float32 pixels; 0 in rows without any match.
+    """
     import cv2
 
     height, width = image.shape
@@ -69,8 +82,11 @@ def disparity(
 
 
 def _filled(found: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Give pixels without a match the smaller disparity of the two nearest matches in their row,
-    because occluded pixels belong to the background (rule of Geiger et al., CVPR 2012)."""
+    """Fill pixels without a match from the two nearest matches in their row.
+
+    They get the smaller one of both disparities, because occluded pixels belong to the background
+    (rule of Geiger et al., CVPR 2012).
+    """
     known = found > 0
     columns = np.broadcast_to(np.arange(found.shape[1]), found.shape)
     before = np.maximum.accumulate(np.where(known, columns, -1), axis=1)

@@ -1,4 +1,4 @@
-"""Laws of the lens and of dirt on the glass in front of it."""
+"""Perturbations by the lens, and by dirt on the glass in front of it."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _vignetting(stops: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 
 def _dirt(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
-    """Blobs that differ between the two cameras and stay the same during the whole drive."""
+    """Cover the image with blobs, which differ between the cameras but stay the same all drive."""
     opacity = [_blobs(percent / 100.0, [*stream, side], scene) for side in range(2)]
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:
@@ -80,8 +80,10 @@ def _blobs(share: float, seed: list[int], scene: Scene) -> NDArray[np.float32]:
 
 
 def _flare(greys: float, stream: RandomStream, scene: Scene) -> PairLaw:
-    """A sun that stays at one place in the image. The place is the same in both cameras, because
-    the sun is far away."""
+    """Add the glare of a sun that stays at one place in the image.
+
+    The place is the same in both cameras, because the sun is far away.
+    """
     camera = scene.camera
     rng = np.random.default_rng(stream)
     sun = np.array([rng.uniform(0.15, 0.85) * camera.width, rng.uniform(0.05, 0.3) * camera.height])
@@ -102,7 +104,7 @@ def _flare(greys: float, stream: RandomStream, scene: Scene) -> PairLaw:
 def _cosine_to(
     sun: NDArray[np.float64], x: NDArray[np.float32], y: NDArray[np.float32], scene: Scene
 ) -> NDArray[np.float64]:
-    """Cosine of the angle between the rays of pixels and the ray of the pixel ``sun``."""
+    """Cosine of the angle between the viewing rays of pixels and that of the pixel ``sun``."""
     camera = scene.camera
     ray = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)])
     to_sun = np.array([(sun[0] - camera.cx) / camera.fx, (sun[1] - camera.cy) / camera.fy, 1.0])

@@ -1,4 +1,7 @@
-"""Types of laws: laws that change one image, and laws that need both images or the scene."""
+"""Types of laws (kinds of perturbation).
+
+Some laws change one image at a time. Others need both images of a frame, or the scene.
+"""
 
 from __future__ import annotations
 
@@ -15,24 +18,28 @@ from vslam.datasets.frames import Source
 from vslam.errors import InputError
 
 RandomStream = tuple[int, int]
-"""The user's seed and a number for the law; the seeds of all random generators of the law begin
-with these two numbers."""
+"""The user's seed, and a number for the law.
+
+The seeds of all random generators of the law begin with these two numbers.
+"""
 
 Law = Callable[[int, float, int, Image], Image]
-"""``(frame, t, side, image) -> image`` of the same shape; t is in seconds since the first frame;
-side is 0 for the left and 1 for the right image."""
+"""A function ``(frame, t, side, image) -> image``, which returns an image of the same shape.
+
+t is the time in seconds since the first frame. side is 0 for the left and 1 for the right image.
+"""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """The images of one frame, which are passed from law to law.
+    """The images of one frame, which are passed from one law to the next.
 
     Attributes:
         index: index of the frame.
         t: seconds since the first frame.
-        left: ``(H, W)`` uint8.
-        second: the right image, ``(H, W)`` uint8, or the depth image, ``(H, W)`` float32; None for
-            a monocular source.
+        left: left image, ``(H, W)`` uint8.
+        second: right image, ``(H, W)`` uint8; or depth image, ``(H, W)`` float32 metres; or None
+            for a monocular source.
         clean: both images before any law changed them.
     """
 
@@ -55,13 +62,13 @@ PairLaw = Callable[[Pair], Pair]
 
 @dataclass(frozen=True)
 class Scene:
-    """The data of a source that a law may use besides the images of a frame.
+    """The data of a source that a law may use in addition to the images of a frame.
 
     Attributes:
         camera: calibration of the source.
-        times: ``(N,)`` seconds since the first frame; None for a source that cannot seek.
-        T_wc: ``(N, 4, 4)`` true poses, NaN where unknown; None if there are none.
-        read: reads the images of any frame; None for a source that cannot seek.
+        times: ``(N,)`` seconds since the first frame; None if the source cannot seek.
+        T_wc: ``(N, 4, 4)`` true camera poses, NaN where unknown; None if there are none.
+        read: reads the images of the frame with the given index; None if the source cannot seek.
     """
 
     camera: Camera
@@ -91,7 +98,7 @@ def check_need(law: str, need: Need, scene: Scene) -> None:
     """Check that the source has the data that a law needs.
 
     Raises:
-        InputError: the source does not have these data.
+        InputError: the source does not have this data.
     """
     has = {
         "right": scene.camera.sensor == "stereo",
@@ -111,7 +118,7 @@ class SceneLaw:
     make: Callable[[Scene], PairLaw]
 
     def bound_to(self, scene: Scene) -> PairLaw:
-        """The law for this scene.
+        """Bind the law to a scene.
 
         Raises:
             InputError: the source does not have the data that the law needs.
@@ -126,23 +133,25 @@ class SceneLaw:
 
 @dataclass(frozen=True)
 class LawKind:
-    """A kind of law, which makes laws of any strength and seed.
+    """A kind of perturbation, which makes laws of any strength and seed.
 
     Attributes:
-        make: ``(strength, stream) -> Law``, or ``(strength, stream, scene) -> PairLaw`` if
-            ``of_scene``.
+        make: ``(strength, stream) -> Law``. If ``of_scene`` is set, it is
+            ``(strength, stream, scene) -> PairLaw``.
         unit: unit of the strength.
-        default: strength if none is given.
-        weakest, strongest: range that ``vslam stress`` searches. ``strongest`` is the smaller
-            number if a small strength has a large effect, for example a short visibility in fog.
+        default: strength that is used if none is given.
+        weakest: weakest strength that ``vslam stress`` tries.
+        strongest: strongest strength that ``vslam stress`` tries. It is the smaller number of the
+            two if a small number has a large effect, for example a short visibility in fog.
         about: a description in a few words.
-        least, most: allowed range of strengths.
+        least: smallest allowed strength.
+        most: largest allowed strength.
         logarithmic: whether ``vslam stress`` compares strengths by their ratio instead of their
             difference.
         drawn: whether the effect is random, so that the images depend on the seed.
         needs: data that the source must have.
         of_scene: whether the law needs the scene.
-        sides: ``both``, or ``one`` for a fault of the stereo rig.
+        sides: ``both`` if the law changes both images, ``one`` for a fault of the stereo rig.
     """
 
     make: Callable[..., Law | PairLaw]
@@ -168,7 +177,7 @@ class LawKind:
 
 @dataclass(frozen=True)
 class EachSide:
-    """Apply a law of one image to the left and the right image; depth stays unchanged."""
+    """Applies a law for one image to both images. Depth stays unchanged."""
 
     law: Law
 

@@ -19,7 +19,9 @@ from vslam.errors import DroppedFrameError, InputError, did_you_mean
 
 @dataclass(frozen=True)
 class Perturbation:
-    """Laws that are applied one after the other; without laws, images stay unchanged.
+    """Laws that are applied to each frame one after the other.
+
+    If there are no laws, the images stay unchanged.
 
     Attributes:
         name: canonical spelling, for example ``none`` or ``brightness:1.5,blur:0.5``.
@@ -30,7 +32,9 @@ class Perturbation:
     laws: tuple[PairLaw | SceneLaw, ...] = ()
 
     def bound_to(self, source: Source) -> Perturbation:
-        """Prepare the perturbation for one source, because some laws need its depth or poses.
+        """Prepare the perturbation for one source.
+
+        This is needed because some laws use the depth or the poses of the source.
 
         Raises:
             InputError: the source does not have the data that a law needs.
@@ -44,13 +48,17 @@ class Perturbation:
     def apply(
         self, index: int, t: float, left: Image, second: Image | DepthImage | None
     ) -> tuple[Image, Image | DepthImage | None]:
-        """Perturb the images of frame ``index``, ``t`` seconds after the first frame; thread-safe.
+        """Perturb the images of a frame. This method is thread-safe.
 
-        Depth images stay unchanged, because depth sensors have their own light source. The left
-        image depends on the second one only in fog, whose depth is computed from both images.
+        Depth images stay unchanged, because depth sensors have their own light source. Fog is the
+        only law for which the left image depends on the second one, because its depth is computed
+        from both images.
 
         Args:
-            left, second: images as in `vslam.datasets.frames.TimedFrame`.
+            index: index of the frame.
+            t: seconds since the first frame.
+            left: left image, as in `vslam.datasets.frames.TimedFrame`.
+            second: right image, depth image or None, as in `vslam.datasets.frames.TimedFrame`.
 
         Raises:
             DroppedFrameError: the perturbation drops the frame.
@@ -65,13 +73,13 @@ def parse_perturbation(spec: str, seed: int) -> Perturbation:
     """Make a perturbation from the value of ``--perturb``.
 
     Args:
-        spec: ``law[:strength]``, separated by commas and applied in this order; ``none`` or the
-            empty string for no perturbation.
-        seed: not negative; equal seeds give equal images.
+        spec: one or more laws, each written as ``law[:strength]``, separated by commas. They are
+            applied in this order. ``none`` or the empty string means no perturbation.
+        seed: not negative. Equal seeds produce equal images.
 
     Raises:
         InputError: a law is unknown or repeated, a strength is not a number in the law's range, the
-            seed is negative, or a package is broken.
+            seed is negative, or a plug-in is broken.
     """
     if seed < 0:
         raise InputError(f"--seed {seed}: must not be negative.")
@@ -101,8 +109,10 @@ def parse_perturbation(spec: str, seed: int) -> Perturbation:
 
 
 def perturbed(frames: Iterator[TimedFrame], perturbation: Perturbation) -> Iterator[TimedFrame]:
-    """Yield the same frames; their images are perturbed as they are read. The time of the laws
-    begins at the first frame."""
+    """Yield the same frames, whose images are perturbed when they are read.
+
+    The time of the laws is 0 at the first frame.
+    """
     first = None
     laws = [law for law in perturbation.laws if isinstance(law, EachSide)]
     pair_needed = len(laws) < len(perturbation.laws)
@@ -137,8 +147,8 @@ def _read_perturbed(
 
 # Contact sheets.
 _WIDTH, _TITLE, _GUTTER = 480, 22, 8  # px
-_PAPER, _MIDDLE = 255, 128  # grey values of the background, and of pixels without a change
-_AMPLIFIED = 4.0  # factor by which changes are enlarged
+_PAPER, _MIDDLE = 255, 128  # grey values of the background, and of pixels that do not change
+_AMPLIFIED = 4.0  # factor by which the changes of grey values are amplified
 
 
 def contact_sheet(
@@ -148,13 +158,16 @@ def contact_sheet(
     start: int = 0,
     every: int = 1,
 ) -> Image:
-    """Show a perturbation in a grey image, with a row for each frame: the original left image, the
-    perturbed images, and the amplified change of the side that changed more.
+    """Show a perturbation in a grey image with one row for each frame.
+
+    Each row shows the original left image, the perturbed images, and the amplified change of the
+    image that changed more.
 
     Args:
-        indices: frames of the sequence.
-        start, every: options with which the frames were selected. The labels show the number of
-            each frame in the whole sequence.
+        indices: indices of the frames to show.
+        start: index of the first frame of ``sequence`` in the whole sequence.
+        every: step with which the frames of ``sequence`` were selected. The labels show the number
+            of each frame in the whole sequence.
 
     Raises:
         InputError: the sequence does not have the data that a law needs.
@@ -169,8 +182,9 @@ def contact_sheet(
 
 
 def sheet_of_laws(sequence: Source, specs: Collection[str], index: int, seed: int) -> Image:
-    """Show several perturbations of one frame in a grey image, with a row for each as in
-    `contact_sheet`; several rows are arranged in two columns.
+    """Show several perturbations of one frame in a grey image.
+
+    Each perturbation has a row as in `contact_sheet`. Several rows are arranged in two columns.
 
     Raises:
         InputError: the sequence does not have the data that a law needs.
@@ -189,7 +203,7 @@ def sheet_of_laws(sequence: Source, specs: Collection[str], index: int, seed: in
 
 
 def laws_for(sequence: Source) -> tuple[list[str], dict[str, str]]:
-    """Names of the laws that can be applied to a source, and the reasons why others cannot."""
+    """The names of the laws that can be applied to a source, and why the others cannot."""
     applicable, reasons = [], {}
     for name in all_laws():
         try:
@@ -222,7 +236,7 @@ def _row(sequence: Source, perturbation: Perturbation, index: int, label: str) -
 
 
 def _titled(title: str, image: Image) -> Image:
-    """An image under its title, with a margin on the right and below."""
+    """Add a title above an image, and a margin on the right and below."""
     import cv2
 
     height = round(_WIDTH * image.shape[0] / image.shape[1])

@@ -1,6 +1,6 @@
-"""Laws of the light and of the camera's response to it.
+"""Perturbations of the light, and of the camera's response to it.
 
-Their random processes are endless in time and do not depend on the order in which frames are read.
+The random processes are endless in time. They do not depend on the order in which frames are read.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ FULL_WELL = 10_000.0  # electrons at grey value 255, as in a Sony ICX267
 READ_NOISE = 10.0  # electrons, typical for such sensors
 _TUNNEL_STOPS = 3.0
 _TUNNELS_PER_S = 1.0 / 5.0
-# Gain and gamma at each level of ``dark``; each level lowers one of them.
+# Gain and gamma at each level of ``dark``. Each level lowers one of them.
 DARK_GAIN = tuple(1.0 - 0.15 * ((level + 1) // 2) for level in range(13))
 DARK_GAMMA = tuple(1.0 - 0.1 * (level // 2) for level in range(13))
-_BLACKOUTS = ((0.16, 0.64), (0.32, 0.40))  # seconds without light, and seconds of rising light
+_BLACKOUTS = ((0.16, 0.64), (0.32, 0.40))  # seconds without light, and seconds of increasing light
 _LIT_S = 1.0  # time before the first blackout may begin
 
 
@@ -40,7 +40,7 @@ def ou_walk(
     """An endless Ornstein-Uhlenbeck process with a time constant of 2 s, exact on a 10 ms grid.
 
     Args:
-        deviation: stationary standard deviation; the process begins in the stationary state.
+        deviation: stationary standard deviation. The process begins in the stationary state.
         rng: generates one normal number for each step.
         jumps: increasing times in seconds at which the process is redrawn with 1.5 times the
             deviation.
@@ -60,8 +60,10 @@ def ou_walk(
 
 
 class Cached:
-    """Gives access by index to the numbers of an endless iterator, which are generated on demand;
-    thread-safe."""
+    """Gives access by index to the numbers of an endless iterator.
+
+    The numbers are generated on demand. The class is thread-safe.
+    """
 
     def __init__(self, numbers: Iterator[float]) -> None:
         self._numbers = numbers
@@ -76,7 +78,7 @@ class Cached:
 
 def on_grid(t: float) -> int:
     """The index of the grid step of a process at time t (seconds)."""
-    # The small offset keeps rounding errors from moving a time on the grid to the previous step.
+    # Without the small offset, rounding errors could move a time on the grid to the previous step.
     return floor(t / STEP_S + 1e-6)
 
 
@@ -89,8 +91,11 @@ def jump_times(rng: np.random.Generator, per_second: float = _JUMPS_PER_S) -> It
 
 
 def _pointwise(curve: Callable[[int, float], NDArray[np.float64]]) -> Law:
-    """A law that maps grey value v of frame k at time t to ``curve(k, t)[v]``; curves are
-    ``(256,)``."""
+    """Make a law that maps each grey value by a curve.
+
+    Args:
+        curve: returns the ``(256,)`` new grey values for the index and the time of a frame.
+    """
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:
         import cv2
@@ -129,7 +134,7 @@ def _flicker(strength: float, stream: RandomStream) -> Law:
 
 
 def _exposure(seconds: float, stream: RandomStream) -> Law:
-    """The light falls and rises by 3 stops in turn; the exposure follows with a time constant."""
+    """Lower and raise the light by 3 stops in turn. The exposure follows with a time constant."""
 
     def errors() -> Iterator[float]:
         rng = np.random.default_rng(stream)
@@ -148,8 +153,10 @@ def _exposure(seconds: float, stream: RandomStream) -> Law:
 
 
 def _night(stops: float, stream: RandomStream) -> Law:
-    """Less light with photon noise (Poisson) and read noise in electrons, at unchanged exposure and
-    gain."""
+    """Reduce the light at unchanged exposure and gain.
+
+    Photon noise (Poisson) and read noise are computed in electrons.
+    """
     electrons = FULL_WELL / 255.0
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:
@@ -157,7 +164,7 @@ def _night(stops: float, stream: RandomStream) -> Law:
             return image
         rng = np.random.Generator(np.random.SFC64([*stream, frame, side]))
         mean = image * np.float32(electrons * 2.0**-stops)
-        # With the read noise, a normal distribution approximates the Poisson distribution well.
+        # Because read noise is added, a normal distribution approximates the Poisson noise well.
         noise = rng.standard_normal(image.shape, dtype=np.float32)
         counted = mean + noise * np.sqrt(mean + np.float32(READ_NOISE**2))
         return to_8_bits(counted / np.float32(electrons))
@@ -172,8 +179,11 @@ def _dark(level: float, stream: RandomStream) -> Law:
 
 
 def _blackout(period: float, stream: RandomStream) -> Law:
-    """One blackout at a random time in every period. Short blackouts after which the light rises
-    slowly alternate with long ones after which it rises fast (``_BLACKOUTS``)."""
+    """Switch the light off once in every period, at a random time.
+
+    Two kinds of blackout alternate (``_BLACKOUTS``). After a short blackout, the light increases
+    slowly. After a long blackout, it increases fast.
+    """
 
     def curve(frame: int, t: float) -> NDArray[np.float64]:
         if t < _LIT_S:

@@ -1,5 +1,8 @@
-"""Motion blur from the camera's rotation during the exposure, and the velocities of camera and
-image that this and other laws need."""
+"""Motion blur by the rotation of the camera during the exposure.
+
+The functions that compute the velocities of the camera and of the image are also used by other
+perturbations.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +16,11 @@ _SHRINK = 2
 
 
 def optical_flow(first: Image, second: Image) -> NDArray[np.float32]:
-    """``(H, W, 2)`` displacement in pixels of each pixel from ``first`` to ``second``, by dense
-    inverse search (Kroeger et al., ECCV 2016) at half size."""
+    """Optical flow by dense inverse search (Kroeger et al., ECCV 2016) at half size.
+
+    Returns:
+        ``(H, W, 2)`` displacement of each pixel from ``first`` to ``second``, in pixels.
+    """
     import cv2
 
     height, width = first.shape
@@ -29,16 +35,20 @@ def optical_flow(first: Image, second: Image) -> NDArray[np.float32]:
 
 
 def neighbours(scene: Scene, frame: int) -> tuple[int, int]:
-    """Indices of the previous and the next frame; where there is none, the frame's own index."""
+    """Indices of the previous and the next frame.
+
+    If there is no previous or next frame, the frame's own index takes its place.
+    """
     assert scene.times is not None
     return max(0, frame - 1), min(len(scene.times) - 1, frame + 1)
 
 
 def image_velocity(scene: Scene, frame: int) -> NDArray[np.float64]:
-    """``(2,)`` velocity of the image's centre due to rotation, pixels per second.
+    """Velocity with which the camera's rotation moves the image, ``(2,)`` pixels per second.
 
-    It is computed from the true rotation if this is known. Otherwise it is the median optical flow
-    to the next frame, which also contains the flow from driving ahead.
+    It is the velocity at the image centre, and is computed from the true rotation if this is known.
+    Otherwise, it is the median optical flow to the next frame, which also contains the flow due to
+    the forward motion.
     """
     assert scene.times is not None
     assert scene.read is not None
@@ -59,7 +69,7 @@ def image_velocity(scene: Scene, frame: int) -> NDArray[np.float64]:
 
 
 def forward_speed(scene: Scene, frame: int) -> float:
-    """Forward speed in metres per second, 0 if it is unknown."""
+    """Forward speed of the camera in metres per second; 0 if it is unknown."""
     if scene.times is None or scene.T_wc is None:
         return 0.0
     previous, following = neighbours(scene, frame)
@@ -71,7 +81,11 @@ def forward_speed(scene: Scene, frame: int) -> float:
 
 
 def line_kernel(shift: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Weights of a centred filter that blurs along a shift of ``(2,)`` pixels."""
+    """Weights of a centred filter for motion blur along a straight line.
+
+    Args:
+        shift: ``(2,)`` displacement in x and y during the exposure, in pixels.
+    """
     reach = int(np.ceil(np.abs(shift).max() / 2.0)) + 1
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
     n = max(2, int(4 * np.hypot(*shift)) + 1)

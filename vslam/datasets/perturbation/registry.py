@@ -1,4 +1,8 @@
-"""All laws by name. Laws of other packages (docs/howto/plugins.md) are checked at every image."""
+"""All laws (kinds of perturbation) by name.
+
+Plug-ins in other Python packages may add laws (docs/howto/plugins.md). Their result is checked for
+every image.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +23,12 @@ _PROBE = (48, 64)  # rows and columns of the image on which a new law is tried
 
 
 def plugin_laws() -> dict[str, Callable[[float, tuple[int, int]], PlugInLaw]]:
-    """The laws of other packages by name, each as a function that makes the law from a strength and
-    a random stream (`RandomStream`)."""
+    """The laws that plug-ins in other Python packages define.
+
+    Returns:
+        For the name of each law, a function that makes the law from its strength and from a random
+        stream (`RandomStream`).
+    """
     return {name: partial(_make, plugin) for name, plugin in find_plugins(PERTURBATIONS).items()}
 
 
@@ -28,7 +36,7 @@ def _make(plugin: PlugIn, strength: float, stream: tuple[int, int]) -> PlugInLaw
     """Make a law and try it on a grey image.
 
     Raises:
-        InputError: the package is broken, or does not make a law.
+        InputError: the plug-in is broken, or does not return a law.
     """
     law = plugin.call(strength, stream)
     if not callable(law):
@@ -45,8 +53,8 @@ def _apply(plugin: PlugIn, law: PlugInLaw, frame: int, t: float, side: int, imag
     """Apply a law to an image.
 
     Raises:
-        UnreadableImageError: the law fails, or does not return an image of this size; the frame is
-            skipped.
+        UnreadableImageError: the law fails, or does not return an image of the same size. The run
+            then skips the frame.
     """
     view = image.view()
     view.flags.writeable = False
@@ -80,7 +88,7 @@ LAWS: dict[str, LawKind] = {
 
 
 def all_laws() -> dict[str, LawKind]:
-    """vslam's laws, then those of other packages, whose strengths are from 0 to 10."""
+    """vslam's own laws, followed by those of plug-ins, whose strengths are from 0 to 10."""
     others = {
         name: LawKind(make, "x", 1.0, 0.1, 10.0, "of another package", logarithmic=True)
         for name, make in plugin_laws().items()

@@ -1,4 +1,4 @@
-"""Laws of the sensor, of compression and of transmission."""
+"""Perturbations by the sensor, by compression and by transmission."""
 
 from __future__ import annotations
 
@@ -84,7 +84,10 @@ def _drop(percent: float, stream: RandomStream) -> Law:
 
 
 def _outage(seconds: float, stream: RandomStream) -> Law:
-    """One outage at a random time in every ten seconds, but not in the first second of the run."""
+    """Drop all frames during one outage in every ten seconds.
+
+    The outage has a random time, but does not begin in the first second of the run.
+    """
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:
         block = int(t // 10.0)

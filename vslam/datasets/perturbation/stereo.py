@@ -1,4 +1,4 @@
-"""Laws for the faults of a stereo rig, which affect only one camera."""
+"""Perturbations by faults of a stereo rig, which affect only one camera."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from vslam.datasets.perturbation.motion import neighbours, optical_flow
 
 
 def _of_right(change: Callable[[Pair, Image], Image]) -> PairLaw:
-    """A law that changes only the right image."""
+    """Make a law that changes only the right image."""
 
     def law(pair: Pair) -> Pair:
         right = pair.right
@@ -38,7 +38,7 @@ def _gain(stops: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 
 def _desync(ms: float, stream: RandomStream, scene: Scene) -> PairLaw:
-    """Simulate a late right image by moving pixels along the optical flow to the next frame."""
+    """Delay the right image by moving its pixels along the optical flow to the next frame."""
     assert scene.times is not None
     assert scene.read is not None
     times, read = scene.times, scene.read
@@ -67,8 +67,12 @@ def _baseline(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 
 def _moved(image: Image, shift: NDArray[np.float32]) -> Image:
-    """Shift the pixels of an image by ``(H, W, 2)`` pixels; each pixel is looked up at its position
-    minus its shift."""
+    """Shift the pixels of an image.
+
+    Args:
+        shift: ``(H, W, 2)`` pixels. The new value of a pixel is taken from its position minus its
+            shift.
+    """
     import cv2
 
     y, x = np.mgrid[0 : image.shape[0], 0 : image.shape[1]].astype(np.float32)
@@ -80,7 +84,7 @@ def _moved(image: Image, shift: NDArray[np.float32]) -> Image:
 
 
 def _turned(axis: int) -> Callable[[float, RandomStream, Scene], PairLaw]:
-    """A law that turns the right camera about its x (0) or y (1) axis."""
+    """Make a law that turns the right camera about its x axis (0) or y axis (1)."""
 
     def make(arc_minutes: float, stream: RandomStream, scene: Scene) -> PairLaw:
         from scipy.spatial.transform import Rotation
@@ -105,7 +109,7 @@ def _turned(axis: int) -> Callable[[float, RandomStream, Scene], PairLaw]:
 def _black(
     side: Literal["left", "right"],
 ) -> Callable[[float, RandomStream, Scene], PairLaw]:
-    """A law that makes the images of one side black during some seconds."""
+    """Make a law that turns the images of one side black during some seconds."""
 
     def make(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
         def law(pair: Pair) -> Pair:

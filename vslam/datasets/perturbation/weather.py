@@ -1,4 +1,4 @@
-"""Laws of the weather: fog, and rain in front of the camera and on the glass.
+"""Perturbations by the weather: fog, and rain in front of the camera and on the glass.
 
 Grey values are assumed to be proportional to luminance, as in KITTI's images.
 """
@@ -28,16 +28,18 @@ AIRLIGHT = 200.0  # grey value of the horizon in dense fog
 _CONTRAST_AT_VISIBILITY = 0.05  # meteorological optical range, WMO Guide No. 8, I.9
 
 _SHUTTER_S = 0.01
-_NEAR_M, _FAR_M = 0.35, 3.0  # streaks of farther drops are fainter than a grey level
-_LEAST_MM = 1.0  # streaks of smaller drops are fainter than a grey level
+_NEAR_M, _FAR_M = 0.35, 3.0  # the streaks of drops farther away are fainter than a grey level
+_LEAST_MM = 1.0  # the streaks of smaller drops are fainter than a grey level
 _STREAK_GREY = 220.0
-_OPACITY_STEPS = 1000.0  # opacities are drawn as uint8 in thousandths, so up to 0.255
+_OPACITY_STEPS = 1000.0  # opacities are drawn as uint8 in thousandths, so that they end at 0.255
 _GLASS_WIDTH_M, _WIPED_EVERY_S, _GLASS_DROP_M = 0.03, 3.0, 0.002
 
 
 def _fog(visibility_m: float, stream: RandomStream, scene: Scene) -> PairLaw:
-    """Koschmieder's law ``I = J e^(-b d) + A (1 - e^(-b d))``, with the distance d along the ray
-    (Beitr. Phys. 1924)."""
+    """Add fog by Koschmieder's law (Beitr. Phys. 1924): ``I = J e^(-b d) + A (1 - e^(-b d))``.
+
+    d is the distance along the viewing ray.
+    """
     extinction = np.float32(-log(_CONTRAST_AT_VISIBILITY) / visibility_m)
     camera = scene.camera
     y, x = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float32)
@@ -58,8 +60,12 @@ def _fog(visibility_m: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 
 def drops_per_m3(mm_per_h: float) -> tuple[float, float]:
-    """Number of raindrops larger than 1 mm per cubic metre, and the rate (1/mm) at which the number
-    decays exponentially with the diameter [Marshall and Palmer, J. Meteorology 1948]."""
+    """Density of raindrops at a rainfall rate [Marshall and Palmer, J. Meteorology 1948].
+
+    Returns:
+        The number of drops larger than 1 mm per cubic metre, and the rate (1/mm) at which the
+        number decays exponentially with the diameter.
+    """
     rate = 4.1 * mm_per_h**-0.21
     return 8000.0 / rate * exp(-rate * _LEAST_MM), rate
 
@@ -87,8 +93,11 @@ def _rain(mm_per_h: float, stream: RandomStream, scene: Scene) -> PairLaw:
 def _streaks(
     mm_per_h: float, rng: np.random.Generator, side: int, frame: int, scene: Scene
 ) -> NDArray[np.float32]:
-    """``(H, W)`` opacity of the drops that fall during the exposure: the share of the exposure for
-    which a drop covers a pixel (Garg and Nayar, IJCV 2007). Both cameras see the same drops."""
+    """``(H, W)`` opacity of the drops that fall during the exposure.
+
+    The opacity is the share of the exposure during which a drop covers a pixel (Garg and Nayar,
+    IJCV 2007). Both cameras see the same drops.
+    """
     import cv2
 
     camera = scene.camera
@@ -124,8 +133,10 @@ def _streaks(
 
 
 def glass_drops(mm_per_h: float, camera: Camera) -> float:
-    """Mean number of drops on a glass that is 30 mm wide and wiped every 3 s. All the water that
-    falls on the glass is assumed to form drops of 2 mm."""
+    """Mean number of drops on a glass that is 30 mm wide and wiped every 3 s.
+
+    All water that falls on the glass is assumed to form drops of 2 mm.
+    """
     area = _GLASS_WIDTH_M**2 * camera.height / camera.width
     fallen = mm_per_h / 3.6e6 * area * _WIPED_EVERY_S
     return fallen / (np.pi / 6.0 * _GLASS_DROP_M**3)
@@ -134,7 +145,7 @@ def glass_drops(mm_per_h: float, camera: Camera) -> float:
 def _drops_on_glass(
     image: Image, mm_per_h: float, rng: np.random.Generator, camera: Camera
 ) -> Image:
-    """Draw drops as lenses that show the scene smaller, upside down and out of focus."""
+    """Draw drops as lenses, which show the scene smaller, upside down and out of focus."""
     import cv2
 
     n = rng.poisson(glass_drops(mm_per_h, camera))

@@ -1,4 +1,7 @@
-"""Rendered towns in KITTI's format: drives with exact ground truth that need no download."""
+"""Rendered towns: stereo drives with exact ground truth, in KITTI's format.
+
+They are rendered on this computer, so that nothing has to be downloaded.
+"""
 
 from __future__ import annotations
 
@@ -32,12 +35,13 @@ __all__ = [
 
 
 def parse_drive(name: str) -> tuple[str, Variation]:
-    """Split ``05+change:0.5+moving:6+aliased+seed:1`` into the route's name and the variation.
+    """Split the name of a drive into the name of the route and the variation of its town.
 
-    A name in `DRIVES` stands for a route with a variation; further parts may be added to it.
+    An example is ``05+change:0.5+moving:6+aliased+seed:1``. A name in `DRIVES` stands for a route
+    with a variation. Further parts may be added to it.
 
     Raises:
-        InputError: a part of the name is not understood.
+        InputError: a part of the name is unknown.
     """
     first, plus, further = name.partition("+")
     route, *parts = (DRIVES.get(first, first) + plus + further).split("+")
@@ -74,11 +78,11 @@ def open_synthetic(
     threads: int = 2,
     on_frame: OnFrame | None = None,
 ) -> Source:
-    """Open a built-in route; frames that are not in the cache are rendered first.
+    """Open a drive on a built-in route. Frames that are not in the cache are rendered first.
 
     Args:
-        name: the route and variation, as for `parse_drive`.
-        variation: replaces the variation in the name.
+        name: name of the drive, as for `parse_drive`.
+        variation: variation of the town, which replaces the variation in the name.
         start, every, max_frames, monocular: as for `open_kitti`.
         threads, on_frame: as for `render_sequence`.
 

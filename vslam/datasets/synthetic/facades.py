@@ -1,4 +1,4 @@
-"""Building fronts: plaster or brick, windows, doors, shops, signs, stains."""
+"""Textures of buildings: plaster or brick, windows, doors, shops, signs and stains."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ class FacadeStyle:
     Attributes:
         wall, frame, glass: grey levels of walls, window frames and panes.
         brick: whether the walls are of brick instead of plaster.
-        storey, pitch: vertical and horizontal distance of windows in metres.
+        storey: vertical distance between windows in metres.
+        pitch: horizontal distance between windows in metres.
         window: ``(width, height)`` of a window in metres.
         shutters, balconies, shop, bands: whether the house has these.
     """
@@ -36,7 +37,7 @@ class FacadeStyle:
 
 
 def random_style(rng: Rng, *, town: bool) -> FacadeStyle:
-    """Draw a random style; in a town, houses may have shops and have fewer shutters."""
+    """Draw a random style. In a town, houses may have shops, and fewer of them have shutters."""
     brick = bool(rng.random() < 0.22)
     low, high = (70, 125) if brick else (185, 238) if rng.random() < 0.6 else (120, 180)
     return FacadeStyle(
@@ -60,8 +61,8 @@ def facade(
     """Paint one side of a house.
 
     Args:
-        rng: random generator for everything that is built.
-        lived: random generator for what residents change: blinds, curtains and lights.
+        rng: random generator for the parts of the building.
+        lived: random generator for what residents change, such as blinds, curtains and lights.
         style: style of the house.
         size: width and height in metres.
         front: whether it is the front, with a door and a shop, or a side with fewer windows.

@@ -1,4 +1,4 @@
-"""Files of a rendered sequence: atomic writes by a single process, and checksums."""
+"""Files of a rendered sequence: atomic writes, checksums, and a lock against other processes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from vslam.lock_file import locked
 
 _IMAGE_BYTES, _DEPTH_BYTES = 450_000, 330_000  # generous estimates of the size of one file
 _RESERVE = 200_000_000  # bytes that must stay free
-_SAMPLED = 5  # frames whose checksums a quick check compares
+_SAMPLED = 5  # number of frames whose checksums are compared in a quick check
 
 
 def frame_files(folder: Path, frame: int, depth: bool) -> list[Path]:
@@ -29,7 +29,7 @@ def frame_files(folder: Path, frame: int, depth: bool) -> list[Path]:
 
 
 def checksum(paths: Collection[Path]) -> str:
-    """The first 64 bits, in hexadecimal, of the SHA-256 of the files' concatenated contents."""
+    """The first 64 bits of the SHA-256 of the concatenated files, as a hexadecimal number."""
     digest = hashlib.sha256()
     for path in paths:
         digest.update(path.read_bytes())
@@ -49,8 +49,8 @@ def damaged_frames(folder: Path, manifest: dict[str, Any], *, thorough: bool) ->
 
     Args:
         folder: folder of the sequence.
-        manifest: its ``checksums`` and ``sizes``, one for each frame.
-        thorough: compare all checksums instead of all sizes and a few checksums.
+        manifest: the ``checksums`` and ``sizes`` of the files of each frame.
+        thorough: compare all checksums. Otherwise, all sizes and a few checksums are compared.
     """
     sums, depth = manifest["checksums"], bool(manifest["depth"])
     sizes = manifest.get("sizes") or [None] * len(sums)
@@ -80,17 +80,17 @@ def write_png(path: Path, image: NDArray[Any], level: int) -> None:
 
 
 def lock_of(folder: Path) -> AbstractContextManager[None]:
-    """Keep other processes from writing to a sequence's folder.
+    """Lock the folder of a sequence, so that no other process writes to it.
 
     Raises:
-        InputError: another running process writes to it.
+        InputError: another running process has locked the folder.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     return locked(folder.with_name(f".{folder.name}.lock"), folder, "is rendering it")
 
 
 def check_disk(cache: Path, frames: int, depth: bool) -> None:
-    """Check that the disk has enough space for ``frames`` pairs of images.
+    """Check that the disk has enough space for a given number of frames.
 
     Raises:
         InputError: there is not enough space.
@@ -110,7 +110,7 @@ def check_disk(cache: Path, frames: int, depth: bool) -> None:
 
 @contextmanager
 def writing(cache: Path) -> Iterator[None]:
-    """Turn an error of the file system into an `InputError`."""
+    """Convert errors of the file system to an `InputError`."""
     try:
         yield
     except OSError as error:

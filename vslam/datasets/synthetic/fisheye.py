@@ -1,7 +1,7 @@
-"""A rendered drive as an unrectified fisheye pair sees it, with the calibration of the pair.
+"""Rendered drives with the images of two unrectified fisheye cameras, and their calibration.
 
-The town is rendered for a rectified pinhole pair with a sufficient field of view, and the images
-are then warped to two equidistant cameras with different lenses and rotations.
+The town is first rendered for a rectified pinhole pair with a sufficient field of view. The images
+are then warped to two equidistant fisheye cameras, whose lenses and rotations differ.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ from vslam.datasets.synthetic.routes import RATE, Route
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.store import OnFrame, render_sequence
 
-# For each camera: ratio of its focal length to the pinhole camera's, offset of the principal point
-# from the image centre (px), k1 to k4, and rotation vector from the rectified camera (rad).
+# For each camera: the ratio of its focal length to that of the pinhole camera, the offset of the
+# principal point from the image centre (px), the distortion coefficients k1 to k4, and the rotation
+# vector from the rectified camera (rad).
 _SIDES = (
     (0.970, (6.3, -3.1), (0.012, -0.006, 0.002, -0.0004), (0.011, -0.014, 0.009)),
     (0.962, (-4.7, 5.2), (0.009, -0.004, 0.001, -0.0002), (-0.008, 0.013, -0.012)),
@@ -36,10 +37,11 @@ class FisheyeRig:
     """Two fisheye cameras at the positions of the cameras of a rectified pair.
 
     Attributes:
-        models: left and right camera.
-        R_own_rectified: for each camera, ``(3, 3)`` float64 rotation from the frame of the
-            rectified camera to its own.
-        T_left_right: ``(4, 4)`` float64, maps points from the right to the left camera.
+        models: models of the left and of the right camera.
+        R_own_rectified: for each camera, the ``(3, 3)`` float64 rotation from the frame of the
+            rectified camera to the frame of the fisheye camera.
+        T_left_right: ``(4, 4)`` float64. It maps points from the right camera's frame to the left
+            camera's frame.
     """
 
     models: tuple[CameraModel, CameraModel]
@@ -63,8 +65,10 @@ def fisheye_rig(camera: Camera) -> FisheyeRig:
 
 
 def wide_camera(camera: Camera) -> Camera:
-    """The rectified pair with the same focal length and the smallest images that cover the fisheye
-    pair's view."""
+    """The rectified pair that is rendered.
+
+    It has the same focal length, and the smallest images that cover the view of the fisheye pair.
+    """
     rig = fisheye_rig(camera)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for model, R_own_rectified in zip(rig.models, rig.R_own_rectified, strict=True):
@@ -87,11 +91,12 @@ def render_fisheye(
 ) -> Path:
     """Write a drive in EuRoC's layout, with the calibration in EuRoC's and in Kalibr's format.
 
-    The rendered pinhole images stay in ``folder/pinhole``, so that another call can continue.
+    The rendered pinhole images stay in ``folder/pinhole``, so that another call can resume an
+    interrupted rendering.
 
     Args:
         route, variation, until, threads, on_frame: as for `render_sequence`.
-        folder: folder for ``mav0``, ``camchain.yaml`` and ``pinhole``.
+        folder: output folder, to which ``mav0``, ``camchain.yaml`` and ``pinhole`` are written.
 
     Returns:
         ``folder``.
@@ -130,8 +135,11 @@ def render_fisheye(
 
 
 def _seen_at(model: CameraModel, R_own_rectified: Array, camera: Camera) -> NDArray[np.float32]:
-    """``(H, W, 2)`` float32: for each pixel of a fisheye camera, the pixel of the rectified pinhole
-    camera with the same viewing direction."""
+    """The pixel of the pinhole camera that has the same viewing direction as each fisheye pixel.
+
+    Returns:
+        ``(H, W, 2)`` float32 coordinates in the image of the rectified pinhole camera, in pixels.
+    """
     u, v = np.meshgrid(np.arange(model.width), np.arange(model.height))
     own = unproject(model, np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
     at = camera.project(own @ R_own_rectified)[:, :2]

@@ -1,4 +1,4 @@
-"""The ground: a mesh over the terrain, with a separate texture for each tile."""
+"""The ground of a town, which is a mesh over the terrain with a separate texture for each tile."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from vslam.kernels import kernel
 from vslam.machine import available_cores
 
 TILE = 12.8  # m
-_FINE, _COARSE = 512, 64  # texels along a side of a tile, with and without a road
+_FINE, _COARSE = 512, 64  # texels along the side of a tile with a road, and of one without a road
 _REACH = 75.0  # m; the ground ends at this distance from the roads
 
 
 @dataclass(frozen=True)
 class RoadStyle:
-    """Cross-section of a road; widths are in metres from its middle line.
+    """Cross-section of a road. Distances are in metres from its middle line.
 
     Attributes:
-        lane: half width of the carriageway.
-        parking: outer edge of the parking bays.
-        walk: outer edge of the pavement; grass begins there.
-        dash, gap: length of a lane mark and of the gap after it in metres; no marks if ``dash`` is
-            0.
+        lane: distance of the edge of the carriageway.
+        parking: distance of the outer edge of the parking bays.
+        walk: distance of the outer edge of the pavement, where the grass begins.
+        dash: length of a lane mark in metres; 0 for a road without marks.
+        gap: length of the gap between two lane marks in metres.
         edge_line: whether there is a solid line at the edge of the carriageway.
         wear: amount of patches and cracks in the asphalt, 0 to 1.
     """
@@ -46,11 +46,12 @@ class RoadStyle:
 
 
 class _RoadArrays(NamedTuple):
-    """M samples of the middle lines of all roads and their cross-section, for `_paint`.
+    """M samples of the middle lines of all roads, and the cross-section of the roads.
 
-    ``xz`` (M, 2) f8, ``heading``, ``along`` (M,) f8, ``junction`` (M,) bool: see `terrain.Roads`;
-    ``marks`` (M, 10) f8: see `_road_marks`; ``lane``, ``parking``, ``walk``, ``dash`` f8,
-    ``edge_line`` bool: see `RoadStyle`; ``period`` f8 metres from one lane mark to the next.
+    ``xz`` is (M, 2) f8, ``heading`` and ``along`` are (M,) f8, and ``junction`` is (M,) bool, as in
+    `terrain.Roads`. ``marks`` is (M, 10) f8, see `_road_marks`. ``lane``, ``parking``, ``walk`` and
+    ``dash`` are f8, and ``edge_line`` is bool, as in `RoadStyle`. ``period`` is the distance from
+    one lane mark to the next in metres, f8.
     """
 
     xz: NDArray[np.float64]
@@ -69,8 +70,9 @@ class _RoadArrays(NamedTuple):
 class _TileGrid(NamedTuple):
     """Position and resolution of a tile.
 
-    ``x``, ``z`` f8 corner in metres; ``texel`` f8 metres per texel; ``nearest`` (N, N) i8 index of
-    the nearest sample of the roads at the nodes of a coarse mesh; ``mesh`` f8 metres between nodes.
+    ``x`` and ``z`` are the coordinates of its corner in metres, f8. ``texel`` is the size of a
+    texel in metres, f8. ``nearest`` is (N, N) i8: for each node of a coarse mesh, the index of the
+    nearest sample of the roads. ``mesh`` is the distance between nodes in metres, f8.
     """
 
     x: float
@@ -83,7 +85,7 @@ class _TileGrid(NamedTuple):
 def make_ground(
     rng: Rng, atlas: AtlasBuilder, roads: Roads, terrain: Terrain, style: RoadStyle
 ) -> Surfaces:
-    """Make the tiles near the roads; tiles with a road have finer textures."""
+    """Make the tiles of the ground near the roads. Tiles with a road have finer textures."""
     tree = cKDTree(roads.xz)
     low = np.floor((roads.xz.min(axis=0) - _REACH) / TILE).astype(int)
     high = np.ceil((roads.xz.max(axis=0) + _REACH) / TILE).astype(int)
@@ -131,7 +133,7 @@ def make_ground(
 
 
 def _tile(x: float, z: float, terrain: Terrain, texture: int, fine: int) -> Surfaces:
-    """Two triangles for each cell of the terrain in a tile."""
+    """Make two triangles for each cell of the terrain in a tile."""
     cells = 2
     step = TILE / cells
     origin, s, t, uv = [], [], [], []
@@ -161,9 +163,14 @@ def _tile(x: float, z: float, terrain: Terrain, texture: int, fine: int) -> Surf
 
 
 def _road_marks(rng: Rng, roads: Roads, style: RoadStyle) -> NDArray[np.float64]:
-    """``(M, 10)`` marks on the road at each sample of its middle line: lateral positions of two
-    cracks, whether a crack runs across, a patch (from, to, tone), a manhole (along, across), and
-    the tones of asphalt and pavement. NaN where there is no crack, patch or manhole."""
+    """Draw the marks on the road at each sample of its middle line.
+
+    Returns:
+        ``(M, 10)`` float64. The columns are the lateral positions of two cracks, whether a crack
+        runs across the road, a patch (from, to, tone), a manhole (along, across), the tone of the
+        asphalt, and the tone of the pavement. Values are NaN where there is no crack, patch or
+        manhole.
+    """
     n = len(roads.xz)
     marks = np.full((n, 10), np.nan)
     for k in range(2):
@@ -208,7 +215,8 @@ def _paint(image, tile, road, grain):
 
     Args:
         image: ``(S, S)`` float32, output.
-        tile, road: `_TileGrid`, `_RoadArrays`.
+        tile: `_TileGrid`.
+        road: `_RoadArrays`.
         grain: ``(2, 1024, 1024)`` float32 coarse and fine noise.
     """
     x0, z0, texel, nearest, mesh = tile.x, tile.z, tile.texel, tile.nearest, tile.mesh
@@ -225,7 +233,7 @@ def _paint(image, tile, road, grain):
                 min(int((z - z0) / mesh + 0.5), len(nearest) - 1),
                 min(int((x - x0) / mesh + 0.5), len(nearest) - 1),
             ]
-            # The mesh is coarser than the samples, so move on to the nearest sample.
+            # The mesh is coarser than the samples. Search along the road for the nearest sample.
             fs, fc = math.sin(heading[i]), math.cos(heading[i])
             ahead = (x - xz[i, 0]) * fs + (z - xz[i, 1]) * fc
             j = min(max(i + round(ahead / 0.25), 0), len(xz) - 1)

@@ -1,4 +1,4 @@
-"""Rendered sequences in other layouts: RGB-D in TUM's (`vslam.datasets.tum`), or as a video."""
+"""Rendered sequences in other formats: RGB-D in TUM's layout, or a video."""
 
 from __future__ import annotations
 
@@ -28,18 +28,20 @@ def render_rgbd(
     threads: int = 2,
     on_frame: OnFrame | None = None,
 ) -> Path:
-    """Render the missing frames of a route for an RGB-D camera into a folder in TUM's layout, and
-    return the folder.
+    """Render the missing frames of a route for an RGB-D camera, in TUM's layout.
 
-    ``out/stereo`` has the same drive as a KITTI tree. The left image serves as the colour image.
-    Depth is in centimetres, 0 in the sky, and has no maximum range. The virtual baseline in
-    ``calibration.yaml`` is the baseline of the rendered pair, so that distant points are as
-    uncertain as with stereo.
+    ``out/stereo`` contains the same drive in KITTI's format. The left image is used as the colour
+    image. Depth is in centimetres and 0 in the sky. It has no maximum range. The virtual baseline
+    in ``calibration.yaml`` is the baseline of the rendered stereo pair. Therefore, distant points
+    are as uncertain as with stereo.
 
     Args:
         route, variation, threads, on_frame: as for `render_sequence`.
         out: output folder.
         until: write only the frames before this one.
+
+    Returns:
+        ``out``.
 
     Raises:
         InputError: as `render_sequence`.
@@ -86,15 +88,16 @@ def _depth_calibration(camera: Camera) -> str:
 
 
 def write_side_by_side(sequence: Source, path: Path) -> Path:
-    """Write a stereo sequence as a lossless video (codec FFV1) with left and right images side by
-    side, and a calibration file beside it.
+    """Write a stereo sequence as a lossless video, and write its calibration to a file.
+
+    The left and right images are side by side. The codec is FFV1.
 
     Args:
-        sequence: a stereo sequence; the video gets its mean frame rate.
+        sequence: a stereo sequence. Its mean frame rate becomes the frame rate of the video.
         path: path of the video, for example with the suffix ``.mkv``.
 
     Returns:
-        The calibration file, which has the same name with ``.yaml``.
+        The path of the calibration file: the path of the video with the suffix ``.yaml``.
 
     Raises:
         InputError: a file cannot be written.

@@ -1,4 +1,4 @@
-"""Labelled pairs of views, with which loop detectors are trained."""
+"""Labelled pairs of rendered images, with which loop detectors are trained."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from vslam.datasets.synthetic.town import Town, build_town
 
 _HEIGHT = 0.25  # m, largest change of the camera's height
 _EXPOSURE = 0.25  # standard deviation of the logarithm of the ratio of the two exposures
-# Two places are different if they are more than _APART m apart and not in the same street. They are
-# in the same street if the headings are parallel, the distance is below _SIGHT m, and the distance
-# across the street is below _STREET m.
+# Two places are different if they are more than _APART metres apart and not in the same street. Two
+# places are in the same street if their headings are parallel, their distance is below _SIGHT
+# metres, and their distance across the street is below _STREET metres.
 _APART, _SIGHT, _STREET = 40.0, 160.0, 25.0
-# Two frames are two passes through one place if they differ by at most 4 m and 30 degrees but by
-# more than 60 frames.
+# Two frames belong to two passes through one place if they differ by at most 4 m and 30 degrees and
+# are more than 60 frames apart.
 _TOGETHER, _ALIGNED, _LATER = 4.0, 30.0, 60
-_ALIKE = 5  # number of the most similar places that count as look-alikes of a place
+_ALIKE = 5  # for each place, the number of different places that are used as the most similar ones
 _PLACES, _SMALL = 160, 8  # number of places that are compared; factor by which views are reduced
 KINDS = ("shift", "alike", "pass", "random")
 _COLUMNS = ("a", "b", "same", "kind", "frame_a", "frame_b", "when_a", "when_b", "distance_m",
@@ -46,7 +46,7 @@ class Moves:
     """Ranges (lowest, highest) of the random motion of the second view of a pair.
 
     Attributes:
-        lateral: metres to the right; -3.2 is on the other lane.
+        lateral: metres to the right. At -3.2, the camera is on the other lane.
         heading: degrees of rotation, to either side.
     """
 
@@ -65,28 +65,35 @@ def render_pairs(
     threads: int = 2,
     on_frame: OnFrame | None = None,
 ) -> None:
-    """Render ``count`` labelled pairs; with all kinds, half of them show the same place twice.
+    """Render labelled pairs of images.
 
-    The second view is moved at random. The kind of a pair tells where the second view is taken:
+    The kind of a pair tells where its second image is taken:
 
-    - ``shift``: at the same frame;
-    - ``pass``: at another pass through the place, if the drive has one;
-    - ``alike``: at one of the places that look most similar in small, blurred views;
-    - ``random``: at any other place.
+    - ``shift``: at the same frame.
+    - ``pass``: at another pass through the same place, if the drive has one.
+    - ``alike``: at one of the different places that look most similar in small, blurred images.
+    - ``random``: at any different place.
 
-    ``folder/pairs.csv`` has one row per pair: the two images; ``same`` (1 or 0); the kind; the
-    frame at which each view is taken; for each view, the frame whose light and objects it shows;
-    the distance between the two frames (m); lateral shift (m), rotation (degrees) and rise (m) of
-    the second view; the ratio of the exposures; and for each camera x and z in metres, and yaw in
-    degrees from z towards x.
+    The camera of the second image is also moved at random. If all kinds are rendered, half of the
+    pairs show the same place.
+
+    ``folder/pairs.csv`` has one row per pair, with these columns:
+
+    - the two image files, whether they show the same place (1 or 0), and the kind of the pair;
+    - for each image, the frame at which it is taken, and the frame whose light and objects it
+      shows;
+    - the distance between the two frames (m);
+    - the lateral shift (m), the rotation (degrees) and the rise (m) of the second camera;
+    - the ratio of the exposures;
+    - for each camera, x and z in metres and the yaw in degrees from z towards x.
 
     Args:
         route: drive from which places are taken.
-        variation: variation of the town; ``aliased`` makes different places more similar, and
-            ``change`` makes the views of one place differ as if taken on different days.
+        variation: variation of the town. ``aliased`` makes different places more similar.
+            ``change`` makes the images of one place differ as if they were taken on different days.
         folder: output folder.
         count: number of pairs.
-        moves: motion of the second views.
+        moves: motion of the second camera.
         kinds: the kinds to render, in turn.
         threads: number of threads of the renderer.
         on_frame: called with the number of finished pairs and ``count``.
@@ -158,7 +165,7 @@ def _view(
 
 
 def _other_passes(T_wc: Float) -> list[NDArray[np.int64]]:
-    """For each frame, the frames of other passes with a similar position and heading."""
+    """For each frame, the frames of other passes that have a similar position and heading."""
     xz, ahead = T_wc[:, [0, 2], 3], T_wc[:, :3, 2]
     again = []
     for k, near in enumerate(cKDTree(xz).query_ball_point(xz, _TOGETHER)):
@@ -169,8 +176,14 @@ def _other_passes(T_wc: Float) -> list[NDArray[np.int64]]:
 
 
 def _different(T_wc: Float, others: Float) -> NDArray[np.bool_]:
-    """``(N,)`` bool: which of the ``(N, 4, 4)`` poses ``others`` are at a different place than the
-    pose ``T_wc`` and not in the same street."""
+    """Which poses are at a different place than the pose ``T_wc``, and not in the same street.
+
+    Args:
+        others: ``(N, 4, 4)`` poses.
+
+    Returns:
+        ``(N,)`` bool.
+    """
     away = (others[:, :3, 3] - T_wc[:3, 3])[:, [0, 2]]
     ahead = T_wc[[0, 2], 2] / np.linalg.norm(T_wc[[0, 2], 2])
     aside = np.abs(away @ np.array([ahead[1], -ahead[0]]))
@@ -181,9 +194,10 @@ def _different(T_wc: Float, others: Float) -> NDArray[np.bool_]:
 
 
 def _look_alikes(route: Route, town: Town, passes: Passes, threads: int) -> NDArray[np.int64]:
-    """``(P, 2)`` pairs of frames that show different but similar places, several for each place.
+    """``(P, 2)`` pairs of frames that show different but similar places.
 
-    The similarity of two places is the correlation of their small, blurred, normalised views.
+    There are several pairs for each place. The similarity of two places is the correlation of their
+    small, blurred and normalised images.
     """
     chosen = np.unique(np.linspace(0, len(route.T_wc) - 1, _PLACES).astype(int))
     c = route.camera

@@ -1,4 +1,4 @@
-"""The state of a town at each frame: standing and moving objects, and light."""
+"""The state of a town at each frame: static objects, moving objects, and light."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from vslam.datasets.synthetic.site import AFTER, ALWAYS, BEFORE, Variation
 from vslam.datasets.synthetic.terrain import CLEARANCE
 from vslam.datasets.synthetic.town import Town
 
-_NEAR, _LEFT = 60.0, 75.0  # m: distances at which a place is reached, and at which it is left
-_AGAIN, _STRETCH = 60, 15  # frames: shortest time until a revisit, and its shortest duration
+_NEAR, _LEFT = 60.0, 75.0  # m: distances at which a place counts as reached, and as left
+_AGAIN, _STRETCH = 60, 15  # frames: shortest time until a revisit, and shortest length of a revisit
 _SHADOW_MAPS = 8  # number of shadow maps that are kept
-_CLOUD = 12.0  # frames around the start of a pass in which a cloud hides the sun, which then moves
+_CLOUD = 12.0  # frames around the start of a pass in which a cloud hides the sun while it moves
 _CAR_REACH = np.array([1.1, 2.7])  # half the width and length of the largest car, m
 
 
 class Passes:
-    """Computes the scene at each frame of a drive; may be called from several threads."""
+    """Computes the scene at each frame of a drive. The class is thread-safe."""
 
     def __init__(self, route: Route, town: Town, variation: Variation) -> None:
         self._route, self._town, self._variation = route, town, variation
@@ -66,10 +66,10 @@ class Passes:
         return surfaces.select((surfaces.thing < 0) | present[surfaces.thing])
 
     def _light(self, frame: int, number: int) -> tuple[Light, float]:
-        """The light at a frame of pass ``number``, and how dark the night is (0 to 1).
+        """The light at a frame of pass ``number``, and how dark it is (0 by day to 1 at night).
 
-        The sun stands still during a pass, and moves behind a cloud between two passes. Night falls
-        slowly during the whole drive.
+        The sun does not move during a pass. Between two passes, it moves while a cloud hides it.
+        Night falls slowly during the whole drive.
         """
         seed, change = self._variation.seed, self._variation.change
         rng = np.random.default_rng([seed, 11])
@@ -97,7 +97,10 @@ class Passes:
         return light, night
 
     def _cars(self, frame: int) -> list[Surfaces]:
-        """The first car drives ahead of the camera; the others approach on the other lane."""
+        """The moving cars.
+
+        The first car drives ahead of the camera. The others approach on the other lane.
+        """
         T_wc = self._route.T_wc
         here, cars = T_wc[frame], []
         for k, model in enumerate(self._town.moving):
@@ -119,8 +122,10 @@ class Passes:
 
 
 def _switch_frames(place: NDArray[np.float64], cameras: NDArray[np.float64]) -> NDArray[np.int64]:
-    """``(T,)`` frame at which each place is left for the first time; the largest int64 if it is
-    never reached or never left."""
+    """``(T,)`` frame at which the camera leaves each place for the first time.
+
+    It is the largest int64 if the camera never reaches the place, or never leaves it.
+    """
     switch = np.full(len(place), np.iinfo(np.int64).max)
     for k, xz in enumerate(place):
         distance = np.hypot(*(cameras - xz).T)
@@ -133,8 +138,13 @@ def _switch_frames(place: NDArray[np.float64], cameras: NDArray[np.float64]) -> 
 
 
 def pass_starts(T_wc: NDArray[np.float64]) -> list[int]:
-    """The first frame of each pass: frame 0, and each frame at which a drive, ``(N, 4, 4)`` poses,
-    returns to an earlier street."""
+    """The first frame of each pass of a drive.
+
+    A pass begins at frame 0 and whenever the camera returns to an earlier street.
+
+    Args:
+        T_wc: ``(N, 4, 4)`` poses of the drive.
+    """
     xz = T_wc[:, [0, 2], 3]
     tree = cKDTree(xz)
     known = np.array([

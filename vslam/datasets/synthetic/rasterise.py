@@ -1,4 +1,4 @@
-"""Projection, culling and z-buffer: which surface each sample of an image sees."""
+"""Projection, culling and z-buffer. They determine which surface each sample of an image sees."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from vslam.kernels import borrowed, inline, kernel
 NEAR = 0.2  # m
 FAR = 400.0  # m
 LAYER_STEP = 1e-3  # relative depth by which a layer is drawn in front of the next lower one
-_SEAM = 1e-6  # overlap of neighbours as a fraction of an edge, so that there are no gaps
+_SEAM = 1e-6  # overlap of adjacent surfaces as a fraction of an edge, so that there are no gaps
 
-# Columns of the result of ``find_visible``. PLANE: 3 x 3 coefficients of s/z, t/z and 1/z, which
-# are affine functions of the pixel (u, v). TEXTURE: 2 x 3 coefficients of both texture coordinates
-# divided by z. Each of the other columns is a single number.
+# Columns of the result of ``find_visible``. PLANE has 3 x 3 coefficients of s/z, t/z and 1/z, which
+# are affine functions of the pixel (u, v). TEXTURE has 2 x 3 coefficients of the two texture
+# coordinates divided by z. Each of the other columns is a single number.
 PLANE, TEXTURE, FIRST_ROW, LAST_ROW, TRIANGLE, LAYER = 0, 9, 15, 16, 17, 18
 NUMBER, DETAIL_U, DETAIL_V, DETAIL, AMBIENT, SUN, GLOW, KEY, COLUMNS = range(19, 28)
 
@@ -25,8 +25,9 @@ NUMBER, DETAIL_U, DETAIL_V, DETAIL, AMBIENT, SUN, GLOW, KEY, COLUMNS = range(19,
 class _Span(NamedTuple):
     """Neighbouring samples of one row that lie on one surface.
 
-    ``begin``, ``end`` i8 range of the samples, without ``end``; ``v`` f8 row in pixels. Sample
-    ``i`` lies at column ``shift + step i`` in pixels (f8) and has 1/z = ``value + slope i`` (f8).
+    The samples are ``begin`` to ``end - 1`` (i8), in row ``v`` in pixels (f8). Sample ``i`` lies at
+    column ``shift + step i`` in pixels (f8), and has the inverse depth 1/z = ``value + slope i``
+    (f8).
     """
 
     begin: int
@@ -39,10 +40,11 @@ class _Span(NamedTuple):
 
 
 class _AlphaMap(NamedTuple):
-    """Alpha of one texture.
+    """Alpha channel of one texture.
 
-    ``alpha`` (N,) u1 values of all textures; ``offset`` (L,) i8 start of each level of this texture
-    in ``alpha``; ``log_size`` (2,) i8 binary logarithms of width and height of level 0.
+    ``alpha`` has the values of all textures, (N,) u1. ``offset`` is the start of each mipmap level
+    of this texture in ``alpha``, (L,) i8. ``log_size`` has the binary logarithms of the width and
+    height of level 0, (2,) i8.
     """
 
     alpha: NDArray[np.uint8]
@@ -55,11 +57,13 @@ def find_visible(surfaces, atlas, camera, light):
     """Project the surfaces that a camera may see, in order of their distance.
 
     Args:
-        surfaces, atlas, camera, light: `scene.Surfaces`, `scene.Atlas`,
-            `scene.PosedCamera`, `scene.LightValues`.
+        surfaces: `scene.Surfaces`.
+        atlas: `scene.Atlas`.
+        camera: `scene.PosedCamera`.
+        light: `scene.LightValues`.
 
     Returns:
-        ``(V, COLUMNS)`` float64; the columns are named above.
+        ``(V, COLUMNS)`` float64. The columns are defined at the beginning of this module.
     """
     origin, edge_s, edge_t, T_wc = (
         borrowed(surfaces.origin), borrowed(surfaces.edge_s), borrowed(surfaces.edge_t),
@@ -279,8 +283,10 @@ def rasterise(visible, atlas, band):
 
 @kernel
 def _fill(value, slope, number, begin, inverse_depth, seen):
-    """Draw surface ``number`` on the part of a row that begins at sample ``begin``. The surface has
-    1/z = ``value + slope i`` at sample ``i`` of the row."""
+    """Draw a surface on the part of a row that begins at sample ``begin``.
+
+    At sample ``i`` of the row, the surface has the inverse depth 1/z = ``value + slope i``.
+    """
     value += slope * begin
     for i in range(np.uintp(len(seen))):
         near = np.float32(value + slope * np.float64(np.int32(i)))
@@ -292,11 +298,13 @@ def _fill(value, slope, number, begin, inverse_depth, seen):
 
 @kernel
 def _fill_cut_out(q, number, span, mask, inverse_depth, seen):
-    """Draw as `_fill`, but only where the alpha of the texture is at least one half.
+    """Draw a surface where the alpha of its texture is at least one half.
 
     Args:
-        q, number: a row of the result of `find_visible`, and its index.
-        span, mask: `_Span`, `_AlphaMap`.
+        q: the row of the result of `find_visible` that describes the surface.
+        number: the index of this row.
+        span: `_Span`.
+        mask: `_AlphaMap`.
         inverse_depth, seen: one row of the `scene.SampleBand`, updated.
     """
     begin, end, v = span.begin, span.end, span.v

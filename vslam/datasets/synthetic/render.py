@@ -1,10 +1,12 @@
-"""The renderer: exact perspective of flat textured surfaces, in Numba and without a GPU.
+"""The renderer of flat textured surfaces. It is written in Numba and needs no GPU.
 
-A point of a surface is ``origin + s edge_s + t edge_t = z r`` with the ray ``r = K^-1 (u, v, 1)``,
-so ``(s, t, 1) / z = [edge_s edge_t origin]^-1 r``, which are three affine functions of the pixel.
-Therefore, a surface covers a single interval of each image row, and depth and texture coordinates
-are exact at every pixel. Visibility is determined on a grid that is twice as fine as the pixels. A
-pixel is shaded once for each surface that its four samples see.
+A point of a surface is ``origin + s edge_s + t edge_t = z r`` with the ray ``r = K^-1 (u, v, 1)``.
+Therefore, ``(s, t, 1) / z = [edge_s edge_t origin]^-1 r``. These are three affine functions of the
+pixel. It follows that a surface covers a single interval of each image row, and that depth and
+texture coordinates are exact at every pixel.
+
+Visibility is determined on a grid that is twice as fine as the pixels. A pixel is shaded once for
+each surface that its four samples see.
 """
 
 from __future__ import annotations
@@ -33,12 +35,13 @@ from vslam.datasets.synthetic.shade import shade
 from vslam.datasets.synthetic.shadows import NO_LAMPS, LampPools, ShadowMap
 
 SAMPLES = 2  # visibility samples per pixel in each direction
-_BANDS = 2  # bands of rows per image; each is a job for a thread
+_BANDS = 2  # bands of rows per image; each band is rendered by one thread
 # Lens and sensor.
 SHUTTER = 0.004  # s, exposure time by day
 _BLUR = 0.55  # px, standard deviation of the lens blur
 _VIGNETTE = 0.22  # share of the light lost in the corners
-_READ_NOISE, _SHOT_NOISE = 0.9, 0.022  # standard deviation (grey levels); variance per grey level
+# Standard deviation of the read noise (grey levels), and variance of the shot noise per grey level.
+_READ_NOISE, _SHOT_NOISE = 0.9, 0.022
 _KNEE, _ROLL = 170.0, 0.5  # grey level at which the response bends, and its slope above
 
 Float32 = NDArray[np.float32]
@@ -46,11 +49,11 @@ Float32 = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Light:
-    """Sun, sky and air at a moment.
+    """Lighting and atmosphere at a given time.
 
     Attributes:
-        sun: ``(3,)`` float64 unit vector towards the sun, world.
-        direct: irradiance of the sun on a surface that faces it; 1 at noon under a clear sky.
+        sun: ``(3,)`` float64 unit vector towards the sun, in the world frame.
+        direct: irradiance of the sun on a surface that faces it. It is 1 at noon under a clear sky.
         ambient: irradiance of the sky on a horizontal surface.
         glow: brightness of lamps and lit windows.
         haze: grey level of the air, 0 to 255.
@@ -69,7 +72,7 @@ class Light:
     headlight: float = 0.0
 
     def values(self) -> LightValues:
-        """Convert the light for the kernels."""
+        """Convert the light to the type that the kernels use."""
         sky = (self.direct, self.ambient, self.glow)
         air = (self.haze, self.visibility, self.exposure)
         return LightValues(*(float(x) for x in (*self.sun, *sky, *air, self.headlight)))
@@ -77,7 +80,7 @@ class Light:
 
 @dataclass(frozen=True)
 class Moment:
-    """The scene of one frame; ``night``, from 0 to 1, raises the gain of the sensor."""
+    """The scene of one frame. ``night``, from 0 to 1, raises the gain of the sensor."""
 
     surfaces: Surfaces
     shadows: ShadowMap
@@ -87,18 +90,28 @@ class Moment:
 
 
 class RenderedView(NamedTuple):
-    """A rendered view: ``image`` is ``(H, W)`` float32 grey levels before the sensor, which may
-    exceed 255; ``depth`` is ``(H, W)`` float32 metres along z, 0 in the sky."""
+    """A rendered view.
+
+    ``image`` has the ``(H, W)`` float32 grey levels before the sensor, which may exceed 255.
+    ``depth`` has the ``(H, W)`` float32 depth along z in metres, which is 0 in the sky.
+    """
 
     image: Float32
     depth: Float32
 
 
 class Renderer:
-    """Renders views of a town; the result does not depend on the number of threads."""
+    """Renders views of a town. The result does not depend on the number of threads."""
 
     def __init__(self, camera: Camera, atlas: Atlas, sky: int, threads: int = 1) -> None:
-        """Start the threads; ``sky`` is the number of the panorama texture, see `textures.sky`."""
+        """Start the threads.
+
+        Args:
+            camera: calibration of the rendered images.
+            atlas: textures of the town.
+            sky: number of the sky's texture in the atlas, see `textures.sky`.
+            threads: number of threads.
+        """
         self._camera = camera
         self._atlas = atlas
         self._sky = sky
@@ -110,7 +123,7 @@ class Renderer:
     def stereo(
         self, moment: Moment, T_wc: NDArray[np.float64]
     ) -> tuple[RenderedView, RenderedView]:
-        """Render both views of a rig whose left camera has the ``(4, 4)`` pose ``T_wc``."""
+        """Render both views of a stereo rig whose left camera has the ``(4, 4)`` pose ``T_wc``."""
         right = T_wc.copy()
         right[:3, 3] += T_wc[:3, 0] * self._camera.baseline
         left_view, right_view = self.views(moment, T_wc, right)
@@ -131,7 +144,7 @@ class Renderer:
     def _prepare(
         self, moment: Moment, T_wc: NDArray[np.float64]
     ) -> tuple[RenderedView, list[Callable[[], None]]]:
-        """An empty view, and the jobs that render its bands."""
+        """Make an empty view, and the functions that render its bands."""
         fx, fy, cx, cy = (
             float(x) for x in (self._camera.fx, self._camera.fy, self._camera.cx, self._camera.cy)
         )
@@ -167,9 +180,9 @@ def sensor_image(
 
     Args:
         radiance: ``(H, W)`` float32, from `RenderedView.image`.
-        camera: calibration; the focal length scales the motion blur.
-        yaw_rate: rad/s, causes motion blur.
-        night: from 0 to 1, lengthens the exposure and raises the gain.
+        camera: calibration. The motion blur is proportional to its focal length.
+        yaw_rate: yaw rate of the camera in rad/s, which causes motion blur.
+        night: darkness from 0 to 1, which lengthens the exposure and raises the gain.
         key: seed, frame and side, which determine the noise.
 
     Returns:
@@ -193,7 +206,7 @@ def sensor_image(
 
 
 def _streak(length: float) -> NDArray[np.float32]:
-    """Weights of a box filter of any length in pixels, whose outer pixels are partly covered."""
+    """Weights of a box filter, whose length in pixels need not be an integer."""
     half = int(np.ceil(length / 2 + 0.5))
     at = np.arange(-half, half + 1)
     weight = np.clip(length / 2 + 0.5 - np.abs(at), 0, 1)

@@ -1,4 +1,4 @@
-"""The routes of the camera: built-in ones, and routes along given poses."""
+"""The routes of the camera: built-in routes, and routes along given poses."""
 
 from __future__ import annotations
 
@@ -29,16 +29,17 @@ CALIBRATIONS = tuple(_CAMERAS)
 
 @dataclass(frozen=True)
 class Route:
-    """A drive.
+    """The path of the camera in a town, with its roads and its terrain.
 
     Attributes:
         name: for example ``demo``.
         about: description in a few words.
         land: ``town``, ``suburb`` or ``motorway``.
         camera: the stereo rig.
-        T_wc: ``(N, 4, 4)`` float64 poses of the left camera in the world frame of the town, where
-            y = 0 is the height 0 of the terrain.
-        roads, terrain: the roads and the ground of the drive.
+        T_wc: ``(N, 4, 4)`` float64 poses of the left camera in the world frame of the town. In this
+            frame, y = 0 is the height 0 of the terrain.
+        roads: the roads of the route.
+        terrain: the heights of the ground.
     """
 
     name: str
@@ -55,20 +56,25 @@ class Route:
 
     @property
     def yaw_rate(self) -> Float:
-        """``(N,)`` float64, rad/s."""
+        """Yaw rate of the camera at each frame, ``(N,)`` float64 rad/s."""
         heading = np.unwrap(np.arctan2(self.T_wc[:, 0, 2], self.T_wc[:, 2, 2]))
         return np.asarray(np.gradient(heading) * RATE)
 
     @property
     def ground_truth(self) -> Float:
-        """``(N, 4, 4)`` float64 ``T_wc`` with the first left camera as the world, as in KITTI."""
+        """``(N, 4, 4)`` float64 ``T_wc`` of the left camera.
+
+        As in KITTI, the world frame is that of the left camera at the first frame.
+        """
         return np.asarray(np.linalg.inv(self.T_wc[0]) @ self.T_wc)
 
 
 @dataclass(frozen=True)
 class _Leg:
-    """A drive along corner points ``(x, z)`` in metres. ``lanes`` gives the lane after each corner:
-    1 is the right one, -1 the left one."""
+    """A path along corner points ``(x, z)`` in metres.
+
+    ``lanes`` gives the lane after each corner: 1 for the right lane, -1 for the left lane.
+    """
 
     corners: tuple[tuple[float, float], ...]
     lanes: tuple[float, ...] = ()
@@ -132,7 +138,7 @@ _BUILT_IN = {
 }  # fmt: skip
 
 ROUTES = {name: route.about for name, route in _BUILT_IN.items()}
-# Names for a route with a variation; datasets.md explains how the town was chosen.
+# Names that stand for a route with a variation. datasets.md explains how the town was chosen.
 DRIVES = {"night": "lane+change:1+seed:1"}
 
 
@@ -165,21 +171,20 @@ def built_in_route(name: str) -> Route:
 
 
 def _straight(start: Float, direction: Float, metres: Float) -> Float:
-    """``(K, 2)`` points at ``(K,)`` distances from a point in a direction."""
+    """``(K, 2)`` points on a ray, at the ``(K,)`` distances ``metres`` from its start."""
     return start + np.outer(metres, direction) / np.linalg.norm(direction)
 
 
 def route_of_poses(T_wc: Float, name: str, calibration: str = "00-02") -> Route:
-    """Make a route along given poses, for example KITTI's.
+    """Make a route along given poses, for example along KITTI's ground truth.
 
-    The heights of all passes over a place are averaged, because a road has only one height;
-    headings, pitches and rolls are kept. ``Route.ground_truth`` has the poses with the averaged
-    heights.
+    The heights of all passes over a place are averaged, because a road has only one height.
+    Headings, pitches and rolls are kept. ``Route.ground_truth`` has the averaged heights.
 
     Args:
-        T_wc: ``(N, 4, 4)`` float64, y down.
+        T_wc: ``(N, 4, 4)`` float64 poses, with the y axis pointing down.
         name: name of the route.
-        calibration: one of `CALIBRATIONS`, the KITTI sequences whose camera is used.
+        calibration: one of `CALIBRATIONS`, which names the KITTI sequences whose camera is used.
 
     Raises:
         InputError: the calibration is unknown, a pose is not finite, the path has fewer than 20
@@ -220,8 +225,11 @@ def route_of_poses(T_wc: Float, name: str, calibration: str = "00-02") -> Route:
 
 
 def _round_corners(leg: _Leg) -> tuple[Float, Float]:
-    """``(K, 2)`` samples of the middle line every 0.25 m, with arcs at the corners, and the
-    ``(K,)`` lane at each sample."""
+    """Sample the middle line of the road every 0.25 m, with arcs at the corners.
+
+    Returns:
+        ``(K, 2)`` positions, and the ``(K,)`` lane at each of them.
+    """
     corners = np.array(leg.corners, np.float64)
     lanes = np.array(leg.lanes or (1.0,) * len(corners))
     points, lane = [corners[0][None]], [lanes[:1]]
@@ -254,12 +262,12 @@ def _round_corners(leg: _Leg) -> tuple[Float, Float]:
     keep = np.r_[True, np.diff(along) > 1e-9]
     at = np.arange(0, along[-1], 0.25)
     dense = np.stack([np.interp(at, along[keep], line[keep, i]) for i in (0, 1)], axis=1)
-    # Changing the lane takes about 20 m.
+    # A change of lane takes about 20 m.
     return _smooth(dense, 25), _smooth(np.interp(at, along[keep], value[keep])[:, None], 81)[:, 0]
 
 
 def _smooth(values: Float, window: int) -> Float:
-    """Apply a moving average twice; the ends stay in place."""
+    """Apply a moving average twice. The first and last values do not change."""
     half = window // 2
     for _ in range(2):
         first, last = values[:1], values[-1:]
@@ -277,7 +285,7 @@ def _headings(line: Float) -> Float:
 
 
 def _drive(path: Float, speed: float) -> Float:
-    """``(N, 2)`` positions at 10 Hz along a ``(K, 2)`` path, slower in bends."""
+    """``(N, 2)`` camera positions at 10 Hz along a ``(K, 2)`` path. The camera slows in bends."""
     along = np.cumsum(np.r_[0, np.linalg.norm(np.diff(path, axis=0), axis=1)])
     keep = np.r_[True, np.diff(along) > 1e-9]
     along, path = along[keep], path[keep]
@@ -335,7 +343,12 @@ def _terrain(xz: Float, height: Callable[[Float], Float]) -> Terrain:
 
 
 def _heights_of(xz: Float, up: Float) -> Callable[[Float], Float]:
-    """A smooth function through the given heights, which averages the heights of several passes."""
+    """Make a smooth function of the height, which averages the heights of several passes.
+
+    Args:
+        xz: ``(N, 2)`` positions.
+        up: ``(N,)`` heights at these positions.
+    """
     from scipy.spatial import cKDTree
 
     tree = cKDTree(xz)

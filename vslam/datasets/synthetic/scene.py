@@ -1,5 +1,7 @@
-"""The scene in the form that the renderer's kernels use: flat textured surfaces, their textures
-with mipmaps, light and camera."""
+"""The data types of the renderer's kernels.
+
+They describe flat textured surfaces, their textures with mipmaps, the light and the camera.
+"""
 
 from __future__ import annotations
 
@@ -11,29 +13,33 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 
-# How a surface reacts to light: an opaque one has a lit and a dark side, foliage lets light
-# through, and a screen (a lamp or lit window) emits light.
+# How a surface reacts to light. An opaque surface has a lit and a dark side. Foliage lets light
+# through. A screen (a lamp or a lit window) emits light.
 OPAQUE, FOLIAGE, SCREEN = 0, 1, 2
 
 
 class Surfaces(NamedTuple):
-    """Q parallelograms (or triangles) ``origin + s edge_s + t edge_t``, s and t in [0, 1].
+    """Q flat surfaces, each of which is a parallelogram or a triangle.
+
+    The points of a parallelogram are ``origin + s edge_s + t edge_t`` with s and t in [0, 1]. The
+    points of a triangle are those with ``s + t <= 1``.
 
     Attributes:
-        origin, edge_s, edge_t: ``(Q, 3)`` float64 metres, world (x right, y down, z forward).
-        uv: ``(Q, 6)`` float64 ``u0 us ut v0 vs vt`` for the texture coordinates
-            ``u = u0 + us s + ut t`` and ``v = v0 + vs s + vt t``, where 1 is the width or height of
-            the texture.
-        texture: ``(Q,)`` int32 number in the atlas; where the texture has alpha, only its opaque
-            part is visible (a cut-out).
-        detail: ``(Q,)`` int32 fine texture that multiplies the base texture, -1 for none.
-        detail_size: ``(Q,)`` float64 metres that one repeat of the fine texture covers.
-        gain: ``(Q,)`` float64 factor on the albedo.
-        triangle: ``(Q,)`` bool, keep only ``s + t <= 1``.
-        layer: ``(Q,)`` uint8; of two surfaces in one plane, the one with the higher layer is
-            visible.
-        material: ``(Q,)`` uint8 ``OPAQUE``, ``FOLIAGE`` or ``SCREEN``.
-        thing: ``(Q,)`` int32 number of the object that the surface is a part of, -1 for ground.
+        origin, edge_s, edge_t: ``(Q, 3)`` float64 metres, in the world frame (x right, y down, z
+            forward).
+        uv: ``(Q, 6)`` float64 coefficients ``u0 us ut v0 vs vt`` of the texture coordinates
+            ``u = u0 + us s + ut t`` and ``v = v0 + vs s + vt t``. The width and the height of the
+            texture are 1.
+        texture: ``(Q,)`` int32 number of the texture in the atlas. If the texture has alpha, only
+            its opaque part is visible (a cut-out).
+        detail: ``(Q,)`` int32 number of a fine texture that multiplies the texture; -1 for none.
+        detail_size: ``(Q,)`` float64 size in metres of one repeat of the fine texture.
+        gain: ``(Q,)`` float64 factor by which the albedo is multiplied.
+        triangle: ``(Q,)`` bool, whether the surface is a triangle.
+        layer: ``(Q,)`` uint8. If two surfaces lie in one plane, the surface with the higher layer
+            is visible.
+        material: ``(Q,)`` uint8: ``OPAQUE``, ``FOLIAGE`` or ``SCREEN``.
+        thing: ``(Q,)`` int32 number of the object to which the surface belongs; -1 for the ground.
     """
 
     origin: Float
@@ -50,18 +56,18 @@ class Surfaces(NamedTuple):
     thing: NDArray[np.int32]
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Surfaces:
-        """The surfaces ``rows``, a mask or indices."""
+        """The surfaces that ``rows``, a mask or an array of indices, selects."""
         return Surfaces._make(np.ascontiguousarray(column[rows]) for column in self)
 
     def moved(self, R: Float, t: Float) -> Surfaces:
-        """The surfaces turned by ``R`` ``(3, 3)`` and then shifted by ``t`` ``(3,)``."""
+        """The surfaces rotated by ``R``, ``(3, 3)``, and then translated by ``t``, ``(3,)``."""
         return self._replace(
             origin=self.origin @ R.T + t, edge_s=self.edge_s @ R.T, edge_t=self.edge_t @ R.T
         )
 
 
 def join(parts: list[Surfaces]) -> Surfaces:
-    """Join at least one part, in order."""
+    """Join one or more parts, in their order."""
     if len(parts) == 1:
         return parts[0]
     return Surfaces(*map(np.concatenate, zip(*parts, strict=True)))
@@ -82,7 +88,10 @@ def patches(
     material: int = OPAQUE,
     thing: int = -1,
 ) -> Surfaces:
-    """Make surfaces that differ only in position and texture coordinates, as in `Surfaces`."""
+    """Make surfaces that differ only in their position and texture coordinates.
+
+    The arguments are those of `Surfaces`.
+    """
     arrays = [np.asarray(x, np.float64) for x in (origin, edge_s, edge_t)]
     n = max(len(x) if x.ndim == 2 else 1 for x in arrays)
     o, s, t = (_rows(x, n) for x in arrays)
@@ -103,7 +112,7 @@ def patches(
 
 
 def _rows(values: Float, n: int) -> Float:
-    """Broadcast ``(K,)`` or ``(n, K)`` to a copy ``(n, K)``, faster than NumPy does."""
+    """Broadcast ``(K,)`` or ``(n, K)`` to a copy of shape ``(n, K)``, faster than NumPy does."""
     rows = np.empty((n, values.shape[-1]))
     rows[:] = values
     return rows
@@ -114,9 +123,10 @@ class Atlas(NamedTuple):
 
     Attributes:
         texels: uint8 grey levels of all mipmap levels of all textures.
-        alpha: uint8 alpha of the textures that have it; 128 and more is opaque.
-        offset: ``(T, L)`` int64 start of each level in ``texels``.
-        alpha_offset: ``(T, L)`` int64 start of each level in ``alpha``; -1 for an opaque texture.
+        alpha: uint8 alpha of the textures that have alpha. Values of at least 128 are opaque.
+        offset: ``(T, L)`` int64 start of each mipmap level in ``texels``.
+        alpha_offset: ``(T, L)`` int64 start of each mipmap level in ``alpha``; -1 for an opaque
+            texture.
         log_size: ``(T, 2)`` int64 binary logarithms of width and height of level 0.
     """
 
@@ -138,8 +148,8 @@ class AtlasBuilder:
         """Add a texture.
 
         Args:
-            grey: ``(H, W)`` albedo, 0 to 255; H and W are powers of two. Row 0 is v = 0.
-            alpha: ``(H, W)`` 0 to 255, or None if opaque.
+            grey: ``(H, W)`` albedo, 0 to 255. H and W are powers of two. Row 0 is at v = 0.
+            alpha: ``(H, W)`` alpha, 0 to 255; None if the texture is opaque.
 
         Returns:
             The number of the texture in the atlas.
@@ -151,7 +161,7 @@ class AtlasBuilder:
         return len(self._grey) - 1
 
     def build(self) -> Atlas:
-        """Join the textures."""
+        """Join the textures to an atlas."""
         offset, texels = _flatten([*self._grey])
         alpha_offset, alpha = _flatten(self._alpha)
         log_size = [[int(n).bit_length() - 1 for n in p[0].shape[::-1]] for p in self._grey]
@@ -187,9 +197,9 @@ def _flatten(
 
 
 class LightValues(NamedTuple):
-    """The values of `render.Light`, which documents them, as f8 for kernels.
+    """The values of `render.Light` as f8, for kernels.
 
-    ``sun_x``, ``sun_y``, ``sun_z``: unit vector towards the sun, world.
+    ``sun_x``, ``sun_y`` and ``sun_z`` are the unit vector towards the sun, in the world frame.
     """
 
     sun_x: float
@@ -207,7 +217,8 @@ class LightValues(NamedTuple):
 class PosedCamera(NamedTuple):
     """A camera with its pose, for kernels.
 
-    ``T_wc`` (4, 4) f8; ``fx``, ``fy``, ``cx``, ``cy`` f8 pixels; ``height``, ``width`` i8 pixels.
+    ``T_wc`` is (4, 4) f8. ``fx``, ``fy``, ``cx`` and ``cy`` are f8 in pixels. ``height`` and
+    ``width`` are i8 in pixels.
     """
 
     T_wc: NDArray[np.float64]
@@ -222,9 +233,10 @@ class PosedCamera(NamedTuple):
 class SampleBand(NamedTuple):
     """``(h, w)`` samples in a band of image rows.
 
-    ``first_row`` i8 first row of the band, in pixels; ``samples`` i8 samples per pixel in each
-    direction; ``inverse_depth`` (h, w) f4 1/z of the nearest surface, 0 if there is none; ``seen``
-    (h, w) i4 index of this surface in the result of `find_visible`, -1 if there is none.
+    ``first_row`` is the first row of the band in pixels, i8. ``samples`` is the number of samples
+    per pixel in each direction, i8. ``inverse_depth`` is 1/z of the nearest surface, (h, w) f4; it
+    is 0 if there is no surface. ``seen`` is the index of the nearest surface in the result of
+    `find_visible`, (h, w) i4; it is -1 if there is no surface.
     """
 
     first_row: int

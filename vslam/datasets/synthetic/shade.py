@@ -1,4 +1,4 @@
-"""Shading of pixels: trilinear textures, sun, shadows, lamps, haze and sky."""
+"""Shading of pixels, with trilinear textures, sun, shadows, lamps, haze and sky."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from vslam.kernels import borrowed, inline, kernel
 _SCALE = 0.5 ** np.arange(24)  # scale of each mipmap level
 _TWO_TAPS = 1.25  # a pixel is sampled twice if the aspect ratio of its footprint is above this
 _DETAIL_ENDS = 12.0  # texels of the detail texture per pixel at which its contrast vanishes
-_SKY_HAZE = 185.0  # haze at which the panorama keeps its own grey levels
+_SKY_HAZE = 185.0  # grey level of the haze at which the panorama of the sky is not scaled
 SKY_RISE = 1.0  # tangent of the elevation at the upper edge of the sky's panorama
-SKY_FALL = 0.1  # tangent of the depression at its lower edge
-# Grey levels that the glare adds at the sun, and 1 - cos(angle) at which it falls to a quarter.
+SKY_FALL = 0.1  # tangent of the depression at the lower edge of the sky's panorama
+# Grey levels that the glare adds at the sun, and 1 - cos(angle) at which the glare is a quarter.
 _GLARE, _GLARE_WIDTH = 120.0, 0.10
 _POOL_GAIN = 2.5  # brightness under a street lamp relative to a lit window
 _SHADE_BIAS = 0.35  # m; an occluder must be this much higher than a point to shade it
@@ -37,9 +37,9 @@ _SHADE_BIAS = 0.35  # m; an occluder must be this much higher than a point to sh
 class _PixelRun(NamedTuple):
     """Neighbouring pixels of one row that see one surface.
 
-    ``start``, ``end`` i8 range of columns, without ``end``; ``x``, ``y`` f8 position of the sample
-    in the first pixel, with the same offset in the others; ``weight`` f8 fraction of each pixel
-    that the surface covers.
+    The pixels are in the columns ``start`` to ``end - 1``, i8. ``x`` and ``y`` are the position of
+    the sample in the first pixel, f8. In the other pixels, the sample has the same offset.
+    ``weight`` is the fraction of each pixel that the surface covers, f8.
     """
 
     start: int
@@ -52,9 +52,11 @@ class _PixelRun(NamedTuple):
 class _RowBuffers(NamedTuple):
     """Working memory for one row of W pixels.
 
-    ``total`` (W,) f8 radiance so far; ``nearest`` (W,) f8 largest 1/z so far. For the current run:
-    ``texel`` (6, W) f8 depth, s, t, half the distance of two texture samples in s and in t, albedo;
-    ``size`` (W,) f4 texels per pixel; ``bits`` (W,) i4 the bits of ``size`` (same memory).
+    ``total`` is the radiance so far, (W,) f8. ``nearest`` is the largest 1/z so far, (W,) f8.
+
+    The other arrays describe the current run. ``texel`` is (6, W) f8. Its rows are the depth, s, t,
+    half the distance of two texture samples in s, the same in t, and the albedo. ``size`` is the
+    number of texels per pixel, (W,) f4. ``bits`` is a view of the bits of ``size``, (W,) i4.
     """
 
     total: NDArray[np.float64]
@@ -66,7 +68,7 @@ class _RowBuffers(NamedTuple):
 
 @inline
 def _bilinear(texels, at, log_w, log_h, level, u, v):
-    """Bilinear sample of a repeating texture at ``(u, v)``, in texels of level 0."""
+    """Sample a repeating texture bilinearly at ``(u, v)``, in texels of level 0."""
     scale = _SCALE[level]
     x = u * scale - 0.5
     y = v * scale - 0.5
@@ -87,16 +89,20 @@ def _bilinear(texels, at, log_w, log_h, level, u, v):
 
 @inline
 def _log2(bits):
-    """Binary logarithm of the float32 with these bits: the integer part and the fraction, which is
-    interpolated linearly between powers of two."""
+    """The integer part and the fraction of the binary logarithm of a float32, given its bits.
+
+    The fraction is interpolated linearly between powers of two.
+    """
     return (int(bits) >> 23) - 127, np.float32(int(bits) & 0x7FFFFF) * np.float32(1.0 / 0x800000)
 
 
 @inline
 def _trilinear(texels, offset, number, log_w, log_h, bits, u, v):
-    """Texture ``number`` at ``(u, v)``, averaged over a pixel. ``bits`` are the bits of a float32:
-    the number of texels of level 0 per pixel in one direction. Two levels are blended over the
-    middle half of an octave."""
+    """Sample a texture at ``(u, v)``, averaged over a pixel.
+
+    ``bits`` are the bits of a float32: the number of texels of level 0 per pixel in one direction.
+    Two mipmap levels are blended over the middle half of an octave.
+    """
     low, part = _log2(bits)
     top = max(log_w, log_h)
     part = (part - np.float32(0.25)) * np.float32(2.0)
@@ -104,7 +110,7 @@ def _trilinear(texels, offset, number, log_w, log_h, bits, u, v):
         low, part = 0, np.float32(0.0)
     if low >= top:
         low, part = top, np.float32(0.0)
-    # There is only one return statement, because Numba would otherwise count references here.
+    # There is only one return statement. With more of them, Numba would count references here.
     row = np.uintp(number)
     high = low
     if part >= 1.0:
@@ -120,8 +126,10 @@ def _trilinear(texels, offset, number, log_w, log_h, bits, u, v):
 
 @inline
 def _sky(atlas, number, light, x, y, z, bits):
-    """Grey level of the panorama in the world direction ``(x, y, z)``, with the glare around the
-    sun; ``bits`` as in `_trilinear`."""
+    """Grey level of the sky in the world direction ``(x, y, z)``, with the glare around the sun.
+
+    ``bits`` are those of `_trilinear`.
+    """
     texels, offset, log_size = atlas.texels, atlas.offset, atlas.log_size
     log_w, log_h = log_size[number, 0], log_size[number, 1]
     square = x * x + z * z
@@ -136,7 +144,7 @@ def _sky(atlas, number, light, x, y, z, bits):
 
 @inline
 def _lit(shadow, frame, light, slope, x, y, z):
-    """Fraction of the sunlight that reaches a world point; shadows have soft edges."""
+    """Fraction of the sunlight that reaches a world point. Shadows have soft edges."""
     up = -y
     a = (x - light.sun_x * slope * up - frame[0]) / frame[2] - 0.5
     b = (z - light.sun_z * slope * up - frame[1]) / frame[2] - 0.5
@@ -162,7 +170,7 @@ def _lit(shadow, frame, light, slope, x, y, z):
 
 @inline
 def _pool(pools, frame, x, z):
-    """Light of the street lamps at a world point, 1 under a lamp."""
+    """Light of the street lamps at a world point. It is 1 under a lamp."""
     a = (x - frame[0]) / frame[2]
     b = (z - frame[1]) / frame[2]
     c, r = math.floor(a), math.floor(b)
@@ -181,15 +189,18 @@ def _pool(pools, frame, x, z):
 def shade(visible, band, atlas, sky, light, shadows, pools, camera, view):
     """Shade the rows of a view that belong to a band of samples.
 
-    Pixels whose samples all see one surface are shaded in runs; other pixels are shaded once for
-    each surface.
+    Neighbouring pixels that see only one and the same surface are shaded together (a run). Other
+    pixels are shaded once for each surface that they see.
 
     Args:
-        visible: from `rasterise.find_visible`.
-        band: `scene.SampleBand`, from `rasterise.rasterise`.
-        atlas, light, camera: `scene.Atlas`, `LightValues`, `PosedCamera`.
+        visible: result of `rasterise.find_visible`.
+        band: `scene.SampleBand`, after `rasterise.rasterise`.
+        atlas: `scene.Atlas`.
         sky: number of the sky's panorama in the atlas.
-        shadows, pools: `shadows.ShadowMap`, `shadows.LampPools`.
+        light: `scene.LightValues`.
+        shadows: `shadows.ShadowMap`.
+        pools: `shadows.LampPools`.
+        camera: `scene.PosedCamera`.
         view: `render.RenderedView`, output.
     """
     visible, seen = borrowed(visible), borrowed(band.seen)
@@ -243,15 +254,17 @@ def shade(visible, band, atlas, sky, light, shadows, pools, camera, view):
         for u in range(width):
             image[v, u] = total[u] * light.exposure
             depth[v, u] = 1.0 / nearest[u] if nearest[u] > 0.0 else 0.0
-    # This keeps the arrays alive that are borrowed above.
+    # This keeps the arrays alive whose memory is used above.
     held[0, 0] = held_number[0] + held_rows[0, 0] + held_size[0]
 
 
 @inline
 def _kinds(seen, row, column, samples, number, weight, shift_u, shift_v):
-    """Collect the different surfaces that the samples of a pixel see; returns their number. For
-    each surface, ``weight`` is the number of its samples, and ``shift_u`` and ``shift_v`` are the
-    sums of the samples' offsets from the pixel's centre."""
+    """Collect the different surfaces that the samples of a pixel see, and return their number.
+
+    For each surface, ``weight`` becomes the number of samples that see it. ``shift_u`` and
+    ``shift_v`` become the sums of the offsets of these samples from the pixel's centre.
+    """
     kinds = 0
     step = 1.0 / samples
     for a in range(samples):
@@ -282,7 +295,7 @@ def _alike(seen, row, column, samples, first):
 
 @inline
 def _sky_run(run, atlas, sky, light, camera, buffers):
-    """Add the sky to the pixels of a run, as `_shade_run` adds a surface."""
+    """Add the sky to the pixels of a run. `_shade_run` does the same for a surface."""
     start, end, x0, y, weight = run.start, run.end, run.x, run.y, run.weight
     log_size, T_wc = atlas.log_size, camera.T_wc
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
@@ -303,8 +316,11 @@ def _sky_run(run, atlas, sky, light, camera, buffers):
 
 @inline
 def _shade_run(run, visible, number, atlas, light, shadows, pools, camera, buffers):
-    """Add a surface, row ``number`` of ``visible``, to the pixels of a run, in ``buffers.total``
-    and ``buffers.nearest``; the other arguments are those of `shade`."""
+    """Add a surface to the pixels of a run.
+
+    The surface is row ``number`` of ``visible``. The result is written to ``buffers.total`` and
+    ``buffers.nearest``. The other arguments are those of `shade`.
+    """
     start, end, x0, y, weight = run.start, run.end, run.x, run.y, run.weight
     texels, offset, log_size, T_wc = atlas.texels, atlas.offset, atlas.log_size, camera.T_wc
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
@@ -318,7 +334,7 @@ def _shade_run(run, visible, number, atlas, light, shadows, pools, camera, buffe
     base_x = T_wc[0, 1] * ry + T_wc[0, 2] + (x0 - cx) * step_x
     base_y = T_wc[1, 1] * ry + T_wc[1, 2] + (x0 - cx) * step_y
     base_z = T_wc[2, 1] * ry + T_wc[2, 2] + (x0 - cx) * step_z
-    n = np.uintp(number)  # a view of the row would be slower, because Numba counts its references
+    n = np.uintp(number)  # a view of the row would be slower: Numba would count its references
     au, av = visible[n, TEXTURE], visible[n, TEXTURE + 3]
     bu, bv = visible[n, TEXTURE + 1], visible[n, TEXTURE + 4]
     inverse_0 = visible[n, 6] * x0 + visible[n, 7] * y + visible[n, 8]
@@ -347,7 +363,7 @@ def _shade_run(run, visible, number, atlas, light, shadows, pools, camera, buffe
         taps = 2 if ds != 0.0 or dt != 0.0 else 1
         albedo = np.float32(0.0)
         for tap in range(taps):
-            f = taps - 1 - 2 * tap  # 0 for one tap, 1 and -1 for two
+            f = taps - 1 - 2 * tap  # 0 for one texture sample, 1 and -1 for two
             albedo += _trilinear(
                 texels, offset, texture, log_w, log_h, bits[i], s + f * ds, t + f * dt
             )

@@ -1,4 +1,4 @@
-"""Shadows, as a map of the highest occluder on each sun ray, and the light of street lamps."""
+"""Shadows of the sun, and the light of street lamps."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ _POOL_CELL, _POOL_REACH = 0.5, 16.0  # m
 
 
 class ShadowMap(NamedTuple):
-    """The highest occluder on each sun ray; the cell of a ray is where the ray meets height 0.
+    """The highest occluder on each sun ray.
+
+    A sun ray belongs to the cell where it meets the height 0.
 
     Attributes:
-        height_cm: ``(R, C)`` uint16 height of the highest occluder above ``frame[3]`` in
-            centimetres, 0 for none; rows along z, columns along x.
-        frame: ``(4,)`` float64 x and z of the corner of cell (0, 0), cell size and reference
-            height, metres.
+        height_cm: ``(R, C)`` uint16 height of the highest occluder above the reference height in
+            centimetres; 0 if there is no occluder. Rows run along z, columns along x.
+        frame: ``(4,)`` float64: x and z of the corner of cell (0, 0), the cell size and the
+            reference height, in metres.
     """
 
     height_cm: NDArray[np.uint16]
@@ -31,11 +33,13 @@ class ShadowMap(NamedTuple):
 
 
 class LampPools(NamedTuple):
-    """Light of the street lamps, independent of height: a lamp's cone is treated as a cylinder.
+    """Light of the street lamps.
+
+    It does not depend on the height, because the cone of a lamp is approximated by a cylinder.
 
     Attributes:
-        light: ``(R, C)`` float32, 1 under a lamp; rows along z, columns along x.
-        frame: ``(3,)`` float64 x and z of node (0, 0) and the distance between nodes, metres.
+        light: ``(R, C)`` float32, which is 1 under a lamp. Rows run along z, columns along x.
+        frame: ``(3,)`` float64: x and z of node (0, 0), and the distance between nodes, in metres.
     """
 
     light: NDArray[np.float32]
@@ -65,9 +69,10 @@ def lamp_pools(lamps: NDArray[np.float64]) -> LampPools:
 
 
 def cast_shadows(surfaces: Surfaces, atlas: Atlas, sun: NDArray[np.float64]) -> ShadowMap:
-    """The shadows of all surfaces except the ground (``thing`` -1).
+    """Compute the shadows of all surfaces except the ground (``thing`` -1).
 
-    ``sun`` is a ``(3,)`` unit vector towards the sun.
+    Args:
+        sun: ``(3,)`` unit vector towards the sun, in the world frame.
     """
     occluders = surfaces.select(surfaces.thing >= 0)
     if not len(occluders.origin):
@@ -95,8 +100,9 @@ def _cast(surfaces, atlas, slope, shadows):
     """Raise the heights of a shadow map to the heights of the occluders.
 
     Args:
-        surfaces, atlas: `scene.Surfaces` of the occluders, `scene.Atlas`.
-        slope: ``(2,)`` float64 metres along x and z that a sun ray travels per metre of height.
+        surfaces: `scene.Surfaces` of the occluders.
+        atlas: `scene.Atlas`.
+        slope: ``(2,)`` float64 distance along x and z that a sun ray travels per metre of height.
         shadows: `ShadowMap`, updated.
     """
     origin, edge_s, edge_t = surfaces.origin, surfaces.edge_s, surfaces.edge_t

@@ -1,4 +1,4 @@
-"""A town under construction, to which many functions add, and its textures."""
+"""A town under construction, to which many functions add objects, and its textures."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from vslam.datasets.synthetic.textures import Rng
 
 @dataclass(frozen=True)
 class Palette:
-    """Numbers of textures in the atlas.
+    """The numbers of the town's textures in the atlas.
 
-    ``signs`` has the front and the back of each sign. ``later_twigs`` are the sparser twigs of
-    trees after a change.
+    ``signs`` has the front and the back of each sign. ``later_twigs`` are the sparser twigs that
+    trees have after a change.
     """
 
     sky: int
@@ -43,7 +43,7 @@ class Palette:
 
 
 def make_palette(rng: Rng, atlas: AtlasBuilder, pool: int) -> Palette:
-    """Paint the textures; ``pool`` is the number of variants of trees, fences and walls."""
+    """Paint the textures. ``pool`` is the number of variants of trees, fences and walls."""
     add = atlas.add
     return Palette(
         sky=add(textures.sky(rng)),
@@ -73,7 +73,7 @@ def _sign(rng: Rng, atlas: AtlasBuilder) -> tuple[int, int]:
 
 
 def _kerb(rng: Rng) -> textures.Grey:
-    """Kerb stones of 1 m; the texture covers 4 m."""
+    """Kerb stones with a length of 1 m. The texture covers 4 m."""
     tone = np.repeat(rng.uniform(135, 175, 4), 128)[None, :]
     grey = tone * (1.0 + 0.09 * textures.noise(rng, 32, 512, 8.0, 3))
     grey[:, ::128] = grey[:, 1::128] = 60.0
@@ -90,20 +90,21 @@ def _roof_tiles(rng: Rng) -> textures.Grey:
 
 Float = NDArray[np.float64]
 
-# When an object exists: always, until the camera leaves its place for the first time, or only
-# after that.
+# When an object exists: always (ALWAYS), until the camera leaves its place for the first time
+# (BEFORE), or only after that (AFTER).
 ALWAYS, BEFORE, AFTER = 0, 1, 2
 ALIASES = 4  # number of different houses, trees and cars with --aliased
 
 
 @dataclass(frozen=True)
 class Variation:
-    """The variation of a town.
+    """A variation of a town.
 
     Attributes:
         seed: seed of all random numbers.
-        aliased: repeat a few houses, trees and cars, so that different places look alike.
-        change: how much a place has changed when it is passed again, 0 to 1.
+        aliased: whether a few houses, trees and cars are repeated, so that different places look
+            alike.
+        change: how much a place has changed when the camera passes it again, from 0 to 1.
         moving: number of moving cars.
     """
 
@@ -115,19 +116,24 @@ class Variation:
 
 @dataclass(frozen=True)
 class Site:
-    """The town so far, and everything that is needed to add to it.
+    """The town so far, and everything that is needed to add objects to it.
+
+    In this package, objects are called things.
 
     Attributes:
-        route, variation: the drive and the variation of its town.
-        roads: the route's roads with side streets.
+        route: the route along which the town is built.
+        variation: the variation of the town.
+        roads: the roads of the route, with side streets.
         style: cross-section of the roads.
         plan: occupied ground.
-        atlas, palette: textures.
+        atlas: textures.
+        palette: numbers of the textures.
         rng: random generator for everything that may differ between variations.
         cameras: ``(N, 2)`` x and z of all possible camera positions.
         lamps: x and z of each street lamp.
-        parts: surfaces of the things, in the route's world.
-        place, when: position of each thing and when it exists, as in `town.Town`.
+        parts: surfaces of the things, in the world frame of the route.
+        place: position of each thing, as in `town.Town`.
+        when: when each thing exists, as in `town.Town`.
     """
 
     route: Route
@@ -146,16 +152,16 @@ class Site:
 
     @property
     def next_thing(self) -> int:
-        """Number of the next thing, for ``Surfaces.thing``."""
+        """The number of the next thing, for ``Surfaces.thing``."""
         return len(self.place)
 
     def stand(self, model: Surfaces, xz: Float, heading: float, when: int = ALWAYS) -> None:
-        """Place a model on the ground as the next thing; its ``thing`` must be `next_thing`."""
+        """Place a model on the ground as the next thing. Its ``thing`` must be `next_thing`."""
         up = float(self.route.terrain.height(xz[None])[0])
         self.parts.append(model.moved(solids.turn(heading), np.array([xz[0], -up, xz[1]])))
         self.place.append(xz)
         self.when.append(when)
 
     def changes(self, rng: Rng, rate: float) -> bool:
-        """Draw at random whether an object has changed when its place is passed again."""
+        """Draw at random whether an object has changed when the camera passes it again."""
         return bool(rng.random() < rate * self.variation.change)

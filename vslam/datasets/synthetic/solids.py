@@ -1,7 +1,7 @@
 """Houses, trees and street furniture as flat surfaces.
 
-Each model has its own frame: x right, y down, z away from the viewer, and the ground at y = 0. Its
-front lies in the plane z = 0 or faces -z.
+Each model has its own frame, with x right, y down, z away from the viewer, and the ground at y = 0.
+The front of a model lies in the plane z = 0 or faces -z.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from vslam.datasets.synthetic.scene import FOLIAGE, SCREEN, Surfaces, join, patches
 from vslam.datasets.synthetic.textures import Rng
 
-FOUNDATION = 1.2  # m; walls extend this far below the ground, for slopes
+FOUNDATION = 1.2  # m; walls extend this far below the ground, so that no gap opens on slopes
 
 Vector = tuple[float, ...] | NDArray[np.float64]
 
 
 def turn(heading: float) -> NDArray[np.float64]:
-    """``(3, 3)`` rotation of the z axis to a heading (radians from +z towards +x)."""
+    """``(3, 3)`` rotation of the z axis to a heading, in radians from +z towards +x."""
     c, s = np.cos(heading), np.sin(heading)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
@@ -29,7 +29,10 @@ def box(
     low: Vector, high: Vector, texture: int, *, thing: int, repeat: float = 0.0, gain: float = 1.0,
     material: int = 0,
 ) -> Surfaces:  # fmt: skip
-    """Sides and top of a box; the texture covers ``repeat`` metres, or a whole side if 0."""
+    """Make the sides and the top of a box.
+
+    The texture covers ``repeat`` metres. If ``repeat`` is 0, it covers a whole side.
+    """
     (x0, y0, z0), (x1, y1, z1) = low, high
     w, h, d = x1 - x0, y1 - y0, z1 - z0
     origin = [[x0, y0, z0], [x1, y0, z0], [x1, y0, z1], [x0, y0, z1], [x0, y0, z1]]
@@ -48,12 +51,12 @@ def walls(
     size: tuple[float, float, float], textures: list[int], lights: list[int], fine: int,
     *, thing: int,
 ) -> Surfaces:  # fmt: skip
-    """Front, right, back and left of a house ``(width, height, depth)``.
+    """Make the front, right, back and left wall of a house.
 
     Args:
-        size: metres.
-        textures: textures of the four sides, whose lower edge is at the ground.
-        lights: textures of their lit windows, -1 for none.
+        size: width, height and depth in metres.
+        textures: textures of the four walls, whose lower edge is at the ground.
+        lights: textures of the lit windows of the four walls; -1 for none.
         fine: detail texture.
         thing: number of the house.
     """
@@ -77,7 +80,7 @@ def walls(
 def roof(
     rng: Rng, size: tuple[float, float, float], tiles: int, wall: int, fine: int, *, thing: int
 ) -> Surfaces:
-    """Gable or flat roof with chimneys over a house ``(width, height, depth)``."""
+    """Make a gable or flat roof with chimneys for a house of ``(width, height, depth)`` metres."""
     w, h, d = size
     tone = float(rng.uniform(0.6, 1.4))
     over = 0.45
@@ -118,7 +121,7 @@ def roof(
 def tree(
     rng: Rng, twigs: list[int], bark: int, *, height: float, thing: int, conifer: bool = False
 ) -> Surfaces:
-    """A tree: a trunk, branches, and a crown of twigs on flat cards with alpha."""
+    """Make a tree: a trunk, branches, and a crown of twigs on flat cards with alpha."""
     radius = float(rng.uniform(0.018, 0.028)) * height
     clear = height * (0.12 if conifer else float(rng.uniform(0.28, 0.4)))
     parts = [_trunk(radius, clear + 0.25 * height, bark, thing)]
@@ -147,7 +150,7 @@ def tree(
 
 
 def bush(rng: Rng, twigs: list[int], *, height: float, thing: int) -> Surfaces:
-    """A bush of twigs that reach down to the ground."""
+    """Make a bush of twigs that reach down to the ground."""
     cards = int(rng.integers(4, 8))
     middle = np.column_stack([
         rng.normal(0, 0.3 * height, cards), rng.uniform(-0.75, -0.4, cards) * height,
@@ -169,7 +172,7 @@ def _trunk(radius: float, height: float, bark: int, thing: int) -> Surfaces:
 
 
 def _branch(rng: Rng, start: Vector, end: Vector, radius: float, bark: int, thing: int) -> Surfaces:
-    """Two crossed strips from ``start`` to ``end``."""
+    """Make a branch of two crossed strips from ``start`` to ``end``."""
     way = np.asarray(end) - np.asarray(start)
     side = np.cross(way, rng.normal(0, 1, 3))
     side /= np.linalg.norm(side)
@@ -183,7 +186,12 @@ def _cards(
     rng: Rng, middle: NDArray[np.float64], size: NDArray[np.float64], twigs: list[int],
     thing: int, gain: float,
 ) -> Surfaces:  # fmt: skip
-    """Square twigs at ``(N, 3)`` positions with sides of ``(N,)`` metres, rotated at random."""
+    """Make square twigs with random rotations.
+
+    Args:
+        middle: ``(N, 3)`` positions.
+        size: ``(N,)`` lengths of their sides in metres.
+    """
     n = len(middle)
     heading, tilt, roll = rng.uniform((0, -0.6, 0), (2 * np.pi, 0.6, 6.3), (n, 3)).T[:, :, None]
     zero = np.zeros_like(heading)
@@ -199,7 +207,7 @@ def _cards(
 
 
 def hedge(rng: Rng, length: float, height: float, texture: int, top: int, thing: int) -> Surfaces:
-    """A clipped hedge along x."""
+    """Make a clipped hedge along x."""
     depth, shift = float(rng.uniform(0.5, 0.9)), float(rng.random())
     uv = (shift, length / 4.0, 0, 0, 0, 1)
     x0, x1 = -length / 2, length / 2
@@ -220,7 +228,7 @@ def hedge(rng: Rng, length: float, height: float, texture: int, top: int, thing:
 def panel(
     length: float, height: float, texture: int, thing: int, *, depth: float = 0.0
 ) -> Surfaces:
-    """A fence along x, or a wall if it has depth; the texture covers 4 m."""
+    """Make a fence along x, or a wall if ``depth`` is not 0. The texture covers 4 m."""
     if depth > 0:
         return box((-length / 2, -height, 0), (length / 2, 0.4, depth), texture, thing=thing,
                    repeat=4.0)  # fmt: skip
@@ -230,7 +238,7 @@ def panel(
 
 
 def lamp_post(height: float, arm: float, metal: int, screen: int, thing: int) -> Surfaces:
-    """A street lamp whose arm reaches towards -z."""
+    """Make a street lamp whose arm extends towards -z."""
     return join([
         box((-0.07, -height, -0.07), (0.07, 0.3, 0.07), metal, thing=thing),
         box((-0.04, -height - 0.05, -arm), (0.04, -height + 0.03, 0.05), metal, thing=thing),
@@ -242,7 +250,7 @@ def lamp_post(height: float, arm: float, metal: int, screen: int, thing: int) ->
 def sign_post(
     rng: Rng, height: float, metal: int, faces: list[tuple[int, int]], thing: int
 ) -> Surfaces:
-    """Signs on a pole that face -z; ``faces`` has the front and back texture of each sign."""
+    """Make signs on a pole, which face -z. ``faces`` has the two textures of each sign."""
     parts = [box((-0.035, -height, -0.035), (0.035, 0.3, 0.035), metal, thing=thing)]
     top = -height
     for face in faces:

@@ -1,4 +1,7 @@
-"""Rendered sequences as KITTI trees in the user's cache; interrupted renderings are resumed."""
+"""Rendered sequences in KITTI's format, in the user's cache.
+
+An interrupted rendering is resumed by the next call.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,7 @@ from vslam.datasets.synthetic.town import build_town
 from vslam.errors import counted
 from vslam.trajectory import write_kitti
 
-VERSION = 2  # must be raised whenever the same seed gives different images
+VERSION = 2  # must be increased whenever the same seed produces different images
 DEPTH_SCALE = 100.0  # 16-bit depth images are in centimetres
 _RECORD = "manifest.json"
 
@@ -49,11 +52,11 @@ class Stored:
     """A rendered sequence in a cache folder.
 
     Attributes:
-        root: folder of its KITTI tree.
-        name: name of the sequence in that tree.
+        root: folder with the sequence in KITTI's format.
+        name: name of the sequence in that folder.
         frames: number of frames of the sequence.
         complete: whether all frames are rendered.
-        size: bytes on the disk.
+        size: size on the disk in bytes.
     """
 
     root: Path
@@ -64,14 +67,14 @@ class Stored:
 
 
 def cache_folder() -> Path:
-    """The folder of rendered sequences, in ``$VSLAM_CACHE`` or the user's cache folder."""
+    """The folder of rendered sequences, which is in ``$VSLAM_CACHE`` or in the user's cache."""
     from platformdirs import user_cache_path
 
     return Path(os.environ.get("VSLAM_CACHE") or user_cache_path("vslam")) / "synthetic"
 
 
 def folder_name(variation: Variation) -> str:
-    """The name of the KITTI tree that all sequences of one variation share."""
+    """The name of the folder that all sequences of one variation share."""
     name = f"v{VERSION}-seed{variation.seed}"
     name += "-aliased" if variation.aliased else ""
     name += f"-moving{variation.moving}" if variation.moving else ""
@@ -79,7 +82,7 @@ def folder_name(variation: Variation) -> str:
 
 
 def list_stored(cache: Path) -> list[Stored]:
-    """All sequences in a cache folder, complete or not."""
+    """All sequences in a cache folder. Some of them may be incomplete."""
     found = []
     for record in sorted(cache.glob(f"*/sequences/*/{_RECORD}")):
         folder, root = record.parent, record.parents[2]
@@ -95,13 +98,16 @@ def _folder_size(folder: Path) -> int:
 
 
 def place_folder(cache: Path) -> Path:
-    """The folder of views that benchmarks of loop detectors render."""
+    """The folder of the images that the benchmark of loop detectors renders."""
     return cache / f"v{VERSION}-places"
 
 
 def clean(cache: Path, name: str | None = None) -> int:
-    """Remove the whole cache, or all variations of the route ``name``; returns the number of freed
-    bytes."""
+    """Remove the whole cache, or all variations of the route ``name``.
+
+    Returns:
+        The number of freed bytes.
+    """
     freed = 0
     for places in cache.glob("v*-places") if name is None else []:
         freed += _folder_size(places)
@@ -125,18 +131,20 @@ def render_sequence(
     threads: int = 2,
     on_frame: OnFrame | None = None,
 ) -> Path:
-    """Render the missing frames of a route, and return the folder of its KITTI tree.
+    """Render the missing frames of a route, and return the folder of the sequence.
 
-    Damaged frames are rendered again, with a warning in the log.
+    Damaged frames are rendered again, and a warning is logged. The folder has KITTI's format.
 
     Args:
-        route: drive to render.
+        route: route to render.
         variation: variation of the town.
-        cache: folder of the trees; see `cache_folder`.
-        depth: also write ``depth_0``, the depth of the left camera as 16-bit PNG in centimetres.
-        until: render only the frames before this one; a later call can continue from there.
-        verify: compare the checksums of all frames instead of all sizes and a few checksums.
-        threads: number of frames that are rendered in parallel; images do not depend on it.
+        cache: folder of the rendered sequences, see `cache_folder`.
+        depth: whether to write ``depth_0``, too. It contains the depth of the left camera in
+            centimetres, as 16-bit PNG files.
+        until: render only the frames before this one. A later call can continue from there.
+        verify: compare the checksums of all frames. Otherwise, all file sizes and a few checksums
+            are compared.
+        threads: number of frames that are rendered in parallel. The images do not depend on it.
         on_frame: called with the number of finished frames and the number of all frames.
 
     Raises:
@@ -185,7 +193,7 @@ def render_sequence(
 
 
 def _matching_record(folder: Path, wanted: dict[str, Any], camera: Camera) -> dict[str, Any] | None:
-    """The manifest of a folder if it describes the wanted sequence, else None."""
+    """The manifest of a folder if it describes the wanted sequence, otherwise None."""
     found = _read_record(folder)
     if found is None or any(found.get(key) != value for key, value in wanted.items()):
         return None
@@ -217,7 +225,7 @@ def render_frames(
     Args:
         depth, threads: as for `render_sequence`.
         on_frame: called with the number of finished frames and ``total``.
-        total: number of frames of the sequence; frames that are not rendered count as finished.
+        total: number of frames of the sequence. Frames that are not rendered count as finished.
         monocular: render only the left images.
     """
     town = build_town(route, variation)
@@ -271,7 +279,7 @@ def _read_record(folder: Path) -> dict[str, Any] | None:
 
 
 def calibration_text(camera: Camera) -> str:
-    """The text of KITTI's ``calib.txt``; the colour cameras P2 and P3 repeat the grey ones."""
+    """The text of KITTI's ``calib.txt``. The colour cameras P2 and P3 equal the grey cameras."""
     lines = []
     for side in range(4):
         shift = -camera.bf if side % 2 else 0.0

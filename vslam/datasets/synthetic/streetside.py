@@ -16,7 +16,7 @@ _KERB = (0.15, 0.12)  # width and height of kerb stones, m
 
 
 def plant(site: Site, xz: Float, height: float) -> None:
-    """Plant a tree at ``(2,)`` x and z if there is room."""
+    """Plant a tree at the ``(2,)`` position (x, z) if there is room."""
     rng = np.random.default_rng([site.variation.seed, 7, site.next_thing])
     if not site.plan.claim(rectangle(xz, 0.0, 1.6, 1.6), road=site.style.lane + 1.0):
         return
@@ -38,8 +38,10 @@ def plant(site: Site, xz: Float, height: float) -> None:
 
 
 def _pruned(site: Site, model: Surfaces, xz: Float) -> Surfaces | None:
-    """The model without the twigs that are too near to a camera; None if 30 % or more of the twigs
-    are too near."""
+    """Remove the twigs that are too near to a camera from a model.
+
+    Returns None if 30 % or more of the twigs are too near.
+    """
     near = float(np.min(np.linalg.norm(site.cameras - xz, axis=1)))
     middle = model.origin + 0.5 * (model.edge_s + model.edge_t)
     size = np.linalg.norm(model.edge_s, axis=1) + np.linalg.norm(model.edge_t, axis=1)
@@ -50,8 +52,10 @@ def _pruned(site: Site, model: Surfaces, xz: Float) -> Surfaces | None:
 
 
 def lay_kerbs(site: Site) -> None:
-    """Lay raised kerb stones between carriageway and pavement, except where a road joins or where
-    the drive cuts a corner."""
+    """Lay raised kerb stones between the carriageway and the pavement.
+
+    There are no kerb stones where another road joins, and where the camera cuts a corner.
+    """
     roads, edge, step = site.roads, site.style.parking, 8
     tree, cameras = cKDTree(roads.xz), cKDTree(site.cameras)
     first = np.arange(0, len(roads.xz) - step, step)
@@ -70,7 +74,7 @@ def lay_kerbs(site: Site) -> None:
 
 
 def _on_ground(site: Site, xz: Float, height: float) -> Float:
-    """``(N, 3)`` points above the ground at ``(N, 2)`` x and z."""
+    """``(N, 3)`` points at a height above the ground, at ``(N, 2)`` positions (x, z)."""
     up = site.route.terrain.height(xz) + height
     return np.stack([xz[:, 0], -up, xz[:, 1]], axis=1)
 

@@ -1,4 +1,4 @@
-"""Roads and heights of the ground, which a route and its town share, and the town's plan."""
+"""The roads and the terrain, which a route and its town share, and the plan of the town."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from scipy.spatial import cKDTree
 
 Float = NDArray[np.float64]
 
-CLEARANCE = 2.5  # m, radius around every camera position that is kept free
+CLEARANCE = 2.5  # m, radius around every camera position in which no object may stand
 _CELL = 0.5  # m
 _BORDER = 150.0  # m of plan around the roads
 
 
 @dataclass(frozen=True)
 class Terrain:
-    """Heights on a square grid with bilinear interpolation.
+    """The height of the ground, on a square grid with bilinear interpolation.
 
     Attributes:
-        corner: ``(2,)`` float64 x and z of node (0, 0), metres.
-        cell: metres between nodes.
-        up: ``(R, C)`` float64 height of the nodes, metres above y = 0; rows along z.
+        corner: ``(2,)`` float64 x and z of node (0, 0), in metres.
+        cell: distance between nodes in metres.
+        up: ``(R, C)`` float64 height of the nodes above y = 0, in metres. Rows run along z, columns
+            along x.
     """
 
     corner: Float
@@ -32,8 +33,16 @@ class Terrain:
     up: Float
 
     def height(self, xz: Float) -> Float:
-        """``(N,)`` metres above y = 0 at ``(N, 2)`` positions; outside of the grid, the height of
-        its border."""
+        """Height of the ground above y = 0.
+
+        Outside of the grid, the height is that of the nearest point of the grid.
+
+        Args:
+            xz: ``(N, 2)`` positions.
+
+        Returns:
+            ``(N,)`` metres.
+        """
         at = (np.asarray(xz, np.float64) - self.corner) / self.cell
         limit = np.array(self.up.shape[::-1]) - 1.001
         at = np.clip(at, 0.0, limit)
@@ -49,10 +58,10 @@ class Roads:
     """M samples of the middle lines of all roads, about 0.25 m apart.
 
     Attributes:
-        xz: ``(M, 2)`` float64 metres.
-        heading: ``(M,)`` float64 radians, 0 along +z, positive towards +x.
-        along: ``(M,)`` float64 metres since the beginning of the route.
-        junction: ``(M,)`` bool, whether another road crosses or joins here.
+        xz: ``(M, 2)`` float64 positions in metres.
+        heading: ``(M,)`` float64 headings in radians, 0 along +z and positive towards +x.
+        along: ``(M,)`` float64 distances from the beginning of the route in metres.
+        junction: ``(M,)`` bool, whether another road crosses or joins at the sample.
     """
 
     xz: Float
@@ -70,12 +79,12 @@ class Roads:
 
 
 def roads_of(lines: list[Float], *, same_road: float = 3.0) -> Roads:
-    """The roads along polylines ``(K, 2)``, where each stretch of road occurs only once.
+    """Make the roads along polylines. Each stretch of road occurs only once in the result.
 
     Args:
-        lines: middle lines of the driven roads (m), in driving order.
-        same_road: a later stretch belongs to the same road as an earlier one if it is parallel and
-            at most this far (m) from it.
+        lines: ``(K, 2)`` middle lines of the roads in metres, in driving order.
+        same_road: largest distance in metres at which a later parallel stretch counts as the same
+            road as an earlier one.
     """
     kept: list[NDArray[np.float64]] = []
     offset = 0.0
@@ -115,7 +124,7 @@ def roads_of(lines: list[Float], *, same_road: float = 3.0) -> Roads:
 
 
 def rectangle(middle: Float, heading: float, width: float, depth: float) -> Float:
-    """Corners ``(4, 2)`` (x, z) of a rectangle; ``width`` runs across the heading."""
+    """``(4, 2)`` corners (x, z) of a rectangle, whose width is measured across the heading."""
     ahead = np.array([np.sin(heading), np.cos(heading)])
     right = np.array([np.cos(heading), -np.sin(heading)])
     a, b = 0.5 * width * right, 0.5 * depth * ahead
@@ -123,10 +132,15 @@ def rectangle(middle: Float, heading: float, width: float, depth: float) -> Floa
 
 
 class Plan:
-    """A raster of the town with occupied ground, sight lines and distances from roads."""
+    """A raster map of the town: occupied ground, lines of sight and distances from roads."""
 
     def __init__(self, roads: Roads, cameras: Float) -> None:
-        """``cameras``: ``(N, 2)`` float64 x and z of all possible camera positions."""
+        """Make a plan without objects.
+
+        Args:
+            roads: the roads of the town.
+            cameras: ``(N, 2)`` float64 x and z of all possible camera positions.
+        """
         self._low = roads.xz.min(axis=0) - _BORDER
         columns, rows = np.ceil((roads.xz.max(axis=0) + _BORDER - self._low) / _CELL).astype(int)
         self._taken = np.zeros((rows, columns), np.uint8)
@@ -146,10 +160,18 @@ class Plan:
         return np.minimum(np.maximum(cells, 0, out=cells), self._limit, out=cells)
 
     def claim(self, corners: Float, *, road: float, tall: bool = False) -> bool:
-        """Occupy the ground of a convex polygon ``(K, 2)`` if it is free, at least ``road`` metres
-        from the middle of every road, and `CLEARANCE` from every camera.
+        """Occupy the ground of a convex polygon if it is free.
 
-        ``tall`` objects block lines of sight. Returns whether the ground was occupied.
+        The ground counts as free if no other object stands there, and if it is at least ``road``
+        metres from the middle of every road and `CLEARANCE` from every camera.
+
+        Args:
+            corners: ``(K, 2)`` corners of the polygon.
+            road: smallest allowed distance from the middle of a road in metres.
+            tall: whether the object blocks lines of sight.
+
+        Returns:
+            Whether the ground was free and is now occupied.
         """
         cells = self._cell(corners)
         low, high = cells.min(axis=0), cells.max(axis=0) + 1
@@ -179,13 +201,15 @@ class Plan:
         )
 
     def road_distance(self, xz: Float) -> NDArray[np.float32]:
-        """``(N,)`` metres from ``(N, 2)`` positions to the middle of the nearest road."""
+        """``(N,)`` distances from ``(N, 2)`` positions to the middle of the nearest road, in m."""
         c, r = self._cell(xz).T
         return self._road[r, c]
 
     def open_ray(self, start: Float, heading: float, reach: float) -> Float | None:
-        """``(K, 2)`` positions along a line of sight, one per metre; None if a tall object blocks
-        it."""
+        """``(K, 2)`` positions along a line of sight, with a distance of one metre.
+
+        None if a tall object blocks the line of sight.
+        """
         distance = np.arange(2.0, reach, 1.0)[:, None]
         line = start + distance * np.array([np.sin(heading), np.cos(heading)])
         c, r = self._cell(line).T

@@ -1,4 +1,7 @@
-"""Procedural textures of plants, fences, walls, signs and sky: albedo 0 to 255, top row first."""
+"""Procedural textures of plants, fences, walls, signs and sky.
+
+The values are albedos from 0 to 255. The first row is the top of the texture.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +20,14 @@ _LETTERS = np.array(list("ABCDEFGHIKLMNOPRSTUVWZ0123456789"))
 
 
 def noise(rng: Rng, height: int, width: int, cell: float, octaves: int = 4) -> Grey:
-    """Tileable band-limited noise ``(height, width)`` float32 of zero mean and unit variance.
+    """Tileable band-limited noise with zero mean and unit variance.
 
     Args:
-        cell: cell size of the coarsest grid in texels; each octave has half the cell size and 0.7
-            of the contrast of the one before.
+        cell: cell size of the coarsest grid in texels. Each octave has half the cell size and 0.7
+            of the contrast of the octave before.
+
+    Returns:
+        ``(height, width)`` float32.
     """
     total = np.zeros((1, 1), np.float32)
     for octave in range(octaves):
@@ -44,7 +50,7 @@ def _stretch(grid: Grey, height: int, width: int) -> Grey:
 
 
 def detail(rng: Rng, contrast: float, cell: float = 8.0, size: int = 256) -> Grey:
-    """A fine texture of mean 128, which multiplies another one; see `scene.Surfaces.detail`."""
+    """A fine texture with mean 128, which multiplies another texture (`scene.Surfaces.detail`)."""
     return np.clip(128.0 * (1.0 + contrast * noise(rng, size, size, cell, 4)), 8, 255)
 
 
@@ -54,7 +60,7 @@ def letters(rng: Rng, low: int = 3, high: int = 9) -> str:
 
 
 def write(image: Grey, rng: Rng, text: str, box: tuple[int, int, int, int], grey: float) -> None:
-    """Draw ``text`` as large as ``box`` (x0, y0, x1, y1, in texels) allows."""
+    """Draw ``text`` as large as possible in ``box``, which is x0, y0, x1, y1 in texels."""
     x0, y0, x1, y1 = box
     font: Any = _FONTS[int(rng.integers(len(_FONTS)))]
     thickness = 1 + (y1 - y0 > 24)
@@ -70,7 +76,7 @@ def write(image: Grey, rng: Rng, text: str, box: tuple[int, int, int, int], grey
 
 
 def sign(rng: Rng, size: int = 128) -> tuple[Grey, Grey]:
-    """A traffic or street sign: round, triangular or square; its alpha is symmetric."""
+    """A round, triangular or square sign. Its alpha is symmetric."""
     grey = np.full((size, size), float(rng.uniform(190, 235)), np.float32)
     alpha = np.zeros((size, size), np.float32)
     middle, rim = (size // 2, size // 2), float(rng.uniform(40, 90))
@@ -102,7 +108,7 @@ def sign(rng: Rng, size: int = 128) -> tuple[Grey, Grey]:
 
 
 def foliage(rng: Rng, size: int = 256, density: float = 1.0) -> tuple[Grey, Grey]:
-    """A twig with leaves and its alpha, sparser towards the border."""
+    """A twig with leaves, and its alpha. The leaves are sparser towards the border."""
     grey = np.full((size, size), 28.0, np.float32)
     alpha = np.zeros((size, size), np.float32)
     for _ in range(10):
@@ -208,7 +214,10 @@ def poster(rng: Rng, size: int = 128) -> Grey:
 
 
 def sky(rng: Rng) -> Grey:
-    """A panorama of clouds over distant trees; u is the heading, and v falls with elevation."""
+    """A panorama of clouds over distant trees.
+
+    u corresponds to the heading. v decreases with the elevation.
+    """
     height, width = 512, 2048
     rise = np.linspace(SKY_RISE, -SKY_FALL, height, dtype=np.float32)[:, None]
     zenith = float(rng.uniform(70, 125))  # a clear sky is dark in a grey image

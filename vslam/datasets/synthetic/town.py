@@ -1,4 +1,7 @@
-"""Construction of a town along a route, which depends only on the route and the variation."""
+"""Construction of a town along a route.
+
+The town depends only on the route and on the variation.
+"""
 
 from __future__ import annotations
 
@@ -36,15 +39,17 @@ _ROADS = {
 
 @dataclass(frozen=True)
 class Town:
-    """A town of T things; an object before and after a change is two things.
+    """A town of T things (objects).
+
+    If an object changes during the drive, its old and its new state are two things.
 
     Attributes:
-        surfaces: all surfaces, in the route's world.
-        atlas: their textures.
+        surfaces: all surfaces, in the world frame of the route.
+        atlas: textures of the surfaces.
         sky: number of the sky's panorama in the atlas.
         place: ``(T, 2)`` float64 x and z of each thing.
         when: ``(T,)`` int8 ``ALWAYS``, ``BEFORE`` or ``AFTER``.
-        moving: moving cars, in their own frames; see `solids`.
+        moving: surfaces of the moving cars, in the frames of the cars (see `solids`).
         lamps: ``(L, 2)`` float64 x and z of street lamps.
     """
 
@@ -58,8 +63,14 @@ class Town:
 
 
 def build_town(route: Route, variation: Variation, aside: tuple[float, ...] = (0.0,)) -> Town:
-    """Build the town of a route; ``aside`` lists the lateral shifts of cameras (m, to the right)
-    for which room is kept."""
+    """Build the town of a route.
+
+    Args:
+        route: route along which the town is built.
+        variation: variation of the town.
+        aside: lateral shifts of the camera in metres, to the right. The space at these positions is
+            kept free.
+    """
     rng = np.random.default_rng([variation.seed, 1])
     atlas = AtlasBuilder()
     motorway = route.land == "motorway"
@@ -100,7 +111,7 @@ def build_town(route: Route, variation: Variation, aside: tuple[float, ...] = (0
 
 
 def _with_side_streets(roads: Roads, seed: int) -> Roads:
-    """The roads of the route with short side streets."""
+    """Add short side streets to the roads of the route."""
     rng = np.random.default_rng([seed, 2])
     tree, stubs = cKDTree(roads.xz), []
     at = int(rng.integers(120, 240))
@@ -156,7 +167,7 @@ def _house(site: Site, xz: Float, heading: float, size: tuple[float, float, floa
 def _try_house(
     site: Site, front: Float, heading: float, size: tuple[float, float, float], clear: float
 ) -> bool:
-    """Build a house if its ground is free; returns whether it was built."""
+    """Build a house if its ground is free. Returns whether it was built."""
     ahead = np.array([np.sin(heading), np.cos(heading)])
     middle = front + 0.5 * size[2] * ahead
     if not site.plan.claim(rectangle(middle, heading, size[0], size[2]), road=clear, tall=True):
@@ -200,7 +211,7 @@ def line_with_houses(site: Site) -> None:
 
 
 def close_sight_lines(site: Site) -> None:
-    """Build houses that end every open line of sight along the route."""
+    """Build houses that block every open line of sight along the route."""
     rng = site.rng
     last = np.array([-1e9, -1e9])
     for T in site.route.T_wc:

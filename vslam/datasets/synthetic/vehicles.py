@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from vslam.datasets.synthetic.scene import AtlasBuilder, Surfaces, join, patches
 from vslam.datasets.synthetic.textures import Grey, Rng, letters, noise, write
 
-# Outlines from the front bumper over the roof to the rear: points as fractions of length and
-# height. The third number tells whether the strip from this point to the next is paint (0) or glass
-# (1).
+# Outlines from the front bumper over the roof to the rear. Each point is given as fractions of the
+# length and of the height. The third number tells whether the strip from this point to the next one
+# is paint (0) or glass (1).
 _OUTLINES = {
     "hatchback": ((0.0, 0.16, 0), (0.0, 0.42, 0), (0.05, 0.52, 0), (0.27, 0.62, 1),
                   (0.45, 0.97, 0), (0.62, 1.0, 0), (0.86, 0.93, 1), (0.97, 0.62, 0),
@@ -30,15 +30,17 @@ _SIZES = {  # length, width, height in metres
     "van": (4.9, 1.92, 1.95),
 }
 
-_BELT, _ROOF = 0.6, 0.78  # height of the belt line and width of the roof, as fractions
+_BELT, _ROOF = 0.6, 0.78  # height of the belt line, and width of the roof, relative to the car
 _TAPER_AT, _TAPER = (0.0, 0.12, 0.9, 1.0), (0.84, 1.0, 1.0, 0.9)  # relative width along the car
 
 Float = NDArray[np.float64]
 
 
 def make_car(rng: Rng, atlas: AtlasBuilder, thing: int) -> Surfaces:
-    """A car with a random shape, colour and number plate, at the origin, with +z forward and the
-    wheels on y = 0."""
+    """Make a car with a random shape, colour and number plate.
+
+    The car is at the origin of its frame, with z forward and the wheels on y = 0.
+    """
     kind = str(rng.choice(list(_OUTLINES), p=[0.4, 0.24, 0.24, 0.12]))
     length, width, height = (float(x * rng.uniform(0.94, 1.06)) for x in _SIZES[kind])
     outline = np.array([(x, y) for x, y, _ in _OUTLINES[kind]])
@@ -93,7 +95,7 @@ def make_car(rng: Rng, atlas: AtlasBuilder, thing: int) -> Surfaces:
 def _trapezium(
     top_left: Float, top_right: Float, low_left: Float, low_right: Float, texture: int, thing: int
 ) -> Surfaces:
-    """Two triangles that share a texture; the corners are ``(3,)``."""
+    """Make a trapezium of two triangles that share a texture. The corners are ``(3,)``."""
     return join([
         patches(top_left, top_right - top_left, low_left - top_left, texture, triangle=True,
                 thing=thing),
@@ -103,8 +105,13 @@ def _trapezium(
 
 
 def _sides(size: tuple[float, float, float], texture: int, thing: int) -> list[Surfaces]:
-    """Both sides of a car of ``(length, width, height)``, each with a lower part that tapers at
-    both ends, and a cabin that leans inwards."""
+    """Make both sides of a car.
+
+    Each side has a lower part that tapers at both ends, and a cabin that leans inwards.
+
+    Args:
+        size: length, width and height in metres.
+    """
     length, width, height = size
     parts = []
     for sign in (-1.0, 1.0):
@@ -124,7 +131,7 @@ def _sides(size: tuple[float, float, float], texture: int, thing: int) -> list[S
 
 
 def _paint_side(rng: Rng, outline: Float, glass: list[bool], paint: float) -> tuple[Grey, Grey]:
-    """The side of a car and its alpha."""
+    """Paint the side of a car, and its alpha."""
     width, height = 512, 128
     at = (outline * [width - 1, -(height - 1)] + [0, height - 1]).round().astype(np.int32)
     grey = np.full((height, width), paint, np.float32)
@@ -206,7 +213,7 @@ def _paint_strip(rng: Rng, paint: float) -> Grey:
 
 
 def _paint_glass(rng: Rng) -> Grey:
-    """A pane that reflects a bright sky above and dark houses below."""
+    """Paint a pane of glass that reflects the bright sky above and dark houses below."""
     slope = np.linspace(1, 0, 64, dtype=np.float32)[:, None]
     edge = float(rng.uniform(0.3, 0.7)) + 0.12 * noise(rng, 1, 64, 24.0, 3)
     grey = 18.0 + 14.0 * slope + 70.0 * slope * (slope > edge)

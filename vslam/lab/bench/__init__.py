@@ -1,4 +1,4 @@
 """Benchmarks: a grid of sequences, perturbations, detectors and seeds.
 
-A *cell* of the grid is one run, which has its own process.
+A *cell* of the grid is one run. Each run has its own process.
 """

@@ -1,7 +1,7 @@
 """Run the cells of a benchmark on a Dask cluster, whose workers send the results back.
 
-If a worker dies, the scheduler gives its cells to another one. The workers need vslam with the
-extra ``cluster``, and the data under the same path as here.
+If a worker dies, the scheduler gives its cells to another worker. The workers need vslam with the
+extra ``cluster``. They need the data under the same path as on this machine.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from vslam.lab.bench.execute import CellOutcome, Failed, RunOptions, publish, ru
 from vslam.lab.bench.grid import Cell
 
 _CONNECT_S = 10
-_POLL_S = 2.0  # between checks of the stop event; each check is a request to the scheduler
+_POLL_S = 2.0  # time between checks of the stop event; each check is a request to the scheduler
 
 
 def run_on_cluster(
     cells: Collection[Cell], options: RunOptions, scheduler: str, out: Path
 ) -> Generator[CellOutcome, None, None]:
-    """Run cells on the workers of a scheduler; publish and yield each outcome when it arrives.
+    """Run cells on the workers of a scheduler, and publish and yield each outcome when it arrives.
 
     A worker runs as many cells at a time as it has threads. Closing the generator stops the cells.
 
@@ -64,7 +64,7 @@ def run_on_cluster(
 
 
 def _require_certificates(scheduler: str) -> None:
-    """Refuse a TLS address if Dask has no certificates, because its client would never close."""
+    """Reject a TLS address if Dask has no certificates, because Dask's client would never close."""
     from distributed.security import Security
 
     if not scheduler.startswith("tls://"):
@@ -81,7 +81,7 @@ def _require_certificates(scheduler: str) -> None:
 
 
 def _run_on_worker(cell: Cell, options: RunOptions, stop: str) -> CellOutcome:
-    """Run a cell on this worker; kill it when the benchmark sets the event named ``stop``."""
+    """Run a cell on this worker, and kill it when the benchmark sets the event named ``stop``."""
     from distributed import Event
 
     event = Event(stop)

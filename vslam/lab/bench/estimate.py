@@ -11,11 +11,11 @@ from vslam.errors import InputError, counted
 from vslam.lab.bench.grid import Cell
 from vslam.report.schema import ReportJson
 
-# Seconds per frame and seconds to start a run, used until a cell is finished. Measured on KITTI,
-# with two threads of a Xeon and with loop closing.
+# Seconds per frame, and seconds to start a run. They are used until a cell is finished. They were
+# measured on KITTI with loop closing, with two threads of a Xeon.
 _FRAME_S, _START_S = 0.06, 5.0
-# Measured and rounded up: bytes of the kept files per cell and per frame, and bytes per frame of
-# the map, which is deleted after the run.
+# Bytes of the kept files per cell and per frame, and bytes per frame of the map, which is deleted
+# after the run. The values were measured and rounded up.
 _CELL_BYTES, _FRAME_BYTES, _SCRATCH_FRAME_BYTES = 100_000, 1_000, 45_000
 
 
@@ -25,7 +25,7 @@ class Estimate:
 
     Attributes:
         seconds: wall time if all jobs are always busy.
-        kept: bytes of the files that stay.
+        kept: bytes of the files that are kept.
         scratch: bytes of the files that are deleted after each run.
         basis: what the estimated time is based on, in words.
     """
@@ -42,15 +42,17 @@ def estimate(
     frames: Mapping[str, int],
     jobs: int,
 ) -> Estimate:
-    """Estimate time and space of the missing cells from the finished ones; the time per frame is
-    that of the same detector if one of its cells is finished.
+    """Estimate the time and space that the missing cells need from those of the finished cells.
+
+    If a cell with the same detector is finished, its time per frame is used.
 
     Args:
+        missing: cells that have not run yet.
         finished: finished cells and their reports.
         frames: number of frames of each sequence.
         jobs: number of cells that run at a time.
     """
-    frame_s: dict[str, list[float]] = {}  # seconds per frame of each finished cell, by detector
+    frame_s: dict[str, list[float]] = {}  # for each detector, seconds per frame of finished cells
     starts: list[float] = []
     for cell, report in list(finished.items()):  # a copy, because other threads add cells
         if report.fps > 0:

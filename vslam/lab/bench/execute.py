@@ -1,8 +1,10 @@
 """Run each cell in its own process and publish its results as one complete folder.
 
-A cell is finished when its folder exists, so that a killed benchmark loses only the cells that were
-running. The result files (a few MB per cell) are passed in memory, also from other machines; only
-this module writes to the folder of the benchmark.
+A cell is finished when its folder exists. Therefore, a killed benchmark loses only the cells that
+were running.
+
+The result files of a cell have a few MB. They are passed to this module in memory, even if the cell
+ran on another machine. Only this module writes to the folder of the benchmark.
 """
 
 from __future__ import annotations
@@ -35,10 +37,10 @@ class RunOptions:
     Attributes:
         data: root of the data set on the machine that runs the cell; None for rendered towns.
         config: thresholds, as the text of a ``config.json``.
-        threads: threads of each run; they do not change its result.
+        threads: number of threads of each run. It does not change the result.
         command: program that accepts the arguments of ``vslam``; None for vslam itself.
-        others: programs of other systems by ``Cell.detector``; they accept the same arguments.
-        scratch: folder in which runs write; None for the machine's temporary folder.
+        others: programs of other systems, by ``Cell.detector``. They accept the same arguments.
+        scratch: folder to which runs write; None for the machine's temporary folder.
         source: arguments of ``vslam run`` that describe how to read the data.
     """
 
@@ -53,7 +55,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Finished:
-    """A complete run: its files by path relative to ``folder``, where the run wrote them."""
+    """A complete run, with its files by path. Paths are relative to ``folder``."""
 
     cell: Cell
     folder: str
@@ -62,7 +64,7 @@ class Finished:
 
 @dataclass(frozen=True)
 class Failed:
-    """A run without results: the reason in one line, and the whole output."""
+    """A run without results, with the reason in one line and the whole output of the run."""
 
     cell: Cell
     message: str
@@ -94,7 +96,7 @@ def run_cell(
         code = _call([*command, "--out", str(work / "runs")], work / "log.txt", stopped)
         log = (work / "log.txt").read_text(errors="replace")
         for folder in (path.parent for path in work.glob("runs/*/report.json")):
-            # A run that tracked nothing exits with 1, but its report is a result like any other.
+            # A run that was lost in every frame exits with 1. Its report is a valid result.
             done = code == 0 or (code == 1 and tracked_nothing(folder))
             if done and is_finished(cell, folder, options.config):
                 return Finished(cell, str(folder), _read(folder) | {"log.txt": log.encode()})
@@ -106,11 +108,13 @@ def run_cell(
 def run_here(
     cells: Collection[Cell], options: RunOptions, jobs: int, out: Path
 ) -> Generator[CellOutcome, None, None]:
-    """Run cells on this machine, ``jobs`` at a time; publish and yield each outcome when it ends.
+    """Run cells on this machine, and publish and yield each outcome when it ends.
 
-    Threads suffice, because each thread only waits for a process. The threads also publish, so that
-    a cell that ends while the caller is interrupted is not lost. Closing the generator kills the
-    runs.
+    ``jobs`` cells run at a time. Closing the generator kills the runs.
+
+    The cells are started from threads, which is sufficient because each thread only waits for a
+    process. The threads also publish the outcomes, so that a cell that ends while the caller is
+    interrupted is not lost.
 
     Raises:
         ResultsError: the results of a cell cannot be written.
@@ -142,8 +146,9 @@ def finished_cells(cells: Collection[Cell], out: Path, config: str) -> list[Cell
 
 
 def publish(outcome: CellOutcome, out: Path) -> None:
-    """Write the results of a finished cell into ``out``, completely or not at all. A failed cell
-    has no results; its log is written instead.
+    """Write the results of a finished cell into ``out``, completely or not at all.
+
+    For a failed cell, the log is written instead.
 
     Raises:
         ResultsError: the folder cannot be written.
@@ -167,7 +172,7 @@ def publish(outcome: CellOutcome, out: Path) -> None:
             if path.suffix in (".json", ".md", ".html"):
                 data = data.replace(outcome.folder.encode(), shlex.quote(str(target)).encode())
             path.write_bytes(data)
-        shutil.rmtree(target, ignore_errors=True)  # a damaged result or one of another version
+        shutil.rmtree(target, ignore_errors=True)  # it is damaged, or of another version
         part.rename(target)
         failed.unlink(missing_ok=True)
     except OSError as error:
@@ -178,10 +183,10 @@ def publish(outcome: CellOutcome, out: Path) -> None:
 
 
 def prepare(out: Path, data: str) -> None:
-    """Create the folder of a benchmark and remove what killed benchmarks left there.
+    """Create the folder of a benchmark, and remove the files that killed benchmarks left there.
 
     Args:
-        data: text that identifies the data. All results in a folder must be of the same data,
+        data: text that identifies the data. All results in a folder must come from the same data,
             because sequences of other data may have the same names.
 
     Raises:
@@ -208,7 +213,7 @@ def prepare(out: Path, data: str) -> None:
 
 
 def scratch_folder(out: Path) -> Path:
-    """Folder of the unfinished cells of this process."""
+    """The folder to which the unfinished cells of this process write."""
     return out / _PARTS / str(os.getpid())
 
 
@@ -220,7 +225,7 @@ def tidy(out: Path) -> None:
 
 
 def _call(command: list[str], log: Path, stopped: Callable[[], bool]) -> int:
-    """Run a command and return its exit code; kill it if ``stopped`` returns True.
+    """Run a command, and return its exit code. The command is killed if ``stopped`` returns True.
 
     The command runs in its own session, so that Ctrl-C reaches only this process. Its standard
     input is a pipe that closes when this process dies (:mod:`vslam.cli.child`).

@@ -19,17 +19,23 @@ from vslam.report.schema import ReportJson
 
 @dataclass(frozen=True, order=True)
 class Cell:
-    """One run of the grid, described by everything that determines its result except the images.
+    """One run of the grid.
+
+    Apart from the images, its attributes determine the result of the run.
 
     Attributes:
+        dataset: value of ``--dataset``.
+        sequence: name of the sequence.
         perturb: perturbation in canonical spelling, e.g. ``none`` or ``brightness:1.5,blur:0.5``.
-        max_frames: number of frames, counted from the first one; None for all.
-        weights: weight file of a learned detector, with the same path on every worker; None for
-            the shipped weights.
+        detector: loop detector, or the name of another system.
+        seed: seed of the perturbation.
+        max_frames: number of frames, counted from the first frame; None for all frames.
+        weights: weight file of a learned detector; None for the shipped weights. The file must have
+            the same path on every worker.
         digest: digest of the weight file.
-        sensor: value of ``--sensor``; None for all images that the data has.
+        sensor: value of ``--sensor``; None to use all images of the data.
         calib: calibration files.
-        thresholds: digest of the thresholds that differ from the defaults; empty without any.
+        thresholds: digest of the thresholds that differ from the defaults; empty if there are none.
     """
 
     dataset: str
@@ -46,7 +52,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Name of the folder of the results, which is unique to the cell."""
+        """Name of the folder for the results of this cell. No two cells have the same name."""
         light = self.perturb.replace(":", "").replace(",", "+")
         parts = [self.dataset, self.sequence, light, self.detector, f"seed{self.seed}"]
         parts += [f"{self.max_frames}frames"] if self.max_frames else []
@@ -67,7 +73,9 @@ class Cell:
 
 
 def parse_sequences(text: str) -> list[str]:
-    """Parse names and ranges: ``00-02,05,demo`` gives ``00 01 02 05 demo``, without repetitions.
+    """Parse names and ranges of sequences.
+
+    For example, ``00-02,05,demo`` gives ``00 01 02 05 demo``. Repetitions are removed.
 
     Raises:
         InputError: a range is reversed, or there is no name.
@@ -90,7 +98,7 @@ def parse_sequences(text: str) -> list[str]:
 def parse_perturbations(text: str) -> list[str]:
     """Parse ``none,brightness:2+blur`` into ``none`` and ``brightness:2,blur:1``.
 
-    A comma separates entries of the grid; ``+`` joins perturbations that act together.
+    A comma separates the entries of the grid. ``+`` joins perturbations that are applied together.
 
     Raises:
         InputError: one of the entries is not a valid perturbation.
@@ -112,16 +120,17 @@ def make_grid(
     thresholds: str = "",
     repeated: Collection[str] = (),
 ) -> list[Cell]:
-    """All cells: first every sequence with the first seed, then every sequence with the next seed.
+    """Make all cells of a grid.
 
-    In this order, an interrupted benchmark is most useful. A perturbation without randomness gets
-    only one run: repetitions would be identical, and a statistical test would count them as
+    Every sequence first runs with the first seed, then with the next seed. In this order, the
+    results of an interrupted benchmark are most useful. A perturbation that is not random gets only
+    one run. Its repetitions would be identical, and a statistical test would count them as
     independent samples.
 
     Args:
         runs: number of seeds.
-        weights: weight files by detector, for detectors that do not use the shipped ones.
-        repeated: systems that are not deterministic and therefore run with every seed.
+        weights: weight files by detector, for detectors that do not use the shipped weights.
+        repeated: systems that are not deterministic, so that they run with every seed.
     """
     paths = {name: str(path) for name, path in (weights or {}).items()}
     digests = {name: _digest(path) for name, path in (weights or {}).items()}
@@ -147,7 +156,7 @@ def make_grid(
 
 
 def thresholds_digest(config: str) -> str:
-    """Digest of the thresholds that differ from the defaults (``Cell``); empty without any.
+    """Digest of the thresholds that differ from the defaults; empty if there are none.
 
     Args:
         config: the text of a ``config.json``.
@@ -168,7 +177,7 @@ def _digest(path: Path) -> str:
 
 
 def draws(perturb: str) -> bool:
-    """Whether a perturbation draws random numbers, so that the images depend on the seed."""
+    """Whether a perturbation is random, so that the images depend on the seed."""
     laws = {law.partition(":")[0] for law in perturb.split(",")} - {"none"}
     return any(law_kind(law).drawn for law in laws)
 

@@ -23,8 +23,8 @@ class GridProgress:
 
     Attributes:
         cells: the whole grid.
-        reports: reports of the finished cells, in the order in which they ended.
-        failed: why each failed cell failed, in one line.
+        reports: reports of the finished cells, in the order in which the cells ended.
+        failed: for each failed cell, the reason in one line.
     """
 
     def __init__(
@@ -60,8 +60,10 @@ class GridProgress:
         return f"{len(self.reports) + len(self.failed)}/{len(self.cells)} {cell.name}: {result}"
 
     def table(self) -> Table:
-        """A table with a row for each sequence and perturbation and a column for each detector.
-        Each entry gives the number of finished cells and their median ATE."""
+        """A table with a row for each sequence and perturbation, and a column for each detector.
+
+        Each entry contains the number of finished cells and their median ATE.
+        """
         detectors = list(dict.fromkeys(cell.detector for cell in self.cells))
         caption = "Each entry gives the number of finished runs and their median ATE.\n"
         caption += f"{len(self.reports)} of {counted(len(self.cells), 'run')} finished"
@@ -92,9 +94,12 @@ class GridProgress:
 
 @contextmanager
 def shown_live(progress: GridProgress, *, shown: bool) -> Iterator[Callable[[str], None]]:
-    """Show the table on stderr and update it; yield a function that prints a line if stderr is not
-    a terminal. The table is erased at the end of a complete grid, because its results follow. It
-    stays if cells are missing or failed."""
+    """Show the table on stderr, and update it while the grid runs.
+
+    The context manager yields a function that prints a line if stderr is not a terminal. When the
+    grid is complete, the table is erased, because the results are printed next. If cells are
+    missing or failed, the table stays.
+    """
     console = Console(stderr=True, quiet=not shown, highlight=False, soft_wrap=True)
     live = (
         Live(get_renderable=progress.table, console=console, refresh_per_second=1, transient=True)

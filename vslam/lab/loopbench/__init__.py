@@ -1,1 +1,1 @@
-"""Compare loop detectors on images of places, under changes of light, viewpoint and scene."""
+"""Compare loop detectors on images of places under changes of light, viewpoint and scene."""

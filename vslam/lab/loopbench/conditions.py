@@ -1,4 +1,4 @@
-"""Conditions: changes that are applied to the query images, but not to the gallery."""
+"""Conditions: changes of the query images. The gallery images are not changed."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from vslam.loopclosure.siamese.images import turn_homography
 Image = NDArray[np.uint8]
 
 KINDS = ("none", "light", "clipping", "viewpoint", "occlusion", "noise", "blur", "change", "all")
-# The perturbations of `vslam run --perturb` that make up a condition, with their strengths at the
-# condition's strength 1.
+# For each condition, the perturbations of `vslam run --perturb` of which it consists. Their
+# strengths are those at strength 1 of the condition.
 _LAWS = {
     "light": {"brightness": 2.0, "gamma": 2.0},
     "occlusion": {"occlusion": 2.0},
@@ -26,12 +26,13 @@ _LAWS = {
 _LAWS["all"] = {law: s / 2 for kind in _LAWS.values() for law, s in kind.items()}
 _OTHER_LANE, _TURN = 3.2, 30.0  # metres and degrees of a change of viewpoint at strength 1
 _CLIPPED = 0.6  # share of the pixels that become white, or black, at strength 1
-_APART_S = 10.0  # between images, so that their changes are independent (light changes within 2 s)
+# Time between images. The light changes within 2 s, so that the changes are independent.
+_APART_S = 10.0
 
 
 @dataclass(frozen=True)
 class Condition:
-    """A kind of change and its strength, 0 to 1."""
+    """A kind of change, and its strength from 0 to 1."""
 
     kind: str
     strength: float = 0.0
@@ -48,33 +49,39 @@ class Condition:
 
     @property
     def lateral(self) -> tuple[float, float]:
-        """Range of the lateral offset in metres, positive to the right. Even without a change of
-        viewpoint, there is some offset, because no two drives follow exactly the same line."""
+        """Range of the lateral offset in metres, positive to the right.
+
+        There is some offset even without a change of viewpoint, because no two drives follow
+        exactly the same line.
+        """
         side = -_OTHER_LANE * self.view
         return (side, side) if self.view else (-0.3, 0.3)
 
     @property
     def heading(self) -> tuple[float, float]:
-        """Range of the turn to either side, in degrees."""
+        """Range of the rotation to either side in degrees."""
         turn = _TURN * self.view
         return (turn, turn) if self.view else (0.0, 3.0)
 
     @property
     def change(self) -> float:
-        """Value of ``vslam synth --change`` for the town: 0.5 and 0.9 for strengths 0.5 and 1."""
+        """Value of ``vslam synth --change`` with which the town is rendered.
+
+        For the condition ``change``, it is 0.5 at strength 0.5, and 0.9 at strength 1.
+        """
         strength = {"change": self.strength, "all": self.strength / 2}.get(self.kind)
         return 0.0 if strength is None else round(0.1 + 0.8 * strength, 3)
 
 
 def parse_conditions(kinds: str, strengths: str) -> list[Condition]:
-    """The condition ``none``, followed by every other kind at every strength.
+    """Make the condition ``none``, followed by every other kind at every strength.
 
     Args:
         kinds: names from ``KINDS``, separated by commas.
         strengths: numbers above 0 and up to 1, separated by commas.
 
     Raises:
-        InputError: a kind is unknown, or a strength is not such a number.
+        InputError: a kind is unknown, or a strength is outside of that range.
     """
     names = [name.strip() for name in kinds.split(",") if name.strip()]
     if wrong := [name for name in names if name not in KINDS]:
@@ -95,10 +102,10 @@ def parse_conditions(kinds: str, strengths: str) -> list[Condition]:
 def apply(
     condition: Condition, images: Collection[Image], seed: int, *, rendered: bool
 ) -> list[Image]:
-    """The images under a condition, each with its own random change.
+    """Apply a condition to images. Each image gets its own random change.
 
     Args:
-        condition: the condition. ``change`` leaves the images as they are, because the renderer has
+        condition: the condition. ``change`` does not modify the images, because the renderer has
             already changed the town.
         images: ``(H, W)`` uint8 each.
         seed: seed of all random changes.
@@ -121,8 +128,10 @@ def apply(
 
 
 def turned(image: Image, degrees: float) -> Image:
-    """The image that the camera would see after a turn to the right about its centre; pixels
-    outside the original view are black."""
+    """The image that the camera would see after a rotation to the right about its centre.
+
+    Pixels outside of the original view are black.
+    """
     import cv2
 
     height, width = image.shape

@@ -1,6 +1,6 @@
 """Measure CPU time and memory of one detector in a separate process.
 
-Unlike wall time, CPU time hardly depends on what else the machine does.
+CPU time is measured instead of wall time, because it hardly depends on the load of the machine.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Precision against recall: a figure for each set of images, and one for all drives."""
+"""Precision-recall curves, with a figure for each set of images and one figure for all drives."""
 
 from __future__ import annotations
 
@@ -24,15 +24,18 @@ from vslam.report.drawing import (
 )
 
 _COLORS = [GREY, BLUE, VIOLET, AMBER, GREEN, RED]
-_DASHES = ["-", "--", ":"]  # for the first six detectors, the next six, and all further ones
+_DASHES = ["-", "--", ":"]  # for the first six detectors, the next six, and all other detectors
 _VERIFIED = {"nothing": "-", "both": ":"}
 
-# Panel, curve, label in the legend (may be empty), colour and dashes.
+# Panel, curve, label in the legend (it may be empty), colour and dashes.
 Line = tuple[str, Curve | DecisionCurve, str, str, str]
 
 
 def draw_curves(report: LoopsJson) -> list[page.Figure]:
-    """Draw a figure for each set of images, with a panel per condition, and one for all drives."""
+    """Draw a figure for each set of images, and one figure for all drives.
+
+    The figure of a set of images has one panel per condition.
+    """
     return draw(_drawings(report))
 
 

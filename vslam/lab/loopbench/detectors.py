@@ -1,4 +1,4 @@
-"""Loop detectors as functions of images: they give the similarity of query and gallery images."""
+"""Loop detectors that compute the similarity of query and gallery images, without a map."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 _MATCHING_LEVEL = 2  # vocabulary level with about 100 nodes; features are matched within a node
-_KEPT_GALLERIES = 3  # the gallery of the unchanged town, and the galleries of two strengths
+_KEPT_GALLERIES = 3  # galleries that are cached: the unchanged town, and those of two strengths
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,10 @@ class DescribedImage:
 
     Attributes:
         image: ``(H, W)`` uint8.
-        xy: ``(N, 2)`` float32 pixels.
+        xy: ``(N, 2)`` float32 positions of the features in pixels.
         descriptors: ``(N, 32)`` uint8.
-        words: ``(N,)`` int32 word of each feature.
-        nodes: direct index of the features: which features lie under which node.
+        words: ``(N,)`` int32 visual word of each feature.
+        nodes: direct index, which gives the features under each node of the vocabulary.
     """
 
     image: Image
@@ -52,7 +52,7 @@ class DescribedImage:
 
 
 def describe(images: list[Image], vocabulary: Vocabulary, threads: int) -> list[DescribedImage]:
-    """Extract the features of all images as a run does."""
+    """Extract the features of all images in the same way as a run."""
     node_of_word = vocabulary.ancestors(_MATCHING_LEVEL)
 
     def one(image: Image) -> DescribedImage:
@@ -71,17 +71,17 @@ class Scorer(Protocol):
 
     name: str
     probability: bool
-    """Whether the scores are probabilities p, so that accuracy at p = 0.5 and 0.9 is defined."""
+    """Whether the scores are probabilities, so that the accuracy at p = 0.5 and 0.9 is defined."""
 
     def store(self, gallery: list[DescribedImage]) -> Any:
-        """The data that the detector keeps of the gallery, to compare queries with it."""
+        """Compute the data of the gallery that the detector compares with queries."""
 
     def scores(self, queries: list[DescribedImage], stored: Any) -> NDArray[np.float64]:
-        """``(Q, G)`` similarities; higher is more similar."""
+        """``(Q, G)`` similarities. A higher value means more similar."""
 
 
 class BowScorer:
-    """The tf-idf weights and L1 score of :class:`vslam.loopclosure.bow.BowDetector`."""
+    """A scorer with the tf-idf weights and L1 score of `vslam.loopclosure.bow.BowDetector`."""
 
     name = "bow"
     probability = False
@@ -102,7 +102,7 @@ class BowScorer:
 
 
 def require_comparable(name: str, weights: Path | None) -> None:
-    """Check that a detector can be compared, before large packages are imported.
+    """Check that a detector can be compared. This check is made before large packages are imported.
 
     Raises:
         InputError: the detector is unknown, or there are no weights for it.
@@ -160,15 +160,17 @@ class NetworkScorer:
 
 
 class LocalDescriptorCache:
-    """Local descriptors of images, computed once per image. Only the coarse ones are kept; see
-    ``DescriptorMaps``."""
+    """Local descriptors of images, which are computed once per image.
+
+    Only the coarse descriptors are kept, see `DescriptorMaps`.
+    """
 
     def __init__(self) -> None:
         self._network: LocalDescriptors | None = None
         self._kept: dict[bytes, DescriptorMaps] = {}
 
     def of(self, image: Image) -> DescriptorMaps:
-        """The coarse local descriptors of a grey image ``(H, W)``, without the fine ones.
+        """The coarse local descriptors of an ``(H, W)`` grey image.
 
         Raises:
             InputError: the network cannot be read.
@@ -184,10 +186,10 @@ class LocalDescriptorCache:
 
 
 class DetectorSet:
-    """The detectors of a benchmark; the first one is the baseline of the comparison.
+    """The detectors of a benchmark. The first one is the baseline of the comparison.
 
-    Most conditions share a gallery, so the features and stored data of the last few galleries are
-    cached.
+    The features and stored data of the last few galleries are cached, because most conditions share
+    a gallery.
     """
 
     def __init__(self, scorers: list[Scorer], vocabulary: Vocabulary, threads: int) -> None:
@@ -197,7 +199,7 @@ class DetectorSet:
         self._kept: OrderedDict[bytes, tuple[list[DescribedImage], dict[str, Any]]] = OrderedDict()
 
     def gallery(self, images: list[Image]) -> tuple[list[DescribedImage], dict[str, Any]]:
-        """Features of the images, and the data that each detector keeps of them, by its name."""
+        """The features of the images, and for each detector by name the data that it stores."""
         hashed = hashlib.blake2b()
         for image in images:
             hashed.update(f"{image.shape}".encode())

@@ -1,4 +1,4 @@
-"""Drives for testing loop detectors: images in the order in which they were taken."""
+"""Drives for tests of loop detectors. The images are in the order in which they were taken."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def open_drives(
 ) -> list[ImageSource]:
     """Open ``drive:ROUTE[seed=101,aliased=1,change=0.5,every=10]``, ``kitti:`` or ``fabmap:``.
 
-    The left images of a built-in route are rendered on first use, with ``every=10`` only those of
-    every tenth frame.
+    The left images of a built-in route are rendered on first use. With ``every=10``, only every
+    tenth frame is rendered.
 
     Args:
         cache: folder of rendered towns.
@@ -91,13 +91,14 @@ def render_views(
     threads: int,
     on_frame: OnFrame,
 ) -> None:
-    """Render the left images of some frames into a tree in KITTI's layout, unless they exist.
+    """Render the left images of some frames into a folder in KITTI's layout.
 
-    The images are identical to those of `render_sequence`. Poses and times of the whole drive are
-    written, too. The file of poses is written last, so that it exists only if all images do.
+    Images that exist are not rendered again. The images are identical to those of
+    `render_sequence`. The poses and times of the whole drive are written, too. The file of poses is
+    written last, so that it exists only if all images exist.
 
     Args:
-        root: root of the tree, which must not be used for other routes or variations.
+        root: output folder, which must not be used for other routes or variations.
         frames: frame numbers, ascending.
         threads: number of threads of the renderer.
         on_frame: called with the number of finished frames and the number of all frames.

@@ -28,19 +28,19 @@ from vslam.loopclosure.precision_recall import (
 )
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
 
-# Verification by learned descriptors: least number of coarse matches that fit one homography, and
-# least cosine similarity of a match.
+# Verification by learned descriptors: the least number of coarse matches that fit one homography,
+# and the least cosine similarity of a match.
 MIN_CELLS, LEAST_COSINE = 90, 0.5
-# Verification by ORB: least number of matches that fit one epipolar geometry. ORB-SLAM (VII-B)
+# Verification by ORB: the least number of matches that fit one epipolar geometry. ORB-SLAM (VII-B)
 # requires 20 matches that fit a motion in 3D.
 MIN_MATCHES = 20
 _EPIPOLAR_PIXELS = 2.0
 _CURVE_POINTS = 200
 _RESAMPLES = 200  # bootstrap resamples of the queries
 # Matching of sequences, as in OpenSeqSLAM (Sünderhauf et al., ICRA 2013 workshop).
-LENGTH = 10  # queries in a sequence
-SPEEDS = (0.8, 0.9, 1.0, 1.1, 1.2)  # gallery images per query
-_LEAST_P = 1e-6  # probabilities nearer to 0 or 1 are clipped
+LENGTH = 10  # number of queries in a sequence
+SPEEDS = (0.8, 0.9, 1.0, 1.1, 1.2)  # number of gallery images per query
+_LEAST_P = 1e-6  # probabilities that are nearer to 0 or 1 are clipped
 
 
 def measure(
@@ -49,7 +49,10 @@ def measure(
     detectors: DetectorSet,
     seed: int,
 ) -> tuple[list[Score], list[Gain]]:
-    """Measure all detectors on a set; returns empty lists if the condition cannot be applied."""
+    """Measure all detectors on a set of images.
+
+    Returns empty lists if the condition cannot be applied to the set.
+    """
     query_set = test_set.query_set(condition, seed)
     if query_set is None:
         return [], []
@@ -119,18 +122,20 @@ def _score(
 def _best_images(
     scores: Matrix, relation: NDArray[np.int8]
 ) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
-    """The most similar image with a known relation to each query, and this relation."""
+    """For each query, the most similar image with a known relation to it, and this relation."""
     best = np.where(relation != UNKNOWN, scores, -np.inf).argmax(1)
     return best, relation[np.arange(len(best)), best]
 
 
 def thinned(curve: PrecisionRecall) -> Curve:
-    """Reduce a curve to equal steps of recall, each with its best precision, and to the end of the
-    curve, where every pair is accepted.
+    """Reduce a curve to fewer points, at equal steps of recall.
 
-    Equal steps in the number of pairs would not show the curve of a good detector: it ranks the few
-    true pairs before thousands of false ones, so that nearly the whole curve would lie within the
-    first step.
+    Each step is represented by its point with the best precision. The end of the curve, where every
+    pair is accepted, is also kept.
+
+    Equal steps in the number of pairs would not show the curve of a good detector. Such a detector
+    ranks the few true pairs before thousands of false pairs, so that nearly the whole curve would
+    lie within the first step.
     """
     points = drawn_points(curve)
     return Curve(
@@ -154,7 +159,7 @@ def _gain(
     found: dict[str, Matrix],
     relation: NDArray[np.int8],
 ) -> Gain:
-    """The difference in AP, with a bootstrap interval over the queries."""
+    """The difference in average precision (AP), with a bootstrap interval over the queries."""
     known, rng = relation != UNKNOWN, np.random.default_rng(0)
 
     def gain(rows: NDArray[np.integer]) -> float:
@@ -176,7 +181,7 @@ def _gain(
 
 
 class Verification:
-    """Decides by local features whether two images show the same place; caches the results."""
+    """Decides by local features whether two images show the same place. Results are cached."""
 
     def __init__(
         self,
@@ -197,9 +202,11 @@ class Verification:
         return self._by_orb[key]
 
     def by_learned(self, query: int, image: int) -> bool:
-        """Whether enough similar cells of the two coarse grids roughly fit one homography. The
-        number of cells decides, because their share would depend on how much of the images is sky
-        or road."""
+        """Whether enough similar cells of the two coarse grids roughly fit one homography.
+
+        The number of cells decides, not their share. The share would depend on how much of the
+        images is sky or road.
+        """
         key = query, image
         if key not in self._by_learned:
             a = self._local.of(self._queries[query].image)
@@ -210,7 +217,7 @@ class Verification:
 
 
 def epipolar_inliers(a: DescribedImage, b: DescribedImage) -> int:
-    """Number of ORB matches between two images that fit the best fundamental matrix found."""
+    """Number of ORB matches between two images that fit the best fundamental matrix."""
     import cv2
 
     config = VerificationConfig()
@@ -230,16 +237,17 @@ def epipolar_inliers(a: DescribedImage, b: DescribedImage) -> int:
 def sequence_scores(scores: Matrix) -> Matrix:
     """Scores of sequences instead of single images, as in SeqSLAM (Milford and Wyeth, ICRA 2012).
 
-    A sequence recognises a stretch of road. For each query and gallery image, the scores of the
-    query and its predecessors are added along lines through the gallery that end at this image, one
-    line for each speed. The result is the mean score along the best line.
+    A query and its predecessors are compared with a gallery image and its predecessors. Their
+    scores are averaged along straight lines in the matrix of scores that end at this pair. There is
+    one line for each speed. The result is the mean score along the best line.
 
     Args:
-        scores: ``(Q, G)`` of queries and images in driving order; higher is more similar.
+        scores: ``(Q, G)`` scores of queries and gallery images, both in driving order. A higher
+            score means more similar.
 
     Returns:
-        ``(Q, G)`` mean scores. Where a line leaves the gallery, the mean score of the query takes
-        the place of the missing score; the lines of the first queries are shorter.
+        ``(Q, G)`` mean scores. Where a line leaves the gallery, the mean score of the query
+        replaces the missing score. The lines of the first queries are shorter.
     """
     n_queries, n_images = scores.shape
     usual = scores.mean(1)

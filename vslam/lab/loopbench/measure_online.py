@@ -1,4 +1,4 @@
-"""Measure loop detectors on drives: one decision per image, before and after verification."""
+"""Measure loop detectors on drives, with one decision per image, before and after verification."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def measure_drive(
     Args:
         drive: images in order.
         scorers: the detectors.
-        window: the images just before a query, which are not searched.
+        window: the images just before a query, in which no match is searched for.
         vocabulary: vocabulary of ``bow`` and of the features that verification matches.
 
     Raises:
@@ -38,7 +38,7 @@ def measure_drive(
     """
     n = len(drive)
     searchable = window.searchable(n, drive.times)
-    # Refuse a drive without loops before the features are extracted.
+    # Reject a drive without loops before the features are extracted.
     judge(Decisions(np.full(n, -1), np.full(n, -np.inf)), drive.relation, searchable)
     images = describe([drive.grey(k) for k in range(n)], vocabulary, threads)
     verify = Verification(images, images, LocalDescriptorCache())

@@ -1,8 +1,8 @@
 """Match features by the direct index of a vocabulary (Galvez-Lopez and Tardos, T-RO 2012, IV).
 
-Only features whose words lie under the same node of the tree are compared. Loop closing compares
-all pairs of descriptors instead, which finds a quarter more matches but is too slow for thousands
-of image pairs.
+Only features whose words lie under the same node of the vocabulary tree are compared. Loop closing
+compares all pairs of descriptors instead. This finds a quarter more matches, but is too slow for
+thousands of image pairs.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ from vslam.kernels import hamming, kernel
 class NodeIndex(NamedTuple):
     """Direct index of an image: its features, sorted by the node under which their words lie.
 
-    ``node``: ``(N,)`` int32, ascending. ``feature``: ``(N,)`` int32, index within the image.
+    Attributes:
+        node: ``(N,)`` int32 node of each feature, ascending.
+        feature: ``(N,)`` int32 index of each feature in the image.
     """
 
     node: NDArray[np.int32]
@@ -26,7 +28,11 @@ class NodeIndex(NamedTuple):
 
 
 def index_nodes(node: NDArray[np.int32]) -> NodeIndex:
-    """Direct index of an image whose features lie under the nodes ``(N,)``."""
+    """Make the direct index of an image.
+
+    Args:
+        node: ``(N,)`` node under which the word of each feature lies.
+    """
     order = np.argsort(node, kind="stable").astype(np.int32)
     return NodeIndex(node[order], order)
 
@@ -38,14 +44,17 @@ def match_by_node(
     """Match features of two images whose words lie under the same node of the vocabulary.
 
     Args:
-        node_a, feature_a: direct index of image a (``NodeIndex``); likewise for image b.
-        descriptors_a, descriptors_b: ``(M, 4)`` and ``(N, 4)`` uint64, of all features.
+        node_a, feature_a: direct index of image a (`NodeIndex`).
+        descriptors_a: ``(M, 4)`` uint64 descriptors of all features of image a.
+        node_b, feature_b: direct index of image b.
+        descriptors_b: ``(N, 4)`` uint64 descriptors of all features of image b.
         max_distance: largest Hamming distance in bits.
-        ratio: largest ratio of the best to the second best distance under the node; 1 disables it.
+        ratio: largest ratio of the best distance to the second best distance under the node. 1
+            disables this test.
 
     Returns:
-        ``(M,)`` int32 feature of b for each feature of a, or -1. A feature of b is matched at most
-        once, with the closest feature of a.
+        ``(M,)`` int32 index of the matching feature of image b for each feature of image a, or -1.
+        A feature of image b is matched at most once, with the closest feature of image a.
     """
     matches = np.full(len(descriptors_a), -1, np.int32)
     distances = np.full(len(descriptors_a), 257, np.int64)

@@ -1,12 +1,14 @@
-"""The usual protocol of the literature: one decision per image of a drive, in driving order.
+"""The usual protocol of the literature, with one decision per image of a drive, in driving order.
 
 An image is compared with all earlier images except those in a window just before it. The most
-similar image is its match, and the score of the match is compared with a threshold. The ground
-truth marks which images show the same place:
+similar image is its match. The score of the match is compared with a threshold.
 
-- a match is *right* if the ground truth marks it as the same place, otherwise *wrong*;
-- precision is right / (right + wrong) over the images whose score reaches the threshold;
-- recall is right / (images that have a marked image before the window).
+The ground truth marks which images show the same place. From it, the figures are computed as
+follows:
+
+- A match is *right* if the ground truth marks it as the same place. Otherwise, it is *wrong*.
+- Precision is right / (right + wrong), over the images whose score reaches the threshold.
+- Recall is right / (images that have a marked image before the window).
 
 Recall at 100 % precision is the highest recall over all thresholds without a wrong match (Cummins
 and Newman, IJRR 2008; Galvez-Lopez and Tardos, T-RO 2012; Garcia-Fidalgo and Ortiz, RA-L 2018; An
@@ -27,8 +29,12 @@ from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME
 
 @dataclass(frozen=True)
 class Window:
-    """The window of images just before a query, which are not compared with it: ``amount`` is a
-    number of images, or of seconds if ``timed``."""
+    """The images just before a query, which are not compared with it.
+
+    Attributes:
+        amount: number of images or, if ``timed`` is set, number of seconds.
+        timed: whether ``amount`` is in seconds.
+    """
 
     amount: float
     timed: bool
@@ -41,14 +47,14 @@ class Window:
 
         Args:
             n: number of images in the drive.
-            times: ``(n,)`` seconds, ascending; None assumes one image per second, as DLoopDetector
-                does by default.
+            times: ``(n,)`` seconds, ascending. None assumes one image per second, which is also the
+                default of DLoopDetector.
 
         Returns:
             ``(n,)`` int64.
         """
         clock = np.arange(n, dtype=np.float64) if times is None or not self.timed else times
-        # The tolerance absorbs rounding of the times, which are multiples of the frame interval.
+        # The times are rounded multiples of the frame interval, so that a tolerance is needed.
         return np.searchsorted(clock, clock - self.amount + 1e-6, side="right")
 
 
@@ -56,7 +62,7 @@ def parse_window(text: str) -> Window:
     """Parse ``20s`` (seconds) or ``200`` (images).
 
     Raises:
-        InputError: the text has another form, or the number is not positive.
+        InputError: the text does not have this form, or the number is not positive.
     """
     timed = text.endswith("s")
     try:
@@ -75,7 +81,7 @@ class Decisions:
     """The decisions for N images.
 
     Attributes:
-        match: ``(N,)`` int64 index of the image found; -1 if there is no match.
+        match: ``(N,)`` int64 index of the matching image; -1 if there is no match.
         score: ``(N,)`` float64 score of the match; -inf if there is no match.
     """
 
@@ -87,7 +93,7 @@ class Decisions:
             raise InputError("loops bench: a score is NaN; check the weights of the detector.")
 
     def only(self, accepted: NDArray[np.bool_]) -> Decisions:
-        """The decisions without those that the mask ``(N,)`` rejects: these images get no match."""
+        """Remove the matches of the images for which the ``(N,)`` mask is False."""
         return Decisions(
             np.where(accepted, self.match, -1), np.where(accepted, self.score, -np.inf)
         )
@@ -98,7 +104,7 @@ def decide(scores: NDArray[np.float64], searchable: NDArray[np.int64]) -> Decisi
 
     Args:
         scores: ``(N, N)`` similarities, with a row for each query.
-        searchable: ``(N,)``, see :meth:`Window.searchable`.
+        searchable: ``(N,)``, the result of `Window.searchable`.
     """
     match, score = np.full(len(scores), -1, np.int64), np.full(len(scores), -np.inf)
     for k in np.flatnonzero(searchable):
@@ -114,8 +120,8 @@ class Judged:
     Attributes:
         score: ``(N,)`` float64 score of the match; -inf if there is no match.
         right: ``(N,)`` bool, whether the match is marked as the same place.
-        far: ``(N,)`` bool, whether the match shows another place. A match that is neither right
-            nor far was taken near the place, but not near enough to be marked.
+        far: ``(N,)`` bool, whether the match shows another place. A match may be neither right nor
+            far. It was then taken near the place, but not near enough to be marked.
         answerable: ``(N,)`` bool, whether there is a marked image before the window, so that a
             right match is possible.
     """
@@ -134,8 +140,13 @@ class Judged:
 def judge(
     decisions: Decisions, relation: NDArray[np.int8], searchable: NDArray[np.int64]
 ) -> Judged:
-    """Compare decisions with the ground truth: ``relation`` ``(N, N)`` int8 tells which images show
-    the same place (:class:`vslam.lab.loopbench.sets.QuerySet`).
+    """Compare decisions with the ground truth.
+
+    Args:
+        decisions: the decisions for N images.
+        relation: ``(N, N)`` int8, which tells which images show the same place, as in
+            `vslam.lab.loopbench.sets.QuerySet`.
+        searchable: ``(N,)``, the result of `Window.searchable`.
 
     Raises:
         InputError: no image has a marked image before the window.
@@ -156,12 +167,12 @@ def judge(
 
 
 def decision_curve(judged: Judged, *, near_is_wrong: bool = True) -> PrecisionRecall:
-    """Precision and recall over images, with each distinct score as the threshold.
+    """Precision and recall over images, with each distinct score as a threshold.
 
     Args:
-        near_is_wrong: whether a match that was taken near the place of the query, but is not marked
-            as the same place (``Judged.near``), counts as wrong, as in the literature. If False,
-            such matches are left out.
+        near_is_wrong: whether matches in ``Judged.near`` count as wrong, as in the literature. They
+            were taken near the place of the query, but are not marked as the same place. If False,
+            these matches are left out.
     """
     wrong = judged.far | (judged.near & near_is_wrong)
     counted = judged.right | wrong

@@ -21,40 +21,44 @@ MEAN = "mean of all"
 _ABOUT_AP = (
     "Average precision (AP) without verification, over all pairs of a query and a gallery image "
     "whose relation is known. The last columns give the AP of a detector minus that of the first "
-    "one, with a 95 % bootstrap interval over the queries; * marks intervals that exclude 0."
+    "one, with a 95 % bootstrap interval over the queries. A * marks intervals that exclude 0."
 )
 _ABOUT_RECALL = "The highest recall without a wrong pair, and the precision at a recall of 70 %."
 _ABOUT_VERIFIED = (
-    "Share of the queries with a place in the gallery whose best image shows this place, and the "
-    "shares whose best image is also verified by ORB, by learned descriptors, or by at least one "
-    f"of the two. ORB verifies a pair of images if at least {MIN_MATCHES} matches fit one epipolar "
-    f"geometry. Learned descriptors verify it if at least {MIN_CELLS} coarse matches fit one "
-    "homography."
+    "The first number is the share of queries whose most similar gallery image shows the same "
+    "place. Only queries whose place is in the gallery count. The next numbers are the shares for "
+    "which this image is also verified by ORB, by learned descriptors, or by at least one of them. "
+    f"ORB verifies a pair of images if at least {MIN_MATCHES} matches fit one epipolar geometry. "
+    f"Learned descriptors verify it if at least {MIN_CELLS} coarse matches fit one homography."
 )
 _ABOUT_SEQUENCES = (
-    "Share of the queries whose best image shows their place, by the scores of single images and "
-    f"of sequences of {LENGTH} queries (SeqSLAM). Sequences need images in driving order."
+    "The share of queries whose most similar gallery image shows the same place. The first number "
+    "uses the scores of single images. The second number uses the scores of sequences of "
+    f"{LENGTH} queries (SeqSLAM), which need images in driving order."
 )
-_ABOUT_WRONG = "Number of queries whose best image shows another place but is verified."
+_ABOUT_WRONG = "The number of queries whose most similar image is verified but shows another place."
 _ABOUT_ACCURACY = (
-    "Balanced accuracy at a threshold on p, the probability that the detector gives: the mean of "
-    "the shares of true and of false pairs that are classified correctly."
+    "Balanced accuracy at a threshold on the probability p that the detector computes. It is the "
+    "mean of two shares: the true pairs and the false pairs that are classified correctly."
 )
-_ABOUT_ACCEPTED = "Over the pairs with p of at least 0.9; if there are none, precision is 1."
+_ABOUT_ACCEPTED = (
+    "Precision and recall of the pairs with p of at least 0.9. If there are no such pairs, the "
+    "precision is 1."
+)
 _ABOUT_COST = (
-    "Medians; each detector runs in its own process with one thread. The time for an image does "
-    "not include the ORB features, which tracking extracts anyway. The parameters of bow are the "
-    "weights of its words."
+    "All values are medians. Each detector runs in its own process with one thread. The time for "
+    "an image does not include the ORB features, which tracking extracts anyway. The parameters of "
+    "bow are the weights of its words."
 )
 
 _ABOUT_ONLINE = (
     "Each image is compared with the images before the window. Recall is the share of images with "
-    "a right decision among those with a true match before the window. In brackets: recall if "
-    "unmarked matches near the place do not count as wrong."
+    "a right decision among those with a true match before the window. The recall in brackets does "
+    "not count unmarked matches near the place as wrong."
 )
 _ABOUT_DECISIONS = (
-    "Number of decisions at the lowest threshold whose match is marked as the same place (right), "
-    "is near the place but not marked (near), or shows another place (far)."
+    "The numbers of decisions at the lowest threshold. The match of a decision is marked as the "
+    "same place (right), is near the place but not marked (near), or shows another place (far)."
 )
 
 
@@ -84,13 +88,16 @@ def loops_page(report: LoopsJson) -> Page:
 
 
 def title(report: LoopsJson) -> str:
-    """What was compared, in one line."""
+    """One line that says what was compared."""
     return f"Loop detectors: {', '.join(_detectors(report))}"
 
 
 def words(report: LoopsJson) -> list[str]:
-    """Sentences that compare each detector with the first one under each condition, and sentences
-    that name the best detector on each drive."""
+    """Sentences that summarise the comparison.
+
+    They compare each detector with the first one under each condition, and name the best detector
+    on each drive.
+    """
     sentences = _online_words(report.online)
     for first, second in dict.fromkeys((g.first, g.second) for g in report.gains):
         for condition in _conditions(report):
@@ -154,7 +161,7 @@ def _listed(values: Iterable[float | None]) -> str:
     return ", ".join("-" if value is None else f"{value:.3f}" for value in values)
 
 
-# Title, text of a cell, and note of each table that has a column for each detector.
+# Title, text of a cell, and note of each table that has one column for each detector.
 _TABLES: list[tuple[str, Callable[[Score], str], str]] = [
     ("Recall at 100 % precision, precision at 70 % recall", _operating_points, _ABOUT_RECALL),
     ("Best image right, and also verified by ORB, by learned descriptors, by either", _verified,
@@ -203,7 +210,7 @@ def _retrieval_table(
 
 
 def _online_tables(scores: Iterable[OnlineScore]) -> list[Section]:
-    """Recall at 100 % precision, largest F1 and counts."""
+    """Tables with recall at 100 % precision, the largest F1 score, and counts."""
     head = ("drive", "images", "with a match", "window", "verified by")
     texts = ("drive", "window", "verified by")
 
@@ -230,8 +237,12 @@ def _by_detector(
     about: Callable[[_Scored], tuple[str, ...]],
     shown: Callable[[_Scored], str],
 ) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Head and rows of a table with a column for each detector. ``about`` gives the first cells of
-    a row, and ``shown`` the cell of a detector's score."""
+    """Head and rows of a table with one column for each detector.
+
+    Args:
+        about: returns the first cells of a row.
+        shown: returns the cell for the score of a detector.
+    """
     rows: dict[tuple[str, ...], dict[str, str]] = {}
     for score in scores:
         rows.setdefault(about(score), {})[score.detector] = shown(score)
@@ -240,8 +251,10 @@ def _by_detector(
 
 
 def _online_words(scores: Iterable[OnlineScore]) -> list[str]:
-    """Sentences that name, for each drive and verification, the detector with the highest recall
-    without a wrong match."""
+    """Sentences that name the best detector for each drive and each kind of verification.
+
+    The best detector has the highest recall without a wrong match.
+    """
     sentences = []
     for data in dict.fromkeys(s.data for s in scores):
         for by in ("nothing", "both"):

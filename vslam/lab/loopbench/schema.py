@@ -1,4 +1,4 @@
-"""The schema of ``loops.json``, which scripts may rely on."""
+"""The schema of ``loops.json``. Scripts may rely on it."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from vslam.report.schema import Document, Record
 
 
 class Curve(Record):
-    """Precision and recall at selected thresholds, from the lowest one upwards."""
+    """Precision and recall at selected thresholds, beginning with the lowest threshold."""
 
     precision: list[float]
     recall: list[float]
 
 
 class Verified(Record):
-    """Queries whose best image passes verification.
+    """Queries whose most similar gallery image passes verification.
 
-    ``right``: share of the queries with a place in the gallery whose best image shows this place
-    and is verified. ``wrong``: number of queries whose best image shows another place and is
-    verified.
+    - ``right``: share of the queries whose verified image shows the same place. It is a share of
+      the queries whose place is in the gallery.
+    - ``wrong``: number of queries whose verified image shows another place.
     """
 
     right: float
@@ -30,16 +30,16 @@ class Verified(Record):
 class Score(Record):
     """One detector on one set of images under one condition.
 
-    - ``figures``: see :func:`vslam.loopclosure.precision_recall.summary`; without verification.
-    - ``accuracy``: balanced accuracy by threshold on the probability p; None for detectors that
-      give no probability.
-    - ``accepted``: precision and recall of the pairs with p of at least 0.9; None without p and in
-      older files.
-    - ``queries``: number of queries with a place in the gallery.
-    - ``first_right``: share of these queries whose best image shows their place.
-    - ``sequence_right``: the same for scores added along sequences; None for images without order.
-    - ``verified``: the images verified by ``orb``, by ``learned`` local descriptors, or by at least
-      one of the two (``both``); empty without verification.
+    - ``figures``: figures without verification, see `vslam.loopclosure.precision_recall.summary`.
+    - ``accuracy``: balanced accuracy by threshold on the probability p. None for detectors that
+      compute no probability.
+    - ``accepted``: precision and recall of the pairs with a probability of at least 0.9. None for
+      detectors that compute no probability, and in older files.
+    - ``queries``: number of queries whose place is in the gallery.
+    - ``first_right``: share of these queries whose most similar image shows their place.
+    - ``sequence_right``: the same share for scores of sequences. None for images without an order.
+    - ``verified``: results of verification by ``orb``, by ``learned`` local descriptors, and by at
+      least one of them (``both``). Empty without verification.
     """
 
     data: str
@@ -56,7 +56,7 @@ class Score(Record):
 
 
 class DecisionCurve(Record):
-    """Precision and recall over images at selected thresholds on the score, in ascending order."""
+    """Precision and recall over images, at selected thresholds on the score in ascending order."""
 
     threshold: list[float]
     precision: list[float]
@@ -64,17 +64,18 @@ class DecisionCurve(Record):
 
 
 class OnlineScore(Record):
-    """One detector on one drive, with one decision per image (:mod:`vslam.lab.loopbench.online`).
+    """One detector on one drive, with one decision per image (`vslam.lab.loopbench.online`).
 
-    - ``window``: the images just before a query, which are not searched.
-    - ``verified_by``: ``nothing``, ``orb``, ``learned`` local descriptors, or ``both`` (at least
-      one of the two).
+    - ``window``: the images just before a query, in which no match is searched for.
+    - ``verified_by``: ``nothing``, ``orb``, ``learned`` local descriptors, or ``both`` if one of
+      the two is sufficient.
     - ``answerable``: number of images that have a true match before the window.
-    - ``right``, ``near``, ``far``: numbers of matches, at the lowest threshold, that are marked as
-      the same place, that are near the place but not marked, and that show another place.
-    - Figures whose names end in ``_far`` leave out near matches; the other figures count near
+    - ``right``: number of matches that are marked as the same place, at the lowest threshold.
+    - ``near``: number of matches that are near the place but not marked, at the lowest threshold.
+    - ``far``: number of matches that show another place, at the lowest threshold.
+    - Figures whose names end in ``_far`` leave out near matches. The other figures count near
       matches as wrong.
-    - ``max_f1_threshold``: None if no image has a match.
+    - ``max_f1_threshold``: threshold with the largest F1 score. None if no image has a match.
     """
 
     data: str
@@ -95,7 +96,10 @@ class OnlineScore(Record):
 
 
 class Gain(Record):
-    """AP of ``second`` minus that of ``first``, with a 95 % bootstrap interval over the queries."""
+    """Average precision (AP) of ``second`` minus that of ``first``.
+
+    The 95 % interval is computed by a bootstrap over the queries.
+    """
 
     data: str
     condition: str
@@ -109,8 +113,9 @@ class Gain(Record):
 class Cost(Record):
     """Median costs of one detector in a separate process with one thread.
 
-    ``image_ms``: time per image, without the ORB features, which tracking extracts anyway.
-    ``query_ms``: time per query, by number of keyframes.
+    - ``image_ms``: time per image. It does not include the ORB features, which tracking extracts
+      anyway.
+    - ``query_ms``: time per query, by number of keyframes.
     """
 
     detector: str
@@ -122,9 +127,10 @@ class Cost(Record):
 
 
 class LoopsJson(Document):
-    """The results of ``vslam loops bench``. ``kind`` distinguishes this file from reports of runs.
-    The protocol ``retrieval`` fills ``cells``, ``gains`` and ``costs``; the protocol ``online``
-    fills ``online``.
+    """The results of ``vslam loops bench``.
+
+    ``kind`` distinguishes this file from reports of runs. The protocol ``retrieval`` writes
+    ``cells``, ``gains`` and ``costs``. The protocol ``online`` writes ``online``.
     """
 
     kind: Literal["loops"] = "loops"

@@ -1,4 +1,4 @@
-"""Image sets for testing loop detectors: rendered towns, and collections with ground truth."""
+"""Image sets for tests of loop detectors: rendered towns, and collections with ground truth."""
 
 from __future__ import annotations
 
@@ -17,20 +17,24 @@ from vslam.loopclosure.siamese.image_source import UNKNOWN, ImageSource
 from vslam.loopclosure.siamese.source_registry import open_source, split_spec
 
 ProgressBar = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
-"""``(text, number of steps)`` opens a bar and yields a function to be called after each step."""
+"""A function of ``(text, number of steps)`` that returns a context manager with a progress bar.
 
-_GAP = 50  # number of images just before a query of a drive that are not searched
+The context manager yields a function that must be called after each step.
+"""
+
+_GAP = 50  # number of images just before a query of a drive in which no match is searched for
 
 
 @dataclass(frozen=True)
 class QuerySet:
-    """Query images, the gallery that is searched for their places, and the ground truth.
+    """Query images, the gallery in which their places are searched for, and the ground truth.
 
     Attributes:
-        queries: Q images ``(H, W)`` uint8, under the condition.
+        queries: Q images to which the condition was applied, each ``(H, W)`` uint8.
         gallery: G unchanged images.
-        relation: ``(Q, G)`` int8: 1 same place, -1 another place, 0 unknown (left out).
-        in_order: whether queries and gallery are in the order of a drive.
+        relation: ``(Q, G)`` int8. 1 means the same place, and -1 means another place. Pairs with 0
+            are unknown and are left out.
+        in_order: whether the queries and the gallery are in the order of a drive.
     """
 
     queries: list[Image]
@@ -45,7 +49,7 @@ class TestSet:
 
     Attributes:
         title: title in the report.
-        query_set: function of ``(condition, seed)`` that returns the images under the condition;
+        query_set: function of ``(condition, seed)`` that returns the images under the condition, or
             None if the condition cannot be applied to the set.
     """
 
@@ -58,7 +62,8 @@ class TestSet:
 def open_set(spec: str, cache: Path, *, threads: int, progress_bar: ProgressBar) -> list[TestSet]:
     """Open ``town:ROUTE[seed=101,aliased=1,places=150]`` or a source of ``vslam train``.
 
-    A town is rendered into ``cache`` when it is first needed, once per viewpoint and change.
+    A town is rendered into ``cache`` when it is first needed. It is rendered once for each
+    viewpoint and change.
 
     Args:
         cache: folder of rendered towns.
@@ -77,7 +82,9 @@ def open_set(spec: str, cache: Path, *, threads: int, progress_bar: ProgressBar)
 
 
 def rendered_route(spec: str, defaults: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """The route and the options of ``KIND:ROUTE[options]``, with defaults for missing options.
+    """Parse the route and the options of ``KIND:ROUTE[options]``.
+
+    Missing options have their default values.
 
     Raises:
         InputError: the route or an option is unknown, or an option is not a number.

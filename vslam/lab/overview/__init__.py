@@ -1,1 +1,1 @@
-"""One report of many runs: medians, comparisons of systems, trajectories, strength curves."""
+"""A report of many runs, with medians, comparisons of systems, trajectories and error curves."""

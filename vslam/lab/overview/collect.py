@@ -1,4 +1,4 @@
-"""Find finished runs of vslam and of other systems on disk, and read what the report compares."""
+"""Find finished runs of vslam and of other systems on the disk, and read their figures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _OPTIONS = ("weights", "local_weights", "realtime", "map", "localize", "mask")
 
 @dataclass(frozen=True)
 class Found:
-    """The runs found, in order, and notes on what was left out.
+    """The finished runs, in order, and notes on runs that were left out.
 
     Attributes:
         estimate: the trajectory file of each run, by the ``source`` of the run.
@@ -39,13 +39,14 @@ class Found:
 
 
 def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
-    """Read every run below ``folders`` and evaluate ``trajectories`` on the same sequences.
+    """Read every run below ``folders``, and evaluate ``trajectories`` on the same sequences.
 
-    Interrupted runs and reports that this version cannot read are left out with a note.
+    Interrupted runs are left out, as are reports that this version cannot read. A note is added for
+    each of them.
 
     Raises:
         InputError: a folder is missing, no folder contains a finished run, a trajectory cannot be
-            read, or the sequence of a trajectory is not clear.
+            read, or it is ambiguous to which sequence a trajectory belongs.
     """
     found = Found([], [])
     for folder in run_folders(folders):
@@ -81,7 +82,9 @@ def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
 
 
 def read_aligned(found: Found, run: RunEntry) -> tuple[Trajectory, Trajectory | None]:
-    """The trajectory of a run, aligned to its ground truth, and the ground truth (None if missing).
+    """The trajectory of a run, aligned to its ground truth, and the ground truth.
+
+    The ground truth is None if it is missing.
 
     Raises:
         InputError: a file is missing or malformed.
@@ -95,12 +98,13 @@ def read_aligned(found: Found, run: RunEntry) -> tuple[Trajectory, Trajectory | 
         evaluation = evaluate_trajectory(estimate, truth, run.alignment)
     except InputError:  # too short to align
         return estimate, None
-    # If the estimate lacks some frames, these timestamps are wrong. Only positions are drawn.
+    # These timestamps are wrong if some frames are missing in the estimate. This does not matter,
+    # because only positions are drawn.
     return Trajectory(estimate.timestamps[: evaluation.frames], evaluation.T_wc_aligned), truth
 
 
 def run_folders(folders: Collection[Path]) -> list[Path]:
-    """Folders at any depth that contain a ``report.json``, except hidden ones.
+    """Folders at any depth that contain a ``report.json``, except hidden folders.
 
     Raises:
         InputError: a folder does not exist.
@@ -141,7 +145,7 @@ def _is_overview(path: Path) -> bool:
 def _compared_entry(
     entry: RunEntry, report: ReportJson, other: DetectorFigures, folder: Path
 ) -> RunEntry:
-    """The entry of a detector that a run compared with its own (``--compare``)."""
+    """The entry of a detector that a run compared with its own detector (``--compare``)."""
     return entry.model_copy(
         update={
             "system": other.detector + entry.system.removeprefix(report.detector),
@@ -162,7 +166,8 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
     if report.dataset == "synthetic":
         from vslam.datasets.synthetic import parse_drive  # imports the renderer
 
-        # Changes of a rendered town count as perturbations: 05+change:0.5 is on the route 05.
+        # Changes of a rendered town count as perturbations. For example, 05+change:0.5 is a drive
+        # on the route 05.
         town = parse_drive(sequence)[1].seed
         sequence, *parts_of_town = sequence.split("+")
         laws = [part for part in parts_of_town if not part.startswith("seed:")]
@@ -193,8 +198,11 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
 
 
 def _settings(report: ReportJson, folder: Path) -> dict[str, Any]:
-    """The thresholds and options of a run that differ from the defaults, and the version of the
-    method. Only runs of vslam have settings and a ``run.json``; other systems have neither."""
+    """The settings of a run.
+
+    They are the thresholds and options that differ from the defaults, and the version of the
+    method. Only runs of vslam have a ``run.json`` and settings. Runs of other systems have neither.
+    """
     if not (folder / "run.json").exists():
         return {}
     path = folder / "config.json"
@@ -208,7 +216,7 @@ def _settings(report: ReportJson, folder: Path) -> dict[str, Any]:
 
 
 def _name_by_settings(found: Found) -> None:
-    """Make each combination of settings a system, whose name lists the settings that differ."""
+    """Treat each combination of settings as a system, whose name lists the settings that differ."""
     first = found.runs[0].settings
     shared = {
         name: value
@@ -226,7 +234,7 @@ def _name_by_settings(found: Found) -> None:
 
 
 def without_settings(system: str) -> str:
-    """The name of a system without the settings in brackets."""
+    """The name of a system, without the settings in brackets."""
     return re.sub(r" \(.*\)", "", system)
 
 
@@ -288,8 +296,11 @@ def _add_external(text: str, found: Found) -> None:
 
 
 def _alignment_of_external(system: str, drive: Drive, found: Found) -> str:
-    """The alignment of vslam's runs on the same sequence. If only some of these runs are monocular,
-    it is sim3 for a system whose name ends in ``, mono``, else se3."""
+    """The alignment with which the trajectory of another system is evaluated.
+
+    It is the alignment of vslam's runs on the same sequence. If only some of these runs are
+    monocular, the name of the system decides: sim3 if it ends in ``, mono``, otherwise se3.
+    """
     there = {run.alignment for run in found.runs if run.drive.place == drive.place}
     if len(there) == 1:
         return there.pop()

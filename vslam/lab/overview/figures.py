@@ -1,4 +1,4 @@
-"""The figures of a report of many runs: errors by sequence, strength curves, trajectories."""
+"""The figures of a report of many runs: errors by sequence, error curves and trajectories."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 _COLORS = [AMBER, BLUE, GREEN, VIOLET, RED, "#06b6d4", "#ec4899", "#84cc16"]
 _MIN_STRENGTHS = 2  # least number of strengths in a curve, not counting unperturbed images
-_DASHES = ["-", (0, (5, 1.5)), (0, (2, 1)), (0, (5, 1, 1, 1))]  # keep lines that overlap visible
+_DASHES = ["-", (0, (5, 1.5)), (0, (2, 1)), (0, (5, 1, 1, 1))]  # overlapping lines stay visible
 
 Looks = Mapping[str, tuple[str, Any]]  # colour and dashes of each system
 
@@ -59,7 +59,7 @@ def draw_overview(report: OverviewJson, found: Found) -> list[page.Figure]:
 
 
 def _errors(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
-    """Draw the ATE by sequence, with a figure for each perturbation."""
+    """Draw the ATE of each sequence, with a figure for each perturbation."""
     for perturb in dict.fromkeys(row.drive.perturb for row in rows):
         known = [r for r in rows if r.drive.perturb == perturb and r.measures["ate_rmse_m"]]
         places = list(dict.fromkeys((row.drive.dataset, row.drive.place) for row in known))
@@ -87,8 +87,10 @@ def _errors(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
 
 
 def _curves(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
-    """Draw ATE and loops against the strength of a perturbation, with a figure for each kind of
-    perturbation and sequence."""
+    """Draw the ATE and the number of loops against the strength of a perturbation.
+
+    There is a figure for each kind of perturbation and sequence.
+    """
     laws = {
         law.partition(":")[0]: None
         for row in rows
@@ -147,8 +149,10 @@ def _curve(
 
 
 def _paths(report: OverviewJson, found: Found, looks: Looks) -> Iterator[Drawing]:
-    """Draw the trajectory of the run with the median ATE of each system, with a figure for each
-    drive."""
+    """Draw a trajectory of each system, with a figure for each drive.
+
+    The trajectory is that of the run with the median ATE.
+    """
     for drive in dict.fromkeys(row.drive for row in report.rows):
         figure, axes = new_figure(
             f"{drive.place}, {_light(drive.perturb)}", "x (m)", "z (m)", SQUARE
@@ -200,7 +204,10 @@ def _spreads(rows: list[Row], measure: str) -> np.ndarray:
 
 
 def _logarithmic(axes: Axes) -> None:
-    """Make the y axis logarithmic, from a third to three times the data, with plain numbers."""
+    """Make the y axis logarithmic, and label it with plain numbers.
+
+    The axis ends at a third of the smallest value and at three times the largest value.
+    """
     low, high = axes.dataLim.intervaly
     axes.set_yscale("log")
     axes.set_ylim(max(low, 1e-4) / 3.0, max(high, 1e-4) * 3.0)

@@ -1,4 +1,4 @@
-"""Write the report of many runs: its page, and its rows as CSV."""
+"""Write the report of many runs, as a page and as a CSV table."""
 
 from __future__ import annotations
 
@@ -18,25 +18,26 @@ _MOTION = ("rpe_m", "rpe_deg", "t_rel_percent", "r_rel_deg_per_100m")
 _OTHER = ("loops_found", "loops_missed", "loops_wrong", "fps")
 _ABOUT_ERRORS = (
     "Medians over runs, with the smallest and the largest value in brackets. The ATE counts every "
-    "frame, including lost ones, after the alignment in the table: SE3 keeps the scale; Sim3 fits "
-    "it for monocular runs. The causal ATE is that of the poses as they were first estimated. "
-    "Systems with different alignments are not compared."
+    "frame, including lost frames, after the alignment in the table. SE3 keeps the scale. Sim3 "
+    "also fits the scale, for monocular runs. The causal ATE is that of the poses as they were "
+    "first estimated. Systems with different alignments are not compared."
 )
 _ABOUT_MOTION = (
-    "RPE: error of the motion from one frame to the next. t_rel and r_rel: KITTI's drift over 100 "
-    "to 800 m."
+    "RPE is the error of the motion from one frame to the next. t_rel and r_rel are the error "
+    "metrics of KITTI, which measure the drift over 100 to 800 m."
 )
 _ABOUT_OTHERS = (
-    "Loops are judged by the ground truth. fps: frames per second without start-up; runs that "
-    "shared a machine are slower."
+    "Loops are judged by the ground truth. fps is the number of frames per second without the "
+    "start of the program. Runs that shared a machine are slower."
 )
 ALIGNMENTS = {"se3": "SE3", "sim3": "Sim3"}
 _TESTED = (
-    "Better, worse, same: numbers of sequences on which the errors of the system named first are "
-    "smaller, larger or equal. p: two-sided Wilcoxon signed-rank test over sequences, at the level "
-    f"{ALPHA:g}, not corrected for the number of tests. A sequence counts once, because its runs "
-    "are not independent: with the median of its runs, or, over all conditions, with the mean of "
-    "these medians. Comparisons in which all sequences tie are left out."
+    "The columns better, worse and same give the numbers of sequences on which the errors of the "
+    "system named first are smaller, larger or equal. p is the p-value of the two-sided Wilcoxon "
+    f"signed-rank test over sequences, at the level {ALPHA:g}. It is not corrected for the number "
+    "of tests. Each sequence counts once, with the median of its runs, because its runs are not "
+    "independent. Over all conditions, it counts with the mean of these medians. Comparisons in "
+    "which all sequences tie are left out."
 )
 
 
@@ -46,17 +47,18 @@ def write_overview(
     out: Path,
     baseline: str | None = None,
 ) -> OverviewJson:
-    """Gather finished runs and write ``report.{html,md,json}`` and ``table.csv`` into ``out``.
+    """Collect finished runs, and write ``report.{html,md,json}`` and ``table.csv`` into ``out``.
 
     Args:
         runs: folders that contain runs at any depth.
         trajectories: trajectories of other systems, ``NAME[@SEQUENCE[@PERTURB]]=FILE``.
-        out: folder, created if it does not exist.
-        baseline: the system with which the others are compared; None for the simplest system.
+        out: output folder, which is created if it does not exist.
+        baseline: the system with which the other systems are compared; None for the simplest
+            system.
 
     Raises:
-        InputError: there is no finished run, or no run of the baseline, or a trajectory cannot be
-            read or its sequence is not clear.
+        InputError: there is no finished run, there is no run of the baseline, a trajectory cannot
+            be read, or it is ambiguous to which sequence a trajectory belongs.
         ResultsError: a file cannot be written.
     """
     found = collect(runs, trajectories)
@@ -71,7 +73,7 @@ def write_overview(
 
 
 def overview_page(report: OverviewJson, figures: Collection[Figure]) -> Page:
-    """The page of many runs."""
+    """Make the page of a report of many runs."""
     return Page(
         title(report),
         (f"vslam {report.versions.get('vslam', '')}", f"{report.created:%Y-%m-%d %H:%M %Z}"),
@@ -88,7 +90,7 @@ def overview_page(report: OverviewJson, figures: Collection[Figure]) -> Page:
 
 
 def title(report: OverviewJson) -> str:
-    """The systems and the number of runs, in one line."""
+    """One line with the systems and the number of runs."""
     places = len({(row.drive.dataset, row.drive.place) for row in report.rows})
     return (
         f"{', '.join(report.systems)}: {counted(len(report.runs), 'run')} on "
@@ -97,7 +99,7 @@ def title(report: OverviewJson) -> str:
 
 
 def render_csv(report: OverviewJson) -> str:
-    """A line for each row, with the median, smallest and largest value of each measure."""
+    """The rows as CSV, with the median, the smallest and the largest value of each measure."""
     names = [name for name, *_ in MEASURES]
     head = ["dataset", "sequence", "excerpt", "perturb", "system", "alignment", "runs", "frames"]
     lines: list[list[object]] = [
@@ -115,7 +117,10 @@ def render_csv(report: OverviewJson) -> str:
 
 
 def _results(report: OverviewJson) -> list[Section]:
-    """The results in several tables with the same rows, because one table would be too wide."""
+    """The tables of results.
+
+    There are several tables with the same rows, because one table would be too wide.
+    """
     texts = ("sequence", "perturbation", "system")
 
     def table(name: str, measures: Collection[Measure], note: str, *, aligned: bool) -> Section:

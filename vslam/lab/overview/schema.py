@@ -1,4 +1,4 @@
-"""The schema of the ``report.json`` of many runs, which scripts may rely on."""
+"""The schema of the ``report.json`` of many runs. Scripts may rely on it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import Field
 from vslam.report.schema import Document, Record
 
 Measure = tuple[str, str, str, int]
-# Name in the JSON, title, unit, decimals.
+# For each measure: the name in the JSON file, the title, the unit and the number of decimals.
 MEASURES: tuple[Measure, ...] = (
     ("lost_frames", "lost frames", "", 0),
     ("ate_rmse_m", "ATE RMSE", "m", 3),
@@ -25,13 +25,15 @@ MEASURES: tuple[Measure, ...] = (
     ("fps", "fps", "", 1),
 )
 DECIMALS = {name: decimals for name, _, _, decimals in MEASURES}
-ALL = "all"  # ``Comparison.perturb`` of a comparison over all perturbations
+ALL = "all"  # value of ``Comparison.perturb`` for a comparison over all perturbations
 
 
 class Drive(Record):
-    """The images on which systems are compared: a sequence or an excerpt of it, with a
-    perturbation. Runs with different seeds have the same drive. ``excerpt`` is empty for a whole
-    sequence."""
+    """The images on which systems are compared.
+
+    They are those of a sequence or of an excerpt of it, with a perturbation. ``excerpt`` is empty
+    for a whole sequence. Runs with different seeds have the same drive.
+    """
 
     dataset: str
     sequence: str
@@ -47,18 +49,18 @@ class Drive(Record):
 class RunEntry(Record):
     """One run.
 
-    - ``system``: the loop detector, followed in brackets by the settings that not all runs share,
-      or the name of another system.
-    - ``settings``: thresholds and options that differ from the defaults, and the
-      version of the method.
+    - ``system``: the name of the loop detector or of another system. The settings that not all runs
+      share follow the name of a loop detector in brackets.
+    - ``settings``: thresholds and options that differ from the defaults, and the version of the
+      method.
     - ``seed``: seed of the perturbation; None for other systems.
     - ``town``: seed of a rendered town. The same route in another town counts as the same drive
       with another seed.
-    - ``alignment``: the transformation fitted before errors are computed: ``se3``, or ``sim3`` for
-      a monocular run, whose scale is arbitrary.
+    - ``alignment``: the transformation that is fitted before errors are computed. It is ``se3``, or
+      ``sim3`` for a monocular run, whose scale is arbitrary.
     - ``measures``: values by the names in ``MEASURES``; None if unknown.
-    - ``source``: the folder of the run, or the trajectory file of another system or of a detector
-      of ``--compare``.
+    - ``source``: the folder of the run. For another system or a detector of ``--compare``, it is
+      the trajectory file.
     """
 
     drive: Drive
@@ -74,7 +76,7 @@ class RunEntry(Record):
 
 
 class Spread(Record):
-    """Median and extremes over the ``n`` runs that have a value."""
+    """Median, smallest and largest value over the ``n`` runs that have a value."""
 
     n: int
     median: float
@@ -83,7 +85,7 @@ class Spread(Record):
 
 
 class Row(Record):
-    """All runs of one system on one drive. A measure is None if no run has a value."""
+    """All runs of one system on one drive. A measure is None if no run has a value for it."""
 
     drive: Drive
     system: str
@@ -94,7 +96,7 @@ class Row(Record):
 
 
 class Pair(Record):
-    """Medians of two systems on one drive; ``difference`` is the second minus the first."""
+    """Medians of two systems on one drive. ``difference`` is the second minus the first median."""
 
     drive: Drive
     first: float
@@ -105,10 +107,11 @@ class Pair(Record):
 class Comparison(Record):
     """Two systems under one perturbation, paired by sequence.
 
-    - ``perturb``: ``all`` for a comparison over all perturbations. A sequence then counts once,
-      with its mean over the perturbations under which both systems have run.
-    - ``p_value``: p of the two-sided Wilcoxon signed-rank test on the differences that are not
-      ties; None if there are too few differences.
+    - ``perturb``: the perturbation, or ``all`` for a comparison over all perturbations. In the
+      latter case, each sequence counts once, with its mean over the perturbations under which both
+      systems have run.
+    - ``p_value``: p-value of the two-sided Wilcoxon signed-rank test on the differences that are
+      not ties; None if there are too few differences.
     - ``winner``: the system with significantly smaller errors; None if there is no such system.
     - ``words``: the result in sentences.
     """
@@ -128,8 +131,11 @@ class Comparison(Record):
 
 
 class OverviewJson(Document):
-    """A report of many runs. ``kind`` distinguishes this file from the ``report.json`` of one run.
-    ``systems`` lists the baseline first, then the systems that are compared with it."""
+    """A report of many runs.
+
+    ``kind`` distinguishes this file from the ``report.json`` of one run. ``systems`` lists the
+    baseline first, followed by the systems that are compared with it.
+    """
 
     kind: Literal["overview"] = "overview"
     schema_version: int = 4

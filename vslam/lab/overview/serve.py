@@ -1,12 +1,12 @@
-"""``vslam report --serve``: a web page of all runs in some folders, for this machine only.
+"""The web server of ``vslam report --serve``, which lists all runs in some folders.
 
-Requests name a report by its number; a path from a request is never opened. Requests for another
-host name are refused, so that a web site cannot read reports through the user's browser (DNS
-rebinding).
+The server can only be reached from this machine. A request names a report by its number. A path
+from a request is never opened. Requests for another host name are rejected, so that a web site
+cannot read reports through the user's browser (DNS rebinding).
 
-A report may come from a stranger and contain any script. It is therefore sandboxed: its scripts run
-in their own origin and can reach neither other reports nor the network. A ``report.html`` or
-``report.json`` that is a symbolic link is not read.
+A report may come from an untrusted person and contain any script. Therefore, it is sandboxed: its
+scripts run in their own origin, and cannot access other reports or the network. A ``report.html``
+or ``report.json`` that is a symbolic link is not read.
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ _REPORT = re.compile("/run/([0-9]{1,9})")
 
 
 def list_runs(folders: Collection[Path]) -> list[tuple[Path, ReportJson]]:
-    """Folders of all runs and their reports, newest first; unreadable reports are left out.
+    """The folders of all runs and their reports, newest first.
+
+    Reports that cannot be read are left out.
 
     Raises:
         InputError: a folder does not exist, or no folder contains a run.
@@ -57,18 +59,18 @@ def list_runs(folders: Collection[Path]) -> list[tuple[Path, ReportJson]]:
 
 
 def _is_own(path: Path) -> bool:
-    """Whether a path in a resolved folder is a file and not a symbolic link."""
+    """Whether a path in a resolved folder is a file, but not a symbolic link."""
     return path.is_file() and path.resolve() == path
 
 
 def make_server(folders: Sequence[Path], port: int = 0) -> http.server.ThreadingHTTPServer:
-    """A server on the loopback interface; its ``serve_forever`` starts it.
+    """Make a server on the loopback interface. Its method ``serve_forever`` starts it.
 
-    The folders are read again whenever the list is requested.
+    The folders are read again whenever the list of runs is requested.
 
     Args:
         folders: folders that contain runs at any depth.
-        port: 0 for any free port.
+        port: port of the server; 0 for any free port.
 
     Raises:
         InputError: there is no run, or the port is in use.
@@ -105,8 +107,10 @@ def make_server(folders: Sequence[Path], port: int = 0) -> http.server.Threading
 
 
 class _Pages:
-    """The pages of the server. The number of a report is its index in ``_known`` and never changes
-    while the server runs."""
+    """The pages of the server.
+
+    The number of a report is its index in ``_known``. It never changes while the server runs.
+    """
 
     def __init__(self, folders: Sequence[Path]) -> None:
         self._folders = folders
@@ -115,7 +119,7 @@ class _Pages:
         self._list()
 
     def answer(self, request: str) -> tuple[int, str]:
-        """The HTTP status and the page for a path with its query."""
+        """The HTTP status and the page for a requested path with its query."""
         try:
             url = urlsplit(request)
             if url.path == "/":

@@ -1,8 +1,8 @@
 """Summarize runs in rows and compare systems.
 
 On each drive, a system is represented by the median of its runs. Two systems are compared under
-each perturbation, and over all perturbations. A comparison pairs the systems by *sequence*: runs on
-the same sequence are not independent, so counting each run would overstate the evidence.
+each perturbation, and over all perturbations. A comparison pairs the systems by *sequence*. Runs on
+the same sequence are not independent, so that counting each run would overstate the evidence.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _KNOWN = ("none", "bow", *NETWORKS, "both")
 
 
 class Shown(NamedTuple):
-    """How an error is printed: its title, its unit, and the factor ``scale`` to this unit."""
+    """How an error is printed. Its value is multiplied by ``scale`` to get it in ``unit``."""
 
     title: str
     unit: str
@@ -43,7 +43,7 @@ class Shown(NamedTuple):
     decimals: int
 
     def text(self, value: float, sign: str = "") -> str:
-        """The value as text without unit; ``sign`` is ``+`` for differences."""
+        """The value as text without its unit. ``sign`` is ``+`` for differences."""
         return f"{self.scale * value:{sign}.{self.decimals}f}"
 
 
@@ -56,7 +56,8 @@ def summarize(found: Found, baseline: str | None = None) -> OverviewJson:
 
     Args:
         found: the runs.
-        baseline: the system with which the others are compared; None for the simplest system.
+        baseline: the system with which the other systems are compared; None for the simplest
+            system.
 
     Raises:
         InputError: there is no run of the baseline.
@@ -89,7 +90,7 @@ def summarize(found: Found, baseline: str | None = None) -> OverviewJson:
 
 
 def _unlike_towns(runs: Iterable[RunEntry]) -> Iterator[str]:
-    """A note on each drive on which the systems ran in different rendered towns."""
+    """Notes on the drives on which the systems ran in different rendered towns."""
     towns: dict[Drive, dict[str, set[int]]] = {}
     for run in runs:
         if run.town is not None:
@@ -103,9 +104,12 @@ def _unlike_towns(runs: Iterable[RunEntry]) -> Iterator[str]:
 
 
 def systems(runs: Iterable[RunEntry | Row], baseline: str | None = None) -> list[str]:
-    """Names of the systems: first the baseline if one is named, then loop detectors from the
-    simplest to the most elaborate, then other systems in the order found. A detector with default
-    settings precedes the same detector with other settings."""
+    """Names of the systems in the order of the report.
+
+    If a baseline is named, it is the first system. It is followed by the loop detectors, from the
+    simplest to the most elaborate one, and by the other systems in the order of ``runs``. A
+    detector with default settings precedes the same detector with other settings.
+    """
     names = dict.fromkeys(run.system for run in runs)
 
     def key(name: str) -> tuple[bool, int, bool]:
@@ -117,12 +121,12 @@ def systems(runs: Iterable[RunEntry | Row], baseline: str | None = None) -> list
 
 
 def _is_called(system: str, name: str | None) -> bool:
-    """Whether a name means a system. The name may omit the settings and the suffix ``, mono``."""
+    """Whether a name denotes a system. It may omit the settings and the suffix ``, mono``."""
     return name in {one.removesuffix(MONOCULAR) for one in (system, without_settings(system))}
 
 
 def make_rows(runs: list[RunEntry]) -> list[Row]:
-    """A row for each drive and system, ordered by the names of the sequences."""
+    """Make a row for each drive and system, in the order of the names of the sequences."""
     groups: dict[tuple[Drive, str], list[RunEntry]] = {}
     for run in runs:
         groups.setdefault((run.drive, run.system), []).append(run)
@@ -154,14 +158,14 @@ def compare(
     """Compare the errors of two systems.
 
     Args:
-        rows: medians of both systems; rows of other systems are ignored.
+        rows: medians of both systems. Rows of other systems are ignored.
         first, second: names of the systems. Errors after different alignments are not compared.
-        perturb: a perturbation, or `ALL`, which compares the mean of each sequence over the
-            perturbations under which both systems have run.
-        measure: ``ate_rmse_m`` or ``rpe_m``; less is better.
+        perturb: a perturbation, or `ALL`. With `ALL`, the mean of each sequence over the
+            perturbations under which both systems have run is compared.
+        measure: ``ate_rmse_m`` or ``rpe_m``. Smaller values are better.
 
     Returns:
-        None if the systems share no drive.
+        The comparison; None if there is no drive on which both systems have run.
     """
     medians: dict[str, dict[tuple[Drive, str], float]] = {first: {}, second: {}}
     for row in rows:
@@ -210,8 +214,9 @@ def is_tie(difference: float, measure: str) -> bool:
 
 
 def strengths(drives: Iterable[Drive], law: str) -> dict[Drive, float]:
-    """The strength of a perturbation in each drive that has only this perturbation, and 0 for
-    unperturbed drives.
+    """The strength of a perturbation in each drive that has only this perturbation.
+
+    The strength is 0 for unperturbed drives.
 
     Args:
         law: name of the perturbation, without strength.
@@ -231,8 +236,10 @@ def least_pairs() -> int:
 
 
 def _wilcoxon(differences: list[float]) -> tuple[float | None, bool]:
-    """The two-sided p (None if there are too few differences), and whether the differences tend to
-    be negative."""
+    """The two-sided p-value, and whether the differences tend to be negative.
+
+    The p-value is None if there are too few differences.
+    """
     if len(differences) < least_pairs():
         return None, False
     from scipy.stats import wilcoxon

@@ -1,4 +1,4 @@
-"""Systems side by side: tables by sequence and perturbation, and sentences that name the winner."""
+"""Comparison of systems, as tables by sequence and perturbation, and as sentences."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vslam.report.page import Bullets, Section, Table
 _TEXTS = ("sequence", "perturbation")
 _SHOWN = {**COMPARED, **ROTATION}
 _MEASURES = ("lost_frames", *_SHOWN, "loops_found")
-_WIDTH = 60  # characters for all columns of numbers, so that a table fits 80 columns
+_WIDTH = 60  # characters for all columns of numbers, so that a table is at most 80 characters wide
 _COLUMN = 6  # smallest width of a column of numbers, in characters
 _NOTES = {
     "lost_frames": "Lost: number of lost frames.",
@@ -30,10 +30,10 @@ Rows = dict[str, dict[Key, Row]]
 
 
 def versus(report: OverviewJson) -> list[Section]:
-    """Sections that show systems side by side and name the winner.
+    """Make the sections that compare systems and name the winner.
 
-    Systems share a section if they share a drive and an alignment. If no drive has a revisit, the
-    first section explains why loop detectors cannot differ.
+    Two systems are in the same section if they ran on the same drive and have the same alignment.
+    If no drive has a revisit, the first section explains why loop detectors cannot differ.
     """
     rows: Rows = {name: {} for name in report.systems}
     for row in report.rows:
@@ -52,14 +52,17 @@ def versus(report: OverviewJson) -> list[Section]:
 
 
 def median_text(spread: Spread | None, decimals: int) -> str:
-    """The median as text. The median of counts gets one decimal if it is no integer."""
+    """The median as text. The median of counts gets one decimal if it is not an integer."""
     if spread is None:
         return "n/a"
     return f"{spread.median:.{1 if decimals == 0 and spread.median % 1 else decimals}f}"
 
 
 def _without_revisits(report: OverviewJson) -> str:
-    """Why loop detectors hardly differ; empty if a drive has a revisit, or without ground truth."""
+    """Text that explains why loop detectors hardly differ.
+
+    It is empty if a drive has a revisit, or if there is no ground truth.
+    """
     judged = [row for row in report.rows if row.measures["loops_found"] is not None]
     names = {row.system for row in judged if row.system == without_settings(row.system)}
     counts = [row.measures[name] for row in judged for name in ("loops_found", "loops_missed")]
@@ -124,9 +127,12 @@ def _cell(row: Row | None, measure: str) -> str:
 
 
 def _points(report: OverviewJson, rows: Rows, names: list[str]) -> Iterator[str]:
-    """Sentences that give the totals of lost frames and loops over the drives that all systems
-    share, and sentences that compare each system with its baseline, which is the first system that
-    shares a drive with it."""
+    """Sentences that summarise the comparison.
+
+    The first sentences give the total numbers of lost frames and loops over the drives that all
+    systems share. The other sentences compare each system with its baseline. The baseline of a
+    system is the first system that ran on one of its drives.
+    """
     shared = set.intersection(*(set(rows[name]) for name in names))
     runs = {
         name: [

@@ -9,15 +9,17 @@ from vslam.report.schema import ReportJson
 _LOSS_S = 10.0
 _ERRORS_M = (10.0, 1.0)
 ABSOLUTE = (
-    "Absolute: why the run also fails by the rules of AirSLAM (Xu et al., T-RO 2025), which allow "
-    f"losing track for at most {_LOSS_S:g} s, and an ATE of at most {_ERRORS_M[0]:g} m (on OIVIO "
-    f"and UMA-VI) or {_ERRORS_M[1]:g} m (on Dark EuRoC)."
+    "The column absolute says why the run also fails by the rules of AirSLAM (Xu et al., T-RO "
+    f"2025). These rules allow losing track for at most {_LOSS_S:g} s. They allow an ATE of at "
+    f"most {_ERRORS_M[0]:g} m (on OIVIO and UMA-VI) or {_ERRORS_M[1]:g} m (on Dark EuRoC)."
 )
 
 
 def absolute_verdict(report: ReportJson) -> str:
-    """Why a run exceeded the limits that do not depend on a clean run (``ABSOLUTE``); empty if the
-    run kept them."""
+    """Text that says why a run exceeded the absolute limits; empty if it did not exceed them.
+
+    The absolute limits (``ABSOLUTE``) do not depend on a run on clean images.
+    """
     if report.longest_loss_s is not None and report.longest_loss_s > _LOSS_S:
         return f"lost for {report.longest_loss_s:.0f} s"
     above = [limit for limit in _ERRORS_M if (report.ate_rmse_m or 0.0) > limit]
@@ -25,18 +27,19 @@ def absolute_verdict(report: ReportJson) -> str:
 
 
 def lost_percent(report: ReportJson) -> float:
-    """Lost frames in percent of the frames that were not dropped."""
+    """Lost frames, in percent of the frames that were not dropped."""
     return 100.0 * report.lost_frames / max(1, report.frames - report.dropped_frames)
 
 
 @dataclass(frozen=True)
 class Criterion:
-    """Limits relative to the same system's run on the unperturbed (clean) images.
+    """Limits relative to a run of the same system on the unperturbed (clean) images.
 
     Attributes:
-        lost_percent: largest allowed percentage of lost frames; dropped frames are not counted.
-        ate_factor: largest allowed ratio of the ATE to the clean ATE.
-        ate_least_m: ATE in metres that is always allowed, however small the clean ATE is.
+        lost_percent: largest allowed percentage of lost frames. Dropped frames are not counted.
+        ate_factor: largest allowed ratio of the ATE to the ATE of the clean run.
+        ate_least_m: ATE in metres that is always allowed, even if the clean run has a very small
+            ATE.
     """
 
     lost_percent: float = 5.0
@@ -54,7 +57,7 @@ class Criterion:
         )
 
     def verdict(self, report: ReportJson, clean: ReportJson) -> str:
-        """Why a run failed; empty if it did not fail."""
+        """Text that says why a run failed; empty if it did not fail."""
         if (lost := lost_percent(report)) > self.lost_percent:
             return f"{lost:.0f} % lost"
         limit = self.ate_limit(clean)

@@ -1,12 +1,13 @@
 """Run other systems, which read a folder in KITTI's format and write a trajectory.
 
-The command is a template with ``{folder}`` and ``{out}``. ``folder`` holds ``image_0``,
-``image_1``, ``calib.txt`` and ``times.txt`` of the perturbed frames, without dropped ones. The
-command writes into the folder ``out``:
+The command of a system is a template with ``{folder}`` and ``{out}``. ``folder`` contains
+``image_0``, ``image_1``, ``calib.txt`` and ``times.txt`` of the perturbed frames. Dropped frames
+are left out. The command writes these files into the folder ``out``:
 
-- ``trajectory.txt``: one pose per frame in KITTI's format, or poses with times in TUM's format;
-- ``causal.txt`` (optional): the same, with the poses as they were first estimated;
-- ``states.txt`` (optional): ``OK`` or ``LOST`` for each frame.
+- ``trajectory.txt`` contains one pose per frame in KITTI's format, or poses with times in TUM's
+  format.
+- ``causal.txt`` (optional) has the same format, with the poses as they were first estimated.
+- ``states.txt`` (optional) contains ``OK`` or ``LOST`` for each frame.
 """
 
 from __future__ import annotations
@@ -37,13 +38,13 @@ _SAME_TIME_S = 1e-3
 
 @dataclass(frozen=True)
 class Poses:
-    """``(N, 4, 4)`` poses ``T_wc`` of the frames of a run, and a mask ``(N,)`` of known poses."""
+    """``(N, 4, 4)`` poses ``T_wc`` of the frames of a run, and an ``(N,)`` mask of known poses."""
 
     T_wc: NDArray[np.float64]
     known: NDArray[np.bool_]
 
     def bridged(self, times: NDArray[np.float64]) -> Trajectory:
-        """The trajectory at the ``(N,)`` times of the frames; unknown poses are interpolated."""
+        """The trajectory at the ``(N,)`` times of the frames. Unknown poses are interpolated."""
         return bridge_gaps(Trajectory(times, self.T_wc), self.known)
 
 
@@ -80,15 +81,16 @@ def run_external(
     template: str,
     folder: Path,
 ) -> ReportJson:
-    """Run another system on a perturbed sequence; write ``report.json`` and trajectories.
+    """Run another system on a perturbed sequence, and write ``report.json`` and trajectories.
 
     Loops are not evaluated, because other systems do not report them.
 
     Args:
-        folder: the folder of the run.
+        template: command of the system, with ``{folder}`` and ``{out}``.
+        folder: output folder of the run.
 
     Raises:
-        InputError: the system ends with an error or writes no trajectory.
+        InputError: the system exits with an error, or writes no trajectory.
     """
     with tempfile.TemporaryDirectory(prefix="kitti.", dir=folder) as name:
         work = Path(name)
@@ -108,8 +110,11 @@ def run_external(
 
 
 def export_kitti(sequence: Source, perturbation: Perturbation, folder: Path) -> NDArray[np.int64]:
-    """Write the perturbed frames in KITTI's format; returns the indices of the written frames,
-    which exclude dropped ones."""
+    """Write the perturbed frames in KITTI's format. Dropped frames are left out.
+
+    Returns:
+        The indices of the written frames.
+    """
     import cv2
 
     times: list[float] = []
@@ -139,7 +144,8 @@ def _call(template: str, sequence: Path, out: Path) -> None:
         template.format(folder=shlex.quote(str(sequence)), out=shlex.quote(str(out)))
     )
     try:
-        # When this process ends, the standard input of the system closes, so that it can end, too.
+        # When this process ends, the standard input of the system is closed. The system can then
+        # end, too.
         with subprocess.Popen(
             words,
             stdin=subprocess.PIPE,
@@ -207,8 +213,10 @@ def _outcome(
 
 
 def read_poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) -> Poses:
-    """Read the poses that a system wrote. An unknown pose repeats the last known pose before it, or
-    else the first known pose.
+    """Read the poses that a system wrote.
+
+    An unknown pose is replaced by the last known pose before it. If there is none, it is replaced
+    by the first known pose.
 
     Args:
         path: file in KITTI's or TUM's format.
@@ -235,7 +243,7 @@ def read_poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) 
 
 
 def _last_known(poses: Poses) -> NDArray[np.float64]:
-    """Replace each unknown pose by the last known pose before it, or else by the first one."""
+    """Replace each unknown pose by the last known pose before it, or by the first known pose."""
     if not poses.known.any():
         return poses.T_wc
     at = np.where(poses.known, np.arange(len(poses.known)), -1)

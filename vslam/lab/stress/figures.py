@@ -1,4 +1,4 @@
-"""Curves of a stress test: lost frames, ATE and loops against the strength of a law."""
+"""Curves of a stress test, with lost frames, ATE and loops against the strength of a law."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from vslam.lab.stress.schema import BoundaryEntry, StressJson
 
 _COLORS = (BLUE, AMBER, GREEN, VIOLET, RED)
-# Value, title, and least upper end of the axis, so that zeros are drawn at the bottom of the panel.
+# For each panel: the value, the title, and the smallest upper end of the axis. Without a smallest
+# upper end, a curve of zeros would not be drawn at the bottom of the panel.
 _PANELS = (
     ("lost_percent", "lost (%)", 5.0),
     ("ate_rmse_m", "ATE (m)", 0.1),
@@ -36,7 +37,7 @@ _PANELS = (
 
 
 def draw_curves(report: StressJson) -> list[page.Figure]:
-    """Draw a figure for each sequence and law, with the strongest perturbation on the right."""
+    """Draw a figure for each sequence and law. The strongest perturbation is on the right."""
     systems = list(dict.fromkeys(entry.system for entry in report.boundaries))
     colors = {name: _COLORS[k % len(_COLORS)] for k, name in enumerate(systems)}
     groups: dict[tuple[str, str], list[BoundaryEntry]] = {}

@@ -1,8 +1,9 @@
 """The preset ``kitti-c``: the corruptions of RoboDepth's KITTI-C that vslam can apply.
 
-KITTI-C (Kong et al., NeurIPS 2023) has 18 corruptions in 5 severities, most of them with the
+KITTI-C (Kong et al., NeurIPS 2023) has 18 corruptions with 5 severities each. Most of them have the
 parameters of ImageNet-C (Hendrycks and Dietterich, ICLR 2019). If vslam's perturbation has the same
-parameter, the strengths here are the values of KITTI-C; otherwise, a note describes the difference.
+parameter, the strengths in this module are the values of KITTI-C. Otherwise, a note describes the
+difference.
 """
 
 from __future__ import annotations
@@ -14,8 +15,12 @@ from vslam.datasets.perturbation import parse_perturbation
 
 @dataclass(frozen=True)
 class Corruption:
-    """``specs``: values of ``--perturb``, weakest first; empty if vslam has no such perturbation.
-    ``note``: the difference from KITTI-C."""
+    """One corruption of KITTI-C.
+
+    Attributes:
+        specs: values of ``--perturb``, weakest first; empty if vslam has no such perturbation.
+        note: the difference between vslam's perturbation and the corruption of KITTI-C.
+    """
 
     specs: tuple[str, ...]
     note: str = ""
@@ -30,29 +35,29 @@ def _specs(text: str, values: tuple[float, ...]) -> tuple[str, ...]:
     return tuple(text.format(value) for value in values)
 
 
-_SIGMA = (0.08, 0.12, 0.18, 0.26, 0.38)  # as a fraction of white
+_SIGMA = (0.08, 0.12, 0.18, 0.26, 0.38)  # standard deviation as a fraction of white
 
 CORRUPTIONS: dict[str, Corruption] = {
     "brightness": Corruption(_specs("bias:{:g}", (25.5, 51.0, 76.5, 102.0, 127.5))),
     "dark": Corruption(
         _specs("night:{:g}", (0.74, 1.0, 1.32, 1.74, 2.32)),
-        "light times 0.6 to 0.2 with our sensor's noise; theirs also squares the image",
+        "light reduced to 0.6 to 0.2 with vslam's sensor noise; KITTI-C also squares the image",
     ),
     "fog": Corruption(
         _specs("fog:{:g}", (600, 300, 150, 75, 40)),
-        "by distance, visibility 600 to 40 m; theirs is a cloud texture that ignores depth",
+        "fog by distance, visibility 600 to 40 m; KITTI-C uses a cloud texture without depth",
     ),
     "frost": Corruption((), "no law"),
     "snow": Corruption((), "no law"),
     "contrast": Corruption(_specs("contrast:{:g}", (40, 30, 20, 10, 5))),
     "defocus_blur": Corruption(
         _specs("blur:{:g}", (1.0, 1.33, 2.0, 2.67, 3.33)),
-        "Gaussian with the standard deviation of their discs of 3 to 10 pixels",
+        "Gaussian blur with the standard deviation of KITTI-C's discs of 3 to 10 pixels",
     ),
     "glass_blur": Corruption((), "no law"),
     "motion_blur": Corruption(
         _specs("motion:{:g}", (20, 40, 60, 80, 100)),
-        "shutter of 20 to 100 ms at the true rotation; theirs has a fixed direction and length",
+        "exposure of 20 to 100 ms at the true rotation; KITTI-C has a fixed direction and length",
     ),
     "zoom_blur": Corruption((), "no law"),
     "elastic_transform": Corruption((), "no law"),

@@ -3,8 +3,8 @@
 usage: PYTHON orbslam3.py VOCABULARY FOLDER OUT [--frames N]
 
 The script prints the costs of its frame loop as a JSON object. It imports nothing from vslam,
-because the interpreter that has pyorbslam3 may not have vslam. The process ends when its standard
-input is closed.
+because pyorbslam3 may be installed in another Python environment. The process ends when its
+standard input is closed.
 """
 
 from __future__ import annotations
@@ -55,8 +55,14 @@ Viewer.ViewpointF: 2000.0
 
 
 def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
-    """Track the first ``frames`` stereo frames (None: all) and write ``trajectory.txt``,
-    ``causal.txt`` and ``states.txt``."""
+    """Track stereo frames, and write ``trajectory.txt``, ``causal.txt`` and ``states.txt``.
+
+    Args:
+        vocabulary: vocabulary file of ORB-SLAM3.
+        folder: folder in KITTI's format.
+        out: output folder.
+        frames: number of frames, counted from the first frame; None for all frames.
+    """
     import pyorbslam3
 
     out.mkdir(exist_ok=True)
@@ -102,7 +108,7 @@ def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
 
 
 def _keep_first_of_each_time(path: Path) -> None:
-    """Remove duplicate times: ORB-SLAM3 writes some frames twice after a loss."""
+    """Remove duplicate times, because ORB-SLAM3 writes some frames twice after a tracking loss."""
     by_time: dict[float, str] = {}
     for line in path.read_text().splitlines():
         by_time.setdefault(float(line.split()[0]), line)

@@ -1,4 +1,4 @@
-"""Searches in progress: the cells to run next, and the results so far."""
+"""The searches of a stress test: which cells run next, and the results so far."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from vslam.lab.stress.search import Boundary, boundary, next_position, strength_
 from vslam.report.schema import ReportJson
 
 Reports = Callable[[Cell], ReportJson | str | None]
-"""Function that gives the report of a cell, the reason why it failed, or None before it has run."""
+"""A function that returns the report of a cell, or the reason why the cell failed.
+
+It returns None if the cell has not run yet.
+"""
 
 
 @dataclass
@@ -26,8 +29,8 @@ class Search:
         law: name of the law.
         seed: seed of the perturbation.
         steps: number of bisections.
-        verdicts: verdicts of finished tests, by position, which is 0 for the weakest and 1 for the
-            greatest strength.
+        verdicts: verdicts of finished tests, by position. The position is 0 for the weakest and 1
+            for the greatest strength.
         tested: cells of finished tests, by position.
     """
 
@@ -39,7 +42,7 @@ class Search:
     tested: dict[float, Cell] = field(default_factory=dict)
 
     def cell(self, position: float) -> Cell:
-        """The cell that tests a position from 0 (weakest) to 1 (strongest)."""
+        """The cell that tests a position from 0 (weakest strength) to 1 (greatest strength)."""
         strength = strength_at(law_kind(self.law), position)
         name = parse_perturbation(f"{self.law}:{strength:g}", self.seed).name
         return replace(self.clean, perturb=name, seed=self.seed)
@@ -53,7 +56,7 @@ class Search:
         return None if (position := self.position()) is None else self.cell(position)
 
     def advance(self, reports: Reports, criterion: Criterion) -> None:
-        """Judge the tests that have ended, and thus find the next position."""
+        """Judge the tests that have ended. This determines the next position."""
         clean = reports(self.clean)
         if not isinstance(clean, ReportJson):
             return
@@ -67,7 +70,7 @@ class Search:
 
     @property
     def boundary(self) -> Boundary:
-        """The result, once the search has ended."""
+        """The result of the search. The search must have ended."""
         return boundary(self.verdicts, law_kind(self.law), self.steps)
 
 
@@ -81,9 +84,10 @@ class Plan:
         seeds: number of seeds for each law.
         steps: number of bisections in each search.
         baseline: the system with which the errors of a preset are compared.
-        repeated: systems that are not deterministic and therefore run with every seed.
-        preset: ``kitti-c``, whose fixed severities are tested instead of ``laws``; None without a
-            preset.
+        criterion: criterion that decides whether a run has failed.
+        repeated: systems that are not deterministic, so that they run with every seed.
+        preset: ``kitti-c``, whose fixed severities are tested instead of ``laws``. None if there is
+            no preset.
     """
 
     clean: list[Cell]
@@ -96,8 +100,11 @@ class Plan:
     preset: str | None = None
 
     def searches(self) -> list[Search]:
-        """All searches. A law that draws no random numbers is searched with one seed only, unless
-        the system is not deterministic."""
+        """All searches.
+
+        A law that is not random is searched with only one seed, unless the system is not
+        deterministic.
+        """
         return [
             Search(clean, law, seed, self.steps)
             for seed in range(self.seeds)
@@ -107,7 +114,7 @@ class Plan:
         ]
 
     def preset_cells(self) -> list[Cell]:
-        """The runs of the preset; empty without a preset."""
+        """The runs of the preset; empty if there is no preset."""
         if self.preset is None:
             return []
         specs = [spec for corruption in CORRUPTIONS.values() for spec in corruption.perturbations]
@@ -121,7 +128,7 @@ class Plan:
 
 
 def parse_laws(text: str) -> list[str]:
-    """Parse ``fog,rain`` or ``all``.
+    """Parse names of laws, such as ``fog,rain`` or ``all``.
 
     Raises:
         InputError: a law is unknown, or the text names no law.

@@ -1,5 +1,8 @@
-"""Write the report of a stress test: ``stress.json``, ``boundaries.csv``, ``boundaries.jpg``,
-``report.md`` and ``report.html``."""
+"""Write the report of a stress test.
+
+Its files are ``stress.json``, ``boundaries.csv``, ``boundaries.jpg``, ``report.md`` and
+``report.html``.
+"""
 
 from __future__ import annotations
 
@@ -20,13 +23,13 @@ from vslam.report.page import Bullets, Figure, Page, Row, Section, Table, number
 from vslam.report.render import csv_text, html, markdown, write_files
 
 _ABOUT = (
-    "The weakest strength at which a run fails, found by bisection: the median over seeds, the "
-    "smallest and the largest value in brackets, and the reason of failure for one of the seeds. "
-    "> means that runs do not fail even at the greatest strength."
+    "The weakest strength at which a run fails, as found by bisection. The table gives the median "
+    "over the seeds, the smallest and the largest value in brackets, and the reason for the "
+    "failure with one of the seeds. > means that runs do not fail even at the greatest strength."
 )
 _NOT_MONOTONE = (
-    "Bisection assumes that a system that withstands a strength also withstands all weaker ones. "
-    "These runs failed although a run at a greater strength did not."
+    "Bisection assumes that a system that does not fail at a strength does not fail at weaker "
+    "strengths. These runs failed although a run at a greater strength did not fail."
 )
 
 
@@ -35,9 +38,9 @@ def write_report(out: Path, report: StressJson, sequences: Mapping[str, Source])
 
     Args:
         out: an existing folder.
-        report: the numbers.
-        sequences: sequences by name, from which example images are drawn; only the first sequence
-            of the report is needed, and without it no images are drawn.
+        report: the results.
+        sequences: sequences by name, from which example images are drawn. Only the first sequence
+            of the report is needed. Without it, no images are drawn.
 
     Raises:
         ResultsError: a file cannot be written.
@@ -58,7 +61,7 @@ def write_report(out: Path, report: StressJson, sequences: Mapping[str, Source])
 
 
 def render_csv(report: StressJson) -> str:
-    """A line for each search."""
+    """The results as CSV, with a line for each search."""
     names = ("dataset", "sequence", "law", "unit", "system", "seed", "holds_to", "fails_at")
     lines: list[list[object]] = [[*names, "reason", "also_failed", "runs"]]
     for entry in report.boundaries:
@@ -69,7 +72,7 @@ def render_csv(report: StressJson) -> str:
 
 
 def title(report: StressJson) -> str:
-    """The systems and sequences in one line."""
+    """One line with the systems and the sequences."""
     systems = list(dict.fromkeys(entry.system for entry in report.clean))
     places = list(dict.fromkeys(f"{entry.dataset} {entry.sequence}" for entry in report.clean))
     excerpt = f", {counted(report.max_frames, 'frame')}" if report.max_frames else ""
@@ -80,7 +83,7 @@ def title(report: StressJson) -> str:
 def stress_page(
     report: StressJson, figures: Collection[Figure] = (), sheet: Collection[Figure] = ()
 ) -> Page:
-    """The page of a stress test, with its curves and images at the boundaries."""
+    """Make the page of a stress test, with its curves and with images at the boundaries."""
     return Page(
         title(report),
         [report.criterion],
@@ -97,12 +100,15 @@ def stress_page(
 
 
 def boundary_sections(report: StressJson) -> list[Section]:
-    """The boundaries of each system and the errors by corruption, which the command line prints."""
+    """The sections that the command line also prints.
+
+    They contain the boundaries of each system, and the errors for each corruption.
+    """
     return [*_boundaries(report), *_preset(report)]
 
 
 def groups(report: StressJson) -> dict[tuple[str, str, str], list[BoundaryEntry]]:
-    """Searches grouped by sequence, law and system; the searches of a group differ in the seed."""
+    """Group searches by sequence, law and system. The searches of a group differ in the seed."""
     found: dict[tuple[str, str, str], list[BoundaryEntry]] = {}
     for entry in report.boundaries:
         found.setdefault((entry.sequence, entry.law, entry.system), []).append(entry)
@@ -110,7 +116,7 @@ def groups(report: StressJson) -> dict[tuple[str, str, str], list[BoundaryEntry]
 
 
 def cell(entries: Collection[BoundaryEntry]) -> str:
-    """The strengths at which the seeds fail, as ``60 (50-75), 12 % lost``."""
+    """The strengths at which the seeds fail, as a text such as ``60 (50-75), 12 % lost``."""
     if not entries:
         return ""
     law = law_kind(next(iter(entries)).law)
@@ -157,9 +163,9 @@ def _preset(report: StressJson) -> list[Section]:
         ("sequence", "corruption", *systems, "law"),
         rows,
         ("sequence", "corruption", "law"),
-        "ATE summed over the five severities, in percent of the sum of the baseline; the mean "
-        "share of lost frames in brackets. The mean is over the corruptions for which every system "
-        "has an ATE.",
+        "The ATE summed over the five severities, in percent of the sum of the baseline. The mean "
+        "share of lost frames is in brackets. The mean in the last row is over the corruptions for "
+        "which every system has an ATE.",
     )
     title = f"Corruption error against {report.baseline}, preset {report.preset}"
     return [Section(title, [table])]
@@ -221,8 +227,11 @@ def _runs(report: StressJson) -> Table:
 
 
 def _sheet(report: StressJson, sequences: Mapping[str, Source]) -> list[Figure]:
-    """A picture of the middle frame of the first sequence under each law, at the strength at which
-    the first system failed, or at the greatest strength if it did not fail."""
+    """A picture of the middle frame of the first sequence under each law.
+
+    Each law has the strength at which the first system failed. If the system did not fail, the law
+    has the greatest strength.
+    """
     specs: dict[str, str] = {}
     first = next(iter(sequences), None)
     for entry in report.boundaries:

@@ -1,4 +1,7 @@
-"""Run all searches together: each round runs the next cell of every search that has not ended."""
+"""Run all searches together, in rounds.
+
+Each round runs the next cell of every search that has not ended.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ RunCells = Callable[[Collection[Cell]], Generator[CellOutcome, None, None]]
 
 
 class Results:
-    """The results of cells: reports in the folder, and failures since the command was started."""
+    """The results of cells: the reports in the folder, and the failures since the command began."""
 
     def __init__(self, out: Path, config: str) -> None:
         self._out, self._config = out, config

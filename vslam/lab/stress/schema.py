@@ -1,4 +1,8 @@
-"""The schema of ``stress.json``, without times and machine: equal runs give equal bytes."""
+"""The schema of ``stress.json``.
+
+The file contains no times and does not name the machine. Therefore, equal runs produce
+byte-identical files.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +10,12 @@ from vslam.report.schema import Document, Record
 
 
 class Tested(Record):
-    """One run at one strength. ``verdict``: why the run failed; empty if it did not. ``absolute``:
-    why it failed by limits that do not depend on the clean run; empty if it did not."""
+    """One run at one strength.
+
+    - ``verdict``: why the run failed; empty if it did not fail.
+    - ``absolute``: why it exceeded the limits that do not depend on the clean run; empty if it did
+      not exceed them.
+    """
 
     strength: float
     verdict: str
@@ -19,7 +27,7 @@ class Tested(Record):
 
 
 class BoundaryEntry(Record):
-    """The result of one search (:class:`vslam.lab.stress.search.Boundary`)."""
+    """The result of one search, as in `vslam.lab.stress.search.Boundary`."""
 
     dataset: str
     sequence: str
@@ -49,11 +57,13 @@ class CleanEntry(Record):
 
 
 class CorruptionEntry(Record):
-    """One corruption of a preset, with values by system. Values are None if vslam cannot apply the
-    corruption or a run has no ATE.
+    """One corruption of a preset, with values by system.
 
-    ``ate_sum_m``: the median ATE over seeds, summed over severities. ``error_percent``: this sum in
-    percent of the sum of the baseline. ``lost_percent``: the mean share of lost frames.
+    Values are None if vslam cannot apply the corruption, or if a run has no ATE.
+
+    - ``ate_sum_m``: the median ATE over the seeds, summed over the severities.
+    - ``error_percent``: this sum in percent of the sum of the baseline.
+    - ``lost_percent``: the mean share of lost frames.
     """
 
     sequence: str

@@ -1,4 +1,4 @@
-"""Bisection of the strength at which a run fails, from the outcomes of earlier runs."""
+"""Search for the strength at which runs fail, by bisection."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ class Boundary:
     """The strength at which a system fails under a law.
 
     Attributes:
-        holds_to: greatest strength at which a run did not fail, according to the bisection; None if
+        holds_to: greatest strength at which a run did not fail, according to the bisection. None if
             runs failed at every tested strength.
-        fails_at: least strength at which a run failed, according to the bisection; None if no run
-            failed.
-        reason: reason of the failure at ``fails_at``.
-        also_failed: strengths below ``holds_to`` at which a run failed nevertheless.
+        fails_at: smallest strength at which a run failed, according to the bisection. None if no
+            run failed.
+        reason: reason for the failure at ``fails_at``.
+        also_failed: strengths below ``holds_to`` at which a run also failed.
     """
 
     holds_to: float | None
@@ -31,7 +31,7 @@ class Boundary:
 
 
 def strength_at(kind: LawKind, position: float) -> float:
-    """Strength at a position from 0 (weakest) to 1 (strongest), to three significant digits."""
+    """The strength at a position from 0 (weakest) to 1 (greatest), to three significant digits."""
     weak, strong = kind.weakest, kind.strongest
     if kind.logarithmic:
         value = weak * (strong / weak) ** position
@@ -41,12 +41,15 @@ def strength_at(kind: LawKind, position: float) -> float:
 
 
 def bracket(failed: Mapping[float, bool], steps: int) -> tuple[float, float, float | None]:
-    """The bisection so far: the greatest position at which the system holds, the least position at
-    which it fails, and the next position to test (None if the bisection has ended).
+    """The state of the bisection.
 
     Args:
-        failed: whether the run failed, by tested position.
+        failed: for each tested position, whether the run failed.
         steps: number of bisections.
+
+    Returns:
+        The greatest position at which the system did not fail, the smallest position at which it
+        failed, and the next position to test. The next position is None if the bisection has ended.
     """
     if not failed.get(1.0, True):
         return 1.0, 1.0, None
@@ -63,9 +66,9 @@ def next_position(failed: Mapping[float, bool], steps: int) -> float | None:
     """The next position to test; None at the end of the search.
 
     The greatest strength is tested first. If the run fails, the interval is bisected ``steps``
-    times. Bisection assumes that a system that withstands a strength withstands all weaker ones.
-    The last test checks this assumption, at half of the greatest position that holds. The arguments
-    are those of :func:`bracket`.
+    times. Bisection assumes that a system that does not fail at a strength does not fail at weaker
+    strengths. The last test checks this assumption, at half of the greatest position at which the
+    system did not fail. The arguments are those of `bracket`.
     """
     if 1.0 not in failed:
         return 1.0
@@ -77,7 +80,7 @@ def next_position(failed: Mapping[float, bool], steps: int) -> float | None:
 
 
 def boundary(verdicts: Mapping[float, Verdict], kind: LawKind, steps: int) -> Boundary:
-    """The boundary according to the verdicts of finished tests, by position."""
+    """The boundary according to the verdicts of the finished tests, which are given by position."""
     holds, fails, _ = bracket({p: bool(v) for p, v in verdicts.items()}, steps)
     weaker = tuple(
         strength_at(kind, position)

@@ -1,4 +1,4 @@
-"""Compute the numbers of the report from finished searches."""
+"""Compute the figures of the report from finished searches."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ from vslam.report.schema import ReportJson
 def summarise(
     plan: Plan, searches: Collection[Search], reports: Reports, notes: list[str]
 ) -> StressJson:
-    """Make the report from the searches that have ended. Each clean run that failed gets a note."""
+    """Make the report from the searches that have ended.
+
+    A note is added for each clean run that failed.
+    """
     failed = [(cell, found) for cell in plan.clean if isinstance(found := reports(cell), str)]
     notes = [*notes, *(f"{cell.name} is left out because it fails on clean images: {why}"
                        for cell, why in failed)]  # fmt: skip
@@ -41,7 +44,7 @@ def summarise(
 def clean_entries(
     cells: Collection[Cell], reports: Reports, criterion: Criterion
 ) -> list[CleanEntry]:
-    """Entries of the finished clean runs."""
+    """The entries of the finished clean runs."""
     return [
         CleanEntry(
             dataset=cell.dataset,
@@ -97,8 +100,10 @@ def _tested(strength: float, verdict: str, report: ReportJson | str | None) -> T
 def corruption_entries(
     cells: Collection[Cell], reports: Reports, baseline: str
 ) -> list[CorruptionEntry]:
-    """Errors of each corruption relative to a baseline, from which the mean corruption error is
-    computed (mCE, Hendrycks and Dietterich, ICLR 2019)."""
+    """The errors under each corruption, relative to a baseline.
+
+    The mean corruption error (mCE; Hendrycks and Dietterich, ICLR 2019) is computed from them.
+    """
     systems = list(dict.fromkeys(cell.detector for cell in cells))
     return [
         _corruption(sequence, name, corruption, cells, reports, systems, baseline)
@@ -128,7 +133,7 @@ def _corruption(
             ]
             found = [report for report in outcomes if isinstance(report, ReportJson)]
             known = [report.ate_rmse_m for report in found if report.ate_rmse_m is not None]
-            # Leaving out failed seeds would make a system that fails look better.
+            # If failed seeds were left out, a system that fails would look better.
             all_known = bool(known) and len(known) == sum(one is not None for one in outcomes)
             ates.append(statistics.median(known) if all_known else None)
             losses += [lost_percent(report) for report in found]
@@ -151,7 +156,10 @@ def _corruption(
 
 
 def mean_error(entries: Collection[CorruptionEntry], system: str) -> float | None:
-    """mCE in percent: the mean over the corruptions for which every system has an error."""
+    """The mean corruption error (mCE) in percent.
+
+    It is the mean over the corruptions for which every system has an error.
+    """
     complete = (e.error_percent for e in entries if None not in e.error_percent.values())
     values = [value for errors in complete if (value := errors.get(system)) is not None]
     return statistics.fmean(values) if values else None

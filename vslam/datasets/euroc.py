@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from vslam.calibration.documents import read_document
 from vslam.calibration.files import read_calibration
-from vslam.datasets.association import Pairing, poses_at
+from vslam.datasets.association import Pairing, associate, poses_at
 from vslam.datasets.frames import RawSource, Source
 from vslam.datasets.image_files import (
     checked_files,
@@ -161,20 +161,16 @@ def _pair(cameras: list[Path], times: list[NDArray[np.int64]]) -> NDArray[np.int
     Returns:
         ``(N, cameras)`` int64 indices of the images of each frame.
     """
-    left, right = times[0], times[-1]
-    rows = np.arange(len(left))
     if len(times) == 1:
-        return rows[:, None]
-    after = np.searchsorted(right, left).clip(0, len(right) - 1)
-    before = (after - 1).clip(0)
-    nearest = np.where(left - right[before] <= abs(right[after] - left), before, after)
-    near = abs(right[nearest] - left) <= _MOST_APART_NS
-    if not near.any():
+        return np.arange(len(times[0]))[:, None]
+    left, right = (1e-9 * (side - times[0][0]) for side in times)
+    pairs = np.column_stack(associate(left, right, _MOST_APART_NS * 1e-9))
+    if not len(pairs):
         raise InputError(
             f"{cameras[1]}: none of its {len(right)} images has the time of an image in "
             f"{cameras[0]}; take both cameras from one sequence."
         )
-    return np.column_stack([rows, nearest])[near]
+    return pairs
 
 
 def _pairing(base: Path, times: list[NDArray[np.int64]], paired: NDArray[np.int64]) -> Pairing:

@@ -83,6 +83,19 @@ def test_who_waits_within_a_job_runs_no_other_job():
     other.result()
 
 
+def test_a_job_that_is_done_keeps_its_result_alone():
+    class Work:
+        def __call__(self) -> int:
+            return 3
+
+    work = Work()
+    gone = weakref.ref(work)
+    job = Workers(1).submit(work, Urgency.READING)
+    del work
+    assert job.result() == 3
+    assert gone() is None
+
+
 @pytest.mark.parametrize("threads", [1, 3])
 def test_a_map_keeps_the_order_and_may_be_called_within_a_job(threads):
     workers = Workers(threads)

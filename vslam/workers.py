@@ -74,7 +74,7 @@ class Job(Generic[T]):
         self.has_begun = False
         self.is_done = False
         self.error: BaseException | None = None
-        self._work = work
+        self._work: Callable[[], T] | None = work
         self._queue = queue
         self._value: T | None = None
 
@@ -98,8 +98,10 @@ class Job(Generic[T]):
 
     def run(self) -> None:
         """Run the function and keep its result or its exception."""
+        work, self._work = self._work, None  # what it refers to is not needed any more
+        assert work is not None
         try:
-            self._value = self._work()
+            self._value = work()
         except BaseException as error:
             self.error = error
 

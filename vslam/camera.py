@@ -115,18 +115,27 @@ class Camera:
 
     @property
     def bf(self) -> float:
-        """The baseline times the focal length. A point at depth z has the disparity ``bf / z``
-        pixels."""
+        """The baseline times the focal length, in metres times pixels.
+
+        A point at depth z has a disparity of ``bf / z`` pixels.
+        """
         return self.baseline * self.fx
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:
-        """``(6,)`` float64 ``[fx, fy, cx, cy, bf, disparity_weight]``, the form that kernels
-        use."""
+        """The camera in the form that kernels use.
+
+        The array is ``(6,)`` float64 ``[fx, fy, cx, cy, bf, disparity_weight]``.
+        """
         return np.array([self.fx, self.fy, self.cx, self.cy, self.bf, DISPARITY_WEIGHT])
 
     def project(self, p_c: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Project ``(N, 3)`` points of the left camera to ``(N, 3)`` rows ``u, v, u_right``."""
+        """Project ``(N, 3)`` points in the frame of the left camera into the images.
+
+        Returns:
+            ``(N, 3)`` columns u and rows v in the left image, and columns u_right in the right
+            image, in pixels.
+        """
         x, y, z = p_c.T
         u = self.fx * x / z + self.cx
         return np.stack([u, self.fy * y / z + self.cy, u - self.bf / z], axis=1)
@@ -134,7 +143,15 @@ class Camera:
     def backproject(
         self, xy: NDArray[np.floating], depth: NDArray[np.floating]
     ) -> NDArray[np.float64]:
-        """Lift ``(N, 2)`` pixels at ``(N,)`` depths (m) to ``(N, 3)`` points of the left camera."""
+        """Compute the 3D points of pixels with known depths.
+
+        Args:
+            xy: ``(N, 2)`` pixels of the left image.
+            depth: ``(N,)`` depths in metres.
+
+        Returns:
+            ``(N, 3)`` points in the frame of the left camera.
+        """
         z = np.asarray(depth, np.float64)
         x = (xy[:, 0] - self.cx) * z / self.fx
         y = (xy[:, 1] - self.cy) * z / self.fy
@@ -142,11 +159,11 @@ class Camera:
 
 
 def calibration_doubts(camera: Camera) -> list[str]:
-    """Reasons why a calibration is implausible.
+    """Return the reasons why a calibration is implausible.
 
     Each reason is one sentence without a full stop. The list is empty if the calibration is
-    plausible. A camera with an implausible calibration can exist, but more often the calibration
-    belongs to other images.
+    plausible. A camera can really have such a calibration. More often, the calibration belongs to
+    other images.
     """
     off_centre = principal_point_doubt((camera.cx, camera.cy), (camera.width, camera.height))
     doubts = [off_centre] if off_centre else []
@@ -161,9 +178,13 @@ def calibration_doubts(camera: Camera) -> list[str]:
 
 
 def principal_point_doubt(principal: tuple[float, float], size: tuple[int, int]) -> str:
-    """The reason why a principal point (pixels) is implausible for images of a size (pixels).
+    """Return the reason why a principal point is implausible.
 
     The reason is a sentence without a full stop. It is empty if the principal point is plausible.
+
+    Args:
+        principal: column and row of the principal point in pixels.
+        size: width and height of the images in pixels.
     """
     (cx, cy), (width, height) = principal, size
     across, down = cx / width, cy / height
@@ -176,10 +197,10 @@ def principal_point_doubt(principal: tuple[float, float], size: tuple[int, int])
 
 
 def _cause(across: float, down: float) -> str:
-    """The probable cause of an implausible principal point.
+    """Return the probable cause of an implausible principal point.
 
     Args:
-        across, down: the principal point as a share of the image's width and height.
+        across, down: the principal point as fractions of the image's width and height.
     """
     if min(across, down) <= 0.0 or not 1 / _SAME_RATIO < across / down < _SAME_RATIO:
         return "check the order of its numbers, and whether the images were cropped or turned"
@@ -199,7 +220,7 @@ def field_of_view(camera: Camera) -> tuple[float, float]:
 
 
 def same_camera(one: Camera, other: Camera) -> bool:
-    """Whether two cameras are equal, apart from the rounding of numbers in calibration files."""
+    """Return whether two cameras are equal, apart from rounding errors of calibration files."""
     shapes = [(c.width, c.height, c.depth, c.monocular) for c in (one, other)]
     first, second = ([*c.intrinsics, c.right_delay] for c in (one, other))
     return shapes[0] == shapes[1] and bool(np.allclose(first, second, rtol=1e-6))
@@ -222,7 +243,7 @@ class ImageMap(Protocol):
 
 
 def check_images(left: Image, second: Image | DepthImage | None, camera: Camera) -> None:
-    """Check that images match a camera (``Slam.step``).
+    """Check that the images of a frame match a camera.
 
     Raises:
         ValueError: the sizes, the types or the number of the images are wrong. The message says
@@ -260,7 +281,7 @@ def check_images(left: Image, second: Image | DepthImage | None, camera: Camera)
 
 
 def check_mask(mask: NDArray[np.uint8] | NDArray[np.bool_], camera: Camera) -> None:
-    """Check that a mask matches a camera (``Slam.step``).
+    """Check that a mask of the left image matches a camera.
 
     Raises:
         ValueError: the size or type of the mask is wrong. The message says what is wrong.

@@ -1,8 +1,8 @@
 """Threads that run the jobs of a pipeline. A thread that waits for a job runs other jobs meanwhile.
 
-On two cores, the main thread and one worker share all work: there are never more busy threads than
-cores, and neither idles while a job is queued. Jobs begin in the order of their ``Urgency``. When a
-job runs, and in which thread, must not change its result.
+On two cores, the main thread and one worker share all work. There are never more busy threads than
+cores, and no thread is idle while a job is queued. Jobs start in order of ``Urgency``. The result
+of a job must not depend on when the job runs or on which thread runs it.
 """
 
 from __future__ import annotations
@@ -31,8 +31,10 @@ class Urgency(IntEnum):
 
 
 class Workers:
-    """Runs jobs in ``threads - 1`` threads, and in every thread that waits for a result. With one
-    thread, a job thus runs when its result is needed."""
+    """Runs jobs in ``threads - 1`` threads, and in every thread that waits for a result.
+
+    With one thread, a job therefore runs when its result is needed.
+    """
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
@@ -48,18 +50,24 @@ class Workers:
         weakref.finalize(self, _stop, queue, self._started)
 
     def submit(self, work: Callable[[], T], urgency: Urgency) -> Job[T]:
-        """Queue a function; the job that is returned gives its result."""
+        """Queue a function. The result of the function is available from the returned job."""
         return self._queue.add(work, urgency)
 
     def map(
         self, function: Callable[[Given], T], items: Iterable[Given], urgency: Urgency
     ) -> Iterator[T]:
-        """As the built-in ``map``, in parallel."""
+        """Apply a function to each item, in parallel.
+
+        The results are in the order of the items, as with the built-in ``map``.
+        """
         jobs = [self.submit(partial(function, item), urgency) for item in items]
         return (job.result() for job in jobs)
 
     def refuse_fork(self) -> None:
-        """Raise a RuntimeError in a forked process, which has none of the threads."""
+        """Raise a RuntimeError in a forked process.
+
+        A fork does not inherit the worker threads.
+        """
         if self._started and os.getpid() != self._process:
             raise RuntimeError(
                 "this Slam was created before the process was forked, which does not copy its "
@@ -79,25 +87,30 @@ class Job(Generic[T]):
         self._value: T | None = None
 
     def wait(self) -> None:
-        """Return when the job is done, whether or not it failed. The calling thread runs the job if
-        it has not begun, and otherwise other queued jobs. If Ctrl-C interrupts the wait, this can
-        be called again."""
+        """Wait until the job is done, even if the job fails.
+
+        If the job has not started, the calling thread runs it. Otherwise, the calling thread runs
+        other queued jobs while it waits. If Ctrl-C interrupts the wait, this method can be called
+        again.
+        """
         self._queue.wait_for(self)
 
     def result(self) -> T:
-        """Wait for the job, and return its result or raise its exception; a cancelled job raises
-        ``CancelledError``."""
+        """Wait for the job, and return its result or raise its exception.
+
+        If the job was cancelled, ``CancelledError`` is raised.
+        """
         self.wait()
         if self.error is not None:
             raise self.error
         return self._value  # type: ignore[return-value]
 
     def cancel(self) -> None:
-        """Prevent that the job begins; if it has begun, wait for it."""
+        """Cancel the job if it has not started. Otherwise, wait until it is done."""
         self._queue.cancel(self)
 
     def run(self) -> None:
-        """Run the function and keep its result or its exception."""
+        """Run the function, and keep its result or its exception."""
         try:
             self._value = self._work()
         except BaseException as error:
@@ -105,13 +118,13 @@ class Job(Generic[T]):
 
 
 class _Thread(threading.local):
-    """What a queue knows of each thread."""
+    """What a queue stores about each thread."""
 
     runs_job = False
 
 
 class _Queue:
-    """Jobs that have not begun, and the threads that wait for a change."""
+    """Jobs that have not started, and the threads that wait for a change of the queue."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -139,7 +152,11 @@ class _Queue:
             self._run(job)
 
     def wait_for(self, awaited: Job[T]) -> None:
-        """See ``Job.wait``. Within a job, other jobs are not run, because they would delay it."""
+        """Wait for a job (``Job.wait``).
+
+        If a job waits for another job, it does not run further jobs meanwhile, because they would
+        delay it.
+        """
         while True:
             with self._changed:
                 if awaited.is_done:

@@ -385,7 +385,7 @@ class Map:
         return slice(int(first[keyframe]), int(first[keyframe + 1]))
 
     def landmarks_of(self, keyframe: int) -> NDArray[np.int32]:
-        """Return the ids of the landmarks that a keyframe observes, in the order of its keypoints."""
+        """Return the ids of the landmarks that a keyframe observes, ordered by keypoint."""
         observed = self.arrays.landmark[self.rows(keyframe)]
         return observed[observed != NONE]
 

@@ -635,10 +635,9 @@ class PoseGraphConfig(Section):
     its standard deviation grows with the square root of the distance travelled. With the default
     values, the drift is 1.2 % after 400 m, and nearly all of it is caused by errors of rotation.
 
-    A gap is an edge between two keyframes between which tracking was lost. The motion along a gap
-    is only predicted. A gap gets a small weight if no prediction was possible. It also gets a small
-    weight under the hypothesis that the camera was carried to another place while tracking was
-    lost.
+    An edge is a gap if tracking was lost between its two keyframes. The motion along a gap is only
+    predicted. A gap gets a small weight if no prediction was possible. It also gets a small weight
+    under the hypothesis that the camera was carried to another place while tracking was lost.
     """
 
     min_shared: int = Field(100, ge=1)

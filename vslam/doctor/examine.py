@@ -140,7 +140,7 @@ class _Pair:
 def _pairs(sequence: Source, lefts: dict[int, Image], lag: int) -> list[_Pair]:
     """Match each left image with the right image ``lag`` frames later.
 
-    Pairs whose right image cannot be read are left out.
+    Pairs whose right image is missing or cannot be read are left out.
     """
     found = []
     for frame, left in lefts.items():

@@ -68,7 +68,7 @@ class Camera:
     right_delay: float = 0.0
 
     def __post_init__(self) -> None:
-        """Reject impossible numbers.
+        """Check that the numbers of the camera are possible.
 
         Raises:
             ValueError: a number is impossible. The message says which number.
@@ -103,7 +103,7 @@ class Camera:
         return self.baseline == 0.0
 
     def left_camera(self) -> Camera:
-        """The left camera as a single camera."""
+        """Return the left camera of this stereo pair or RGB-D camera as a single camera."""
         return replace(self, baseline=0.0, depth=False, right_delay=0.0)
 
     @property

@@ -128,7 +128,10 @@ class LoopClosing:
         return LoopSearch(edges)
 
     def state(self) -> ClosingState:
-        """The state of loop closing for a checkpoint, without the detector and the images."""
+        """Return the state of loop closing for a checkpoint.
+
+        It does not contain the detector and the images.
+        """
         return ClosingState(self._consistency.state(), self.verifier.state(), self._followed)
 
     def restore(self, state: ClosingState) -> None:

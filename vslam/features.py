@@ -38,7 +38,7 @@ class Pyramid:
     scales: NDArray[np.float64]
 
     def level(self, index: int) -> NDArray[np.uint8]:
-        """A view of one level as an ``(h, w)`` image."""
+        """Return a view of one pyramid level as an ``(h, w)`` image."""
         height, width = self.shapes[index]
         start = self.offsets[index]
         return self.pixels[start : start + height * width].reshape(height, width)
@@ -90,7 +90,7 @@ class Features:
 
     @classmethod
     def none(cls) -> Features:
-        """No features, for a frame without images."""
+        """Return an empty set of features, for a frame without images."""
         return cls(
             np.empty((0, 2), np.float32),
             np.empty(0, np.uint8),
@@ -133,7 +133,7 @@ class Extracted:
 
     @classmethod
     def nothing(cls) -> Extracted:
-        """The result for a frame without images, which has no features."""
+        """Return a result without features, for a frame without images."""
         return cls(Features.none())
 
 

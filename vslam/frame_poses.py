@@ -28,7 +28,7 @@ class KeyframePoses(Protocol):
     def reference(self) -> int: ...
 
     def keyframe_pose(self, keyframe: int) -> Matrix:
-        """``T_cw`` of a keyframe."""
+        """Return the pose ``T_cw`` of a keyframe."""
         ...
 
     def unit_scale(self, keyframe: int) -> float:
@@ -97,7 +97,7 @@ class FramePoses:
             mine[: len(values)] = values
 
     def table(self) -> FrameTable:
-        """A copy of the poses of all frames."""
+        """Return a copy of the poses of all frames."""
         return FrameTable._make(values.copy() for values in self._frames.until(self._n))
 
     def __len__(self) -> int:
@@ -171,7 +171,7 @@ class FramePoses:
         return T_c_reference @ self._keyframes.keyframe_pose(reference)
 
     def trajectory(self) -> Trajectory:
-        """The pose of every frame.
+        """Return the pose of every frame.
 
         A predicted pose is replaced by an interpolation between the tracked frames before and after
         it. Frames before the first tracked frame get the pose of the first tracked frame.

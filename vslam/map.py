@@ -457,9 +457,7 @@ class Map:
         return np.flatnonzero(self.arrays.keyframe_alive[: self.n_keyframes])
 
     def living_landmarks(self) -> NDArray[np.int64]:
-        """Return the ids of the landmarks that have neither been culled nor merged into another
-        landmark.
-        """
+        """Return the ids of the landmarks that were neither culled nor merged into another one."""
         return np.flatnonzero(self.arrays.landmark_alive[: self.n_landmarks])
 
 

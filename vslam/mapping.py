@@ -71,13 +71,15 @@ class Mapper:
         map_: Map | None = None,
         frames: FrameTable | None = None,
     ) -> None:
-        """Args:
-        context: camera, thresholds and pyramid scales.
-        closing: searches for loops at new keyframes and closes them.
-        rig: corrects frames, and receives the disparity offset of the map.
-        workers: threads that run mapping jobs, one at a time, and searches for loops.
-        map_: map to continue in. None begins an empty map.
-        frames: poses of earlier frames of the same drive.
+        """Create the mapper of a new or continued map.
+
+        Args:
+            context: camera, thresholds and pyramid scales.
+            closing: searches for loops at new keyframes and closes them.
+            rig: corrects frames, and receives the disparity offset of the map.
+            workers: threads that run mapping jobs, one at a time, and searches for loops.
+            map_: map to continue in. None begins an empty map.
+            frames: poses of earlier frames of the same drive.
         """
         self.view = MapView()
         self.last_frame = -1
@@ -134,7 +136,7 @@ class Mapper:
         return self._shared.map
 
     def keyframe_pose(self, keyframe: int) -> Matrix:
-        """``T_cw`` of a keyframe at the last merge.
+        """Return the pose ``T_cw`` that a keyframe had at the last merge.
 
         While a mapping job runs, only the pose of the reference keyframe is available.
         """
@@ -143,16 +145,17 @@ class Mapper:
         return self.map.keyframe_pose(keyframe)
 
     def unit_scale(self, keyframe: int) -> float:
-        """Factor by which loop closures have scaled lengths near a keyframe since it was added.
+        """Return the factor by which loop closures have scaled lengths near a keyframe.
 
-        While a mapping job runs, only the factor of the reference keyframe is available.
+        The factor is measured since the keyframe was added. While a mapping job runs, only the
+        factor of the reference keyframe is available.
         """
         if not self._is_merged and keyframe == self.view.reference:
             return self.view.unit_scale
         return float(self.map.unit_scale[keyframe])
 
     def trajectory(self) -> Trajectory:
-        """The pose of every frame (``FramePoses.trajectory``).
+        """Return the pose of every frame (``FramePoses.trajectory``).
 
         Raises:
             RuntimeError: a keyframe is being mapped, or its mapping failed.
@@ -408,7 +411,7 @@ class Mapper:
     # State for checkpoints
 
     def state(self) -> MapperState:
-        """The state of the mapper, without the map."""
+        """Return the state of the mapper for a checkpoint, without the map."""
         return MapperState(
             self.reference, self.last_frame, self.last_timestamp, self._patches.all()
         )

@@ -75,7 +75,7 @@ class Mode:
         return False
 
     def state(self) -> PolicyState | None:
-        """The state of the mode for a checkpoint. None if no checkpoint is possible now."""
+        """Return the state of the mode for a checkpoint. None if no checkpoint is possible now."""
         return None
 
     def restore(self, state: PolicyState) -> None:
@@ -182,9 +182,9 @@ class MapBuilding(Mode):
         return False
 
     def state(self) -> PolicyState | None:
-        """The state of the keyframe policy for a checkpoint.
+        """Return the state of the keyframe policy for a checkpoint.
 
-        It is None while the start of a monocular map waits for its second frame.
+        The result is None while the start of a monocular map waits for its second frame.
         """
         return None if self.starter.is_waiting else self.policy.state()
 

@@ -205,7 +205,7 @@ class Odometry:
         self.T_odom_camera, self.now = T_odom_camera, uncertainty
 
     def state(self) -> tuple[float, ...]:
-        """The state of the odometry for a checkpoint."""
+        """Return the state of the odometry for a checkpoint."""
         return (*self.T_odom_camera.ravel(), *self.now.numbers().tolist(), self._lost_s)
 
     def restore(self, state: tuple[float, ...]) -> None:

@@ -82,7 +82,9 @@ class Slam:
         localize: bool = False,
         resume: bool = False,
     ) -> None:
-        """Args:
+        """Begin SLAM with a new map, or continue in a stored map.
+
+        Args:
             camera: the rectified camera that the images come from. Use ``camera.left_camera()`` for
                 monocular SLAM.
             config: thresholds, as a ``Config`` or as a dictionary such as ``{"orb": {"n_features":
@@ -182,10 +184,10 @@ class Slam:
         save_map(path, self.stored_map(drive), resumable=resumable)
 
     def stored_map(self, drive: str = "") -> StoredMap:
-        """The map in the form that ``save`` writes.
+        """Return the map in the form that ``save`` writes to a file.
 
-        It shares the arrays of the map that is being built. Call ``compact()`` before the next
-        step, because this method copies the arrays.
+        The result shares its arrays with the map that is being built. Before the next step, call
+        ``compact()`` on it to get a copy.
 
         Raises:
             RuntimeError: mapping failed, so that the map is incomplete.
@@ -418,8 +420,9 @@ class Slam:
         self._session.resume_odometry(last)
 
     def finish(self) -> None:
-        """Complete all mapping, so that the map and the trajectory do not change until the next
-        step.
+        """Complete all mapping.
+
+        Afterwards, the map and the trajectory do not change until the next step.
         """
         self._mapper.finish()
 
@@ -482,18 +485,18 @@ class Slam:
         return self._closing.corrections
 
     def trajectory(self) -> Trajectory:
-        """The pose of every frame according to the present map.
+        """Return the pose of every frame according to the present map.
 
         The poses of lost frames are interpolated between the tracked frames before and after them.
         """
         return self._mapper.trajectory()
 
     def keyframe_trajectory(self) -> Trajectory:
-        """The poses of the living keyframes of this drive."""
+        """Return the poses of the keyframes of this drive, without culled keyframes."""
         return keyframe_trajectory(self.map)
 
     def in_map(self) -> NDArray[np.bool_]:
-        """``(N,)`` bool, True for frames that were tracked in the first part of the map.
+        """Return which frames were tracked in the first part of the map, as ``(N,)`` bool.
 
         This part contains the first keyframe of the map, and the sub-maps that loops have joined to
         it.

@@ -68,9 +68,7 @@ def describe_parameters(command: Any, context: Any) -> str:
 
 
 def _name(parameter: Any) -> str:
-    """Return the name of a parameter in the help, such as ``--record/--no-record`` or ``--map
-    FILE``.
-    """
+    """Return the name of a parameter in the help, such as ``--map FILE`` or ``RUN``."""
     if parameter.param_type_name == "argument":
         name = parameter.metavar or parameter.name.upper()
         return f"{name}..." if parameter.nargs != 1 else str(name)

@@ -136,8 +136,9 @@ def info(
 
 
 def _find(images: list[str]) -> list[Path]:
-    """Return the image files of all folders and glob patterns, sorted by name and without
-    repetitions.
+    """Return the image files of all folders and glob patterns.
+
+    The files are sorted by name, without repetitions.
     """
     import glob
 

@@ -281,8 +281,9 @@ def write_trajectories(written: Results, outcome: RunOutcome) -> None:
 
 
 def _evo_command(folder: Path, outcome: RunOutcome, evaluation: Evaluation | None) -> str | None:
-    """Return the command that repeats the evaluation with evo. None if evo cannot evaluate this
-    run.
+    """Return the command that repeats the evaluation with evo.
+
+    The result is None if evo cannot evaluate this run.
     """
     if evaluation is None or evaluation.on_one_line:
         return None

@@ -99,7 +99,7 @@ class Autosave:
         """Save the run if saving is due. This method is called after ``frame``."""
 
     def close(self, slam: Slam, progress: Callable[[], Progress], *, resumable: bool) -> None:
-        """End saving.
+        """End the saving of a run.
 
         Args:
             slam: the SLAM system of the run.
@@ -119,10 +119,13 @@ class FolderAutosave(Autosave):
     """
 
     def __init__(self, folder: Path, seconds: float, drive: str) -> None:
-        """Args:
-        seconds: interval between two saved maps. A killed run loses at most the work of this
-            time. With 0, no map is saved.
-        drive: name of the drive in the map file.
+        """Prepare to save the state of a run.
+
+        Args:
+            folder: the folder of the run.
+            seconds: interval between two saved maps. A killed run loses at most the work of this
+                time. With 0, no map is saved.
+            drive: name of the drive in the map file.
         """
         self._folder, self._seconds, self._drive = folder, seconds, drive
         self._last = time.monotonic()

@@ -134,8 +134,9 @@ def causal_trajectory(tracks: list[TrackResult]) -> Trajectory:
 
 
 def odometry_trajectory(tracks: list[TrackResult]) -> Trajectory:
-    """Return the pose of each frame from odometry, which never jumps
-    (``TrackResult.T_odom_camera``).
+    """Return the pose of each frame from odometry (``TrackResult.T_odom_camera``).
+
+    These poses never jump.
     """
     known = [track for track in tracks if track.T_odom_camera is not None]
     times = np.array([track.timestamp for track in known], np.float64)

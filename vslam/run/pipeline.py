@@ -224,7 +224,7 @@ class _Run:
             self.fail(what, error)
 
     def trajectory(self) -> Trajectory:
-        """The pose of each processed frame, according to the present map."""
+        """Return the pose of each processed frame, according to the present map."""
         # A step that failed may have added a pose without a result.
         return self.slam.trajectory().select(np.arange(len(self.tracks)))
 
@@ -251,7 +251,7 @@ class _Run:
             self.latency_ms.append(1e3 * (time.perf_counter() - arrived))
 
     def finish(self) -> None:
-        """Complete all mapping."""
+        """Complete all mapping of the run."""
         start = time.perf_counter()
         self.slam.finish()
         self.step_s += time.perf_counter() - start

@@ -1,18 +1,20 @@
 """Compilation of all kernels before the first frame, so that it does not slow down the run.
 
 Compilation takes most of the time of a first run. A process compiles one kernel at a time, because
-Numba holds a lock. Therefore, two processes share the work through Numba's cache: ``python -m
-vslam.run.warmup first`` and ``python -m vslam.run.warmup second``. The process of the run then
-calls ``EVERYTHING``, which loads the compiled kernels. This process compiles only missing kernels,
-so it does not need the memory of the compiler. Later runs load a kernel when they first call it.
+Numba holds a lock. Therefore, two processes share the work through Numba's cache. They run
+``python -m vslam.run.warmup first`` and ``python -m vslam.run.warmup second``. The process of the
+run then calls ``EVERYTHING``, which loads the compiled kernels. This process compiles only missing
+kernels, so it does not need the memory of the compiler. Later runs load a kernel when they first
+call it.
 
 When you add kernels, add a function that calls them to the entry of ``COMPILE_SHARES`` that takes
 less time. If ``run_everything`` does not call the kernels, add this function to ``EVERYTHING`` as
 well. If the kernels form a new module, add the last kernel of the module to ``COLD_PROBES``. These
 commands show how long each share takes:
 
-    for share in first second; do time NUMBA_CACHE_DIR=$(mktemp -d) python -m vslam.run.warmup
-    $share done
+    for share in first second; do
+        time NUMBA_CACHE_DIR=$(mktemp -d) python -m vslam.run.warmup $share
+    done
 
 Monocular runs need no further kernels, because their initialisation and their similarities use
 NumPy.

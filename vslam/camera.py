@@ -25,7 +25,7 @@ DISPARITY_WEIGHT = 3.0
 # With a calibration for images of half the size, this share is 0.25. With a calibration for images
 # of twice the size, it is 0.5.
 _OFF_CENTRE = 0.2
-# If a calibration belongs to images of another size, the principal point is wrong by nearly the
+# If a calibration belongs to images of a different size, the principal point is wrong by nearly the
 # same factor in x and in y. The ratio of both factors must lie between this number and its inverse.
 _SAME_RATIO = 1.25
 _FACTORS = {0.5: "half", 2.0: "twice"}

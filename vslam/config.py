@@ -33,8 +33,9 @@ class Section(BaseModel):
 
     Each docstring ends with the source of the threshold in brackets. [own] means that both the rule
     and the value are our own. Otherwise, the brackets name the paper and section that give the
-    rule, and then the source of the value. *Printed* values stand in that section. *Customary*
-    values are those of the programs of the ORB-SLAM family. *Own* values were chosen for vslam.
+    rule, and then the source of the value. *Printed* values are printed in that section of the
+    paper. *Customary* values are those of the programs of the ORB-SLAM family. *Own* values were
+    chosen for vslam.
 
     OS1: Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2: Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017. ZS:
     Zhou and Sun, Sci Rep 15, 7644 (2025).

@@ -161,8 +161,9 @@ class LandmarkPatches(NamedTuple):
         view: ``(N,)`` int64, index into ``T_cw`` of the keyframe that the patch was taken from.
         size: ``(N,)`` float64, size of a pixel of the patch in full-resolution pixels.
         angle: ``(N,)`` float32, orientation of the feature in radians.
-        pixels: ``(P, PATCH_PIXELS)`` uint8, as in ``KeyframePatches``.
-        shift: ``(P, 2)`` float32, as in ``KeyframePatches``.
+        pixels: ``(P, PATCH_PIXELS)`` uint8, the square patch around each keypoint, row by row.
+        shift: ``(P, 2)`` float32, vector from each keypoint to the position of its landmark after
+            sub-pixel alignment, in pixels of the keypoint's octave.
         T_cw: ``(K, 4, 4)`` float64 poses of the keyframes.
     """
 

@@ -123,7 +123,7 @@ def solve_positive(H: Matrix, b: Matrix) -> Matrix:
     """Solve ``H x = b`` for a small symmetric positive definite ``H`` by Cholesky.
 
     Args:
-        H: ``(n, n)``; only the lower triangle is read.
+        H: ``(n, n)``. Only the lower triangle is read.
         b: ``(n,)``.
 
     Returns:

@@ -54,7 +54,9 @@ class LoopEdge:
     """The outcome of a loop candidate. Rejected candidates are kept for the report.
 
     Attributes:
-        query, match, score, proposed_by: the same as in ``LoopCandidate``.
+        query, match: the two keyframes that may show the same place, as in ``LoopCandidate``.
+        score: similarity in the detector's own measure.
+        proposed_by: name of the detector that proposed the candidate.
         accepted: whether the loop was closed.
         reason: "closed", or the reason in a few words why the candidate was rejected.
         n_matches: number of landmarks around the match that were matched to features of the query.

@@ -60,7 +60,7 @@ class Arrays(NamedTuple):
         n_observations: ``(L,)`` i4, number of observations. A stereo observation counts twice
             (ORB-SLAM2).
         xy: ``(R, 2)`` f4, position of each keypoint in pixels.
-        u_right: ``(R,)`` f4, column of the stereo match in pixels; NaN if there is no match.
+        u_right: ``(R,)`` f4, column of the stereo match in pixels. NaN if there is no match.
         octave: ``(R,)`` u1, pyramid level.
         angle: ``(R,)`` f4, orientation in radians.
         descriptor: ``(R, 4)`` u8, 256-bit descriptor of each keypoint.

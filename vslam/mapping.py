@@ -49,7 +49,8 @@ from vslam.states import MapperState
 from vslam.trajectory import Trajectory
 from vslam.workers import Job, Workers
 
-_CLOSE_AFTER_FRAMES = 10  # a found loop is closed this long after its keyframe, or at the next one
+# A loop that was found is closed this many frames after its keyframe, or at the next keyframe.
+_CLOSE_AFTER_FRAMES = 10
 
 
 class Mapper:
@@ -147,8 +148,8 @@ class Mapper:
     def unit_scale(self, keyframe: int) -> float:
         """Return the factor by which loop closures have scaled lengths near a keyframe.
 
-        The factor is measured since the keyframe was added. While a mapping job runs, only the
-        factor of the reference keyframe is available.
+        The factor covers all loop closures since the keyframe was added. While a mapping job runs,
+        only the factor of the reference keyframe is available.
         """
         if not self._is_merged and keyframe == self.view.reference:
             return self.view.unit_scale
@@ -166,10 +167,10 @@ class Mapper:
     # The schedule
 
     def hold(self, *frames: Frame | None) -> None:
-        """Set the frames that merges update.
+        """Choose the frames that are updated when a merge changes the map.
 
-        When a merge changes the map, the poses, landmarks and twists of these frames are updated.
-        Frames from an earlier call are no longer updated.
+        The poses, landmarks and twists of these frames are updated. Frames from an earlier call of
+        this method are no longer updated.
         """
         self._held = tuple(frame for frame in frames if frame is not None)
 

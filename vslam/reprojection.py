@@ -78,7 +78,10 @@ def chi_square_ratio(x, y, z, u, v, u_right, inverse_sigma2, pinhole):
 def residual(x, y, z, u, v, u_right, pinhole):
     """Compute the reprojection errors of a point in u, in v and in the negative disparity.
 
-    The arguments are the same as for ``chi_square_ratio``.
+    Args:
+        x, y, z: float64 point in the camera frame.
+        u, v, u_right: float64 observation in pixels.
+        pinhole: intrinsics as ``unpacked`` returns them.
 
     Returns:
         The three errors in pixels, and whether the observation is stereo. The error of the

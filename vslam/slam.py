@@ -367,7 +367,7 @@ class Slam:
         else:
             is_keyframe = self._mode.update_map(frame, found)
             self.rig.observe(frame, frame.twist)
-        # If patches failed for this frame, they will probably fail for the next ones.
+        # If patches failed for this frame, they will probably fail for the next frames.
         self.next_extraction = self._mode.due if by_patches else frame.index + 2
         return is_keyframe
 

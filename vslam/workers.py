@@ -154,8 +154,8 @@ class _Queue:
     def wait_for(self, awaited: Job[T]) -> None:
         """Wait for a job (``Job.wait``).
 
-        If a job waits for another job, it does not run further jobs meanwhile, because they would
-        delay it.
+        A job that waits for another job does not run further jobs meanwhile, because these would
+        delay the waiting job.
         """
         while True:
             with self._changed:

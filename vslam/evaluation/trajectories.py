@@ -260,7 +260,7 @@ def _associate(estimate: Trajectory, ground_truth: Trajectory) -> tuple[Trajecto
         times, true_times, rtol=0.0, atol=MAX_TIME_DIFFERENCE_S
     ):
         return estimate, ground_truth
-    if len(true_times) > len(times):  # evo also looks up the shorter in the longer
+    if len(true_times) > len(times):  # evo also looks up the shorter trajectory in the longer one
         matched, true = matching_time_indices(times, true_times, MAX_TIME_DIFFERENCE_S)
     else:
         true, matched = matching_time_indices(true_times, times, MAX_TIME_DIFFERENCE_S)

@@ -64,7 +64,8 @@ def open_images(
     Args:
         data: the new location of the data if it has been moved. With None, the location in
             ``run.json`` is used.
-        on_render: as in ``vslam.datasets.open_sequence``.
+        on_render: function that is called while a synthetic sequence is rendered. Its arguments are
+            the number of frames rendered so far and the total number.
 
     Raises:
         InputError: the images are missing, belong to another camera or came from a live camera, or

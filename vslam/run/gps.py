@@ -47,7 +47,7 @@ class GpsTrack:
 
 
 def locate(stored: StoredMap, fixes: Fixes, config: PoseGraphConfig) -> GpsTrack:
-    """Georeference a finished drive with GPS fixes. The map is not changed.
+    """Georeference a finished drive using GPS fixes. The map is not changed.
 
     Args:
         stored: the map, which contains the poses of the frames of its last drive.

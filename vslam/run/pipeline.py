@@ -92,7 +92,7 @@ def run_sequence(
     recorder.begin(sequence.camera, ground_truth_of(sequence))
     main = _Run(slam, settings, Progress() if resume is None else resume.progress)
     n_recorded = 0  # loops passed to the recorder so far
-    end_reasons: list[str] = []  # why the run ended early; the first one counts
+    end_reasons: list[str] = []  # why the run ended early; the first reason counts
     with _stop_on_interrupt() as interrupted:
         frames = perturbed(_until_broken(sequence.frames(), end_reasons), perturbation)
         frames = _following(frames, main.before.tracks.timestamps)
@@ -124,7 +124,7 @@ def run_sequence(
                     if not sequence.live:  # for a live source, Ctrl-C is the usual end
                         end_reasons.append("Ctrl-C")
                     break
-        except Exception as error:  # keep the results so far
+        except Exception as error:  # keep the results obtained so far
             if isinstance(error, InputError) and not main.has_begun:
                 raise
             main.fail(f"frame {len(main.tracks)}", error)
@@ -484,7 +484,7 @@ def _until_broken(frames: Iterator[TimedFrame], end_reasons: list[str]) -> Itera
         end_reasons.append(str(error).rstrip("."))
     except InputError:
         raise
-    except Exception as error:  # the frames that were read before must still be tracked
+    except Exception as error:  # the frames that were already read must still be tracked
         end_reasons.append(f"reading the images failed, {reason(error)}")
 
 

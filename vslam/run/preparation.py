@@ -149,7 +149,7 @@ class _Mailbox:
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._newest: _Arrival | None = None
-        self._dropped: list[float] = []  # times of frames dropped since the last one was taken
+        self._dropped: list[float] = []  # times of frames dropped since the last frame was taken
         self._first = True
         self._ended = False
         self.stopped = False

@@ -43,8 +43,9 @@ class Camera:
         cx, cy: principal point of the left camera in pixels.
         baseline: distance from the left to the right camera in metres. It is 0 for a single camera.
             The map of a single camera has an arbitrary unit instead of metres
-            (``backend/two_views.py``). An RGB-D camera has a virtual baseline, which determines the
-            uncertainty of the depth (``frontend/depth.py``).
+            (``backend/two_views.py``). An RGB-D camera has no right camera. Its baseline states how
+            accurate the depth is: a stereo pair with this baseline would measure depth equally
+            accurately (``frontend/depth.py``).
         width, height: image size in pixels.
         depth: whether the second image is a depth image instead of a right image. It holds the
             depth of each pixel of the left image.

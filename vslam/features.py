@@ -157,7 +157,7 @@ class LandmarkPatches(NamedTuple):
 
     Attributes:
         ids: ``(N,)`` int32 landmark ids, sorted.
-        where: ``(N,)`` int64, the row of ``pixels`` and ``shift`` that belongs to each landmark.
+        where: ``(N,)`` int64, index into ``pixels`` and ``shift`` of the patch of each landmark.
         view: ``(N,)`` int64, index into ``T_cw`` of the keyframe that the patch was taken from.
         size: ``(N,)`` float64, size of a pixel of the patch in full-resolution pixels.
         angle: ``(N,)`` float32, orientation of the feature in radians.
@@ -283,7 +283,7 @@ class TrackResult:
         T_odom_camera: ``(4, 4)`` pose from odometry, which drifts but never jumps. It is the
             identity at the first frame. None in results that were read from files of older
             versions.
-        uncertainty: covariance of the pose. None in results that were read from files of older
+        uncertainty: covariances of the pose. None in results that were read from files of older
             versions.
     """
 
@@ -305,8 +305,8 @@ class TrackResult:
     def T_map_odom(self) -> NDArray[np.float64]:
         """``(4, 4)`` transformation from the odometry frame to the map frame (ROS REP 105).
 
-        ``T_wc = T_map_odom @ T_odom_camera``. It jumps when a loop is closed, when the map is
-        adjusted, and when the camera is relocalised.
+        ``T_wc = T_map_odom @ T_odom_camera``. This transformation jumps when a loop is closed, when
+        the map is adjusted, and when the camera is relocalised.
         """
         if self.T_odom_camera is None:
             return np.eye(4)

@@ -141,8 +141,8 @@ def resolve(a, landmarks):
     """Return the current ids of landmarks that may have been merged or culled.
 
     Returns:
-        ``(N,)`` int32. This is the landmark that each landmark was merged into, or -1 if it was
-        culled. Other landmarks keep their ids.
+        ``(N,)`` int32. For a merged landmark, this is the id of the landmark that it was merged
+        into. For a culled landmark, it is -1. Other landmarks keep their ids.
     """
     out = np.empty(len(landmarks), np.int32)
     for i in range(len(landmarks)):

@@ -60,7 +60,7 @@ class Revisits:
 
 @dataclass(frozen=True)
 class LoopEvaluation:
-    """Which loops are right, and which revisits were found.
+    """The result of comparing the loops of a run with the ground truth.
 
     Attributes:
         revisits: the M stretches of the path on which the camera revisits places.

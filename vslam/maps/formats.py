@@ -159,7 +159,7 @@ def save_image(image: NDArray[np.uint8], path: Path) -> None:
     """Write an image as PNG.
 
     Args:
-        image: ``(H, W)`` grey or ``(H, W, 3)`` red, green, blue.
+        image: ``(H, W)`` grey or ``(H, W, 3)`` RGB image.
 
     Raises:
         OSError: the file cannot be written.

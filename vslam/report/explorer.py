@@ -31,8 +31,12 @@ def explorer(
 ) -> list[Section]:
     """Return the section of the report with the interactive explorer.
 
-    The result is empty if fewer than two frames were tracked. The arguments are the same as for
-    ``explorer_data``.
+    The result is empty if fewer than two frames were tracked.
+
+    Args:
+        outcome: the run.
+        evaluation: errors of ``outcome.trajectory``. None if they cannot be computed.
+        moments: images of keyframes, from a `vslam.run.moments.MomentRecorder`.
     """
     data = explorer_data(outcome, evaluation, moments)
     if data is None:

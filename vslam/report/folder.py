@@ -42,8 +42,8 @@ def create_run_folder(
 ) -> Path:
     """Create the folder ``out/<YYYYmmdd-HHMMSS>-<dataset>-<sequence>-<perturb>-<detector>``.
 
-    If thresholds differ from the defaults, the first changed threshold is appended to the name, and
-    the number of the other changed thresholds. If the name is in use, a number is appended.
+    If thresholds differ from the defaults, the first changed threshold is appended to the name,
+    followed by the number of other changed thresholds. If the name is in use, a number is appended.
     ``out/latest`` becomes a symbolic link to the folder if the file system supports such links.
 
     Raises:

@@ -245,10 +245,11 @@ def run_page(
 
     Args:
         report: the content of ``report.json``.
-        figures: from :func:`vslam.report.figures.draw_figures`.
+        figures: the figures of the report, from :func:`vslam.report.figures.draw_figures`.
         seen: pictures of closed loops, from :func:`vslam.report.loop_tables.seen_loops`.
         recordings: names of the recordings in the folder of the page.
-        explorer: from :func:`vslam.report.explorer.explorer`.
+        explorer: the section with the interactive explorer, from
+            :func:`vslam.report.explorer.explorer`.
         config: text of ``config.json``, for the HTML page.
     """
     alerts = [Alert(f"Warning: {warning}") for warning in report.warnings]

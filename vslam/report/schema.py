@@ -69,7 +69,7 @@ class StageTime(Record):
 class LoopEntry(Record):
     """A loop candidate that was accepted or rejected. It refers to frames of this run.
 
-    - ``query_frame``: index of the frame at which the loop was searched. None for a frame that did
+    - ``query_frame``: index of the frame for which loops were searched. None for a frame that did
       not become a keyframe.
     - ``match_frame``: index of the earlier frame at the same place. None for a keyframe of an
       earlier drive.
@@ -214,9 +214,9 @@ class Machine(Record):
 class ReportJson(Measures, Document):
     """The content of ``report.json``, which describes one run in numbers.
 
-    - ``frames``: number of processed frames. Some of them were not tracked: ``skipped_frames``
-      frames had an image that could not be read. In a real-time run, ``dropped_frames`` frames were
-      replaced by a newer frame.
+    - ``frames``: number of processed frames. ``skipped_frames`` is the number of frames with an
+      image that could not be read. ``dropped_frames`` is the number of frames that were replaced by
+      a newer frame in a real-time run.
     - ``lost_before_map``: number of lost frames before the first tracked frame, in a run that began
       a new map. ``longest_loss_s`` is the longest time in seconds from a lost frame to the next
       tracked frame, or to the end.

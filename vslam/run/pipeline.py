@@ -476,7 +476,7 @@ def _frames_of_this_run(map_: Map) -> NDArray[np.int64]:
 def _until_broken(frames: Iterator[TimedFrame], end_reasons: list[str]) -> Iterator[TimedFrame]:
     """Yield the frames of a source until reading fails.
 
-    The reason of the failure is appended to ``end_reasons``.
+    The reason for the failure is appended to ``end_reasons``.
     """
     try:
         yield from frames

@@ -156,10 +156,10 @@ class _Mailbox:
         self.error: Exception | None = None
 
     def put(self, arrival: _Arrival) -> None:
-        """Replace the frame in the mailbox by a newer frame.
+        """Replace the frame in the mailbox with a newer frame.
 
-        The first frame of a run must not be replaced. After the first frame, this method waits
-        until this frame has been taken.
+        The first frame of a run must not be replaced. Therefore, after putting the first frame,
+        this method waits until the frame has been taken.
         """
         with self._changed:
             if self._newest is not None:

@@ -110,7 +110,10 @@ class Progress:
 
     Attributes:
         tracks: results of the frames.
-        skipped, latency_ms, wall_s, cpu_s: see ``RunOutcome``.
+        skipped: a message for each frame whose images could not be read.
+        latency_ms: milliseconds from the arrival of each tracked frame until its pose is known, in
+            a real-time run.
+        wall_s, cpu_s: wall and CPU time of the frames, in seconds.
         loops: loops between frames of the run, with frame numbers in place of keyframe ids. The
             number -1 stands for a keyframe of an earlier drive.
         corrections: corrections of the map by the accepted loops, with frame numbers in place of
@@ -141,7 +144,7 @@ def _frame_of(message: str) -> int:
 
 
 def frames_of(loops: list[LoopEdge], frames: NDArray[np.int64]) -> list[LoopEdge]:
-    """Replace the keyframe ids of loops by frame numbers, and remove features and landmarks.
+    """Replace the keyframe ids of loops with frame numbers, and remove features and landmarks.
 
     Args:
         frames: ``(K,)`` frame number of each keyframe.
@@ -161,7 +164,7 @@ def frames_of(loops: list[LoopEdge], frames: NDArray[np.int64]) -> list[LoopEdge
 def in_frames(
     loops: list[LoopEdge], corrections: list[LoopCorrection], frames: NDArray[np.int64]
 ) -> tuple[list[LoopEdge], list[LoopCorrection]]:
-    """Replace the keyframe ids of loops and of their corrections by frame numbers.
+    """Replace the keyframe ids of loops and of their corrections with frame numbers.
 
     Args:
         frames: ``(K,)`` frame number of each keyframe.

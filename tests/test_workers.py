@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import threading
-import time
 import weakref
 from concurrent.futures import CancelledError
 
@@ -67,12 +66,16 @@ def test_who_waits_within_a_job_runs_no_other_job():
     other = workers.submit(lambda: done.append("other"), Urgency.MAPPING)
 
     def outer() -> None:
-        end = threading.Event()
-        inner = workers.submit(lambda: end.wait(PATIENCE), Urgency.READING)
+        begun, end = threading.Event(), threading.Event()
+
+        def inner_work() -> None:
+            begun.set()
+            end.wait(PATIENCE)
+
+        inner = workers.submit(inner_work, Urgency.READING)
         elsewhere = threading.Thread(target=inner.wait)
         elsewhere.start()
-        while not inner.has_begun:
-            time.sleep(0.001)
+        assert begun.wait(PATIENCE)
         threading.Timer(0.1, end.set).start()
         inner.result()
         elsewhere.join()
@@ -88,9 +91,9 @@ def test_a_job_that_is_done_keeps_its_result_alone():
         def __call__(self) -> int:
             return 3
 
-    work = Work()
+    workers, work = Workers(1), Work()
     gone = weakref.ref(work)
-    job = Workers(1).submit(work, Urgency.READING)
+    job = workers.submit(work, Urgency.READING)
     del work
     assert job.result() == 3
     assert gone() is None
@@ -152,14 +155,14 @@ def test_a_cancelled_job_never_runs_and_one_that_has_begun_is_completed():
     assert done == []
 
 
-def test_threads_end_with_the_workers_and_queued_jobs_do_not_run():
+def test_threads_end_with_the_workers_and_queued_jobs_are_cancelled():
     before = set(threading.enumerate())
-    workers, done = Workers(3), []
+    workers, idle = Workers(3), Workers(1)
     started = set(threading.enumerate()) - before
     assert len(started) == 2
-    gone = weakref.ref(workers)
-    del workers
+    queued = idle.submit(lambda: 3, Urgency.READING)
+    del workers, idle
     gc.collect()
-    assert gone() is None
     assert not any(thread.is_alive() for thread in started)
-    assert done == []
+    with pytest.raises(CancelledError):
+        queued.result()

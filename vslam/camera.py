@@ -25,7 +25,7 @@ DISPARITY_WEIGHT = 3.0
 # With a calibration for images of half the size, this share is 0.25. With a calibration for images
 # of twice the size, it is 0.5.
 _OFF_CENTRE = 0.2
-# If a calibration belongs to images of another size, the principal point is wrong by nearly the
+# If a calibration belongs to images of a different size, the principal point is wrong by nearly the
 # same factor in x and in y. The ratio of both factors must lie between this number and its inverse.
 _SAME_RATIO = 1.25
 _FACTORS = {0.5: "half", 2.0: "twice"}
@@ -43,8 +43,9 @@ class Camera:
         cx, cy: principal point of the left camera in pixels.
         baseline: distance from the left to the right camera in metres. It is 0 for a single camera.
             The map of a single camera has an arbitrary unit instead of metres
-            (``backend/two_views.py``). An RGB-D camera has a virtual baseline, which determines the
-            uncertainty of the depth (``frontend/depth.py``).
+            (``backend/two_views.py``). An RGB-D camera has no right camera. Its baseline states how
+            accurate the depth is: a stereo pair with this baseline would measure depth equally
+            accurately (``frontend/depth.py``).
         width, height: image size in pixels.
         depth: whether the second image is a depth image instead of a right image. It holds the
             depth of each pixel of the left image.
@@ -68,7 +69,7 @@ class Camera:
     right_delay: float = 0.0
 
     def __post_init__(self) -> None:
-        """Reject impossible numbers.
+        """Check that the numbers of the camera are possible.
 
         Raises:
             ValueError: a number is impossible. The message says which number.
@@ -103,7 +104,7 @@ class Camera:
         return self.baseline == 0.0
 
     def left_camera(self) -> Camera:
-        """The left camera as a single camera."""
+        """Return the left camera of this stereo pair or RGB-D camera as a single camera."""
         return replace(self, baseline=0.0, depth=False, right_delay=0.0)
 
     @property
@@ -115,18 +116,27 @@ class Camera:
 
     @property
     def bf(self) -> float:
-        """The baseline times the focal length. A point at depth z has the disparity ``bf / z``
-        pixels."""
+        """The baseline times the focal length, in metres times pixels.
+
+        A point at depth z has a disparity of ``bf / z`` pixels.
+        """
         return self.baseline * self.fx
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:
-        """``(6,)`` float64 ``[fx, fy, cx, cy, bf, disparity_weight]``, the form that kernels
-        use."""
+        """The camera in the form that kernels use.
+
+        The array is ``(6,)`` float64 ``[fx, fy, cx, cy, bf, disparity_weight]``.
+        """
         return np.array([self.fx, self.fy, self.cx, self.cy, self.bf, DISPARITY_WEIGHT])
 
     def project(self, p_c: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Project ``(N, 3)`` points of the left camera to ``(N, 3)`` rows ``u, v, u_right``."""
+        """Project ``(N, 3)`` points in the frame of the left camera into the images.
+
+        Returns:
+            ``(N, 3)`` columns u and rows v in the left image, and columns u_right in the right
+            image, in pixels.
+        """
         x, y, z = p_c.T
         u = self.fx * x / z + self.cx
         return np.stack([u, self.fy * y / z + self.cy, u - self.bf / z], axis=1)
@@ -134,7 +144,15 @@ class Camera:
     def backproject(
         self, xy: NDArray[np.floating], depth: NDArray[np.floating]
     ) -> NDArray[np.float64]:
-        """Lift ``(N, 2)`` pixels at ``(N,)`` depths (m) to ``(N, 3)`` points of the left camera."""
+        """Compute the 3D points of pixels with known depths.
+
+        Args:
+            xy: ``(N, 2)`` pixels of the left image.
+            depth: ``(N,)`` depths in metres.
+
+        Returns:
+            ``(N, 3)`` points in the frame of the left camera.
+        """
         z = np.asarray(depth, np.float64)
         x = (xy[:, 0] - self.cx) * z / self.fx
         y = (xy[:, 1] - self.cy) * z / self.fy
@@ -142,11 +160,11 @@ class Camera:
 
 
 def calibration_doubts(camera: Camera) -> list[str]:
-    """Reasons why a calibration is implausible.
+    """Return the reasons why a calibration is implausible.
 
     Each reason is one sentence without a full stop. The list is empty if the calibration is
-    plausible. A camera with an implausible calibration can exist, but more often the calibration
-    belongs to other images.
+    plausible. A camera can really have such a calibration. More often, the calibration belongs to
+    other images.
     """
     off_centre = principal_point_doubt((camera.cx, camera.cy), (camera.width, camera.height))
     doubts = [off_centre] if off_centre else []
@@ -161,9 +179,13 @@ def calibration_doubts(camera: Camera) -> list[str]:
 
 
 def principal_point_doubt(principal: tuple[float, float], size: tuple[int, int]) -> str:
-    """The reason why a principal point (pixels) is implausible for images of a size (pixels).
+    """Return the reason why a principal point is implausible.
 
     The reason is a sentence without a full stop. It is empty if the principal point is plausible.
+
+    Args:
+        principal: column and row of the principal point in pixels.
+        size: width and height of the images in pixels.
     """
     (cx, cy), (width, height) = principal, size
     across, down = cx / width, cy / height
@@ -176,10 +198,10 @@ def principal_point_doubt(principal: tuple[float, float], size: tuple[int, int])
 
 
 def _cause(across: float, down: float) -> str:
-    """The probable cause of an implausible principal point.
+    """Return the probable cause of an implausible principal point.
 
     Args:
-        across, down: the principal point as a share of the image's width and height.
+        across, down: the principal point as fractions of the image's width and height.
     """
     if min(across, down) <= 0.0 or not 1 / _SAME_RATIO < across / down < _SAME_RATIO:
         return "check the order of its numbers, and whether the images were cropped or turned"
@@ -199,7 +221,7 @@ def field_of_view(camera: Camera) -> tuple[float, float]:
 
 
 def same_camera(one: Camera, other: Camera) -> bool:
-    """Whether two cameras are equal, apart from the rounding of numbers in calibration files."""
+    """Return whether two cameras are equal, apart from rounding errors of calibration files."""
     shapes = [(c.width, c.height, c.depth, c.monocular) for c in (one, other)]
     first, second = ([*c.intrinsics, c.right_delay] for c in (one, other))
     return shapes[0] == shapes[1] and bool(np.allclose(first, second, rtol=1e-6))
@@ -222,7 +244,7 @@ class ImageMap(Protocol):
 
 
 def check_images(left: Image, second: Image | DepthImage | None, camera: Camera) -> None:
-    """Check that images match a camera (``Slam.step``).
+    """Check that the images of a frame match a camera.
 
     Raises:
         ValueError: the sizes, the types or the number of the images are wrong. The message says
@@ -260,7 +282,7 @@ def check_images(left: Image, second: Image | DepthImage | None, camera: Camera)
 
 
 def check_mask(mask: NDArray[np.uint8] | NDArray[np.bool_], camera: Camera) -> None:
-    """Check that a mask matches a camera (``Slam.step``).
+    """Check that a mask of the left image matches a camera.
 
     Raises:
         ValueError: the size or type of the mask is wrong. The message says what is wrong.

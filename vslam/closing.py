@@ -50,9 +50,9 @@ class LoopClosing:
         verifier: decides which candidates are loops.
         edges: the outcome of every candidate, in order.
         corrections: the loops that were closed.
-        closed: the edges of all closed loops, in the present unit of the map. The loops of a loaded
-            map come first.
-        problems: one sentence for each step that failed. These failures left the map unchanged.
+        closed: the edges of all closed loops. Their translations are in the present unit of the
+            map. The loops of a loaded map come first.
+        problems: one sentence for each step that failed. Such a failure leaves the map unchanged.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class LoopClosing:
     def search(
         self, map_: Map, keyframe: int, features: Features, image: NDArray[np.uint8] | None
     ) -> LoopSearch:
-        """Search for a loop at a keyframe after its local mapping. The map is only read."""
+        """Search for a loop at a keyframe whose local mapping is complete. The map is only read."""
         with self._failure_reported("Looking for loops"):
             if self.verifier.is_image_redundant(map_, keyframe):
                 image = None  # no network needs this image
@@ -98,17 +98,17 @@ class LoopClosing:
         return LoopSearch()
 
     def close(self, map_: Map, search: LoopSearch) -> None:
-        """Record the outcome of a search, and close the loop that it found, if any."""
+        """Record the outcome of a search. If the search found a loop, close this loop."""
         self.edges += search.edges
         if search.loop is not None:
             self._close(map_, search.loop)
 
     def consider(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> None:
-        """Verify the candidates of a keyframe, best first, and close the first true loop."""
+        """Verify the loop candidates of a keyframe, best first, and close the first true loop."""
         self.close(map_, self._find(map_, keyframe, candidates))
 
     def _find(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> LoopSearch:
-        """Verify candidates, best first, until one is a true loop. The map is only read."""
+        """Verify loop candidates, best first, until one is a true loop. The map is only read."""
         candidates = self.verifier.rate(map_, keyframe, candidates)
         _, rejected = self._consistency.update(keyframe, candidates, map_)
         rejections = {edge.match: edge for edge in rejected}
@@ -128,7 +128,10 @@ class LoopClosing:
         return LoopSearch(edges)
 
     def state(self) -> ClosingState:
-        """The state for a checkpoint, without the detector and the images."""
+        """Return the state of loop closing for a checkpoint.
+
+        It does not contain the detector and the images.
+        """
         return ClosingState(self._consistency.state(), self.verifier.state(), self._followed)
 
     def restore(self, state: ClosingState) -> None:
@@ -139,20 +142,20 @@ class LoopClosing:
 
     @property
     def is_adjusting(self) -> bool:
-        """Whether the result of a global bundle adjustment is still to be merged."""
+        """Whether a global bundle adjustment is running, or its result has not been merged yet."""
         return self._global is not None
 
     def count_reused_keyframe(self, keyframe: int) -> bool:
-        """Count a frame that made an old keyframe the reference instead of becoming a keyframe.
+        """Record that an old keyframe became the reference keyframe instead of a new keyframe.
 
-        Such frames count as keyframes when the time to merge the global bundle adjustment is
-        determined.
+        The result of the global bundle adjustment is merged after a certain number of keyframes. A
+        reused keyframe counts towards this number in the same way as a new keyframe.
 
         Args:
             keyframe: id of the newest keyframe.
 
         Returns:
-            Whether the global bundle adjustment must be merged now.
+            Whether the result of the global bundle adjustment must be merged now.
         """
         self._followed += 1
         return self._is_due(keyframe)
@@ -166,10 +169,10 @@ class LoopClosing:
         return self._global is not None and keyframe + self._followed >= self._global.due
 
     def conclude(self, map_: Map) -> None:
-        """At the end of a drive, close a verified loop that still waits for confirmation.
+        """At the end of a drive, close a verified loop that has not been confirmed yet.
 
-        Another keyframe must confirm each loop. At the end of a drive, no later keyframe can do so.
-        The loop is closed if an earlier keyframe confirms it
+        Normally, a later keyframe confirms each loop. At the end of a drive, there is no later
+        keyframe. The loop is then closed if an earlier keyframe confirms it
         (``LoopConsistency.confirmed_by_earlier``).
         """
         gates, found, edges = self._config.verification, None, []
@@ -214,8 +217,8 @@ class LoopClosing:
         """Solve the pose graph with a verified loop.
 
         Returns:
-            The outcome for ``edges``, and the loop. The loop is None if it contradicts the rest of
-            the graph.
+            The outcome for the list ``edges``, and the loop. The loop is None if it contradicts the
+            other edges of the graph.
         """
         start = time.perf_counter()
         solution = self._solution(map_, edge, Hypothesis.PREDICTED)
@@ -290,7 +293,7 @@ def _superseded(candidate: LoopCandidate) -> LoopEdge:
 
 @dataclass(frozen=True)
 class _Loop:
-    """A verified loop and its correction of the map.
+    """A verified loop, and the correction of the map that it causes.
 
     ``start`` is the time (``perf_counter``) at which the computation of the correction started.
     """
@@ -305,7 +308,7 @@ class LoopSearch:
     """The outcome of a search for a loop at a keyframe.
 
     Attributes:
-        edges: the outcome of every candidate.
+        edges: the outcome of every loop candidate.
         loop: the verified loop, which has not been closed yet. None if no candidate is a loop.
     """
 

@@ -33,8 +33,9 @@ class Section(BaseModel):
 
     Each docstring ends with the source of the threshold in brackets. [own] means that both the rule
     and the value are our own. Otherwise, the brackets name the paper and section that give the
-    rule, and then the source of the value. *Printed* values stand in that section. *Customary*
-    values are those of the programs of the ORB-SLAM family. *Own* values were chosen for vslam.
+    rule, and then the source of the value. *Printed* values are printed in that section of the
+    paper. *Customary* values are those of the programs of the ORB-SLAM family. *Own* values were
+    chosen for vslam.
 
     OS1: Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2: Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017. ZS:
     Zhou and Sun, Sci Rep 15, 7644 (2025).
@@ -462,7 +463,7 @@ class VerificationConfig(Section):
 
 
 class LearnedMatchingConfig(Section):
-    """Verification of loop candidates by the network's local descriptors, where ORB fails."""
+    """Verification of loop candidates using the network's local descriptors, where ORB fails."""
 
     max_candidates: int = Field(2, ge=1)
     """Upper bound of the number of candidates that are tried for a keyframe or a lost frame.
@@ -606,7 +607,7 @@ class LoopConfig(Section):
 
 
 class BowConfig(Section):
-    """Loop candidates by bag of words [OS1, III-E and VII-A]."""
+    """Loop candidates from a bag of words [OS1, III-E and VII-A]."""
 
     min_shared: int = Field(15, ge=1)
     """Two keyframes are neighbours if they share at least this many landmarks. The neighbours of
@@ -635,9 +636,9 @@ class PoseGraphConfig(Section):
     its standard deviation grows with the square root of the distance travelled. With the default
     values, the drift is 1.2 % after 400 m, and nearly all of it is caused by errors of rotation.
 
-    A gap is an edge over frames in which tracking was lost and the motion was only predicted. A gap
-    becomes a weak edge if there was no prediction. It also becomes a weak edge under the hypothesis
-    that the camera was carried to another place while tracking was lost.
+    An edge is a gap if tracking was lost between its two keyframes. The motion along a gap is only
+    predicted. A gap gets a small weight if no prediction was possible. It also gets a small weight
+    under the hypothesis that the camera was carried to another place while tracking was lost.
     """
 
     min_shared: int = Field(100, ge=1)
@@ -694,7 +695,7 @@ class PoseGraphConfig(Section):
 
 
 class SiameseConfig(Section):
-    """Loop candidates by a Siamese network [ZS]."""
+    """Loop candidates from a Siamese network [ZS]."""
 
     threshold: float = Field(0.9, ge=0, le=1)
     """A keyframe is a loop candidate if its similarity is at least this. [ZS, printed]"""
@@ -734,8 +735,9 @@ class SiameseConfig(Section):
 
 
 class Config(Section):
-    """All thresholds. Each run writes them to ``config.json``, and the option ``--config`` reads
-    them.
+    """All thresholds of the pipeline.
+
+    Each run writes its thresholds to ``config.json``. The option ``--config`` reads such a file.
 
     A threshold can also be given by its dotted name: ``{"orb.n_features": 1000}`` means the same as
     ``{"orb": {"n_features": 1000}}``.
@@ -762,8 +764,10 @@ class Config(Section):
     @model_validator(mode="before")
     @classmethod
     def _nest(cls, given: Any) -> Any:
-        """Move thresholds that are given by dotted names into their sections, and rename thresholds
-        of older versions."""
+        """Move thresholds that are given by dotted names into their sections.
+
+        Thresholds with the names of older versions are renamed.
+        """
         if not isinstance(given, dict):
             return given
         nested = {name: value for name, value in given.items() if "." not in str(name)}
@@ -783,7 +787,7 @@ class Config(Section):
 
 
 def load_config(path: Path | str) -> Config:
-    """Read a configuration from a JSON file. Keys that the file omits keep their defaults.
+    """Read thresholds from a JSON file. Keys that the file omits keep their defaults.
 
     Raises:
         InputError: the file is missing or is not JSON, a key is unknown, or a value is out of
@@ -807,10 +811,11 @@ def as_config(given: Config | Mapping[str, Any], where: str = "config") -> Confi
 
 
 def changed_thresholds(config: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """The thresholds of a ``config.json`` that differ from the defaults, by dotted name.
+    """Return the thresholds that differ from the defaults, by dotted name.
 
     Args:
-        config: thresholds by section. They may come from another version of vslam.
+        config: the content of a ``config.json``, with thresholds by section. It may come from
+            another version of vslam.
     """
     default = Config().model_dump()
     return {
@@ -822,9 +827,11 @@ def changed_thresholds(config: Mapping[str, Mapping[str, Any]]) -> dict[str, Any
 
 
 def thresholds_in_words(changed: Mapping[str, Any], most: int = 3) -> str:
-    """List the first ``most`` thresholds, and count the others.
+    """Describe thresholds in a short text, such as ``orb.n_features=1000, 2 more in config.json``.
 
-    An example is ``orb.n_features=1000, 2 more in config.json``.
+    Args:
+        changed: thresholds by dotted name.
+        most: number of thresholds that are listed. The other thresholds are only counted.
     """
     words = [f"{name}={value}" for name, value in changed.items()]
     more = [f"{len(words) - most} more in config.json"] if len(words) > most else []
@@ -860,7 +867,7 @@ def checked(model: type[_Model], given: object, where: str, what: str) -> _Model
         what: the name of the values in error messages, such as ``thresholds``.
 
     Raises:
-        InputError: for the same reasons as in ``read_json``.
+        InputError: the JSON cannot be parsed, a key is unknown, or a value is out of range.
     """
     try:
         if isinstance(given, bytes):
@@ -887,8 +894,10 @@ def _fault(model: type[BaseModel], error: ValidationError, what: str) -> str:
 
 
 def _without_section(model: type[BaseModel], place: list[str]) -> str:
-    """A suggestion for a key that was given without its section; empty if no section has the
-    key."""
+    """Suggest the full name of a key that was given without its section.
+
+    The suggestion is empty if no section has this key.
+    """
     sections = [section for section in model.model_fields if place[-1] in _keys(model, [section])]
     if len(place) > 1 or not sections:
         return ""
@@ -896,8 +905,10 @@ def _without_section(model: type[BaseModel], place: list[str]) -> str:
 
 
 def _keys(model: type[BaseModel], place: list[str]) -> list[str]:
-    """The keys of the section of ``model`` at ``place``; empty if there is no section at
-    ``place``."""
+    """Return the names of the keys in the section of ``model`` at ``place``.
+
+    The list is empty if there is no section at ``place``.
+    """
     for name in place:
         field = model.model_fields.get(name)
         if field is None or not isinstance(field.annotation, type):

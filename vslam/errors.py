@@ -18,7 +18,8 @@ class InputError(Exception):
 class UnreadableImageError(InputError):
     """One image of a sequence cannot be decoded or has the wrong size.
 
-    During a run, the frame is reported, skipped and counted. Before a run, it is an error.
+    During a run, the frame is reported, skipped and counted. If this happens before the first frame
+    of a run, the run ends with an error.
     """
 
     def __init__(self, path: Path, why: str) -> None:
@@ -34,10 +35,10 @@ class DroppedFrameError(UnreadableImageError):
 
 
 class BrokenSourceError(InputError):
-    """A video, bag or camera ended early: the file is cut off, or the device was unplugged.
+    """A video, bag or camera ended early. The file was cut off, or the device was unplugged.
 
-    During a run, the frames before the break are kept. The run fails only if there are no such
-    frames.
+    During a run, the results for the frames before the break are kept. The run fails only if there
+    are no such frames.
     """
 
 
@@ -52,7 +53,7 @@ def write_file(path: Path, content: str | bytes, fix: str = "free some space") -
     The folder of the file is created if needed.
 
     Raises:
-        ResultsError: the file cannot be written. The message ends with ``fix``.
+        ResultsError: the file cannot be written. The message ends with the advice ``fix``.
     """
     part = path.with_name(f"{path.name}.part")
     try:
@@ -66,7 +67,7 @@ def write_file(path: Path, content: str | bytes, fix: str = "free some space") -
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """A suggestion for a misspelt word, such as `` (did you mean NAME?)``.
+    """Return a suggestion for a misspelt word, such as `` (did you mean NAME?)``.
 
     NAME is the known name that is most similar to the word. The suggestion is empty if no known
     name is similar.
@@ -78,7 +79,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 def counted(number: int, noun: str) -> str:
-    """A number with its noun in the singular or plural, such as ``1 run`` or ``1,200 runs``."""
+    """Return a number with its noun in the singular or plural: ``1 run`` or ``1,200 runs``."""
     return f"{number:,} {noun}{'s' * (number != 1)}"
 
 

@@ -22,14 +22,14 @@ CELL = 16  # side of a FeatureGrid cell in pixels; search windows are 5 to 60 px
 
 @dataclass(frozen=True)
 class Pyramid:
-    """Image pyramid that has all its levels in one buffer, so that a kernel takes it as one array.
+    """Image pyramid with all levels in one buffer, which can be passed to a kernel as one array.
 
     Attributes:
-        pixels: ``(P + SPARE,)`` uint8, the levels row by row, followed by padding. Vectorised
-            kernels read up to one register beyond the last pixel and discard these bytes.
+        pixels: ``(P + SPARE,)`` uint8, pixels of the levels, row by row, followed by padding.
+            Vectorised kernels read up to one register beyond the last pixel and ignore the padding.
         offsets: ``(L,)`` int64, index of the first pixel of each level.
         shapes: ``(L, 2)`` int64, height and width of each level.
-        scales: ``(L,)`` float64, full-resolution pixels per pixel of the level.
+        scales: ``(L,)`` float64, size of a pixel of each level in full-resolution pixels.
     """
 
     pixels: NDArray[np.uint8]
@@ -38,7 +38,7 @@ class Pyramid:
     scales: NDArray[np.float64]
 
     def level(self, index: int) -> NDArray[np.uint8]:
-        """A view of one level as an ``(h, w)`` image."""
+        """Return a view of one pyramid level as an ``(h, w)`` image."""
         height, width = self.shapes[index]
         start = self.offsets[index]
         return self.pixels[start : start + height * width].reshape(height, width)
@@ -46,7 +46,10 @@ class Pyramid:
 
 @inline
 def level_of(pixels, offsets, shapes, level):
-    """The same as ``Pyramid.level``, for kernels."""
+    """Return one level of a pyramid as an ``(h, w)`` image. Kernels call this function.
+
+    The arguments are the attributes of ``Pyramid``, and the index of the level.
+    """
     height, width = shapes[level]
     start = offsets[level]
     return pixels[start : start + height * width].reshape(height, width)
@@ -87,7 +90,7 @@ class Features:
 
     @classmethod
     def none(cls) -> Features:
-        """No features, for a frame without images."""
+        """Return an empty set of features, for a frame without images."""
         return cls(
             np.empty((0, 2), np.float32),
             np.empty(0, np.uint8),
@@ -114,11 +117,11 @@ class Extracted:
 
     Attributes:
         features: the N features that were extracted from the image of ``side``.
-        pyramid: the pyramid of this image. None if matches are not aligned to sub-pixel accuracy in
-            the image.
-        row_offset: ``(N,)`` float32, row of the stereo match in the right image minus row in the
-            left image, in pixels. NaN for a feature without this measurement. None if no feature
-            has this measurement.
+        pyramid: the pyramid of this image. None if matches in this image are not refined to
+            sub-pixel accuracy.
+        row_offset: ``(N,)`` float32 pixels. This is the row of the stereo match in the right image
+            minus the row of the feature in the left image. NaN for a feature without this
+            measurement. None if no feature has this measurement.
         side: the camera whose image was used. The right image is used only if the left image is
             black. In this case, no feature has a stereo match.
     """
@@ -130,7 +133,7 @@ class Extracted:
 
     @classmethod
     def nothing(cls) -> Extracted:
-        """The result for a frame without images, which has no features."""
+        """Return a result without features, for a frame without images."""
         return cls(Features.none())
 
 
@@ -140,8 +143,8 @@ class KeyframePatches(NamedTuple):
     Attributes:
         keyframe: id of the keyframe.
         pixels: ``(N, PATCH_PIXELS)`` uint8, the square patch around each keypoint, row by row.
-        shift: ``(N, 2)`` float32, from each keypoint to the aligned position of its landmark, in
-            pixels of the keypoint's octave.
+        shift: ``(N, 2)`` float32, vector from each keypoint to the position of its landmark after
+            sub-pixel alignment, in pixels of the keypoint's octave.
     """
 
     keyframe: int
@@ -154,12 +157,13 @@ class LandmarkPatches(NamedTuple):
 
     Attributes:
         ids: ``(N,)`` int32 landmark ids, sorted.
-        where: ``(N,)`` int64, the row of ``pixels`` and ``shift`` that belongs to each landmark.
-        view: ``(N,)`` int64, the keyframe that the patch was taken from, as an index into ``T_cw``.
-        size: ``(N,)`` float64, full-resolution pixels per pixel of the patch.
+        where: ``(N,)`` int64, index into ``pixels`` and ``shift`` of the patch of each landmark.
+        view: ``(N,)`` int64, index into ``T_cw`` of the keyframe that the patch was taken from.
+        size: ``(N,)`` float64, size of a pixel of the patch in full-resolution pixels.
         angle: ``(N,)`` float32, orientation of the feature in radians.
-        pixels: ``(P, PATCH_PIXELS)`` uint8, as in ``KeyframePatches``.
-        shift: ``(P, 2)`` float32, as in ``KeyframePatches``.
+        pixels: ``(P, PATCH_PIXELS)`` uint8, the square patch around each keypoint, row by row.
+        shift: ``(P, 2)`` float32, vector from each keypoint to the position of its landmark after
+            sub-pixel alignment, in pixels of the keypoint's octave.
         T_cw: ``(K, 4, 4)`` float64 poses of the keyframes.
     """
 
@@ -188,18 +192,23 @@ NO_PATCHES = LandmarkPatches(
 def shifted_columns(
     u_right: NDArray[np.float32], u: NDArray[np.float32], change: float | NDArray[np.float64]
 ) -> NDArray[np.float32]:
-    """Move ``(N,)`` columns of the right image ``change`` pixels to the left.
+    """Subtract ``change`` pixels from the columns of stereo matches in the right image.
 
-    A disparity is never reduced below ``MIN_DISPARITY``. A smaller disparity could move a point
-    behind the camera. NaN stays NaN.
+    A disparity is never reduced below ``MIN_DISPARITY``, because a smaller disparity could move a
+    point behind the camera.
+
+    Args:
+        u_right: ``(N,)`` columns of the matches in the right image, in pixels. NaN stays NaN.
+        u: ``(N,)`` columns of the features in the left image, in pixels.
+        change: pixels to subtract, as a number or as an ``(N,)`` array.
     """
     return np.minimum(u_right - np.asarray(change, np.float32), u - np.float32(MIN_DISPARITY))
 
 
 class FeatureGrid(NamedTuple):
-    """Indices of features, sorted by the cell of the image that each feature lies in.
+    """Indices of features, sorted by grid cell. The grid divides the image into equal cells.
 
-    The cells are numbered row by row. Cell c holds ``items[start[c]:start[c + 1]]``.
+    The cells are numbered row by row. The features in cell c are ``items[start[c]:start[c + 1]]``.
     """
 
     start: NDArray[np.int64]
@@ -208,7 +217,7 @@ class FeatureGrid(NamedTuple):
 
     @classmethod
     def of_positions(cls, xy: NDArray[np.float32], width: int, height: int) -> FeatureGrid:
-        """Sort ``(N, 2)`` pixel positions into the cells of an image."""
+        """Sort features at ``(N, 2)`` pixel positions into the grid cells of an image."""
         columns, rows = -(-width // CELL), -(-height // CELL)
         start, items = build_grid(xy, columns, rows)
         return cls(start, items, columns)
@@ -216,7 +225,10 @@ class FeatureGrid(NamedTuple):
 
 @kernel
 def build_grid(xy, columns, rows):
-    """Sort ``(N, 2)`` positions into cells by counting sort. The cells are numbered row by row."""
+    """Sort features at ``(N, 2)`` positions into grid cells by counting sort.
+
+    The cells are numbered row by row.
+    """
     n = len(xy)
     cell = np.empty(n, np.int64)
     start = np.zeros(columns * rows + 1, np.int64)
@@ -271,7 +283,7 @@ class TrackResult:
         T_odom_camera: ``(4, 4)`` pose from odometry, which drifts but never jumps. It is the
             identity at the first frame. None in results that were read from files of older
             versions.
-        uncertainty: covariance of the pose. None in results that were read from files of older
+        uncertainty: covariances of the pose. None in results that were read from files of older
             versions.
     """
 
@@ -291,10 +303,10 @@ class TrackResult:
 
     @property
     def T_map_odom(self) -> NDArray[np.float64]:
-        """``(4, 4)`` correction of the odometry (ROS REP 105).
+        """``(4, 4)`` transformation from the odometry frame to the map frame (ROS REP 105).
 
-        ``T_wc = T_map_odom @ T_odom_camera``. The correction jumps when a loop is closed, when the
-        map is adjusted, and when the camera is relocalised.
+        ``T_wc = T_map_odom @ T_odom_camera``. This transformation jumps when a loop is closed, when
+        the map is adjusted, and when the camera is relocalised.
         """
         if self.T_odom_camera is None:
             return np.eye(4)

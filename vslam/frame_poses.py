@@ -15,7 +15,7 @@ from vslam.trajectory import Trajectory, bridge_gaps
 
 
 class KeyframePoses(Protocol):
-    """The present poses of the keyframes that frame poses are relative to.
+    """The present poses of the keyframes, to which the poses of frames are relative.
 
     Attributes:
         n_keyframes: number of keyframes, including culled keyframes.
@@ -28,7 +28,7 @@ class KeyframePoses(Protocol):
     def reference(self) -> int: ...
 
     def keyframe_pose(self, keyframe: int) -> Matrix:
-        """``T_cw`` of a keyframe."""
+        """Return the pose ``T_cw`` of a keyframe."""
         ...
 
     def unit_scale(self, keyframe: int) -> float:
@@ -48,7 +48,7 @@ class FrameTable(NamedTuple):
         T_c_reference: ``(N, 4, 4)`` float64, maps points from the camera of the keyframe to the
             camera of the frame.
         tracked: ``(N,)`` bool, False where the pose is only predicted.
-        unit_scale: ``(N,)`` float64, the ``unit_scale`` that the keyframe had when
+        unit_scale: ``(N,)`` float64, ``KeyframePoses.unit_scale`` of the keyframe at the time when
             ``T_c_reference`` was measured.
     """
 
@@ -59,7 +59,7 @@ class FrameTable(NamedTuple):
     unit_scale: NDArray[np.float64]
 
     def until(self, frames: int) -> FrameTable:
-        """The first ``frames`` frames."""
+        """Return the poses of the first ``frames`` frames."""
         return FrameTable._make(values[:frames] for values in self)
 
 
@@ -80,7 +80,12 @@ class FramePoses:
     """
 
     def __init__(self, keyframes: KeyframePoses, before: FrameTable | None = None) -> None:
-        """Begin with the poses ``before`` of earlier frames of the same drive."""
+        """Begin with the poses of earlier frames of the same drive.
+
+        Args:
+            keyframes: the present poses of the keyframes.
+            before: poses of the earlier frames. None if there are no earlier frames.
+        """
         self._keyframes = keyframes
         self._n = 0 if before is None else len(before.timestamp)
         self._frames = _room_for(max(1024, self._n))
@@ -92,7 +97,7 @@ class FramePoses:
             mine[: len(values)] = values
 
     def table(self) -> FrameTable:
-        """A copy of the poses of all frames."""
+        """Return a copy of the poses of all frames."""
         return FrameTable._make(values.copy() for values in self._frames.until(self._n))
 
     def __len__(self) -> int:
@@ -100,12 +105,15 @@ class FramePoses:
 
     @property
     def unit(self) -> float:
-        """``unit_scale`` of the reference keyframe; 1 while there is no keyframe."""
+        """Factor by which loop closures have scaled lengths near the reference keyframe.
+
+        It is 1 while there is no keyframe.
+        """
         keyframes = self._keyframes
         return keyframes.unit_scale(keyframes.reference) if keyframes.n_keyframes else 1.0
 
     def timestamp(self, index: int) -> float:
-        """Timestamp of a frame in seconds. Index -1 is the last frame."""
+        """Return the timestamp of a frame in seconds. Index -1 is the last frame."""
         return float(self._frames.timestamp[self._number(index)])
 
     def append(self, timestamp: float, T_cw: Matrix, *, tracked: bool) -> None:
@@ -148,8 +156,10 @@ class FramePoses:
         return index % self._n
 
     def pose(self, index: int) -> Matrix:
-        """``T_cw`` of a frame, from the present pose of its keyframe. Index -1 is the last
-        frame."""
+        """Return ``T_cw`` of a frame, computed from the present pose of its keyframe.
+
+        Index -1 is the last frame.
+        """
         index = self._number(index)
         T_c_reference = self._frames.T_c_reference[index].copy()
         if self._keyframes.n_keyframes == 0:
@@ -161,7 +171,7 @@ class FramePoses:
         return T_c_reference @ self._keyframes.keyframe_pose(reference)
 
     def trajectory(self) -> Trajectory:
-        """The pose of every frame.
+        """Return the pose of every frame.
 
         A predicted pose is replaced by an interpolation between the tracked frames before and after
         it. Frames before the first tracked frame get the pose of the first tracked frame.

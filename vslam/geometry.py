@@ -1,4 +1,4 @@
-"""SE(3) algebra that both Python code and Numba kernels can call.
+"""Functions of SE(3) algebra, which both Python code and Numba kernels can call.
 
 In the camera frame, x points right, y down and z forward. The world frame is the frame of the left
 camera at the first frame. ``T_a_b`` is a 4x4 float64 matrix that maps points of frame b to frame a.
@@ -18,7 +18,7 @@ Matrix = NDArray[np.float64]
 
 @kernel
 def compose(T_a_b: Matrix, T_b_c: Matrix) -> Matrix:
-    """``T_a_c``, the product of two ``(4, 4)`` float64 motions."""
+    """Return ``T_a_c``, the product of two ``(4, 4)`` float64 rigid motions."""
     T = np.zeros((4, 4))
     for i in range(3):
         for j in range(4):
@@ -31,7 +31,7 @@ def compose(T_a_b: Matrix, T_b_c: Matrix) -> Matrix:
 
 @kernel
 def inverse(T_a_b: Matrix) -> Matrix:
-    """``T_b_a``, the inverse of a ``(4, 4)`` rigid motion."""
+    """Return ``T_b_a``, the inverse of a ``(4, 4)`` rigid motion."""
     T = np.zeros((4, 4))
     for i in range(3):
         for j in range(3):
@@ -63,8 +63,10 @@ def orthonormalised(T_a_b: Matrix) -> Matrix:
 
 @kernel
 def se3_exp(twist: Matrix) -> Matrix:
-    """``(4, 4)`` motion of a ``(6,)`` twist ``[v, w]``, by the exponential map of SE(3) (Solà et
-    al., "A micro Lie theory", D.2)."""
+    """Return the ``(4, 4)`` motion of a ``(6,)`` twist ``[v, w]``.
+
+    This is the exponential map of SE(3) (Solà et al., "A micro Lie theory", D.2).
+    """
     v, w = twist[:3], twist[3:]
     angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     if angle2 < 1e-6:
@@ -89,8 +91,10 @@ def se3_exp(twist: Matrix) -> Matrix:
 
 @kernel
 def se3_log(T: Matrix) -> Matrix:
-    """``(6,)`` twist ``[v, w]`` of a ``(4, 4)`` motion, by the logarithm of SE(3). The rotation
-    must be below 180 degrees."""
+    """Return the ``(6,)`` twist ``[v, w]`` of a ``(4, 4)`` motion.
+
+    This is the logarithm of SE(3). The angle of the rotation must be below 180 degrees.
+    """
     cos = 0.5 * (T[0, 0] + T[1, 1] + T[2, 2] - 1.0)
     w = 0.5 * np.array([T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]])
     sin = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
@@ -119,7 +123,7 @@ def solve_positive(H: Matrix, b: Matrix) -> Matrix:
     """Solve ``H x = b`` for a small symmetric positive definite ``H`` by Cholesky.
 
     Args:
-        H: ``(n, n)``; only the lower triangle is read.
+        H: ``(n, n)``. Only the lower triangle is read.
         b: ``(n,)``.
 
     Returns:
@@ -154,10 +158,13 @@ def solve_positive(H: Matrix, b: Matrix) -> Matrix:
 
 @kernel
 def symmetric_eigen(A: Matrix) -> tuple[Matrix, Matrix]:
-    """Eigenvalues ``(n,)``, unsorted, and eigenvectors (columns) of a small symmetric matrix.
+    """Compute the eigenvalues and eigenvectors of a small symmetric matrix.
 
-    The method is cyclic Jacobi rotations (Golub and Van Loan, "Matrix Computations", 8.5). They are
-    exact to round-off even if eigenvalues coincide.
+    The method is cyclic Jacobi rotations (Golub and Van Loan, "Matrix Computations", 8.5). The
+    results are exact to round-off even if eigenvalues coincide.
+
+    Returns:
+        ``(n,)`` eigenvalues, unsorted, and ``(n, n)`` eigenvectors as columns.
     """
     n = len(A)
     D, V = A.copy(), np.eye(n)
@@ -195,12 +202,12 @@ def symmetric_eigen(A: Matrix) -> tuple[Matrix, Matrix]:
 
 
 def transform(T_a_b: Matrix, p_b: Matrix) -> Matrix:
-    """Map ``(N, 3)`` points of frame b to frame a."""
+    """Transform ``(N, 3)`` points from frame b to frame a."""
     return p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
 def inverses(T_a_b: Matrix) -> Matrix:
-    """``T_b_a`` of ``(N, 4, 4)`` rigid motions."""
+    """Return ``(N, 4, 4)`` ``T_b_a``, the inverses of N rigid motions."""
     T_b_a = np.zeros((len(T_a_b), 4, 4))
     T_b_a[:, :3, :3] = T_a_b[:, :3, :3].transpose(0, 2, 1)
     T_b_a[:, :3, 3] = -np.einsum("nij,nj->ni", T_b_a[:, :3, :3], T_a_b[:, :3, 3])

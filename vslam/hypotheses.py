@@ -2,9 +2,9 @@
 
 After tracking is lost, a new sub-map begins. The pose of the sub-map in the map is only predicted.
 Under the first hypothesis, the camera moved about as predicted, and the prediction is a measurement
-with a known error. Under the second hypothesis, the camera was kidnapped: somebody carried it to an
-unknown place, and the prediction is worthless. A loop is tried under the first hypothesis. If the
-loop is inconsistent, it is tried under the second hypothesis.
+with a known error. Under the second hypothesis, the camera was carried to an unknown place (a
+"kidnapped robot"), and the prediction is worthless. Each loop is tested under the first hypothesis.
+If the loop is inconsistent, it is tested under the second hypothesis.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from vslam.map import Map
 
 
 class Hypothesis(Enum):
-    """What the camera did while tracking was lost."""
+    """A hypothesis about how the camera moved while tracking was lost."""
 
     PREDICTED = "it moved about as predicted"
     KIDNAPPED = "it was carried to an unknown place"
@@ -49,10 +49,10 @@ class Solution:
     """An optimised pose graph.
 
     Attributes:
-        graph: N keyframes, with the poses that the optimisation started from.
+        graph: the graph of N keyframes, with the initial poses of the optimisation.
         T_cw: ``(N, 4, 4)`` optimised poses.
-        S_wc: ``(N, 4, 4)`` the inverses of these poses as similarities. The scale is 1 in a metric
-            map.
+        S_wc: ``(N, 4, 4)`` inverses of the optimised poses, as similarities. Their scale is 1 in a
+            metric map.
         verdict: whether the edges of the optimised graph are consistent.
     """
 
@@ -65,7 +65,7 @@ class Solution:
     def has_gaps(self) -> bool:
         """Whether tracking was lost between keyframes of the graph.
 
-        Without such a gap, both hypotheses give the same solution.
+        Without such a gap, both values of ``Hypothesis`` give the same solution.
         """
         return bool(np.isin(self.graph.kind, (GAP, WEAK)).any())
 
@@ -83,7 +83,7 @@ def solve(
 
     Args:
         closed: loops that were closed before, in the present unit of the map.
-        edge: the new loop, with its pose.
+        edge: the new loop, whose relative pose is known.
         monocular: whether to optimise similarities instead of rigid motions. A monocular map needs
             similarities, because its scale drifts.
     """
@@ -103,16 +103,20 @@ def solve(
 
 
 def joined_submaps(map_: Map, closed: Sequence[LoopEdge]) -> NDArray[np.int64]:
-    """``(n_keyframes,)`` sub-map of each keyframe. Sub-maps that closed loops join count as one."""
+    """Return the index of the sub-map of each keyframe as an ``(n_keyframes,)`` array.
+
+    Sub-maps that are joined by a closed loop count as one sub-map.
+    """
     submap = map_.submaps()
     ends = np.array([(edge.query, edge.match) for edge in closed], np.int64).reshape(-1, 2)
     return parts_of(submap[ends], len(submap))[submap]
 
 
 def _aligned(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
-    """Initial ``(n_keyframes, 4, 4)`` ``T_cw`` for a kidnapped camera.
+    """Return initial poses ``T_cw`` for a camera that was carried to another place.
 
-    The sub-map at one end of the loop is moved rigidly to the place that the loop gives it.
+    The sub-map at one end of the loop is moved rigidly to the place that the loop gives it. The
+    result is ``(n_keyframes, 4, 4)``.
     """
     T_cw = map_.arrays.T_cw[: map_.n_keyframes].copy()
     moving, keyframes = _moving_submap(map_, closed, edge)
@@ -128,10 +132,10 @@ def _aligned(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
 
 
 def _aligned_similarities(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
-    """Initial ``S_wc`` of a monocular map for a kidnapped camera, as in ``_aligned``.
+    """Return initial ``S_wc`` for a monocular camera that was carried to another place.
 
-    The sub-map that moves also adopts the unit of the other sub-map, so its poses become
-    similarities.
+    The sub-map at one end of the loop is moved to the place that the loop gives it. It also adopts
+    the unit of the other sub-map, so its poses become similarities.
     """
     T_cw = map_.arrays.T_cw[: map_.n_keyframes]
     S_wc = inverses(T_cw)
@@ -150,9 +154,11 @@ def _aligned_similarities(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge)
 def _moving_submap(
     map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge
 ) -> tuple[int, NDArray[np.int64]]:
-    """The keyframe of a loop whose sub-map moves, and the ``(N,)`` keyframes of this sub-map.
+    """Determine the sub-map that is moved to close a loop.
 
-    N is 0 if both keyframes of the loop lie in the same sub-map.
+    Returns:
+        The keyframe of the loop that lies in this sub-map, and the ``(N,)`` keyframes of the
+        sub-map. N is 0 if both keyframes of the loop lie in the same sub-map.
     """
     submap = joined_submaps(map_, closed)
     if submap[edge.query] == submap[edge.match]:

@@ -1,12 +1,12 @@
 """Image velocities of points in a rectified stereo pair.
 
-If the right camera exposes later than the left camera, they are used to correct the columns in the
-right image.
+The velocities are used to correct columns in the right image if the right camera exposes later than
+the left camera.
 
 The velocities follow Longuet-Higgins and Prazdny (Proc. R. Soc. B, 1980), eq. 2.9 to 2.11, for the
-point (x, y, 1) z of the left camera. The paper uses the motion of the camera. Here, the twist [v,
-w] is the motion of the points relative to the camera, so all signs are reversed. In the right
-camera, x is smaller by the baseline divided by z.
+point (x z, y z, z) in the frame of the left camera. The paper uses the motion of the camera. Here,
+the twist [v, w] is the motion of the points relative to the camera, so all signs are reversed. In
+the right camera, x is smaller by the baseline divided by z.
 """
 
 from __future__ import annotations
@@ -24,8 +24,11 @@ _ROUNDS = 3  # rounds of a fixed-point iteration: speed and disparity depend on 
 def rays(
     xy: NDArray[np.float32], camera: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Normalised image coordinates ``(N,)`` x and ``(N,)`` y of ``(N, 2)`` pixels of the left
-    image."""
+    """Return the normalised image coordinates of ``(N, 2)`` pixels of the left image.
+
+    Returns:
+        ``(N,)`` x and ``(N,)`` y.
+    """
     u, v = xy.astype(np.float64).T
     return (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
 
@@ -33,9 +36,12 @@ def rays(
 def row_speeds(
     x: NDArray[np.float64], y: NDArray[np.float64], inverse_depth: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """``(N, 6)`` derivative of a point's row velocity with respect to the twist, in focal lengths.
+    """Return the derivative of the row velocity of image points with respect to the twist.
 
-    The row velocity is the same in both images.
+    The row velocity of a point is the same in both images.
+
+    Returns:
+        ``(N, 6)``, in focal lengths.
     """
     zero = np.zeros_like(x)
     return np.column_stack([zero, inverse_depth, -y * inverse_depth, -1.0 - y * y, x * y, x])
@@ -47,8 +53,11 @@ def column_speeds(
     inverse_depth: NDArray[np.float64],
     baseline: float,
 ) -> NDArray[np.float64]:
-    """``(N, 6)`` derivative of a point's column velocity in the right image with respect to the
-    twist, in focal lengths."""
+    """Return the derivative of the column velocity in the right image with respect to the twist.
+
+    Returns:
+        ``(N, 6)``, in focal lengths.
+    """
     zero, right = np.zeros_like(x), x - baseline * inverse_depth
     return np.column_stack(
         [inverse_depth, zero, -right * inverse_depth, -right * y, 1.0 + right * x, -y]
@@ -62,12 +71,15 @@ def columns_without_delay(
     delay: float,
     camera: Camera,
 ) -> NDArray[np.float32]:
-    """``(N,)`` columns in the right image as if it had been taken ``delay`` seconds earlier.
+    """Correct columns in the right image, as if it had been taken ``delay`` seconds earlier.
 
     Args:
         xy: ``(N, 2)`` pixels in the left image.
-        u_right: ``(N,)`` columns in the right image; NaN stays NaN.
+        u_right: ``(N,)`` columns of the stereo matches in the right image. NaN stays NaN.
         twist: ``(6,)`` twist of the points relative to the camera, per second.
+
+    Returns:
+        The ``(N,)`` corrected columns.
     """
     x, y = rays(xy, camera)
     measured = xy[:, 0].astype(np.float64) - u_right

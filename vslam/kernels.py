@@ -5,18 +5,19 @@ threads of the pipeline run kernels in parallel. ``error_model="numpy"`` and fus
 the only relaxations of floating-point arithmetic. Sums are not re-associated. Therefore, a result
 never depends on how a loop was vectorised.
 
-Numba prepares for compilation before it looks into its cache. It imports support for everything
+Before Numba looks into its cache, it prepares for compilation. It imports support for everything
 that it can compile, which takes 0.25 s of CPU time. For each kernel, it also imports the modules of
 all functions that the kernel calls. Finally, it parses the code that would be needed to inline the
-kernel into another kernel. A run that finds all kernels in the cache needs none of this.
-``_KernelCache`` defers these steps until a kernel is compiled, and so loads kernels in a fifth of
-the time. Its files have Numba's format. It relies on internals of Numba. With releases of Numba for
-which it was not tested, Numba's own cache is used instead.
+kernel into another kernel. A run that finds all kernels in the cache needs none of these steps.
+``_KernelCache`` skips these steps until a kernel must be compiled. Therefore, it loads kernels in a
+fifth of the time. The files of ``_KernelCache`` have Numba's format. The class relies on internals
+of Numba. With releases of Numba for which the class was not tested, Numba's own cache is used
+instead.
 
 A cache problem never ends a run. A power cut can truncate a cache file, and loading such a file
-would abort Python. A checksum detects truncated files, and their kernels are compiled again. If
-neither the folder of the source nor the home folder is writable, the process uses a temporary
-cache.
+would abort Python. Truncated files are detected by a checksum, and their kernels are compiled
+again. If neither the folder of the source nor the home folder is writable, the process uses a
+temporary cache.
 """
 
 from __future__ import annotations
@@ -57,7 +58,9 @@ _OPTIONS: dict[str, Any] = {
 
 
 class _KernelFormat(CompileResultCacheImpl):
-    """Which parts of a kernel are written to its cache file, and how they are loaded."""
+    """Defines which parts of a kernel are written to its cache file, and how these parts are
+    loaded.
+    """
 
     def reduce(self, compiled: Any) -> tuple[Any, ...]:
         *parts, environments = super().reduce(compiled)
@@ -84,7 +87,10 @@ def _no_bitcode() -> bytes:
 
 
 def _parsed(library: Any, bitcode: bytes) -> Any:
-    """The LLVM module of a loaded kernel. It is parsed only when another kernel inlines it."""
+    """Return the LLVM module of a loaded kernel.
+
+    The module is parsed only when another kernel inlines the kernel.
+    """
     if library._shared_module is None:
         module = llvm.parse_bitcode(bitcode)
         library.codegen._engine._load_defined_symbols(module)
@@ -127,7 +133,7 @@ def _checksum(code: bytes) -> bytes:
 
 
 class _KernelCache(FunctionCache):
-    """The cache of one kernel."""
+    """The Numba cache of one kernel."""
 
     _impl_class = _KernelFormat
 
@@ -194,12 +200,15 @@ def _enable_cache(dispatcher: Any, function: Callable[..., Any]) -> None:
 
 
 def kernel(function: Function) -> Function:
-    """Compile ``function`` on its first call, with the options of all kernels and the cache."""
+    """Decorate a function as a kernel, which Numba compiles on its first call.
+
+    All kernels have the same compiler options. The compiled code is kept in the cache.
+    """
     return cast(Function, _cached(function, _OPTIONS))
 
 
 def inner_kernel(function: Function) -> Function:
-    """Compile a function that only kernels call.
+    """Decorate a function that only kernels call. Numba compiles it.
 
     The function gets no entry point for Python, which makes compilation faster.
     """
@@ -207,13 +216,13 @@ def inner_kernel(function: Function) -> Function:
 
 
 def inline(function: Function) -> Function:
-    """Compile ``function`` into the kernels that call it."""
+    """Decorate a function that is inlined into the kernels that call it."""
     return cast(Function, numba.njit(inline="always", error_model="numpy")(function))
 
 
 @intrinsic
 def popcount(typing_context, value):
-    """Number of set bits of a uint64, as one instruction."""
+    """Count the set bits of a uint64, using a single instruction."""
 
     def generate(context, builder, signature, arguments):
         return builder.ctpop(arguments[0])
@@ -223,7 +232,7 @@ def popcount(typing_context, value):
 
 @intrinsic
 def trailing_zeros(typing_context, value):
-    """Index of the lowest set bit of a non-zero uint64, as one instruction."""
+    """Return the index of the lowest set bit of a non-zero uint64, using a single instruction."""
 
     def generate(context, builder, signature, arguments):
         never_zero = context.get_constant(types.boolean, True)
@@ -234,8 +243,9 @@ def trailing_zeros(typing_context, value):
 
 @intrinsic
 def borrowed(typing_context, array):
-    """The same array without reference counting. It is valid while a caller holds the original
-    array.
+    """Return the same array without reference counting.
+
+    The result is valid while a caller holds the original array.
 
     Numba counts a reference whenever an array is passed to another function. This atomic operation
     takes longer than the call of a small function.
@@ -252,7 +262,7 @@ def borrowed(typing_context, array):
 
 @inline
 def hamming(a, b):
-    """Hamming distance of two 256-bit descriptors given as ``(4,)`` uint64 rows."""
+    """Return the Hamming distance of two 256-bit descriptors, each given as ``(4,)`` uint64."""
     return int(
         popcount(a[0] ^ b[0])
         + popcount(a[1] ^ b[1])

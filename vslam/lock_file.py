@@ -1,4 +1,4 @@
-"""A lock file that admits one process at a time."""
+"""A lock file that ensures that only one process at a time writes to a folder."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ def locked(lock: Path, folder: Path, doing: str) -> Iterator[None]:
     Args:
         lock: the lock file, which is created and removed.
         folder: the folder that the lock protects, for the error message.
-        doing: what the process does to the folder, such as "is rendering it".
+        doing: what the process that holds the lock does, for the error message, such as "is
+            rendering it".
 
     Raises:
         InputError: another process holds the lock.

@@ -15,9 +15,10 @@ class LoopCandidate:
     """A pair of keyframes that, according to a detector, show the same place.
 
     Attributes:
-        query: keyframe whose place is searched for. It is -1 for a frame that is not in the map.
-        match: keyframe of the map that shows the same place. It has not been culled.
-        score: similarity in the detector's own measure. A greater score means more similar.
+        query: the keyframe for which the detector searched the map. It is -1 for a frame that is
+            not in the map.
+        match: the keyframe of the map that shows the same place. It has not been culled.
+        score: similarity in the detector's own measure. Higher scores mean greater similarity.
         similarity: similarity of the two images by the network's local descriptors. Learned
             verification is tried only for similar images. None if the similarity was not computed.
         promising: whether the candidate is verified even if the consistency test rejects it.
@@ -53,16 +54,18 @@ class LoopEdge:
     """The outcome of a loop candidate. Rejected candidates are kept for the report.
 
     Attributes:
-        query, match, score, proposed_by: as in the candidate.
+        query, match: the two keyframes that may show the same place, as in ``LoopCandidate``.
+        score: similarity in the detector's own measure.
+        proposed_by: name of the detector that proposed the candidate.
         accepted: whether the loop was closed.
         reason: "closed", or the reason in a few words why the candidate was rejected.
-        n_matches: number of landmarks of the place that were matched to features of the query.
+        n_matches: number of landmarks around the match that were matched to features of the query.
         n_inliers: number of matches that agree with ``T_query_match``.
         T_query_match: ``(4, 4)`` float64, maps points from the camera of the match to the camera of
             the query, in the unit of the map around the match. None if the candidate was rejected
             before this pose was computed.
         features: ``(N,)`` int32, indices of the inlier features within the query keyframe.
-        landmarks: ``(N,)`` int32, the landmark of the place that each feature observes.
+        landmarks: ``(N,)`` int32, the landmark that each of these features observes.
         scale: number of map units around the query per map unit around the match. It is 1 in metric
             maps. In monocular maps, it differs from 1 by the scale drift.
         matched_by: the kind of descriptors that were matched, "orb" or "learned".
@@ -89,8 +92,13 @@ class LoopEdge:
         reason: str = "",
         matched_by: Literal["orb", "learned"] = "orb",
     ) -> LoopEdge:
-        """A loop edge for a candidate that was rejected for a reason, or has not been verified
-        yet."""
+        """Create a loop edge without a relative pose from a candidate.
+
+        Args:
+            candidate: a candidate that was rejected or has not been verified yet.
+            reason: why the candidate was rejected. Empty if it has not been verified yet.
+            matched_by: the kind of descriptors that were matched.
+        """
         return cls(
             candidate.query,
             candidate.match,
@@ -103,7 +111,7 @@ class LoopEdge:
 
 
 def loop_entry(loop: LoopEdge) -> dict[str, Any]:
-    """A loop as a JSON object, without its features and landmarks."""
+    """Convert a loop to a JSON object, without its features and landmarks."""
     entry = {name: value for name, value in vars(loop).items() if name not in _LEFT_OUT}
     T = loop.T_query_match
     return entry | {"T_query_match": None if T is None else T.tolist()}
@@ -113,10 +121,10 @@ _LEFT_OUT = ("features", "landmarks")
 
 
 def loop_of(entry: dict[str, Any]) -> LoopEdge:
-    """The loop that ``loop_entry`` wrote.
+    """Read a loop from the JSON object that ``loop_entry`` returned.
 
     Raises:
-        KeyError, TypeError, ValueError: the entry does not describe a loop.
+        KeyError, TypeError, ValueError: the object does not describe a loop.
     """
     T = entry["T_query_match"]
     T_query_match = None if T is None else np.array(T, np.float64).reshape(4, 4)
@@ -143,18 +151,22 @@ class LoopCorrection:
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Concatenate N ranges: ``first[i] ... first[i] + count[i] - 1`` for each i."""
+    """Concatenate N ranges of integers.
+
+    Range i begins at ``first[i]`` and contains ``count[i]`` integers.
+    """
     before = np.cumsum(count) - count
     return np.arange(int(count.sum()), dtype=np.int64) + np.repeat(first - before, count)
 
 
 @dataclass(frozen=True)
 class PerKeyframe:
-    """Values of different length for each of K keyframes, such as words or an image file.
+    """An array of any length for each of K keyframes, such as visual words or an encoded image.
 
     Attributes:
         first: ``(K + 1,)`` int64 offsets.
-        values: ``(N, ...)``; keyframe k has ``values[first[k]:first[k + 1]]``.
+        values: ``(N, ...)`` values of all keyframes. Keyframe k has ``values[first[k]:first[k +
+            1]]``.
     """
 
     first: NDArray[np.int64]
@@ -164,19 +176,21 @@ class PerKeyframe:
         return len(self.first) - 1
 
     def of(self, keyframe: int) -> NDArray:
-        """The values of a keyframe."""
+        """Return the values of a keyframe."""
         return self.values[self.first[keyframe] : self.first[keyframe + 1]]
 
     def select(self, keyframes: NDArray[np.int64]) -> PerKeyframe:
-        """The values of ``(M,)`` keyframes, which are renumbered from 0. Unknown keyframes get no
-        values."""
+        """Return the values of ``(M,)`` keyframes, which are renumbered from 0.
+
+        Keyframes that have no entry get no values.
+        """
         nothing = self.values[:0]
         parts = [self.of(k) if k < len(self) else nothing for k in keyframes.tolist()]
         first = np.cumsum([0, *map(len, parts)]).astype(np.int64)
         return PerKeyframe(first, np.concatenate([nothing, *parts]))
 
     def followed_by(self, other: PerKeyframe) -> PerKeyframe:
-        """These values, followed by the values of the keyframes of another map."""
+        """Append the values of the keyframes of another map."""
         first = np.concatenate([self.first, self.first[-1] + other.first[1:]])
         return PerKeyframe(first, np.concatenate([self.values, other.values]))
 
@@ -187,7 +201,7 @@ class DetectorMemory:
 
     Attributes:
         name: name of the detector.
-        fingerprint: checksum of the vocabulary or weights that it used.
+        fingerprint: checksum of the vocabulary or weights that the detector used.
         tables: the data for each keyframe, under names that the detector chooses.
     """
 
@@ -198,10 +212,11 @@ class DetectorMemory:
 
 @dataclass(frozen=True)
 class ResembledPlace:
-    """A place that resembled recent keyframes. It consists of a candidate and its covisible
-    keyframes.
+    """A place that recent keyframes resembled.
 
-    ``length`` consecutive keyframes resembled it, the last of them ``age`` keyframes ago.
+    It consists of a loop candidate and its covisible keyframes. ``length`` is the number of
+    consecutive keyframes that resembled it. ``age`` is the number of keyframes since the last of
+    them.
     """
 
     keyframes: frozenset[int]

@@ -30,7 +30,7 @@ _PACKAGES = (
 
 
 def versions() -> dict[str, str]:
-    """Version of Python and of each listed package that is installed."""
+    """Return the version of Python and of each listed package that is installed."""
     found = {"python": platform.python_version()}
     for name in _PACKAGES:
         try:
@@ -41,7 +41,7 @@ def versions() -> dict[str, str]:
 
 
 def opencv_conflict(found: dict[str, str]) -> str | None:
-    """A warning if several wheels that all install ``cv2`` are installed; None otherwise."""
+    """Return a warning if several installed wheels provide the module ``cv2``, otherwise None."""
     wheels = [name for name in found if name.startswith("opencv-")]
     if len(wheels) < 2:
         return None
@@ -52,15 +52,17 @@ def opencv_conflict(found: dict[str, str]) -> str | None:
 
 
 def available_cores() -> int:
-    """Number of cores that this process may use. A container may have fewer cores than its
-    machine."""
+    """Return the number of cores that this process may use.
+
+    A container may have fewer cores than its machine.
+    """
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def process_age() -> float:
-    """Seconds since this process started."""
+    """Return the seconds since this process started."""
     with suppress(OSError, AttributeError):  # the system is not Linux
         # The process name is in brackets and may contain spaces. Field 22 is the start time in
         # ticks since boot.
@@ -72,7 +74,7 @@ def process_age() -> float:
 
 
 def peak_memory_mb() -> float:
-    """Peak resident memory of this process so far, in MB (2**20 bytes)."""
+    """Return the peak resident memory of this process so far, in MB (2**20 bytes)."""
     import resource
 
     # Linux's getrusage includes the memory of the parent process from before exec.
@@ -88,9 +90,9 @@ def keep_memory() -> None:
     """Let the C library keep large freed blocks for the next frame's images.
 
     By default, the C library returns these blocks to the system, which must clear each page again.
-    This caused 150,000 page faults in 216 frames of KITTI and took a thirtieth of the CPU time. In
-    addition, all threads share one arena, which saves 40 MB compared with one arena for each
-    thread.
+    This caused 150,000 page faults in 216 frames of KITTI and took 1/30 of the CPU time. In
+    addition, this function makes all threads share one arena, which saves 40 MB compared with one
+    arena for each thread.
 
     The function does nothing if the C library is not glibc.
     """
@@ -115,7 +117,7 @@ def give_back_memory() -> None:
 
 
 def cpu_name() -> str:
-    """Model name of the processor."""
+    """Return the model name of the processor."""
     # platform.processor() is empty or just "x86_64" on Linux.
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -129,13 +131,16 @@ def cpu_name() -> str:
 
 @dataclass
 class StageClock:
-    """Measures the wall time of each stage, in milliseconds."""
+    """Measures the wall time of each stage of the pipeline, in milliseconds."""
 
     ms: dict[str, float] = field(default_factory=dict)
     last: float = field(default_factory=time.perf_counter)
 
     def lap(self, stage: str) -> None:
-        """Add the time since the last call to a stage."""
+        """Add the time since the previous call of ``lap`` to the time of a stage.
+
+        The first call measures the time since the clock was created.
+        """
         now = time.perf_counter()
         self.ms[stage] = self.ms.get(stage, 0.0) + 1e3 * (now - self.last)
         self.last = now

@@ -1,19 +1,20 @@
 """The map: keyframes, landmarks and observations as a structure of arrays.
 
-A *row* is one keypoint of one keyframe. The rows of a keyframe are consecutive. The table of rows
-is also the table of observations. ``landmark[row]`` is the landmark that the keypoint observes, and
-``next_row`` links the rows of each landmark into a linked list. Covisibility is not stored. It is
-counted from the rows when it is needed. The use of arrays instead of objects follows DPVO's
+A *row* is one keypoint of one keyframe: it is one row of the arrays that hold keypoints. The rows
+of a keyframe are consecutive. A row also stores the observation that the keypoint makes.
+``landmark[row]`` is the landmark that the keypoint observes. The rows that observe the same
+landmark form a linked list, in which ``next_row`` is the next row. Covisibility is not stored. It
+is counted from the rows when it is needed. The use of arrays instead of objects follows DPVO's
 PatchGraph.
 
-Culled keyframes and landmarks stay in the tables and are marked as culled. A landmark that was
+Culled keyframes and landmarks stay in the arrays and are marked as culled. A landmark that was
 merged into another landmark counts as culled. Ids of keyframes are never reused. Ids of landmarks
 change only when culled landmarks are dropped. A full array grows by half its size.
 
-To add a column, declare it in ``Arrays`` or ``KeyframeTable`` with an empty array of its dtype and
-shape as the default. The column is then grown, copied, selected, appended, saved and loaded like
-the other columns. A new entry is zero unless ``Map.add_keyframe`` or ``Map.add_landmarks`` sets it.
-A number that describes the map as a whole belongs in ``Scalars``.
+Each array is called a column. To add a column, declare it in ``Arrays`` or ``KeyframeTable`` with
+an empty array of its dtype and shape as the default. The new column is then grown, copied, saved
+and loaded like the other columns. A new entry is zero unless ``Map.add_keyframe`` or
+``Map.add_landmarks`` sets it. A number that describes the map as a whole belongs in ``Scalars``.
 """
 
 from __future__ import annotations
@@ -37,35 +38,38 @@ _FEW_LANDMARKS = 8192  # they take about 1 MB; it is not worth dropping fewer la
 class Arrays(NamedTuple):
     """The part of the map that kernels read and write.
 
-    The arrays have a capacity of K keyframes, L landmarks and R rows. An id of -1 means none. The
-    types are abbreviated as in NumPy: f8 is float64, u8 is uint64, i4 is int32.
+    The arrays have a capacity of K keyframes, L landmarks and R keypoints of keyframes (rows). An
+    id of -1 means none. The types are abbreviated as in NumPy: f8 is float64, u8 is uint64, i4 is
+    int32.
 
     Attributes:
         T_cw: ``(K, 4, 4)`` f8, pose of each keyframe.
         first_row: ``(K + 1,)`` i8, first row of each keyframe.
         keyframe_alive: ``(K,)`` bool, False for a culled keyframe.
         xyz: ``(L, 3)`` f8, position of each landmark in the world frame.
-        normal: ``(L, 3)`` f8, mean viewing direction.
+        normal: ``(L, 3)`` f8, mean viewing direction of each landmark.
         distance_range: ``(L, 2)`` f8, least and greatest distance at which the pyramid detects the
             landmark.
-        landmark_descriptor: ``(L, 4)`` u8.
+        landmark_descriptor: ``(L, 4)`` u8, 256-bit descriptor of each landmark.
         first_keyframe: ``(L,)`` i4, the first keyframe that observed the landmark.
-        visible: ``(L,)`` i4, number of frames in which the landmark should have been found.
+        visible: ``(L,)`` i4, number of frames in which the landmark was expected to be visible.
         found: ``(L,)`` i4, number of frames in which the landmark was found.
         landmark_alive: ``(L,)`` bool, False for a culled or merged landmark.
         merged_into: ``(L,)`` i4, the landmark that this landmark was merged into.
-        head: ``(L,)`` i4, first row of the landmark's linked list.
+        head: ``(L,)`` i4, the first row that observes the landmark. It begins a linked list.
         n_observations: ``(L,)`` i4, number of observations. A stereo observation counts twice
             (ORB-SLAM2).
         xy: ``(R, 2)`` f4, position of each keypoint in pixels.
-        u_right: ``(R,)`` f4, column of the stereo match in pixels; NaN if there is no match.
+        u_right: ``(R,)`` f4, column of the stereo match in pixels. NaN if there is no match.
         octave: ``(R,)`` u1, pyramid level.
         angle: ``(R,)`` f4, orientation in radians.
-        descriptor: ``(R, 4)`` u8.
-        keyframe: ``(R,)`` i4, the keyframe that the row belongs to.
+        descriptor: ``(R, 4)`` u8, 256-bit descriptor of each keypoint.
+        keyframe: ``(R,)`` i4, the keyframe that the keypoint belongs to.
         landmark: ``(R,)`` i4, the landmark that the keypoint observes.
-        next_row: ``(R,)`` i4, the next row that observes the same landmark.
-        certainty: ``(R,)`` u1, variance of an unaligned keypoint divided by the variance of ``xy``.
+        next_row: ``(R,)`` i4, the next row of the linked list of rows that observe the same
+            landmark.
+        certainty: ``(R,)`` u1, variance of a keypoint without sub-pixel alignment, divided by the
+            variance of ``xy``.
     """
 
     T_cw: NDArray[np.float64] = np.zeros((0, 4, 4))
@@ -102,14 +106,14 @@ PREDICTED, UNPREDICTED = 1, 2  # values of KeyframeTable.restart
 
 
 class KeyframeTable(NamedTuple):
-    """The columns of keyframes that kernels do not need, with a capacity of K keyframes.
+    """Data of keyframes that kernels do not need. The arrays have a capacity of K keyframes.
 
     Attributes:
         timestamp: ``(K,)`` f8, seconds.
         frame: ``(K,)`` i8, index of the frame that became the keyframe.
         parent: ``(K,)`` i8, parent of the keyframe in the spanning tree, or -1.
-        session: ``(K,)`` i8, the drive, counted from 0, that the timestamp and the frame index
-            belong to.
+        session: ``(K,)`` i8, number of the drive in which the keyframe was added, from 0. The
+            timestamp and the frame index refer to this drive.
         unit_scale: ``(K,)`` f8, factor by which loop closures have scaled lengths near the keyframe
             since it was added. It is always 1 in metric maps.
         T_c_parent: ``(K, 4, 4)`` f8, pose of a culled keyframe relative to its parent. It is the
@@ -134,13 +138,13 @@ class Scalars:
     """Numbers that describe the whole map.
 
     Attributes:
-        session: the drive that new keyframes belong to.
-        disparity_offset: number of pixels by which every measured disparity is too small. The
-            column ``u_right`` of all rows is corrected by this offset
+        session: number of the drive in which new keyframes are added, from 0.
+        disparity_offset: number of pixels by which every measured disparity is too small. All
+            stereo columns ``Arrays.u_right`` are already corrected by this offset
             (``backend/disparity_offset.py``).
         offset_information: inverse variance of the measurements from which ``disparity_offset`` was
             estimated.
-        calibrated_until: the newest keyframe that these measurements used, or -1.
+        calibrated_until: the newest keyframe from which the disparity offset was estimated, or -1.
     """
 
     session: int = 0
@@ -159,10 +163,11 @@ class Map:
     """A map that can grow. Callers must ensure that only one thread writes it at a time.
 
     Attributes:
-        arrays: the columns that kernels use.
-        keyframes: the other columns of keyframes.
+        arrays: the arrays that kernels use.
+        keyframes: the other data of keyframes.
         scalars: numbers that describe the map as a whole.
-        n_keyframes, n_landmarks, n_rows: number of entries in use, including culled entries.
+        n_keyframes, n_landmarks: number of keyframes and landmarks, including culled ones.
+        n_rows: number of keypoints of all keyframes.
     """
 
     def __init__(self, scales: NDArray[np.float64]) -> None:
@@ -184,27 +189,30 @@ class Map:
 
     @property
     def timestamps(self) -> NDArray[np.float64]:
-        """View ``(n_keyframes,)`` of ``KeyframeTable.timestamp``."""
+        """``(n_keyframes,)`` timestamps of the keyframes in seconds, as a view."""
         return self.keyframes.timestamp[: self.n_keyframes]
 
     @property
     def frames(self) -> NDArray[np.int64]:
-        """View ``(n_keyframes,)`` of ``KeyframeTable.frame``."""
+        """``(n_keyframes,)`` indices of the frames that became keyframes, as a view."""
         return self.keyframes.frame[: self.n_keyframes]
 
     @property
     def parents(self) -> NDArray[np.int64]:
-        """View ``(n_keyframes,)`` of ``KeyframeTable.parent``."""
+        """``(n_keyframes,)`` parents of the keyframes in the spanning tree, or -1, as a view."""
         return self.keyframes.parent[: self.n_keyframes]
 
     @property
     def sessions(self) -> NDArray[np.int64]:
-        """View ``(n_keyframes,)`` of ``KeyframeTable.session``."""
+        """``(n_keyframes,)`` number of the drive in which each keyframe was added, as a view."""
         return self.keyframes.session[: self.n_keyframes]
 
     @property
     def unit_scale(self) -> NDArray[np.float64]:
-        """View ``(n_keyframes,)`` of ``KeyframeTable.unit_scale``."""
+        """``(n_keyframes,)`` view of ``KeyframeTable.unit_scale``.
+
+        It is the factor by which loop closures have scaled lengths near each keyframe.
+        """
         return self.keyframes.unit_scale[: self.n_keyframes]
 
     @property
@@ -214,7 +222,7 @@ class Map:
 
     @property
     def unpredicted_restarts(self) -> list[int]:
-        """The keyframes of ``restarts`` whose pose was not predicted."""
+        """Keyframes at which mapping restarted with a pose that was not predicted."""
         unpredicted = self.keyframes.restart[: self.n_keyframes] == UNPREDICTED
         return np.flatnonzero(unpredicted).tolist()
 
@@ -248,7 +256,8 @@ class Map:
             T_cw: ``(4, 4)`` pose of the keyframe.
             timestamp: seconds.
             frame: index of the frame that becomes the keyframe.
-            certainty: ``(N,)`` certainty of the features (``Arrays``).
+            certainty: ``(N,)`` variance of a keypoint without sub-pixel alignment, divided by the
+                variance of each feature. One number applies to all features.
         """
         k, n = self.n_keyframes, len(features)
         self._reserve_keyframes(1)
@@ -278,10 +287,15 @@ class Map:
     def add_landmarks(
         self, xyz: NDArray[np.float64], descriptors: NDArray[np.uint64], keyframe: int
     ) -> NDArray[np.int32]:
-        """Append ``(N, 3)`` landmarks that ``keyframe`` sees first, and return their ``(N,)`` ids.
+        """Append landmarks that a keyframe sees first, and return their ``(N,)`` ids.
 
-        The new landmarks have no observations. They must be linked to rows before the map is used
-        again.
+        The new landmarks have no observations. They must be linked to keypoints before the map is
+        used again.
+
+        Args:
+            xyz: ``(N, 3)`` positions in the world frame.
+            descriptors: ``(N, 4)`` descriptors.
+            keyframe: the keyframe that sees the landmarks.
         """
         n, start = len(xyz), self.n_landmarks
         self._reserve(LANDMARK_FIELDS, start, n)
@@ -297,7 +311,10 @@ class Map:
         return np.arange(start, start + n, dtype=np.int32)
 
     def columns(self) -> dict[str, NDArray]:
-        """Views of all columns of ``arrays`` and ``keyframes`` by name, without unused capacity."""
+        """Return views of all arrays of the map by name, without unused capacity.
+
+        These are the arrays of ``Arrays`` and ``KeyframeTable``.
+        """
         of_arrays = {
             name: getattr(self.arrays, name)[:size]
             for fields, size in (
@@ -312,9 +329,12 @@ class Map:
         return of_arrays | {name: column[: self.n_keyframes] for name, column in of_keyframes}
 
     def with_columns(self, columns: dict[str, NDArray]) -> Map:
-        """This map with other arrays as its columns, under the names of ``columns()``.
+        """Return this map with other arrays.
 
         The arrays are not copied.
+
+        Args:
+            columns: the arrays under the names that ``columns()`` returns.
         """
         other = copy.copy(self)
         other.arrays = Arrays(**{name: columns[name] for name in Arrays._fields})
@@ -325,7 +345,7 @@ class Map:
         return other
 
     def copy(self) -> Map:
-        """A copy without unused capacity."""
+        """Copy the map, without unused capacity."""
         return self.with_columns({name: column.copy() for name, column in self.columns().items()})
 
     def begin_drive(self) -> None:
@@ -334,18 +354,18 @@ class Map:
 
     @property
     def many_culled_landmarks(self) -> bool:
-        """Whether culled landmarks take so much memory that it is worth dropping them."""
+        """Whether culled landmarks take so much memory that they should be dropped."""
         living = int(np.count_nonzero(self.arrays.landmark_alive[: self.n_landmarks]))
         return self.n_landmarks - living > max(_FEW_LANDMARKS, living // 2)
 
     def drop_culled_landmarks(self) -> NDArray[np.int32]:
         """Remove culled landmarks, and renumber the other landmarks in their order.
 
-        Most landmarks die within a few keyframes of their creation.
+        Most landmarks are culled within a few keyframes of their creation.
 
         Returns:
-            ``(n_landmarks,)`` the new id of each old landmark, or -1 if it was culled. A landmark
-            that was merged into another landmark has the new id of that landmark (``resolve``).
+            ``(n_landmarks,)`` new id of each old landmark, or -1 if it was culled. A landmark that
+            was merged into another landmark has the new id of that landmark (``resolve``).
         """
         a, living = self.arrays, self.living_landmarks()
         resolved = resolve(a, np.arange(self.n_landmarks, dtype=np.int32))
@@ -360,19 +380,19 @@ class Map:
         return new_id[resolved]
 
     def rows(self, keyframe: int) -> slice:
-        """Rows of one keyframe."""
+        """Return the range of rows that hold the keypoints of a keyframe."""
         first = self.arrays.first_row
         return slice(int(first[keyframe]), int(first[keyframe + 1]))
 
     def landmarks_of(self, keyframe: int) -> NDArray[np.int32]:
-        """Ids of the landmarks that a keyframe observes, by row."""
+        """Return the ids of the landmarks that a keyframe observes, ordered by keypoint."""
         observed = self.arrays.landmark[self.rows(keyframe)]
         return observed[observed != NONE]
 
     def covisible(
         self, keyframe: int, minimum: int = 1
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Keyframes that share at least ``minimum`` landmarks with a keyframe.
+        """Find keyframes that share at least ``minimum`` landmarks with a keyframe.
 
         Returns:
             ``(N,)`` ids of these keyframes, sorted by decreasing number of shared landmarks, and
@@ -384,7 +404,7 @@ class Map:
         return order, counts[order]
 
     def keyframe_pose(self, keyframe: int) -> NDArray[np.float64]:
-        """A copy of the ``T_cw`` of a keyframe.
+        """Return a copy of the pose ``T_cw`` of a keyframe.
 
         The pose of a culled keyframe is computed from the pose of its parent.
         """
@@ -396,8 +416,8 @@ class Map:
     def cull_keyframe(self, keyframe: int) -> None:
         """Cull a keyframe and remove its observations. Its children become children of its parent.
 
-        This also applies to children that were culled before, so that every parent is a living
-        keyframe.
+        Children that have been culled earlier also get the new parent. Therefore, no parent is a
+        culled keyframe.
         """
         a, table, parents = self.arrays, self.keyframes, self.parents
         parent = parents[keyframe]
@@ -411,15 +431,21 @@ class Map:
         a.keyframe_alive[keyframe] = False
 
     def begin_submap(self, keyframe: int, parent: int, *, predicted: bool) -> None:
-        """Record that mapping restarted at a keyframe.
+        """Record that mapping restarted at a keyframe, which begins a sub-map.
 
-        ``predicted`` says whether the pose of the keyframe relative to its parent was predicted.
+        Args:
+            keyframe: the first keyframe of the sub-map.
+            parent: its parent in the spanning tree.
+            predicted: whether the pose of the keyframe relative to its parent was predicted.
         """
         self.keyframes.parent[keyframe] = parent
         self.keyframes.restart[keyframe] = PREDICTED if predicted else UNPREDICTED
 
     def submaps(self) -> NDArray[np.int64]:
-        """``(n_keyframes,)`` the sub-map of each keyframe, as the id of its first keyframe."""
+        """Return the sub-map of each keyframe as an ``(n_keyframes,)`` array.
+
+        A sub-map is identified by the id of its first keyframe.
+        """
         root = np.zeros(self.n_keyframes, np.int64)
         restart, parents = self.keyframes.restart.tolist(), self.parents.tolist()
         for keyframe in range(1, self.n_keyframes):
@@ -427,19 +453,21 @@ class Map:
         return root
 
     def living_keyframes(self) -> NDArray[np.int64]:
-        """Ids of the keyframes that have not been culled."""
+        """Return the ids of the keyframes that have not been culled."""
         return np.flatnonzero(self.arrays.keyframe_alive[: self.n_keyframes])
 
     def living_landmarks(self) -> NDArray[np.int64]:
-        """Ids of the landmarks that have neither been culled nor merged into another landmark."""
+        """Return the ids of the landmarks that were neither culled nor merged into another one."""
         return np.flatnonzero(self.arrays.landmark_alive[: self.n_landmarks])
 
 
 def loop_of_living(map_: Map, loop: LoopEdge) -> LoopEdge:
-    """The same loop between living keyframes. A culled keyframe is replaced by its parent.
+    """Move a loop to keyframes that have not been culled.
+
+    A culled keyframe of the loop is replaced by its parent, and the relative pose is adapted.
 
     Raises:
-        ValueError: the loop has no pose.
+        ValueError: the relative pose of the loop is unknown.
     """
     if loop.T_query_match is None:
         raise ValueError(f"The loop from keyframe {loop.query} to {loop.match} has no pose.")

@@ -1,4 +1,4 @@
-"""Functions that connect a frame with the map through observations, landmarks and places.
+"""Functions that relate a frame to the map through observations, landmarks and places.
 
 The caller must ensure that no other thread writes the map while one of these functions runs.
 """
@@ -37,9 +37,9 @@ def add_frame(
     another keyframe begins a sub-map.
 
     Args:
-        certainty: ``(N,)`` certainty of the frame's features (``Arrays.certainty``).
+        certainty: ``(N,)`` certainty of the features of the frame (``Arrays.certainty``).
         reference: the parent of the keyframe if it begins a sub-map.
-        predicted: whether its pose was predicted, if it begins a sub-map.
+        predicted: whether the pose of the keyframe was predicted, if the keyframe begins a sub-map.
 
     Returns:
         The id of the keyframe.
@@ -59,7 +59,7 @@ def add_frame(
 
 
 def add_two_views(map_: Map, start: TwoViewStart, reference: int) -> tuple[int, int]:
-    """Add the first two keyframes of a monocular map or sub-map, and the points that both observe.
+    """Add the first two keyframes of a monocular map or sub-map, and their common landmarks.
 
     Args:
         reference: the parent of the first keyframe if it begins a sub-map.
@@ -87,10 +87,10 @@ def add_two_views(map_: Map, start: TwoViewStart, reference: int) -> tuple[int, 
 
 
 class LandmarkCounts:
-    """Collects the landmarks that frames should have seen and the landmarks that they found.
+    """Counts how often landmarks should have been seen, and how often they were found.
 
     The counters of the map can be updated only while no other thread writes the map. Until then,
-    this object keeps the landmarks.
+    this object stores the landmarks to count.
     """
 
     def __init__(self) -> None:
@@ -98,7 +98,7 @@ class LandmarkCounts:
         self._found: list[NDArray[np.int32]] = []
 
     def add(self, visible: NDArray[np.int32], found: NDArray[np.int32]) -> None:
-        """Add a frame.
+        """Add the landmarks of a frame.
 
         Args:
             visible: ``(N,)`` ids of the landmarks that the frame should have seen.
@@ -108,7 +108,7 @@ class LandmarkCounts:
         self._found.append(found)
 
     def write(self, map_: Map) -> None:
-        """Update the counters of the map, and forget the collected frames."""
+        """Update the counters of the map, and forget the stored landmarks."""
         a = map_.arrays
         for seen, counter in ((self._visible, a.visible), (self._found, a.found)):
             for ids in seen:
@@ -117,7 +117,10 @@ class LandmarkCounts:
 
 
 def drop_culled_landmarks(map_: Map, frames: Sequence[Frame]) -> None:
-    """Drop the culled landmarks of the map, and renumber the landmarks that the frames track."""
+    """Remove the culled landmarks from the map.
+
+    The other landmarks are renumbered in the map and in ``frames``.
+    """
     new_id = map_.drop_culled_landmarks()
     for frame in {id(frame): frame for frame in frames}.values():
         tracked = frame.landmark >= 0
@@ -126,17 +129,17 @@ def drop_culled_landmarks(map_: Map, frames: Sequence[Frame]) -> None:
 
 
 def has_more_points(map_: Map, keyframe: int, frame: Frame) -> bool:
-    """Whether the far stereo points of a keyframe have not been mapped yet.
+    """Return whether the far stereo points of a keyframe have not been mapped yet.
 
-    This is the case if the keyframe is the first keyframe of a map or sub-map, if no other keyframe
-    follows it, and if ``frame`` is the frame that became this keyframe.
+    This is the case if three conditions are met. The keyframe is the first keyframe of a map or
+    sub-map. No other keyframe follows it. ``frame`` is the frame that became this keyframe.
     """
     begins = keyframe == 0 or keyframe in map_.restarts
     return begins and keyframe == map_.n_keyframes - 1 and map_.frames[keyframe] == frame.index
 
 
 def observe_keyframe(frame: Frame, map_: Map, keyframe: int) -> None:
-    """Assign all landmarks that a keyframe observes to the frame that became this keyframe."""
+    """Let a frame that became a keyframe track all landmarks that this keyframe observes."""
     frame.landmark = map_.arrays.landmark[map_.rows(keyframe)]
     update_landmarks(frame, map_)
 
@@ -160,7 +163,11 @@ def update_landmarks(frame: Frame, map_: Map) -> None:
 
 
 def count_shared_landmarks(map_: Map, frame: Frame) -> NDArray[np.int64]:
-    """``(n_keyframes,)`` number of landmarks that each keyframe shares with a frame."""
+    """Count the landmarks that each keyframe shares with a frame.
+
+    Returns:
+        ``(n_keyframes,)`` numbers of shared landmarks.
+    """
     a, n = map_.arrays, map_.n_keyframes
     _, rows = gather_observations(a, frame.landmark[frame.landmark >= 0], np.arange(n))
     return np.bincount(a.keyframe[rows], minlength=n)
@@ -181,7 +188,7 @@ class OldPlace(NamedTuple):
 
 
 def find_old_place(map_: Map, frame: Frame, known_after_s: float) -> OldPlace | None:
-    """The old place that shares the most landmarks with a frame.
+    """Find the old place that shares the most landmarks with a frame.
 
     Only keyframes that are at least ``known_after_s`` seconds old are considered. The result is
     None if none of these keyframes shares a landmark with the frame.
@@ -196,17 +203,23 @@ def find_old_place(map_: Map, frame: Frame, known_after_s: float) -> OldPlace | 
 
 
 def keyframe_trajectory(map_: Map) -> Trajectory:
-    """The poses of the living keyframes of the last drive."""
+    """Return the poses of the keyframes of the last drive, without culled keyframes."""
     living = map_.living_keyframes()
     living = living[map_.sessions[living] == map_.scalars.session]
     return Trajectory(map_.timestamps[living], inverses(map_.arrays.T_cw[living]))
 
 
 def in_first_part(map_: Map, closed: Sequence[LoopEdge], frames: FrameTable) -> NDArray[np.bool_]:
-    """``(N,)`` bool, whether each frame was tracked in the part of the map with the first keyframe.
+    """Determine which frames were tracked in the part of the map that contains the first keyframe.
+
+    This part includes all sub-maps that are joined to it by closed loops.
 
     Args:
-        closed: closed loops. Sub-maps that these loops join form one part.
+        closed: the closed loops.
+        frames: the poses of N frames, relative to keyframes.
+
+    Returns:
+        ``(N,)`` bool, True for frames that were tracked in this part.
     """
     if not map_.n_keyframes:
         return frames.tracked

@@ -1,8 +1,8 @@
 """Kernels that read and write the observations of a map.
 
-``a`` is the ``Arrays`` of the map (vslam/map.py). The rows of a landmark form a linked list, which
-begins at ``head`` and continues through ``next_row``. Adding, removing and merging observations
-changes only this list.
+``a`` is the ``Arrays`` of the map (vslam/map.py). A row is one keypoint of one keyframe. The rows
+that observe a landmark form a linked list, which begins at ``head`` and continues through
+``next_row``. Adding, removing and merging observations changes only such lists.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from vslam.kernels import hamming, inner_kernel, kernel
 
 @kernel
 def count_shared(a, keyframe, n_keyframes):
-    """``(n_keyframes,)`` int64, the number of landmarks that each keyframe shares with
-    ``keyframe``.
+    """Count the landmarks that each keyframe shares with ``keyframe``.
 
-    The number is 0 for ``keyframe`` itself.
+    Returns:
+        ``(n_keyframes,)`` int64. The number is 0 for ``keyframe`` itself.
     """
     counts = np.zeros(n_keyframes, np.int64)
     for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
@@ -34,7 +34,11 @@ def count_shared(a, keyframe, n_keyframes):
 
 @kernel
 def link(a, row, landmark):
-    """Record that a row observes a landmark. The row must not observe a landmark yet."""
+    """Record that a keypoint observes a landmark.
+
+    ``row`` is the index of the keypoint in the arrays of the map. The keypoint must not observe a
+    landmark yet.
+    """
     a.landmark[row] = landmark
     a.next_row[row] = a.head[landmark]
     a.head[landmark] = row
@@ -43,14 +47,22 @@ def link(a, row, landmark):
 
 @kernel
 def link_many(a, rows, landmarks):
-    """Record that each of ``(N,)`` rows observes one of ``(N,)`` landmarks, as ``link`` does."""
+    """Record which landmark each of N keypoints observes.
+
+    ``rows`` are the ``(N,)`` indices of the keypoints in the arrays of the map. None of these
+    keypoints may observe a landmark yet.
+    """
     for i in range(len(rows)):
         link(a, rows[i], landmarks[i])
 
 
 @kernel
 def unlink(a, row):
-    """Remove the observation of a row. A landmark that has no observations left is culled."""
+    """Remove the observation of a landmark by a keypoint.
+
+    ``row`` is the index of the keypoint in the arrays of the map. If the landmark has no
+    observations left, it is culled.
+    """
     landmark = a.landmark[row]
     if a.head[landmark] == row:
         a.head[landmark] = a.next_row[row]
@@ -90,7 +102,7 @@ def detach_keyframe(a, keyframe):
 
 @kernel
 def observed_by(a, landmark, keyframe):
-    """The row of ``keyframe`` that observes the landmark, or -1."""
+    """Return the row of the keypoint of ``keyframe`` that observes a landmark, or -1."""
     row = a.head[landmark]
     while row >= 0:
         if a.keyframe[row] == keyframe:
@@ -105,8 +117,8 @@ def merge_landmarks(a, loser, winner):
 
     A keyframe that observes both landmarks keeps only its observation of ``winner``.
 
-    Rows and keyframes are cast to int64, which is the type that other callers pass. Therefore,
-    ``link`` and ``observed_by`` are compiled only once.
+    Indices are cast to int64, because the other callers of ``link`` and ``observed_by`` pass this
+    type. Therefore, both kernels are compiled only once.
     """
     row = np.int64(a.head[loser])
     while row >= 0:
@@ -126,8 +138,12 @@ def merge_landmarks(a, loser, winner):
 
 @kernel
 def resolve(a, landmarks):
-    """``(N,)`` int32, the living landmark that each landmark was merged into, or -1 if it was
-    culled."""
+    """Return the current ids of landmarks that may have been merged or culled.
+
+    Returns:
+        ``(N,)`` int32. For a merged landmark, this is the id of the landmark that it was merged
+        into. For a culled landmark, it is -1. Other landmarks keep their ids.
+    """
     out = np.empty(len(landmarks), np.int32)
     for i in range(len(landmarks)):
         landmark = landmarks[i]
@@ -139,7 +155,10 @@ def resolve(a, landmarks):
 
 @inner_kernel
 def lower_median(values, n):
-    """Lower median of the first ``n`` values. These values are sorted in place (insertion sort)."""
+    """Return the lower median of the first ``n`` values.
+
+    These values are sorted in place by insertion sort.
+    """
     for i in range(1, n):
         value, j = values[i], i
         while j > 0 and values[j - 1] > value:
@@ -154,8 +173,8 @@ def refresh_landmarks(a, landmarks, scales):
     """Recompute the descriptor, normal and distance range of landmarks from their observations.
 
     The descriptor is taken from the observation whose median distance to the descriptors of the
-    other observations is least (ORB-SLAM, III-C). Only the newest 32 observations are considered,
-    to limit the computing time. The distance range is computed from the octave in the first
+    other observations is least (ORB-SLAM, III-C). To limit the computing time, only the newest 32
+    observations are considered. The distance range is computed from the octave in the first
     keyframe that observes the landmark.
     """
     limit = 32
@@ -211,14 +230,18 @@ def refresh_landmarks(a, landmarks, scales):
 
 @kernel
 def predict_octave(distance, farthest, log_scale, levels):
-    """Pyramid level at which a landmark should be detected at a distance (ORB-SLAM, V-D)."""
+    """Predict the pyramid level at which a landmark is detected from a distance (ORB-SLAM, V-D)."""
     level = int(np.ceil(np.log(farthest / distance) / log_scale))
     return min(max(level, 0), levels - 1)
 
 
 @kernel
 def collect_landmarks(a, keyframes, n_landmarks):
-    """``(N,)`` int32, sorted ids of the landmarks that at least one of the keyframes observes."""
+    """Return the sorted ids of the landmarks that at least one of the keyframes observes.
+
+    Returns:
+        ``(N,)`` int32.
+    """
     seen = np.zeros(n_landmarks, np.bool_)
     for keyframe in keyframes:
         for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
@@ -229,7 +252,7 @@ def collect_landmarks(a, keyframes, n_landmarks):
 
 @kernel
 def count_seen_by(a, keyframe, needed):
-    """Number of landmarks of a keyframe that at least ``needed`` keyframes observe.
+    """Count the landmarks of a keyframe that at least ``needed`` keyframes observe.
 
     The keyframe itself counts as one of the ``needed`` keyframes.
     """
@@ -249,10 +272,13 @@ def count_seen_by(a, keyframe, needed):
 
 @kernel
 def covisible_pairs(a, keyframes, n_keyframes, minimum):
-    """All pairs of ``(N,)`` keyframes that share at least ``minimum`` landmarks.
+    """Find all pairs of keyframes that share at least ``minimum`` landmarks.
 
-    Returns ``(M, 2)`` int64 pairs in ascending order, each with the lower id first, and the
-    ``(M,)`` numbers of landmarks that the pairs share.
+    Only the ``(N,)`` given keyframes are considered.
+
+    Returns:
+        ``(M, 2)`` int64 pairs in ascending order, and the ``(M,)`` numbers of landmarks that the
+        pairs share. The lower id comes first in each pair.
     """
     counts = np.zeros(n_keyframes, np.int64)
     listed = np.zeros(n_keyframes, np.bool_)
@@ -291,9 +317,13 @@ def covisible_pairs(a, keyframes, n_keyframes, minimum):
 
 @kernel
 def gather_observations(a, landmarks, index):
-    """Rows of the keyframes with ``index[keyframe] >= 0`` that observe each of ``(P,)`` landmarks.
+    """Find the keypoints that observe each of P landmarks.
 
-    Returns ``(P + 1,)`` int64 offsets, and the rows of one landmark after the other.
+    Only keyframes with ``index[keyframe] >= 0`` are considered.
+
+    Returns:
+        ``(P + 1,)`` int64 offsets, and the rows of the keypoints, sorted by landmark. The rows of
+        landmark i begin at offset i and end before offset i + 1.
     """
     first = np.zeros(len(landmarks) + 1, np.int64)
     for i in range(len(landmarks)):

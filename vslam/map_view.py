@@ -15,11 +15,12 @@ from vslam.map_kernels import collect_landmarks, count_seen_by
 
 
 class LocalMap(NamedTuple):
-    """N landmarks around a keyframe.
+    """The N landmarks around a keyframe.
 
     Attributes:
-        ids: ``(N,)`` int32.
-        xyz, normal, distance_range, descriptor: ``(N, ...)`` columns of ``Arrays``.
+        ids: ``(N,)`` int32 ids of the landmarks.
+        xyz, normal, distance_range, descriptor: ``(N, ...)`` data of the landmarks, as in
+            ``Arrays``.
     """
 
     ids: NDArray[np.int32]
@@ -32,8 +33,8 @@ class LocalMap(NamedTuple):
 def local_map(map_: Map, keyframe: int, limit: int) -> LocalMap:
     """Copy the landmarks of a keyframe and of its covisible keyframes (ORB-SLAM, V-D).
 
-    ORB-SLAM also takes the neighbours of the covisible keyframes. These made no difference in our
-    measurements (docs/explanation/design.md).
+    ORB-SLAM also takes the neighbours of the covisible keyframes. These neighbours made no
+    difference in our measurements (docs/explanation/design.md).
 
     Args:
         limit: greatest number of keyframes. The keyframes that share the most landmarks are chosen.
@@ -58,23 +59,25 @@ NO_LANDMARKS = LocalMap(
 
 @dataclass(frozen=True)
 class MapView:
-    """The map as tracking sees it: a copy of its state when the last result of local mapping was
-    merged.
+    """A copy of the parts of the map that tracking reads.
 
-    The defaults describe an empty map.
+    The copy is made when a result of local mapping is merged.
+
+    The default values describe an empty map.
 
     Attributes:
         reference: the keyframe that frames are tracked against. The poses of frames are relative to
             it. It is usually the newest keyframe.
-        T_reference: ``(4, 4)`` the ``T_cw`` of the reference keyframe.
-        unit_scale: the ``Map.unit_scale`` of the reference keyframe.
+        T_reference: ``(4, 4)`` pose ``T_cw`` of the reference keyframe.
+        unit_scale: factor by which loop closures have scaled lengths near the reference keyframe
+            since it was added. It is 1 in metric maps.
         n_keyframes: number of keyframes so far, including culled keyframes.
         local_landmarks: landmarks of the reference keyframe and of its covisible keyframes.
         reference_landmarks: landmarks of the reference keyframe alone.
         n_reference: number of ``reference_landmarks`` that at least three keyframes observe. If the
             map has fewer than three keyframes, all of its keyframes must observe the landmark.
         patches: image patches of the local landmarks that the newest keyframes observe.
-        with_patches: the landmarks that have patches, in the order of ``patches``.
+        with_patches: the landmarks that have patches, in the same order as in ``patches``.
     """
 
     reference: int = 0

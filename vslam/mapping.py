@@ -1,11 +1,13 @@
 """Local mapping in parallel with tracking, with the same result on every machine.
 
-``Mapper`` owns the map. Each keyframe is mapped by a job in another thread. The *merge*, which
-makes the job's result visible to tracking, happens at a fixed frame index, however long the job
-takes. Between two merges tracking reads a ``MapView``, a copy that the last merge made. Every
-method that needs the merged map performs the merge itself. A merge also updates the frames that
-were passed to ``Mapper.hold``. After the merge, the other thread searches the map for loops at the
-keyframe. A loop that it finds is closed before the next change of the map.
+``Mapper`` owns the map. A job in another thread maps each keyframe. A *merge* then makes the result
+of this job visible to tracking. The merge happens at a fixed frame index, regardless of how long
+the job takes. Between two merges, tracking reads a ``MapView``, which is a copy of parts of the map
+made at the last merge. A method that needs the merged map first performs the merge. A merge also
+updates the frames that were given to ``Mapper.hold``.
+
+After the merge, the other thread searches for a loop at the keyframe. If a loop is found, it is
+closed before the map is changed again.
 """
 
 from __future__ import annotations
@@ -47,14 +49,15 @@ from vslam.states import MapperState
 from vslam.trajectory import Trajectory
 from vslam.workers import Job, Workers
 
-_CLOSE_AFTER_FRAMES = 10  # a found loop is closed this long after its keyframe, or at the next one
+# A loop that was found is closed this many frames after its keyframe, or at the next keyframe.
+_CLOSE_AFTER_FRAMES = 10
 
 
 class Mapper:
-    """The owner of the map: all changes are made by its methods or by the jobs that it starts.
+    """The owner of the map. Only its methods, and the jobs that it starts, change the map.
 
     Attributes:
-        view: the copy of the map that tracking reads.
+        view: the copy of parts of the map that tracking reads.
         frames: the pose of every frame, relative to a keyframe.
         last_frame, last_timestamp: index and time (seconds) of the frame that became the last
             keyframe.
@@ -69,13 +72,14 @@ class Mapper:
         map_: Map | None = None,
         frames: FrameTable | None = None,
     ) -> None:
-        """
+        """Create the mapper of a new or continued map.
+
         Args:
             context: camera, thresholds and pyramid scales.
-            closing: processes new keyframes for loop closing.
-            rig: corrects frames, and receives the map's disparity offset.
-            workers: run mapping jobs, one at a time, and searches for loops.
-            map_: a map to continue in; None begins an empty one.
+            closing: searches for loops at new keyframes and closes them.
+            rig: corrects frames, and receives the disparity offset of the map.
+            workers: threads that run mapping jobs, one at a time, and searches for loops.
+            map_: map to continue in. None begins an empty map.
             frames: poses of earlier frames of the same drive.
         """
         self.view = MapView()
@@ -100,7 +104,7 @@ class Mapper:
 
     @property
     def n_keyframes(self) -> int:
-        """Number of keyframes so far, culled ones included."""
+        """Number of keyframes so far, including culled keyframes."""
         return self.view.n_keyframes
 
     @property
@@ -115,12 +119,12 @@ class Mapper:
 
     @property
     def has_found_loop(self) -> bool:
-        """Whether a loop was found that is not closed yet; waits for the search."""
+        """Wait for the search for loops. Return whether it found a loop that is not closed yet."""
         return self._search is not None and self._search.result().loop is not None
 
     @property
     def is_mapping(self) -> bool:
-        """Whether a keyframe is being mapped, so that another thread may write the map."""
+        """Whether a keyframe is being mapped, so that another thread may be writing the map."""
         return self._shared.is_busy
 
     @property
@@ -133,23 +137,29 @@ class Mapper:
         return self._shared.map
 
     def keyframe_pose(self, keyframe: int) -> Matrix:
-        """``T_cw`` of a keyframe at the last merge; while a job runs, it is available only for the
-        reference keyframe."""
+        """Return the pose ``T_cw`` that a keyframe had at the last merge.
+
+        While a mapping job runs, only the pose of the reference keyframe is available.
+        """
         if not self._is_merged and keyframe == self.view.reference:
             return self.view.T_reference
         return self.map.keyframe_pose(keyframe)
 
     def unit_scale(self, keyframe: int) -> float:
-        """``Map.unit_scale`` of a keyframe, under the same condition as ``keyframe_pose``."""
+        """Return the factor by which loop closures have scaled lengths near a keyframe.
+
+        The factor covers all loop closures since the keyframe was added. While a mapping job runs,
+        only the factor of the reference keyframe is available.
+        """
         if not self._is_merged and keyframe == self.view.reference:
             return self.view.unit_scale
         return float(self.map.unit_scale[keyframe])
 
     def trajectory(self) -> Trajectory:
-        """The pose of every frame (``FramePoses.trajectory``).
+        """Return the pose of every frame (``FramePoses.trajectory``).
 
         Raises:
-            RuntimeError: as ``map``.
+            RuntimeError: a keyframe is being mapped, or its mapping failed.
         """
         self.map  # noqa: B018 (raises if it cannot be read)
         return self.frames.trajectory()
@@ -157,32 +167,38 @@ class Mapper:
     # The schedule
 
     def hold(self, *frames: Frame | None) -> None:
-        """Choose the frames whose poses, landmarks and twists are updated when a merge changes the
-        map; they replace the frames held before."""
+        """Choose the frames that are updated when a merge changes the map.
+
+        The poses, landmarks and twists of these frames are updated. Frames from an earlier call of
+        this method are no longer updated.
+        """
         self._held = tuple(frame for frame in frames if frame is not None)
 
     def admit(self, frame: Frame, last: Frame | None, twist: Matrix | None) -> None:
-        """Prepare the next frame for tracking: merge if a merge is due at its index, and correct
-        its columns in the right image by the measured offset and delay of the rig.
+        """Prepare the next frame for tracking.
 
-        Until the next frame is admitted, merges update this frame and the last tracked one.
+        If a merge is due at the index of the frame, the merge is performed. The columns of the
+        frame in the right image are corrected by the measured offset and delay of the rig.
+
+        Until this method is called again, merges update ``frame`` and ``last``.
 
         Args:
-            frame: the next frame, not tracked yet.
-            last: the last tracked frame; None before the first.
-            twist: ``(6,)`` twist of the points relative to the camera, per second; None if unknown.
+            frame: the next frame, which has not been tracked yet.
+            last: the last tracked frame. None if no frame has been tracked.
+            twist: ``(6,)`` twist of the points relative to the camera, per second. None if it is
+                unknown.
         """
         self.hold(last, frame)
         self.merge_if_due(frame.index)
         self.rig.prepare(frame, twist)
 
     def append_pose(self, frame: Frame, *, tracked: bool, near: int = -1) -> PlacedFrame:
-        """Record the pose of the next frame, and return it as a frame with a recorded pose.
+        """Record the pose of the next frame, and return the frame with its recorded pose.
 
         Args:
             tracked: False for a pose that is only predicted.
-            near: the keyframe near which the frame was relocalised; it becomes the reference. -1 if
-                the frame was not relocalised.
+            near: the keyframe near which the frame was relocalised. It becomes the reference
+                keyframe. -1 if the frame was not relocalised.
         """
         if near >= 0:
             self.refer_to(near)
@@ -190,13 +206,20 @@ class Mapper:
         return PlacedFrame(frame)
 
     def count(self, visible: NDArray[np.int32], found: NDArray[np.int32]) -> None:
-        """Count the landmarks that a frame should have seen, ``(N,)`` ids, and those that it found,
-        ``(M,)`` ids."""
+        """Count the landmarks that a frame should have seen, and the landmarks that it found.
+
+        Args:
+            visible: ``(N,)`` ids of the landmarks that the frame should have seen.
+            found: ``(M,)`` ids of the landmarks that the frame found.
+        """
         self._counts.add(visible, found)
 
     def merge_if_due(self, frame: int) -> None:
-        """Merge if the last keyframe is at least ``merge_after_frames`` older than this frame. If
-        it is at least ``_CLOSE_AFTER_FRAMES`` older, close a loop that was found at it."""
+        """Merge if this frame is at least ``merge_after_frames`` newer than the last keyframe.
+
+        If the frame is at least ``_CLOSE_AFTER_FRAMES`` newer than the last keyframe, a loop that
+        was found at this keyframe is closed.
+        """
         age = frame - self.last_frame
         if age >= self._config.keyframes.merge_after_frames:
             self._merge_mapping()
@@ -204,8 +227,10 @@ class Mapper:
             self._settle()
 
     def merge(self) -> Map:
-        """Wait for the running mapping job and make its result visible to tracking; then wait for
-        the search for loops and return the map.
+        """Make the result of the mapping job visible to tracking, and return the map.
+
+        This method waits for the running mapping job. After the merge, it waits for the search for
+        loops.
 
         Raises:
             RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
@@ -214,12 +239,13 @@ class Mapper:
         return self.complete()
 
     def complete(self) -> Map:
-        """Wait for the running mapping job and for the search for loops, and return the map. The
-        result of mapping does not become visible to tracking, so calling this does not change any
-        result.
+        """Wait for the running mapping job and for the search for loops, and return the map.
+
+        The result of the mapping job does not become visible to tracking. Therefore, calling this
+        method does not change any result.
 
         Raises:
-            RuntimeError: as ``merge``.
+            RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
         """
         map_ = self._wait_for_mapping()
         self._start_search()
@@ -258,7 +284,7 @@ class Mapper:
         return map_
 
     def finish(self) -> None:
-        """Complete all running work, including global bundle adjustment."""
+        """Complete all running work, including a global bundle adjustment."""
         with self._changing() as map_:
             self._closing.conclude(map_)
             self._closing.finish(map_)
@@ -270,11 +296,12 @@ class Mapper:
     def insert(self, frame: PlacedFrame, *, predicted: bool = True) -> None:
         """Make the newest frame a keyframe, map its stereo points and start its mapping job.
 
-        The frame then tracks all landmarks that its features observe, including new ones. A frame
-        that shares no landmark with the map begins a sub-map.
+        The frame then tracks all landmarks that its features observe, including new landmarks. A
+        frame that shares no landmark with the map begins a sub-map.
 
         Args:
-            predicted: whether the pose was predicted; matters only if the frame begins a sub-map.
+            predicted: whether the pose was predicted. It matters only if the frame begins a
+                sub-map.
         """
         with self._changing() as map_:
             self._make_room(map_, frame)
@@ -296,12 +323,16 @@ class Mapper:
                 self._closing.process(map_, keyframe, frame.features, frame.image)
 
     def map_far_points(self, frame: Frame) -> bool:
-        """Map all stereo points of a frame that is the first keyframe of a map or sub-map, if no
-        keyframe follows it yet. Returns whether points were added.
+        """Map all stereo points of the first keyframe of a map or sub-map.
 
-        ORB-SLAM2 (III-B) maps all of them from the start. The calibration error of the pair biases
-        far points and thus the first poses, so they are added only when they are needed: at high
-        speed, close points leave the view within a frame.
+        Nothing is done if ``frame`` is not such a keyframe, or if another keyframe follows it.
+
+        ORB-SLAM2 (III-B) maps all points from the start. However, the calibration error of a stereo
+        pair biases far points and therefore the first poses. Far points are added only when they
+        are needed. This is the case at high speed, when close points leave the view within a frame.
+
+        Returns:
+            Whether points were added.
         """
         with self._changing() as map_:
             keyframe = self.reference
@@ -314,14 +345,16 @@ class Mapper:
         return len(new) > 0
 
     def begin(self, start: TwoViewStart, twist: Callable[[], Matrix | None]) -> None:
-        """Begin a monocular map or sub-map with two keyframes; the second is the newest frame.
+        """Begin a monocular map or sub-map with two keyframes.
 
-        The newest frame gets the twist between the two views, and tracks all landmarks that it
-        observes.
+        The second keyframe is the newest frame.
+
+        This frame gets the twist between the two views. It tracks all landmarks that it observes.
 
         Args:
-            twist: called after the merge, returns the ``(6,)`` twist of the camera before it was
-                lost, per second, or None if unknown. It determines the unit of a sub-map.
+            twist: function that is called after the merge. It returns the ``(6,)`` twist of the
+                camera before it was lost, per second, or None if this twist is unknown. The twist
+                determines the unit of a sub-map.
         """
         with self._changing() as map_:
             start = start.at_speed(twist(), self._config.initialization.max_rescaling)
@@ -337,12 +370,15 @@ class Mapper:
             start.second.twist = start.twist
 
     def find_old_place(self, frame: Frame) -> OldPlace | None:
-        """The old place that the frame has returned to; None if there is none
-        (``map_frames.find_old_place``)."""
+        """Find a place that was mapped some time ago and to which the frame has returned.
+
+        Returns:
+            The place, or None if there is none (``map_frames.find_old_place``).
+        """
         return find_old_place(self._settle(), frame, self._config.keyframes.known_after_s)
 
     def use_existing_keyframe(self, place: OldPlace, frame: PlacedFrame) -> None:
-        """Make an existing keyframe the reference instead of inserting the newest frame."""
+        """Make an existing keyframe the reference keyframe instead of inserting a new keyframe."""
         self._settle()
         self.last_timestamp = frame.timestamp
         self.refer_to(place.keyframe)
@@ -354,7 +390,7 @@ class Mapper:
     # The reference keyframe, which is not part of the map
 
     def refer_to(self, keyframe: int) -> None:
-        """Make a keyframe the reference, so that tracking sees the landmarks around it."""
+        """Make a keyframe the reference keyframe, so that tracking sees the landmarks around it."""
         map_, config = self.map, self._config.tracking
         local = local_map(map_, keyframe, config.local_keyframes)
         patches = self._patches.of(map_, local.ids)
@@ -364,8 +400,10 @@ class Mapper:
         self.rig.offset_sigma = offset_sigma(known.offset_information, self._config.stereo)
 
     def refer_to_nearest(self, frame: Frame) -> None:
-        """Make the keyframe that shares the most landmarks with a frame the reference (ORB-SLAM,
-        V-D)."""
+        """Make the keyframe that shares the most landmarks with a frame the reference keyframe.
+
+        This follows ORB-SLAM, section V-D.
+        """
         shared = count_shared_landmarks(self.merge(), frame)
         best = int(np.argmax(shared))
         if shared[best] and best != self.reference:
@@ -374,20 +412,23 @@ class Mapper:
     # State for checkpoints
 
     def state(self) -> MapperState:
-        """The state of the mapper without the map."""
+        """Return the state of the mapper for a checkpoint, without the map."""
         return MapperState(
             self.reference, self.last_frame, self.last_timestamp, self._patches.all()
         )
 
     def restore(self, state: MapperState) -> None:
-        """Restore what ``state`` returned; the map must be the one that it was taken with."""
+        """Continue from a state that ``state`` returned.
+
+        The map must be the map that was saved together with this state.
+        """
         self.last_frame, self.last_timestamp = state.last_frame, state.last_timestamp
         for patches in state.patches:
             self._patches.add(patches)
         self.refer_to(state.reference)
 
     def continue_drive(self) -> None:
-        """Treat the reference keyframe as the last inserted one if it belongs to this drive."""
+        """Treat the reference keyframe as the last inserted keyframe, if it is of this drive."""
         map_, newest = self.map, self.reference
         if map_.n_keyframes and map_.sessions[newest] == map_.scalars.session:
             self.last_frame = int(map_.frames[newest])
@@ -395,19 +436,25 @@ class Mapper:
 
     @contextmanager
     def _changing(self) -> Iterator[Map]:
-        """Yield the merged map for changes. After an exception, the map cannot be used any more."""
+        """Yield the merged map for changes.
+
+        If the block raises an exception, the map becomes unusable.
+        """
         self._settle()
         with self._shared.change() as map_:
             yield map_
 
     def _make_room(self, map_: Map, frame: Frame) -> None:
-        """Drop culled landmarks if there are many. The ids of the other landmarks then change, so
-        nothing is dropped during a global bundle adjustment, which refers to landmarks by id."""
+        """Drop culled landmarks from the map if there are many.
+
+        The ids of the other landmarks then change. A global bundle adjustment refers to landmarks
+        by id, so nothing is dropped while it runs.
+        """
         if not self._closing.is_adjusting and map_.many_culled_landmarks:
             drop_culled_landmarks(map_, (*self._held, frame))
 
     def _set_newest(self, keyframe: int, frame: Frame) -> None:
-        """Record that a frame became the newest keyframe, and make it the reference."""
+        """Record that a frame became the newest keyframe, and make it the reference keyframe."""
         map_ = self.map
         self._patches.remember(frame, keyframe, map_.scales)
         self.last_frame, self.last_timestamp = frame.index, frame.timestamp
@@ -421,8 +468,11 @@ class Mapper:
             self._move(frame, before)
 
     def _move(self, frame: Frame, before: MapView) -> None:
-        """Update a frame after the map moved. A frame whose pose is recorded moves with its
-        keyframe, any other frame with the reference keyframe."""
+        """Update the pose of a frame after a merge has changed the map.
+
+        A frame whose pose is recorded moves with its keyframe. Any other frame moves with the
+        reference keyframe.
+        """
         growth = self.view.unit_scale / before.unit_scale
         self.rig.correct_offset(frame)
         update_landmarks(frame, self.map)
@@ -440,6 +490,9 @@ class Mapper:
         self._closing.merge_adjustment_if_due(map_, keyframe)
 
     def _start(self, job: Callable[[Map], None]) -> None:
-        """Start a mapping job; until the merge, tracking continues with the present view."""
+        """Start a mapping job.
+
+        Until the merge, tracking continues with the present view of the map.
+        """
         self._shared.start(job)
         self._is_merged = False

@@ -1,9 +1,10 @@
-"""Merging of the maps of several drives by loop closures between them.
+"""Merging of the maps of several drives. Loop closures between the maps join them.
 
-Each further map is appended to the first map as a sub-map at an unknown place. For each keyframe of
-the appended map, the detector of the first map proposes loop candidates. These candidates are
-verified and closed as in a run. The first loop moves the sub-map to its place. Later loops correct
-drift and fuse landmarks. At the end, a global bundle adjustment optimises the merged map.
+Each of the other maps is appended to the first map as a sub-map at an unknown place. For each
+keyframe of the appended map, the detector of the first map proposes loop candidates. These
+candidates are verified and closed as in a run. The first loop moves the sub-map to its place. Later
+loops correct drift and fuse landmarks. At the end, a global bundle adjustment optimises the merged
+map.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ Memory = tuple[LoopDetector, KeyframeImages | None]
 
 @dataclass(frozen=True)
 class MergedMaps:
-    """The result of merging several maps. A map is named by its position in the input.
+    """The result of merging several maps. A map is identified by its index in the input.
 
     Attributes:
         stored: the first map, together with all maps that were joined to it.
         joined: the maps that were joined to the first map, in the order in which they were joined.
         left_out: the maps that no verified loop connects to the first map.
-        loops: for each joined map, the loops that connect it to the maps before it.
+        loops: for each joined map, the loops that connect it to the maps that were joined earlier.
     """
 
     stored: StoredMap
@@ -52,12 +53,12 @@ def merge_maps(
 ) -> MergedMaps:
     """Join maps to the first map.
 
-    A map need not overlap the first map if it overlaps another map. It is then joined after that
-    map.
+    A map need not overlap the first map if it overlaps another map. Such a map is joined after the
+    map that it overlaps.
 
     Args:
         maps: two or more maps with the same camera, pyramid and detector.
-        create: function that creates an empty detector of the same kind as the detector of the
+        create: function that creates an empty loop detector of the same kind as the detector of the
             maps, and the store of its images.
         on_keyframe: function that is called after the search for loops at each keyframe.
 
@@ -95,11 +96,12 @@ def join(
     The joined map has the world frame of the first map.
 
     Args:
-        memory: an empty detector of the same kind as the detector of the maps, and the store of its
-            images.
+        memory: an empty loop detector of the same kind as the detector of the maps, and the store
+            of its images.
 
     Returns:
-        The joined map and the loops that were closed between the two, or None if there are none.
+        The joined map, and the loops that were closed between the two maps. None if no loop was
+        closed.
 
     Raises:
         ValueError: the detector differs from that of the maps.
@@ -132,9 +134,9 @@ def _candidates(
     images: KeyframeImages | None,
     config: Config,
 ) -> list[LoopCandidate]:
-    """Keyframes of the first map that resemble a keyframe of the second map.
+    """Find keyframes of the first map that resemble a keyframe of the second map.
 
-    Keyframes that already share enough landmarks with it are left out.
+    Keyframes that already share enough landmarks with this keyframe are left out.
     """
     image = images.image(keyframe) if images is not None and keyframe in images else None
     found = detector.locate(image, features_of(map_, keyframe), map_)
@@ -143,7 +145,7 @@ def _candidates(
 
 
 def features_of(map_: Map, keyframe: int) -> Features:
-    """The features of a keyframe."""
+    """Return the features of a keyframe."""
     a, rows = map_.arrays, map_.rows(keyframe)
     descriptors = a.descriptor[rows].view(np.uint8)
     return Features(a.xy[rows], a.octave[rows], a.angle[rows], descriptors, a.u_right[rows])

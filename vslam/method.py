@@ -1,4 +1,4 @@
-"""Version of the method. It changes whenever trajectories change."""
+"""The version of the SLAM method. It changes whenever the resulting trajectories change."""
 
 # Increment it whenever the results of the method change. tests/test_method_version.py fails if the
 # results have changed, but the version has not.

@@ -14,7 +14,9 @@ from vslam.states import PolicyState
 
 
 class Mode:
-    """How frames change the map. This base class only localises in the map and never changes it.
+    """Decides how frames change the map.
+
+    This base class only localises in the map and never changes it.
 
     Attributes:
         changes_map: whether a drive in this mode changes the map.
@@ -27,29 +29,39 @@ class Mode:
 
     @property
     def due(self) -> int:
-        """Index of the frame that is planned to become a keyframe. It is -1 if no keyframe is
-        planned."""
+        """Index of the frame that is planned to become a keyframe.
+
+        It is -1 if no keyframe is planned.
+        """
         return -1
 
     def begin(self, frame: PlacedFrame) -> bool:
         """Try to begin a map or sub-map with a frame that has a pose but was not tracked.
 
         Returns:
-            Whether a map or sub-map was begun.
+            True if a map or sub-map was begun.
         """
         return False
 
     def begin_after_loss(self, frame: PlacedFrame) -> bool:
-        """Do the same as ``begin``, but only if the camera has been lost for enough frames."""
+        """Try to begin a map or sub-map if the camera has been lost for enough frames.
+
+        Args:
+            frame: a frame that has a pose but was not tracked.
+
+        Returns:
+            True if a map or sub-map was begun.
+        """
         return False
 
     def map_far_points(self) -> bool:
-        """Map the far stereo points of the first keyframe if the frame directly after it was lost.
+        """Map the far stereo points of the last frame if it began a map or sub-map.
 
-        This concerns the first keyframe of a map or sub-map.
+        This method is called if the frame directly after the first keyframe of a map was lost.
+        Other keyframes have no far points that are not mapped yet.
 
         Returns:
-            Whether points were added, so that tracking can be tried again.
+            True if points were added, so that tracking can be tried again.
         """
         return False
 
@@ -57,13 +69,13 @@ class Mode:
         """Count the landmarks that a tracked frame saw, and insert it as a keyframe if needed.
 
         Returns:
-            Whether the frame was inserted as a keyframe.
+            True if the frame was inserted as a keyframe.
         """
         self._mapper.refer_to_nearest(frame)
         return False
 
     def state(self) -> PolicyState | None:
-        """The state for a checkpoint. None if no checkpoint is possible now."""
+        """Return the state of the mode for a checkpoint. None if no checkpoint is possible now."""
         return None
 
     def restore(self, state: PolicyState) -> None:
@@ -71,7 +83,7 @@ class Mode:
 
 
 class MapBuilding(Mode):
-    """Builds a map: inserts frames that see something new as keyframes.
+    """Builds a map. Frames that see something new are inserted as keyframes.
 
     Attributes:
         starter: finds the frames with which a map or a sub-map begins.
@@ -153,10 +165,12 @@ class MapBuilding(Mode):
         return self.policy.is_due(frame.index, evidence)
 
     def _match_features(self, frame: PlacedFrame) -> bool:
-        """Give a frame that was tracked by patches the features that a keyframe needs.
+        """Match the features of a frame that was tracked by patches.
+
+        A keyframe needs such matches.
 
         Returns:
-            False if the features do not match the map. The frame is then left as it is.
+            False if the features do not match the map. The frame is then left unchanged.
         """
         if frame.source is None:
             return True
@@ -168,10 +182,9 @@ class MapBuilding(Mode):
         return False
 
     def state(self) -> PolicyState | None:
-        """The state of the keyframe policy.
+        """Return the state of the keyframe policy for a checkpoint.
 
-        It is None while the starter keeps a first frame and waits for a second frame to begin a
-        map.
+        The result is None while the start of a monocular map waits for its second frame.
         """
         return None if self.starter.is_waiting else self.policy.state()
 

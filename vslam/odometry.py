@@ -6,20 +6,20 @@ controller of a robot needs poses that do not jump. Therefore, ROS also has the 
 
 The error of a pose has two parts. The *local* error is the error of the camera pose relative to the
 landmarks around the camera. It is independent in every frame. The *drift* is the error of these
-landmarks relative to the start of the drive. It grows with every keyframe, because new landmarks
-inherit the error of the keyframe that maps them. Consecutive keyframes share landmarks, so their
-errors are correlated. Therefore, the drift grows like a random walk with correlated steps (a
-first-order autoregressive process).
+landmarks relative to the start of the drive. The drift grows with every keyframe, because new
+landmarks inherit the error of the keyframe from which they are mapped. Consecutive keyframes share
+landmarks, so their errors are correlated. Therefore, the drift grows like a random walk with
+correlated steps (a first-order autoregressive process).
 
-A stereo camera adds a third part. Its disparity offset is estimated during the drive
+A stereo camera adds a third part. The disparity offset of the camera is estimated during the drive
 (``backend/disparity_offset.py``). The error of this estimate makes all motions too long or too
-short by the same share. In contrast to the drift, this error does not average out.
+short by the same factor. In contrast to the drift, this error does not average out.
 
-A covariance is the covariance of ``xi = [v, w]`` in metres and radians, in the frame of the camera.
-If ``T_cw`` is the estimated pose, the true pose is ``exp(xi) T_cw``. The covariance describes
-odometry alone. It does not take into account that loop closures reduce the drift, or that the scale
-of a monocular map is unknown. It also ignores all errors of the calibration except the disparity
-offset.
+A covariance describes the error ``xi = [v, w]`` of a pose, in metres and radians, in the frame of
+the camera. If ``T_cw`` is the estimated pose, the true pose is ``exp(xi) T_cw``. The covariance
+describes odometry alone. It does not take into account that loop closures reduce the drift, or that
+the scale of a monocular map is unknown. It also ignores all errors of the calibration except the
+disparity offset.
 """
 
 from __future__ import annotations
@@ -49,12 +49,13 @@ class PoseUncertainty:
     """The uncertainty of a pose.
 
     Attributes:
-        local: ``(6, 6)`` covariance relative to the landmarks, from ``pose_covariance``.
-        drift: ``(6, 6)`` sum of the local covariances of all keyframes since the start of the
+        local: ``(6, 6)`` covariance of the pose relative to the landmarks around the camera, from
+            ``pose_covariance``.
+        drift: ``(6, 6)`` sum of the covariances ``local`` of all keyframes since the start of the
             drive.
         n_keyframes: number of these keyframes.
-        offset: ``(6,)`` error of the pose relative to the start of the drive that an error of the
-            disparity offset by one standard deviation causes.
+        offset: ``(6,)`` error of the pose relative to the start of the drive, if the disparity
+            offset is wrong by one standard deviation.
     """
 
     local: Matrix
@@ -63,16 +64,16 @@ class PoseUncertainty:
     offset: Matrix = field(default_factory=lambda: np.zeros(6))
 
     def numbers(self) -> NDArray[np.float64]:
-        """All numbers of the uncertainty as a ``(49,)`` array. ``of_numbers`` is the inverse.
+        """Return all values of this object as a ``(49,)`` array, so that they can be saved.
 
-        The array holds the upper triangles of ``local`` and ``drift``, row by row, then ``offset``
-        and ``n_keyframes``.
+        The array holds the upper triangles of ``local`` and ``drift``, row by row. ``offset`` and
+        ``n_keyframes`` follow. ``of_numbers`` is the inverse function.
         """
         return np.array([*self.local[_UPPER], *self.drift[_UPPER], *self.offset, self.n_keyframes])
 
     @classmethod
     def of_numbers(cls, numbers: NDArray[np.float64]) -> PoseUncertainty:
-        """Restore an uncertainty from the ``(49,)`` array of ``numbers``."""
+        """Create an uncertainty from the ``(49,)`` array that ``numbers`` returned."""
         both = np.zeros((2, 6, 6))
         for matrix, values in zip(both, numbers[:-7].reshape(2, -1), strict=True):
             matrix[_UPPER] = values
@@ -95,9 +96,10 @@ class PoseUncertainty:
 def relative_covariance(
     first: PoseUncertainty, last: PoseUncertainty, T_last_first: Matrix
 ) -> Matrix:
-    """``(6, 6)`` covariance of the motion from an earlier to a later frame of a drive.
+    """Return the covariance of the motion from an earlier frame to a later frame of a drive.
 
-    It refers to the frame of the later camera. The true motion is ``exp(xi) T_last_first``.
+    The result is the ``(6, 6)`` covariance of the error ``xi``, in the frame of the later camera.
+    The true motion is ``exp(xi) T_last_first``.
 
     Args:
         T_last_first: ``(4, 4)`` estimated motion, which maps points from the camera of the first
@@ -113,7 +115,10 @@ def relative_covariance(
 
 
 def adjoint(T: Matrix) -> Matrix:
-    """``(6, 6)`` matrix that maps ``xi = [v, w]`` so that ``T exp(xi) = exp(adjoint(T) xi) T``."""
+    """Return the ``(6, 6)`` adjoint matrix of a motion, for twists ``xi = [v, w]``.
+
+    It satisfies ``T exp(xi) = exp(adjoint(T) xi) T``.
+    """
     R, t = T[:3, :3], T[:3, 3]
     A = np.zeros((6, 6))
     A[:3, :3] = A[3:, 3:] = R
@@ -127,10 +132,10 @@ def _symmetric(matrix: Matrix) -> Matrix:
 
 
 def _growth(n: int) -> float:
-    """Ratio of the variance of a sum of n correlated steps to the variance of a sum of n
-    independent steps.
+    """Return the factor by which correlation increases the variance of a sum of n steps.
 
-    The steps are an AR(1) process (Hamilton, Time Series Analysis, 1994, 7.2).
+    The factor is 1 for independent steps. The steps are an AR(1) process (Hamilton, Time Series
+    Analysis, 1994, 7.2).
     """
     if n == 0:
         return 1.0
@@ -165,7 +170,7 @@ class Odometry:
                 the camera of the next frame.
             elapsed: seconds between the two frames.
             covariance: ``(6, 6)`` covariance of the optimised pose (``pose_covariance``). None if
-                the pose is only predicted with constant velocity. The error of a predicted pose
+                the pose was only predicted with constant velocity. The error of a predicted pose
                 grows with the square of the time since tracking was lost.
             of_offset: ``(6, 3)`` error of the motion per unit of its translation, if the disparity
                 offset is wrong by one standard deviation (``offset_effect``). None if the offset
@@ -200,7 +205,7 @@ class Odometry:
         self.T_odom_camera, self.now = T_odom_camera, uncertainty
 
     def state(self) -> tuple[float, ...]:
-        """The state for a checkpoint."""
+        """Return the state of the odometry for a checkpoint."""
         return (*self.T_odom_camera.ravel(), *self.now.numbers().tolist(), self._lost_s)
 
     def restore(self, state: tuple[float, ...]) -> None:

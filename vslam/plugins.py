@@ -28,13 +28,13 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PlugIn:
-    """A named plug-in of an installed package, which has not been imported yet.
+    """A plug-in of an installed package, which has not been imported yet.
 
     Attributes:
-        group: one of `KINDS`.
+        group: the group of entry points, which is one of `KINDS`.
         name: the name on the command line.
-        packages: all packages that offer this name, with versions. It is an error to use a plug-in
-            that more than one package offers.
+        packages: all packages that provide a plug-in of this name, with versions. It is an error to
+            use a plug-in whose name more than one package provides.
         entry_point: the entry point of the first package.
     """
 
@@ -53,7 +53,7 @@ class PlugIn:
 
         Raises:
             InputError: the entry point cannot be imported, is not callable or fails, or several
-                packages offer this name.
+                packages provide a plug-in of this name.
         """
         if len(self.packages) > 1:
             raise InputError(f"{self}: several packages offer this name; uninstall all but one.")
@@ -72,11 +72,11 @@ class PlugIn:
         return self.guarded(target, *arguments, **named)
 
     def guarded(self, function: Callable[..., Any], *arguments: object, **named: object) -> Any:
-        """Call a function of the package.
+        """Call a function of the package that provides the plug-in.
 
         Raises:
-            InputError: the function failed. An `InputError` that the function raises itself is
-                passed on.
+            InputError: the function failed. If the function itself raises an `InputError`, this
+                error is passed on.
         """
         try:
             return function(*arguments, **named)
@@ -89,10 +89,10 @@ class PlugIn:
             ) from error
 
     def _line(self, error: Exception) -> str:
-        """The line of the package's code at which an error occurred, with the name of its file.
+        """Return the file name and line of the package's code at which an error occurred.
 
-        If other code raised the error, it is the line that called this code. It is empty if the
-        traceback does not contain the package.
+        If the error was raised by other code, this is the line that called the other code. The
+        result is empty if the traceback does not contain the package.
         """
         package = self.entry_point.module.partition(".")[0]
         lines = [
@@ -110,10 +110,13 @@ def reason(error: Exception) -> str:
 
 
 def find_plugins(group: str) -> dict[str, PlugIn]:
-    """The plug-ins of all installed packages by name, sorted alphabetically.
+    """Find the plug-ins of all installed packages.
 
     Args:
-        group: one of `KINDS`.
+        group: the group of entry points, which is one of `KINDS`.
+
+    Returns:
+        The plug-ins by name, sorted alphabetically.
     """
     found: dict[str, PlugIn] = {}
     for package, entry_point in _entry_points(group):
@@ -133,13 +136,16 @@ def find_plugins(group: str) -> dict[str, PlugIn]:
 
 
 def packages_of(names: Collection[str]) -> dict[str, str]:
-    """The packages, with versions, of the plug-ins among ``names``. Other names are left out."""
+    """Return the package, with its version, of each plug-in in ``names``.
+
+    Names that do not belong to a plug-in are left out.
+    """
     found = {name: plugin for group in KINDS for name, plugin in find_plugins(group).items()}
     return {name: " and ".join(found[name].packages) for name in names if name in found}
 
 
 def _entry_points(group: str) -> list[tuple[str, EntryPoint]]:
-    """All entry points of a group, each with the name and version of its package."""
+    """Return all entry points of a group, each with the name and version of its package."""
     found = []
     for distribution in distributions():
         text = distribution.read_text("entry_points.txt")

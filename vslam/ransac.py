@@ -18,9 +18,9 @@ _S27, _S30, _S31, _S33 = np.uint64(27), np.uint64(30), np.uint64(31), np.uint64(
 
 @kernel
 def random_index(state, n):
-    """Random integer in ``[0, n)``, by SplitMix64 (Steele et al. 2014).
+    """Return a random integer in ``[0, n)``, using SplitMix64 (Steele et al. 2014).
 
-    The ``(1,)`` uint64 array ``state`` is advanced.
+    ``state`` is the ``(1,)`` uint64 state of the generator, which is updated.
     """
     state[0] += _STEP
     z = state[0]
@@ -33,7 +33,7 @@ def random_index(state, n):
 
 @kernel
 def draw_three(state, n):
-    """Three different random integers in ``[0, n)``. ``n`` must be at least 3."""
+    """Return three different random integers in ``[0, n)``. ``n`` must be at least 3."""
     i = random_index(state, n)
     j = random_index(state, n - 1)
     k = random_index(state, n - 2)
@@ -49,10 +49,11 @@ def draw_three(state, n):
 
 @kernel
 def draws_needed(inlier_share, confidence, limit):
-    """Number of draws of three items that RANSAC needs (Fischler and Bolles 1981, section II-B).
+    """Return the number of random samples that RANSAC needs.
 
-    After this number of draws, at least one draw contains only inliers, with probability
-    ``confidence``. The number is at most ``limit``.
+    Each sample consists of three items. With probability ``confidence``, at least one of these
+    samples contains only inliers (Fischler and Bolles 1981, section II-B). The number is at most
+    ``limit``.
     """
     good = inlier_share**3
     if good >= 1.0:

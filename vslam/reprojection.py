@@ -1,10 +1,10 @@
 """Reprojection errors: the layout of observations and the inlier test.
 
-An observation is a row ``u, v, u_right`` in pixels. A keypoint without a stereo match gives a
+An observation consists of ``u, v, u_right`` in pixels. A keypoint without a stereo match gives a
 monocular observation, whose ``u_right`` is NaN.
 
-Kernels that only test for inliers call ``chi_square_ratio``. Optimisers need the residual as well.
-They call ``residual`` and test its result with ``chi_square``.
+Kernels that only test for inliers call ``chi_square_ratio``. Optimisers also need the residual.
+They call ``residual``, and pass its result to ``chi_square``.
 """
 
 from __future__ import annotations
@@ -23,8 +23,15 @@ CHI2_STEREO = 7.815
 
 
 def stack_uvr(xy: NDArray[np.floating], u_right: NDArray[np.floating]) -> Matrix:
-    """``(N, 3)`` float64 observations, from ``(N, 2)`` keypoints and their ``(N,)`` stereo
-    columns."""
+    """Combine keypoints and their stereo columns into observations.
+
+    Args:
+        xy: ``(N, 2)`` keypoints in the left image.
+        u_right: ``(N,)`` columns of the stereo matches in the right image. NaN without a match.
+
+    Returns:
+        ``(N, 3)`` float64 ``u, v, u_right``.
+    """
     uvr = np.empty((len(xy), 3))
     uvr[:, :2], uvr[:, 2] = xy, u_right
     return uvr
@@ -32,7 +39,7 @@ def stack_uvr(xy: NDArray[np.floating], u_right: NDArray[np.floating]) -> Matrix
 
 @inner_kernel
 def unpacked(intrinsics):
-    """``Camera.intrinsics`` as a tuple.
+    """Return the array ``Camera.intrinsics`` as a tuple.
 
     A kernel keeps the values of a tuple in registers, but not the values of an array.
     """
@@ -48,7 +55,7 @@ def unpacked(intrinsics):
 
 @inner_kernel
 def chi_square_ratio(x, y, z, u, v, u_right, inverse_sigma2, pinhole):
-    """Squared reprojection error of a point, divided by its chi-square limit.
+    """Return the squared reprojection error of a point, divided by its chi-square limit.
 
     The ratio is at most 1 for an inlier. The point must lie in front of the camera.
 
@@ -69,9 +76,12 @@ def chi_square_ratio(x, y, z, u, v, u_right, inverse_sigma2, pinhole):
 
 @inner_kernel
 def residual(x, y, z, u, v, u_right, pinhole):
-    """Reprojection errors of a point in u, in v and in the negative disparity.
+    """Compute the reprojection errors of a point in u, in v and in the negative disparity.
 
-    The arguments are the same as for ``chi_square_ratio``.
+    Args:
+        x, y, z: float64 point in the camera frame.
+        u, v, u_right: float64 observation in pixels.
+        pinhole: intrinsics as ``unpacked`` returns them.
 
     Returns:
         The three errors in pixels, and whether the observation is stereo. The error of the
@@ -86,9 +96,10 @@ def residual(x, y, z, u, v, u_right, pinhole):
 
 @inner_kernel
 def chi_square(r_u, r_v, r_disparity, stereo, inverse_sigma2):
-    """Squared error of a ``residual``, divided by its variance, and the limit for an inlier.
+    """Return the squared error of a ``residual`` divided by its variance, and its limit.
 
-    The Huber loss is linear above this limit.
+    The observation is an inlier if the first number is at most the limit. The Huber loss is linear
+    above this limit.
     """
     chi2 = (r_u * r_u + r_v * r_v + r_disparity * r_disparity) * inverse_sigma2
     return chi2, CHI2_STEREO if stereo else CHI2_MONO

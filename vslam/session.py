@@ -1,5 +1,4 @@
-"""Resuming a drive or starting a new drive in a stored map, and collecting the content of a map
-file."""
+"""Opens the map of a drive, resumes a drive, and collects the content of a map file."""
 
 from __future__ import annotations
 
@@ -32,13 +31,13 @@ class OpenedMap:
     """The new or stored map in which a drive begins.
 
     Attributes:
-        map: the stored map; None for a new map.
-        frames: poses of the earlier frames of the drive; None for a new drive.
+        map: the stored map. None for a new map.
+        frames: poses of the earlier frames of the drive. None for a new drive.
         checkpoint: state from which the drive continues with the same results as an uninterrupted
             run. None for a new drive, or if the map was saved without a checkpoint.
         drives: source of the images of each earlier drive, such as "kitti 06".
-        truth_alignment: the transformation of the map into the frame of a ground truth; None if
-            unknown.
+        truth_alignment: the transformation from the map to the frame of a ground truth. None if it
+            is unknown.
     """
 
     map: Map | None = None
@@ -56,9 +55,10 @@ def open_map(
     localize: bool,
     resume: bool,
 ) -> OpenedMap:
-    """Restore the detector, the images and the closed loops from a stored map.
+    """Open the map in which a drive begins.
 
-    If ``stored`` is None, a new map begins.
+    The loop detector, the images and the closed loops are restored from the stored map. If
+    ``stored`` is None, a new map begins.
 
     Args:
         localize: only localise in the map, without changing it.
@@ -94,7 +94,7 @@ def open_map(
 
 @dataclass(frozen=True)
 class Session:
-    """The parts of SLAM that have a state, and the map in which the drive began."""
+    """The parts of SLAM that have a state, and the map in which the present drive began."""
 
     context: TrackingContext
     closing: LoopClosing
@@ -106,9 +106,10 @@ class Session:
     opened: OpenedMap
 
     def stored_map(self, drive: str) -> StoredMap:
-        """The map as it is stored in a file. It has a checkpoint if a checkpoint is possible now.
+        """Return the map in the form in which it is stored in a file.
 
-        The arrays of the map are not copied.
+        It contains a checkpoint if a checkpoint is possible now. The arrays of the map are not
+        copied.
 
         Args:
             drive: source of the images of the present drive, such as "kitti 06".
@@ -128,7 +129,9 @@ class Session:
         )
 
     def state(self) -> Checkpoint | None:
-        """The state of all parts between two frames, or None if no checkpoint is possible now.
+        """Return the state of all parts between two frames.
+
+        The result is None if no checkpoint is possible now.
 
         A checkpoint is impossible before the first frame is tracked and when the run only
         localises. It is also impossible while a keyframe is being mapped, while a monocular map
@@ -168,7 +171,7 @@ class Session:
     def resume_odometry(self, last: TrackResult) -> None:
         """Continue the odometry of a resumed drive after its last frame.
 
-        Nothing is done if ``resume`` has already restored the odometry from a checkpoint.
+        Nothing is done if the odometry has already been restored from a checkpoint.
         """
         T_odom_camera, uncertainty = last.T_odom_camera, last.uncertainty
         if T_odom_camera is None or uncertainty is None or self.opened.checkpoint is not None:
@@ -176,7 +179,7 @@ class Session:
         self.odometry.resume(T_odom_camera, uncertainty)
 
     def resume(self) -> None:
-        """Continue after the last frame of a resumed drive, if there is one.
+        """Resume a drive after its last frame, if the map was opened to resume a drive.
 
         With a checkpoint, the results are identical to the results of an uninterrupted run. Without
         a checkpoint, tracking continues from the last pose and speed.

@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 
 class SharedMap:
-    """A map, and the job that may write it; there is at most one job at a time."""
+    """A map, and the job that may write it. There is at most one such job at a time."""
 
     def __init__(self, map_: Map, workers: Workers) -> None:
         self._map = map_
@@ -24,7 +24,7 @@ class SharedMap:
 
     @property
     def is_busy(self) -> bool:
-        """Whether a job may be writing the map."""
+        """Whether a job in another thread may be writing the map."""
         return self._job is not None
 
     @property
@@ -32,7 +32,8 @@ class SharedMap:
         """The map.
 
         Raises:
-            RuntimeError: a job may be writing it, a job failed, or this process is a fork.
+            RuntimeError: a job may be writing the map, an earlier job failed, or this process is a
+                fork.
         """
         self._workers.refuse_fork()
         if self._failure:
@@ -46,15 +47,16 @@ class SharedMap:
         self._job = self._workers.submit(partial(job, self.map), Urgency.MAPPING)
 
     def start_reading(self, job: Callable[[Map], T]) -> Job[T]:
-        """Start a job that only reads the map. It must be done before the map is written again."""
+        """Start a job that only reads the map. The job must end before the map is written again."""
         return self._workers.submit(partial(job, self.map), Urgency.LOOPS)
 
     def wait(self) -> Map:
-        """Wait for the job, if there is one, and return the map.
+        """Wait for the running job, if there is one, and return the map.
+
+        If the running job fails, its exception is raised unchanged.
 
         Raises:
-            RuntimeError: an earlier job failed, or this process is a fork. An error of this job is
-                raised unchanged.
+            RuntimeError: an earlier job failed, or this process is a fork.
         """
         self._workers.refuse_fork()
         if self._job is not None:
@@ -66,10 +68,12 @@ class SharedMap:
 
     @contextmanager
     def change(self) -> Iterator[Map]:
-        """Wait for the job, if there is one, and yield the map for changes.
+        """Wait for the running job, if there is one, and yield the map for changes.
+
+        If the running job fails, its exception is raised unchanged.
 
         Raises:
-            RuntimeError: as ``wait``.
+            RuntimeError: an earlier job failed, or this process is a fork.
         """
         map_ = self.wait()
         with self._invalidated_on_error():
@@ -77,7 +81,10 @@ class SharedMap:
 
     @contextmanager
     def _invalidated_on_error(self) -> Iterator[None]:
-        """After an exception, which leaves the map incomplete, make every access raise an error."""
+        """Make every later access to the map raise an error if the block raises an exception.
+
+        An exception leaves the map incomplete.
+        """
         try:
             yield
         except BaseException as error:

@@ -1,4 +1,4 @@
-"""SLAM on a stereo, RGB-D or monocular stream; ``Slam.step`` processes one frame."""
+"""SLAM on a stereo, RGB-D or monocular stream. ``Slam.step`` processes one frame."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _ignore(result: TrackResult) -> None:
 
 
 class Slam:
-    """Stereo, RGB-D or monocular SLAM; a monocular map has an arbitrary unit instead of metres.
+    """Stereo, RGB-D or monocular SLAM. A monocular map has an arbitrary unit instead of metres.
 
     >>> slam = Slam(camera)
     >>> for left, right, timestamp in frames:
@@ -56,17 +56,18 @@ class Slam:
     >>> slam.trajectory().T_wc
     >>> slam.save(path)
 
-    ``Slam.load(path)`` continues in that map: the camera is relocalised in it, and new places are
-    added. If relocalisation fails, a new sub-map begins, which a loop may join to the map later.
-    With ``localize=True`` the map is not changed.
+    ``Slam.load(path)`` continues in the saved map. The camera is relocalised in this map, and new
+    places are added. If relocalisation fails, a new sub-map begins. A loop may join this sub-map to
+    the map later. With ``localize=True``, the map is not changed.
 
     Attributes:
         context: camera, thresholds and pyramid scales, for ``FrameImages``.
-        detector: proposes loop candidates and places for relocalisation.
-        rig: measurements of the stereo pair, such as the delay of its right camera.
-        workers: run the mapping jobs; they can also prepare frames in advance.
-        next_extraction: index of a later frame whose features will probably be needed, so that its
-            ``FrameImages.start_corners`` may be called in advance; -1 if none.
+        detector: proposes loop candidates, and places for relocalisation.
+        rig: measurements of the stereo pair, such as the delay of the right camera.
+        workers: threads that run the mapping jobs. They can also prepare frames in advance.
+        next_extraction: index of a later frame whose features will probably be needed.
+            ``FrameImages.start_corners`` may be called in advance for this frame. -1 if there is no
+            such frame.
     """
 
     def __init__(
@@ -81,28 +82,30 @@ class Slam:
         localize: bool = False,
         resume: bool = False,
     ) -> None:
-        """
+        """Begin SLAM with a new map, or continue in a stored map.
+
         Args:
-            camera: the rectified camera that the images come from; ``camera.left_camera()`` for
+            camera: the rectified camera that the images come from. Use ``camera.left_camera()`` for
                 monocular SLAM.
-            config: thresholds, also as a dictionary such as ``{"orb": {"n_features": 1000}}``;
-                those left out keep their defaults.
-            detector: proposes loop candidates and places for relocalisation; an object or a name
-                (``vslam.loopclosure.registry``). ``both`` combines the capsule network with the bag
-                of words; ``none`` closes no loops.
-            threads: with 1, a keyframe is mapped when its result is needed instead of in parallel
-                with tracking. The results are the same.
-            images: only if ``detector`` is an object: store of the keyframe images for learned
-                descriptors, which verify loops where ORB fails; None verifies with ORB only.
-            start: a map to continue in, made with the same camera, detector and pyramid; it is
-                changed in place. ``Slam.load`` reads one from a file.
-            localize: only track in that map, without changing it.
-            resume: continue the map's last drive; otherwise a new drive begins, whose timestamps
-                are independent of those before. The poses equal those of an uninterrupted drive
-                only if the map was saved with ``resumable=True``.
+            config: thresholds, as a ``Config`` or as a dictionary such as ``{"orb": {"n_features":
+                1000}}``. Thresholds that are left out keep their defaults.
+            detector: proposes loop candidates, and places for relocalisation. It is an object or a
+                name (``vslam.loopclosure.registry``). ``both`` combines the capsule network with
+                the bag of words. ``none`` closes no loops.
+            threads: number of threads. With 1, a keyframe is mapped when its result is needed,
+                instead of in parallel with tracking. The results do not depend on this number.
+            images: store of the keyframe images, from which learned descriptors are computed. These
+                descriptors verify loops where ORB fails. None verifies loops with ORB only. This
+                argument is used only if ``detector`` is an object.
+            start: a map to continue in. It must have been made with the same camera, detector and
+                pyramid, and it is changed in place. ``Slam.load`` reads such a map from a file.
+            localize: only track in the map ``start``, without changing it.
+            resume: continue the last drive of the map ``start``. Otherwise, a new drive begins,
+                whose timestamps are independent of earlier drives. The poses equal those of an
+                uninterrupted drive only if the map was saved with ``resumable=True``.
 
         Raises:
-            ValueError: the map cannot be continued; the message gives the reason in a few words.
+            ValueError: the map cannot be continued. The message gives the reason in a few words.
             InputError: a threshold is unknown or out of range.
         """
         config = as_config({} if config is None else config)
@@ -141,10 +144,11 @@ class Slam:
 
         Args:
             path: the map file, or the folder of a run.
-            config: as for a new map; None uses the thresholds that the map was made with.
-            detector: the detector that the map was made with, as a name or an object; None uses
-                the detector that the file names.
-            resume: as for a new map.
+            config: thresholds, as for a new map. None uses the thresholds with which the map was
+                made.
+            detector: the detector with which the map was made, as a name or an object. None uses
+                the detector that is named in the file.
+            resume: continue the last drive of the map instead of beginning a new drive.
             options: ``threads``, ``images`` and ``localize``, as for a new map.
 
         Raises:
@@ -162,25 +166,28 @@ class Slam:
             raise InputError(f"{path}: {error}; use the options of that run.") from error
 
     def save(self, path: Path | str, drive: str = "", *, resumable: bool = False) -> None:
-        """Write the map, and everything else that ``load`` needs, to a file; an existing file is
-        replaced.
+        """Write the map, and everything else that ``load`` needs, to a file.
+
+        An existing file is replaced.
 
         Args:
             path: the file.
             drive: source of the images of this drive, such as "kitti 06".
-            resumable: include the state of tracking and the culled parts of the map, so that a run
-                that loads the file with ``resume=True`` gives the same poses, byte for byte, as an
-                uninterrupted run.
+            resumable: also write the state of tracking and the culled parts of the map. A run that
+                loads the file with ``resume=True`` then gives poses that are byte-identical to the
+                poses of an uninterrupted run.
 
         Raises:
             RuntimeError: mapping failed, so that the map is incomplete.
-            OSError: the file cannot be written; an existing file is unchanged.
+            OSError: the file cannot be written. In this case, an existing file is unchanged.
         """
         save_map(path, self.stored_map(drive), resumable=resumable)
 
     def stored_map(self, drive: str = "") -> StoredMap:
-        """The map as ``save`` writes it. It shares the arrays of the map that is being built; call
-        ``compact()``, which copies them, before the next step.
+        """Return the map in the form that ``save`` writes to a file.
+
+        The result shares its arrays with the map that is being built. Before the next step, call
+        ``compact()`` on it to get a copy.
 
         Raises:
             RuntimeError: mapping failed, so that the map is incomplete.
@@ -196,27 +203,28 @@ class Slam:
         mask: NDArray[np.uint8] | NDArray[np.bool_] | None = None,
         on_pose: Callable[[TrackResult], None] = _ignore,
     ) -> TrackResult:
-        """Track one rectified stereo pair, RGB-D image or monocular image, and insert it as a
-        keyframe if it shows something new.
+        """Track one rectified stereo pair, RGB-D image or monocular image.
 
-        Images that are kept are copied, so that a camera may write the next images into the same
+        A frame that shows something new is inserted as a keyframe.
+
+        Images that are kept are copied. Therefore, a camera may write its next images into the same
         arrays.
 
         Args:
-            left: ``(H, W)`` uint8.
-            second: the right image, ``(H, W)`` uint8; with ``camera.depth`` the depth of the left
-                image's pixels, ``(H, W)`` float32 metres, 0 where unknown; None for a monocular
-                camera.
-            timestamp: seconds, later than that of the last call.
-            mask: ``(H, W)`` uint8 or bool, 0 where the left image must not be used, for example
-                where it shows the hood of the car; None uses the whole image.
-            on_pose: called with the result as soon as the pose is known, because inserting a
-                keyframe takes much longer than tracking. Whether the frame becomes a keyframe
-                (``is_keyframe``) may not be decided yet. Exceptions of ``on_pose`` are passed on.
+            left: ``(H, W)`` uint8 left image.
+            second: for a stereo camera, the ``(H, W)`` uint8 right image. For an RGB-D camera, the
+                ``(H, W)`` float32 depth of the pixels of the left image in metres, and 0 where the
+                depth is unknown. None for a monocular camera.
+            timestamp: seconds. It must be later than the timestamp of the last call.
+            mask: ``(H, W)`` uint8 or bool. It is 0 where the left image must not be used, for
+                example where it shows the hood of the car. None uses the whole image.
+            on_pose: function that is called with the result as soon as the pose is known, because
+                inserting a keyframe takes much longer than tracking. At this time, ``is_keyframe``
+                may not be decided yet. Exceptions of this function are passed on.
 
         Raises:
-            ValueError: the images have another size or type, or the timestamp is not finite or not
-                later than the last one.
+            ValueError: the images have the wrong size or type, or the timestamp is not finite or
+                not later than the last timestamp.
             RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
         """
         check_images(left, second, self.context.camera)
@@ -234,12 +242,17 @@ class Slam:
         stage_ms: dict[str, float] | None = None,
         on_pose: Callable[[TrackResult], None] = _ignore,
     ) -> TrackResult:
-        """As ``step``, for images that were prepared before, for example in another thread.
+        """Track images that were prepared in advance, for example in another thread.
+
+        Apart from this, the method does the same as ``step``.
 
         Args:
-            images: the images, which are not copied: do not write to them afterwards.
-            timestamp, stage_ms: as for ``step_features``.
-            on_pose: as for ``step``.
+            images: the images, which are not copied. Do not write to them afterwards.
+            timestamp: seconds. It must be later than the timestamp of the last call.
+            stage_ms: wall time of the stages before this call, in milliseconds. It is included in
+                the result.
+            on_pose: function that is called with the result as soon as the pose is known
+                (``step``).
         """
         frame = self._next_frame(Extracted.nothing(), timestamp, None)
         frame.source, frame.pyramid, frame.coarse = images, images.pyramid, images.coarse
@@ -253,15 +266,16 @@ class Slam:
         image: Image | None = None,
         stage_ms: dict[str, float] | None = None,
     ) -> TrackResult:
-        """As ``step``, for a frame whose features were extracted before
-        (``FrameImages.extracted``).
+        """Track a frame whose features were extracted in advance (``FrameImages.extracted``).
+
+        Apart from this, the method does the same as ``step``.
 
         Args:
             extracted: the features.
-            timestamp: as for ``step``.
+            timestamp: seconds. It must be later than the timestamp of the last call.
             image: ``(H, W)`` uint8, the image of the features, for loop detectors that need it. It
-                is not copied: do not write to it afterwards.
-            stage_ms: wall time of the stages before this call, in milliseconds, to be included in
+                is not copied. Do not write to it afterwards.
+            stage_ms: wall time of the stages before this call, in milliseconds. It is included in
                 the result.
         """
         frame = self._next_frame(extracted, timestamp, image)
@@ -302,8 +316,11 @@ class Slam:
         return Found.at_start(frame, begun=begun)
 
     def _track(self, frame: Frame, clock: StageClock) -> tuple[Found, Matrix]:
-        """Track a frame by patches or, if that fails, by features. Returns also the ``(4, 4)`` pose
-        ``T_cw`` that constant velocity predicted."""
+        """Track a frame by patches or, if this fails, by features.
+
+        Returns:
+            The result, and the ``(4, 4)`` pose ``T_cw`` that was predicted with constant velocity.
+        """
         mapper, tracker = self._mapper, self._tracker
         T_predicted = tracker.predict(frame.timestamp, mapper.frames, mapper.view)
         tracked = tracker.track_patches(frame, T_predicted, mapper.view)
@@ -319,8 +336,10 @@ class Slam:
         return tracked, T_predicted
 
     def _record_pose(self, frame: Frame, found: Found, T_predicted: Matrix) -> PlacedFrame:
-        """Record the pose of a frame and advance the odometry; a lost frame gets the predicted
-        pose."""
+        """Record the pose of a frame and advance the odometry.
+
+        A lost frame gets the predicted pose.
+        """
         mapper, tracker = self._mapper, self._tracker
         if found.is_lost:
             frame.T_cw = T_predicted
@@ -335,21 +354,28 @@ class Slam:
         return mapper.append_pose(frame, tracked=True, near=found.keyframe)
 
     def _update_map(self, frame: PlacedFrame, found: Found) -> bool:
-        """Update the map with a frame, and choose the next frame whose features to extract in
-        advance; returns whether the frame became a keyframe."""
+        """Update the map with a frame.
+
+        Afterwards, choose the next frame whose features are extracted in advance.
+
+        Returns:
+            Whether the frame became a keyframe.
+        """
         by_patches = frame.source is not None
         if found.is_lost:
             is_keyframe = self._mode.begin_after_loss(frame)
         else:
             is_keyframe = self._mode.update_map(frame, found)
             self.rig.observe(frame, frame.twist)
-        # If patches failed for this frame, they will probably fail for the next ones.
+        # If patches failed for this frame, they will probably fail for the next frames.
         self.next_extraction = self._mode.due if by_patches else frame.index + 2
         return is_keyframe
 
     def skip(self, timestamp: float, *, dropped: bool = False) -> TrackResult:
-        """Add a frame without images at the predicted pose. Its state is LOST, or DROPPED if there
-        was no time to process it."""
+        """Add a frame without images at the predicted pose.
+
+        Its state is LOST, or DROPPED if there was no time to process its images.
+        """
         frame = self._next_frame(Extracted.nothing(), timestamp, None)
         frame.T_cw = self._tracker.predict(timestamp, self._mapper.frames, self._mapper.view)
         self._follow(frame, frame.T_cw, None)
@@ -366,10 +392,10 @@ class Slam:
         covariance: Matrix | None,
         of_offset: Matrix | None = None,
     ) -> None:
-        """Advance the odometry to the next frame, before its pose is recorded.
+        """Advance the odometry to the next frame, before the pose of this frame is recorded.
 
         Args:
-            T_cw: ``(4, 4)`` pose of the frame by continuous motion from the last one; it differs
+            T_cw: ``(4, 4)`` pose of the frame by continuous motion from the last frame. It differs
                 from the pose in the map if the camera was relocalised.
             covariance, of_offset: see ``Odometry.move``.
         """
@@ -381,13 +407,23 @@ class Slam:
         self._odometry.move(T_now_last, elapsed, covariance, of_offset)
 
     def resume_odometry(self, last: TrackResult) -> None:
-        """Continue ``T_odom_camera`` and the uncertainty from the last result of a drive that was
-        resumed from a map without the state of tracking. Without this call, the odometry starts at
-        the identity, with no uncertainty."""
+        """Continue the odometry of a resumed drive.
+
+        This is needed if the map was saved without the state of tracking.
+
+        ``T_odom_camera`` and its uncertainty continue from ``last``. Without this call, the
+        odometry starts at the identity, with no uncertainty.
+
+        Args:
+            last: the last result of the drive before it was resumed.
+        """
         self._session.resume_odometry(last)
 
     def finish(self) -> None:
-        """Complete all mapping, so that map and trajectory do not change until the next step."""
+        """Complete all mapping.
+
+        Afterwards, the map and the trajectory do not change until the next step.
+        """
         self._mapper.finish()
 
     def _next_frame(self, extracted: Extracted, timestamp: float, image: Image | None) -> Frame:
@@ -400,21 +436,23 @@ class Slam:
 
     @property
     def map(self) -> Map:
-        """Keyframes, landmarks and observations.
+        """The map with its keyframes, landmarks and observations.
 
         Raises:
-            RuntimeError: a keyframe is being mapped; check ``is_mapping`` or call ``finish()``.
+            RuntimeError: a keyframe is being mapped. Check ``is_mapping``, or call ``finish()``.
         """
         return self._mapper.map
 
     @property
     def frame(self) -> Frame | None:
-        """The last tracked frame, for visualisation; None before the first."""
+        """The last tracked frame, for visualisation. None before the first tracked frame."""
         return self._tracker.last
 
     @property
     def truth_alignment(self) -> TruthAlignment | None:
-        """The transformation of the loaded map into a ground truth's frame; None if unknown."""
+        """The transformation from the loaded map to the frame of a ground truth. None if it is
+        unknown.
+        """
         return self._session.opened.truth_alignment
 
     @property
@@ -424,35 +462,43 @@ class Slam:
 
     @property
     def is_adjusting(self) -> bool:
-        """Whether the result of a global bundle adjustment is still to be merged."""
+        """Whether a global bundle adjustment is running, or its result has not been merged yet."""
         return self._closing.is_adjusting
 
     @property
     def loops(self) -> list[LoopEdge]:
-        """The outcome of every loop candidate so far."""
+        """The outcomes of all loop candidates so far."""
         return self._closing.edges
 
     @property
     def problems(self) -> list[str]:
-        """One sentence for each failure that did not harm the map: a search for loops or a global
-        bundle adjustment that failed, or a right image that could not be read."""
+        """One sentence for each failure that did not harm the map.
+
+        Such failures are a failed search for loops, a failed global bundle adjustment, and a right
+        image that could not be read.
+        """
         return [*self._closing.problems, *self.rig.problems]
 
     @property
     def corrections(self) -> list[LoopCorrection]:
-        """How each closed loop corrected the keyframes."""
+        """The correction of the keyframes by each closed loop."""
         return self._closing.corrections
 
     def trajectory(self) -> Trajectory:
-        """The pose of every frame according to the present map. The poses of lost frames are
-        interpolated between the tracked frames before and after them."""
+        """Return the pose of every frame according to the present map.
+
+        The poses of lost frames are interpolated between the tracked frames before and after them.
+        """
         return self._mapper.trajectory()
 
     def keyframe_trajectory(self) -> Trajectory:
-        """The poses of the living keyframes of this drive."""
+        """Return the poses of the keyframes of this drive, without culled keyframes."""
         return keyframe_trajectory(self.map)
 
     def in_map(self) -> NDArray[np.bool_]:
-        """``(N,)`` bool: which frames were tracked in the part of the map with its first keyframe,
-        including sub-maps that loops have joined to it."""
+        """Return which frames were tracked in the first part of the map, as ``(N,)`` bool.
+
+        This part contains the first keyframe of the map, and the sub-maps that loops have joined to
+        it.
+        """
         return in_first_part(self.map, self._closing.closed, self._mapper.frames.table())

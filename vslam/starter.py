@@ -27,8 +27,8 @@ class TwoViewStart:
             begins.
         T_2_1: ``(4, 4)``, maps points from the camera of the first frame to the camera of the
             second frame.
-        features: ``(N,)`` int64 indices of the matched features of the first frame, and the same
-            for the second frame.
+        features: two ``(N,)`` int64 arrays with the indices of the matched features in the first
+            frame and in the second frame.
         points: ``(N, 3)`` triangulated points of these features, in the frame of the first camera.
         predicted: whether the unit of the map was derived from the speed that the camera had before
             it was lost.
@@ -47,15 +47,16 @@ class TwoViewStart:
         return se3_log(self.T_2_1) / (self.second.timestamp - self.first.timestamp)
 
     def at_speed(self, twist: Matrix | None, max_rescaling: float) -> TwoViewStart:
-        """Scale the start of a sub-map so that the camera has the same speed as before it was lost.
+        """Scale the start of a sub-map to the speed that the camera had before it was lost.
 
-        The unit of the sub-map is then approximately the unit of the map before the loss.
+        The translation between the two frames, and the points, are scaled. The unit of the sub-map
+        is then approximately the unit of the map before the loss.
 
         Args:
             twist: ``(6,)`` twist of the camera per second before it was lost. None if it is
                 unknown.
             max_rescaling: largest scale factor. If the factor is larger than this number or smaller
-                than its inverse, the start is not scaled.
+                than the inverse of this number, nothing is scaled.
         """
         if twist is None:
             return self
@@ -87,23 +88,28 @@ class Starter:
 
     @property
     def is_waiting(self) -> bool:
-        """Whether a first frame is kept and waits for a second frame."""
+        """Whether a first frame of a monocular map is kept until a second frame forms a pair with
+        it.
+        """
         return self._first is not None
 
     def reset(self) -> None:
-        """Discard the first frame if a first frame is kept."""
+        """Discard the kept first frame of a monocular map, if there is one."""
         self._first = None
 
     def offer(self, frame: PlacedFrame) -> Start | None:
-        """Try to begin a map or sub-map with an untracked frame. None if this is not possible
-        yet."""
+        """Try to begin a map or sub-map with a frame that was not tracked.
+
+        Returns:
+            The start of the map, or None if it is not possible yet.
+        """
         if self._context.camera.monocular:
             return self._offer_monocular(frame)
         enough = frame.n_stereo >= self._context.config.tracking.min_stereo_start
         return OneViewStart(frame) if enough else None
 
     def _offer_monocular(self, frame: PlacedFrame) -> TwoViewStart | None:
-        """Try to pair a frame with the kept frame.
+        """Try to begin a monocular map with a frame and the earlier frame that was kept.
 
         If the two frames have too few matches or are too far apart in time, the new frame replaces
         the kept frame.

@@ -29,8 +29,8 @@ class TrackerState:
         twist: ``(6,)`` twist of the camera per second at this frame. None if it is unknown.
         lost_frames: number of lost frames since this frame.
         n_tracked: number of landmarks that the frame tracked.
-        coarse: ``(Q,)`` uint8, the pixels of the ``coarse_levels`` of the frame. It is empty if the
-            frame has no such levels.
+        coarse: ``(Q,)`` uint8 pixels of the coarse pyramid levels of the frame (``coarse_levels``).
+            It is empty if the frame has no such levels.
     """
 
     index: int
@@ -67,11 +67,12 @@ class PolicyState:
     """State of the keyframe policy.
 
     Attributes:
-        gained_close: running mean of the number of close points that the first frame after a
-            keyframe tracks.
+        gained_close: number of close points that the first frame after a keyframe tracks, as a
+            running mean over keyframes.
         gain_awaited: whether the next frame is the first after a keyframe.
         first_close: number of close points that the first frame after the last keyframe tracked.
-        first_frame: index of this first frame. It is -1 before the first keyframe.
+        first_frame: index of the first frame after the last keyframe. It is -1 before the first
+            keyframe.
         due: index of the frame that is planned to become a keyframe. It is -1 if no keyframe is
             planned.
     """
@@ -89,8 +90,8 @@ class ConsistencyState:
 
     Attributes:
         places: places that recent keyframes resembled.
-        verified: verified loops that other keyframes must still confirm, each with the ``turn`` of
-            its keyframe.
+        verified: verified loops that another keyframe must still confirm. Each loop is stored with
+            the value of ``turn`` at its keyframe.
         turn: number of keyframes that have been tested so far.
     """
 
@@ -103,12 +104,12 @@ class ConsistencyState:
 class VerifierState:
     """State of the verifier of loop candidates.
 
-    It describes the last failed attempt with learned descriptors.
+    It describes the last time when a verification with learned descriptors failed.
 
     Attributes:
-        resting_until: before this keyframe, only candidates with a clearly higher similarity are
-            tried.
-        failed_similarity: similarity of the two images of the failed attempt.
+        resting_until: before this keyframe, learned descriptors are tried only for candidates that
+            are clearly more similar than the failed one.
+        failed_similarity: similarity of the two images for which verification failed.
     """
 
     resting_until: int = 0
@@ -120,8 +121,8 @@ class ClosingState:
     """State of loop closing.
 
     Attributes:
-        consistency, verifier: the states of its parts.
-        followed: how often an old keyframe was reused instead of inserting a new keyframe.
+        consistency, verifier: the states of the consistency test and of the verifier.
+        followed: how many times an old keyframe was reused instead of inserting a new keyframe.
     """
 
     consistency: ConsistencyState = field(default_factory=ConsistencyState)
@@ -135,7 +136,7 @@ class RigState:
 
     Attributes:
         delay: the estimate of the delay between the two cameras (``DelayState``).
-        sides: the results of comparing the two images (``ComparedSides``).
+        sides: results of comparing the left and right images (``ComparedSides``).
     """
 
     delay: tuple[float, ...] = ()
@@ -144,10 +145,10 @@ class RigState:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The states of all parts.
+    """The states of all parts of SLAM between two frames.
 
     Attributes:
-        odometry: pose and uncertainty of the last frame (``Odometry``).
+        odometry: pose of the last frame and its uncertainty (``Odometry``).
     """
 
     tracker: TrackerState

@@ -44,12 +44,12 @@ class Trajectory:
         return len(self.T_wc)
 
     def select(self, indices: NDArray[np.int64]) -> Trajectory:
-        """The poses at ``(M,)`` indices, in that order."""
+        """Return the poses at ``(M,)`` indices, in the order of the indices."""
         return Trajectory(self.timestamps[indices], self.T_wc[indices])
 
 
 def bridge_gaps(trajectory: Trajectory, known: NDArray[np.bool_]) -> Trajectory:
-    """Replace unknown poses by interpolation at constant velocity between known poses.
+    """Replace unknown poses by interpolating between known poses with constant velocity.
 
     Args:
         known: ``(N,)`` bool, True for the poses to keep. Poses before the first known pose and
@@ -122,10 +122,10 @@ def read_table(
 
 
 def trajectory_format(path: Path | str) -> Literal["kitti", "tum"]:
-    """Determine the format of a trajectory file by the number of columns of its first pose.
+    """Determine the format of a trajectory file from the number of columns of its first pose.
 
     Raises:
-        InputError: for the same reasons as in ``read_table``.
+        InputError: the file is missing, empty or malformed.
     """
     return _FORMAT_OF_COLUMNS[read_table(path, (12, 8), "a pose", max_rows=1).shape[1]]
 
@@ -205,8 +205,8 @@ def _tum_lines(timestamps: NDArray[np.float64], T_wc: NDArray[np.float64]) -> st
 def write_euroc(path: Path | str, trajectory: Trajectory) -> None:
     """Write a trajectory in the format of EuRoC's ground truth, without velocities and biases.
 
-    Timestamps are written in nanoseconds. However, their resolution is only 0.2 us if they are Unix
-    times, because they are float64 seconds.
+    Timestamps are written in nanoseconds. If the timestamps are Unix times, their resolution is
+    only 0.2 us, because they are stored as float64 seconds.
     """
     names = ("x [m]", "y [m]", "z [m]"), ("w []", "x []", "y []", "z []")
     columns = [*(f"p_RS_R_{name}" for name in names[0]), *(f"q_RS_{name}" for name in names[1])]
@@ -222,8 +222,8 @@ def quaternions(R: NDArray[np.float64]) -> NDArray[np.float64]:
     """Convert ``(N, 3, 3)`` rotations to ``(N, 4)`` float64 quaternions x, y, z, w with w >= 0.
 
     The results are bit-identical to the results of ``scipy.spatial.transform.Rotation``. SciPy is
-    not used, because importing it takes longer than writing all files of a run. A matrix whose
-    error is above 1e-12 is replaced by the nearest rotation.
+    not used, because importing it takes longer than writing all files of a run. A matrix that
+    deviates from a rotation by more than 1e-12 is replaced by the nearest rotation.
     """
     error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3))
     off = (error > 1e-12 + 1e-5 * np.eye(3)).any(axis=(1, 2))

@@ -63,7 +63,7 @@ def read_npz(path: Path, what: str, fix: str = "give another file") -> dict[str,
     """Read all arrays of an npz file. Python objects (pickles) are rejected.
 
     Args:
-        what: the kind of file that is expected, with an article, for error messages.
+        what: the kind of file that is expected, with an article ("a map"), for error messages.
         fix: what the user can do, for error messages.
 
     Raises:
@@ -98,7 +98,7 @@ def read_json(array: NDArray[Any]) -> Any:
 
 
 def require_memory(path: Path, what: str) -> None:
-    """Check that unpacking an archive does not take too much memory.
+    """Check that unpacking an archive will not take too much memory.
 
     The unpacked archive must not be far larger than the archive itself, and must fit into the free
     memory. Files that are not archives are accepted.
@@ -130,7 +130,7 @@ def _check_size(path: Path, archive: zipfile.ZipFile, what: str) -> None:
 
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
-    """Read an array of an archive.
+    """Read one array of an npz archive.
 
     Raises:
         ValueError: the member is not as long as its header says, holds Python objects, or has an

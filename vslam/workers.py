@@ -1,13 +1,12 @@
 """Threads that run the jobs of a pipeline. A thread that waits for a job runs other jobs meanwhile.
 
-On two cores, the main thread and one worker share all work: there are never more busy threads than
-cores, and neither idles while a job is queued. Jobs begin in the order of their ``Urgency``. When a
-job runs, and in which thread, must not change its result.
+On two cores, the main thread and one worker share all work. There are never more busy threads than
+cores, and no thread is idle while a job is queued. Jobs start in order of ``Urgency``. The result
+of a job must not depend on when the job runs or on which thread runs it.
 """
 
 from __future__ import annotations
 
-import heapq
 import os
 import threading
 import weakref
@@ -15,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
 from enum import IntEnum
 from functools import partial
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 T = TypeVar("T")
 Given = TypeVar("Given")
@@ -31,8 +30,10 @@ class Urgency(IntEnum):
 
 
 class Workers:
-    """Runs jobs in ``threads - 1`` threads, and in every thread that waits for a result. With one
-    thread, a job thus runs when its result is needed."""
+    """Runs jobs in ``threads - 1`` threads, and in every thread that waits for a result.
+
+    With one thread, a job therefore runs when its result is needed.
+    """
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
@@ -48,18 +49,24 @@ class Workers:
         weakref.finalize(self, _stop, queue, self._started)
 
     def submit(self, work: Callable[[], T], urgency: Urgency) -> Job[T]:
-        """Queue a function; the job that is returned gives its result."""
+        """Queue a function. The result of the function is available from the returned job."""
         return self._queue.add(work, urgency)
 
     def map(
         self, function: Callable[[Given], T], items: Iterable[Given], urgency: Urgency
     ) -> Iterator[T]:
-        """As the built-in ``map``, in parallel."""
+        """Apply a function to each item, in parallel.
+
+        The results are in the order of the items, as with the built-in ``map``.
+        """
         jobs = [self.submit(partial(function, item), urgency) for item in items]
         return (job.result() for job in jobs)
 
     def refuse_fork(self) -> None:
-        """Raise a RuntimeError in a forked process, which has none of the threads."""
+        """Raise a RuntimeError in a forked process.
+
+        A fork does not inherit the worker threads.
+        """
         if self._started and os.getpid() != self._process:
             raise RuntimeError(
                 "this Slam was created before the process was forked, which does not copy its "
@@ -70,8 +77,8 @@ class Workers:
 class Job(Generic[T]):
     """A function that was queued by ``Workers.submit``, and its result."""
 
-    def __init__(self, work: Callable[[], T], queue: _Queue) -> None:
-        self.has_begun = False
+    def __init__(self, work: Callable[[], T], urgency: Urgency, queue: _Queue) -> None:
+        self.urgency = urgency
         self.is_done = False
         self.error: BaseException | None = None
         self._work: Callable[[], T] | None = work
@@ -79,25 +86,30 @@ class Job(Generic[T]):
         self._value: T | None = None
 
     def wait(self) -> None:
-        """Return when the job is done, whether or not it failed. The calling thread runs the job if
-        it has not begun, and otherwise other queued jobs. If Ctrl-C interrupts the wait, this can
-        be called again."""
+        """Wait until the job is done, even if the job fails.
+
+        If the job has not started, the calling thread runs it. Otherwise, the calling thread runs
+        other queued jobs while it waits. If Ctrl-C interrupts the wait, this method can be called
+        again.
+        """
         self._queue.wait_for(self)
 
     def result(self) -> T:
-        """Wait for the job, and return its result or raise its exception; a cancelled job raises
-        ``CancelledError``."""
+        """Wait for the job, and return its result or raise its exception.
+
+        If the job was cancelled, ``CancelledError`` is raised.
+        """
         self.wait()
         if self.error is not None:
             raise self.error
         return self._value  # type: ignore[return-value]
 
     def cancel(self) -> None:
-        """Prevent that the job begins; if it has begun, wait for it."""
+        """Cancel the job if it has not started. Otherwise, wait until it is done."""
         self._queue.cancel(self)
 
     def run(self) -> None:
-        """Run the function and keep its result or its exception."""
+        """Run the function, and keep its result or its exception."""
         work, self._work = self._work, None  # what it refers to is not needed any more
         assert work is not None
         try:
@@ -107,26 +119,24 @@ class Job(Generic[T]):
 
 
 class _Thread(threading.local):
-    """What a queue knows of each thread."""
+    """What a queue stores about each thread."""
 
     runs_job = False
 
 
 class _Queue:
-    """Jobs that have not begun, and the threads that wait for a change."""
+    """Jobs that have not started, and the threads that wait for a change of the queue."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._thread = _Thread()
-        self._jobs: list[tuple[Urgency, int, Job]] = []  # type: ignore[type-arg]  # of any type
-        self._added = 0
+        self._jobs: list[Job[Any]] = []  # in the order in which they were added
         self._closed = False
 
     def add(self, work: Callable[[], T], urgency: Urgency) -> Job[T]:
-        job = Job(work, self)
+        job = Job(work, urgency, self)
         with self._changed:
-            heapq.heappush(self._jobs, (urgency, self._added, job))
-            self._added += 1
+            self._jobs.append(job)
             self._changed.notify_all()
         return job
 
@@ -134,52 +144,60 @@ class _Queue:
         """Run jobs until the queue is closed."""
         while True:
             with self._changed:
-                while (job := self._begin_next()) is None:
+                while not self._jobs:
                     if self._closed:
                         return
                     self._changed.wait()
+                job = self._take()
             self._run(job)
+            del job  # and its result, while this thread waits for the next job
 
-    def wait_for(self, awaited: Job[T]) -> None:
-        """See ``Job.wait``. Within a job, other jobs are not run, because they would delay it."""
+    def wait_for(self, awaited: Job[Any]) -> None:
+        """Wait for a job (``Job.wait``).
+
+        A job that waits for another job does not run further jobs meanwhile, because these would
+        delay the waiting job.
+        """
         while True:
             with self._changed:
+                while not (awaited.is_done or awaited in self._jobs or self._can_help()):
+                    self._changed.wait()
                 if awaited.is_done:
                     return
-                if not awaited.has_begun:
-                    awaited.has_begun = True
-                    job: Job | None = awaited  # type: ignore[type-arg]
-                else:
-                    job = None if self._thread.runs_job else self._begin_next()
-                if job is None:
-                    self._changed.wait()
-                    continue
+                job = self._take(awaited if awaited in self._jobs else None)
             self._run(job)
             if job is not awaited and isinstance(job.error, KeyboardInterrupt):
                 raise job.error  # Ctrl-C is meant for the caller
 
-    def cancel(self, job: Job[T]) -> None:
+    def cancel(self, job: Job[Any]) -> None:
         with self._changed:
-            if not job.has_begun:
-                job.has_begun = job.is_done = True
-                job.error = CancelledError()
+            if job in self._jobs:
+                self._drop(job)
         self.wait_for(job)
 
     def close(self) -> None:
+        """Cancel all jobs that have not started, and let the threads end."""
         with self._changed:
-            self._jobs.clear()
+            for job in self._jobs.copy():
+                self._drop(job)
             self._closed = True
             self._changed.notify_all()
 
-    def _begin_next(self) -> Job | None:  # type: ignore[type-arg]  # of any type
-        while self._jobs:
-            _, _, job = heapq.heappop(self._jobs)
-            if not job.has_begun:
-                job.has_begun = True
-                return job
-        return None
+    def _drop(self, job: Job[Any]) -> None:
+        self._jobs.remove(job)
+        job.error, job.is_done = CancelledError(), True
 
-    def _run(self, job: Job[T]) -> None:
+    def _can_help(self) -> bool:
+        """Return whether this thread can run a job while it waits for another one."""
+        return bool(self._jobs) and not self._thread.runs_job
+
+    def _take(self, job: Job[Any] | None = None) -> Job[Any]:
+        """Remove a job from the queue: the given one, or the first of the most urgent ones."""
+        chosen = job or min(self._jobs, key=lambda job: job.urgency)
+        self._jobs.remove(chosen)
+        return chosen
+
+    def _run(self, job: Job[Any]) -> None:
         outer, self._thread.runs_job = self._thread.runs_job, True
         job.run()
         self._thread.runs_job = outer

@@ -1,4 +1,4 @@
-"""The command line: ``main.py`` and one file for each group of commands.
+"""The command line, with one file for each group of commands. The entry point is ``main.py``.
 
 Slow imports are made inside the commands, so that ``--help`` appears at once.
 """

@@ -145,7 +145,7 @@ def calibrate(
 
 
 def _check_place(out: Path) -> None:
-    """Check, before any work, that a calibration can be written to a file.
+    """Check before any work begins that a calibration can be written to a file.
 
     Raises:
         InputError: the file cannot be written, is not YAML, or belongs to another program.
@@ -163,8 +163,8 @@ def _check_place(out: Path) -> None:
 def _keep_earlier(*files: Path) -> None:
     """Rename the files of an earlier calibration.
 
-    ``a.yaml`` is renamed to ``a-1.yaml``. If the number 1 is taken for one of the files, the number
-    2 is used, and so on.
+    ``a.yaml`` is renamed to ``a-1.yaml``. All files get the same number, which is the first number
+    that is free for all of them.
     """
     for n in count(1):
         kept = {path: path.with_stem(f"{path.stem}-{n}") for path in files}
@@ -184,7 +184,7 @@ def _keep_earlier(*files: Path) -> None:
 def _board(
     kind: str, size: str, square: float | None, marker: float | None, tags: str, *, stereo: bool
 ) -> Board:
-    """The board that the options describe."""
+    """Return the calibration board that the options describe."""
     from vslam.calibration.boards import Board, Kind, read_board
 
     if kind not in get_args(Kind):
@@ -213,11 +213,11 @@ def _board(
 
 
 def _frames(raw: RawSource, most: int) -> Iterator[TimedFrame]:
-    """Yield the frames of a source. If it has more than ``most`` frames, yield about ``most`` of
-    them, spread evenly.
+    """Yield the frames of a source.
 
-    If the source ends early because it is damaged, a warning is printed, and the frames that could
-    be read are used.
+    If the source has more than ``most`` frames, about ``most`` frames are yielded, which are spread
+    evenly. If the source ends early because it is damaged, a warning is printed, and the frames
+    that could be read are used.
 
     Raises:
         BrokenSourceError: fewer than two frames can be read.
@@ -235,10 +235,10 @@ def _frames(raw: RawSource, most: int) -> Iterator[TimedFrame]:
 
 
 def _search(raw: RawSource, board: Board) -> tuple[list[Frame], list[Image]]:
-    """Search images for the board.
+    """Search images for the calibration board.
 
     Returns:
-        The views of the board in each frame, and some of the left images.
+        The corners of the board that were found in each frame, and some of the left images.
     """
     from vslam.calibration.boards import find_corners, same_order
 

@@ -1,6 +1,7 @@
-"""The systems and the data that ``vslam bench`` and ``vslam stress`` test.
+"""The systems and the data that are tested by ``vslam bench`` and ``vslam stress``.
 
-A cell is one run: a sequence, a perturbation, a seed and a system.
+These commands run a grid. Each cell of the grid is one run of a system on a sequence, with a
+perturbation and a random seed.
 """
 
 from __future__ import annotations
@@ -27,12 +28,13 @@ _ORBSLAM3 = "orbslam3"
 
 @dataclass(frozen=True)
 class Systems:
-    """The systems to test.
+    """The SLAM systems that a benchmark tests.
 
     Attributes:
         detectors: loop detectors of vslam.
-        weights: weight file of each detector that does not use the shipped weights.
-        others: command templates of other systems by name (``vslam.lab.stress.external``).
+        weights: weight files by detector. Detectors that use the shipped weights are not included.
+        others: templates of the commands that run other systems, by name
+            (``vslam.lab.stress.external``).
     """
 
     detectors: list[str]
@@ -53,7 +55,7 @@ def choose_systems(
     python: Path | None,
     vocabulary: Path | None,
 ) -> Systems:
-    """The systems that the options select.
+    """Return the systems that the options select.
 
     Raises:
         InputError: no system is selected, a system is unknown, or a file that a system needs is
@@ -79,7 +81,7 @@ def choose_systems(
 def _others(
     wanted: list[str], given: Collection[str], python: Path | None, vocabulary: Path | None
 ) -> dict[str, str]:
-    """Command templates of the other systems."""
+    """Return templates of the commands that run other systems, by name."""
     from vslam.lab.stress import orbslam3
     from vslam.lab.stress.external import check_template
 
@@ -111,19 +113,20 @@ def _others(
 
 @dataclass(frozen=True)
 class Cells:
-    """The sequences and settings of the cells of one command.
+    """The sequences and settings of a benchmark, which is a grid of runs (cells).
 
     Attributes:
-        kind: kind of data.
-        given: options of the data. Paths are absolute, because each run has its own working folder.
+        kind: kind of data, which is a value of the option ``--dataset``.
+        given: options that describe the data. Paths are absolute, because each run has its own
+            working folder.
         systems: the systems to test.
         sequences: the opened sequences by name.
-        options: settings that all cells share.
-        jobs: number of runs at a time on this machine.
-        scheduler: address of a Dask scheduler whose workers run the cells. None if this machine
-            runs the cells.
+        options: settings that are the same for all runs.
+        jobs: number of runs that this machine performs at the same time.
+        scheduler: address of a Dask scheduler whose workers perform the runs. None if this machine
+            performs the runs.
         out: folder of the results.
-        console: shows the progress.
+        console: shows the progress in the terminal.
     """
 
     kind: str
@@ -137,7 +140,14 @@ class Cells:
     console: Console
 
     def grid(self, perturbations: Collection[str], seeds: int) -> list[Cell]:
-        """The cells of all sequences and systems (``vslam.lab.bench.grid.make_grid``)."""
+        """Return the cells of the benchmark's grid (``vslam.lab.bench.grid.make_grid``).
+
+        Each cell is one run of a system on a sequence, with a perturbation and a random seed.
+
+        Args:
+            perturbations: the perturbations to apply to the sequences.
+            seeds: number of random seeds.
+        """
         from vslam.lab.bench.grid import make_grid, thresholds_digest
 
         return make_grid(
@@ -154,7 +164,7 @@ class Cells:
         prepare(self.out, _identity(self.kind, self.given))
 
     def run(self, cells: Collection[Cell]) -> Generator[CellOutcome, None, None]:
-        """Run some of the cells on this machine or on a cluster, and yield their outcomes."""
+        """Perform some of the runs on this machine or on a cluster, and yield their outcomes."""
         if self.scheduler is not None:
             from vslam.lab.bench.cluster import run_on_cluster
 
@@ -181,13 +191,14 @@ def open_cells(
     *,
     shown: bool,
 ) -> Cells:
-    """Open all sequences.
+    """Open the sequences of a benchmark.
 
     Args:
-        seqs: list of sequences. None for data that has only one sequence.
+        seqs: list of sequences, such as "00-05" or "00,demo". None for data that has only one
+            sequence.
 
     Raises:
-        InputError: data is missing or cannot be used.
+        InputError: data are missing or cannot be used.
     """
     from vslam.lab.bench.execute import RunOptions, scratch_folder
     from vslam.machine import available_cores
@@ -230,8 +241,10 @@ def _absolute(given: SourceOptions) -> SourceOptions:
 
 
 def _words_of(given: SourceOptions) -> list[str]:
-    """The options of ``vslam run`` that describe the data. Options that are part of a cell are left
-    out."""
+    """Return the options of ``vslam run`` that describe the data.
+
+    Options that differ between the runs of a benchmark are left out.
+    """
     words = ["--side-by-side"] if given.side_by_side else []
     values = {
         "--right": given.right,
@@ -244,7 +257,7 @@ def _words_of(given: SourceOptions) -> list[str]:
 
 
 def _identity(kind: str, given: SourceOptions) -> str:
-    """A text that identifies the data of a benchmark."""
+    """Return a text that identifies the data of a benchmark."""
     if kind != "synthetic":
         return " ".join([given.data, *_words_of(given), *map(str, given.calib)])
     from vslam.datasets.synthetic import Variation, store
@@ -255,9 +268,10 @@ def _identity(kind: str, given: SourceOptions) -> str:
 def _open_all(
     kind: str, given: SourceOptions, seqs: str | None, console: Console
 ) -> dict[str, Source]:
-    """Open every sequence by name, so that missing data is reported before the first run.
+    """Open every sequence, so that missing data are reported before the first run.
 
-    Synthetic sequences are rendered here, so that parallel runs do not render the same sequence.
+    This function renders synthetic sequences, so that parallel runs do not render the same
+    sequence.
     """
     from vslam.datasets.sources import LIVE
     from vslam.lab.bench.grid import parse_sequences

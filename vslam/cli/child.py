@@ -1,9 +1,8 @@
-"""``python -m vslam.cli.child run ...`` runs a command of vslam and ends when its parent process
-ends.
+"""A command of vslam in a child process that ends when its parent process ends.
 
-The parent process holds the other end of the pipe that is the standard input of this process. When
-the parent ends, even if it is killed, the pipe closes. This process then ends, too, because nobody
-would read its results.
+It is started with ``python -m vslam.cli.child run ...``. The standard input of this process is a
+pipe from the parent process. When the parent ends, even if it is killed, the pipe closes. This
+process then ends, too, because nobody would read its results.
 """
 
 from __future__ import annotations

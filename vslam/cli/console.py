@@ -1,4 +1,4 @@
-"""Progress of a command, which is shown on stderr. Results are printed on stdout."""
+"""Display of the progress of a command on stderr. Results are printed on stdout."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 class Console:
-    """Draws progress bars and prints messages. If it is not ``shown``, it does nothing.
+    """Draws progress bars and prints messages. If ``shown`` is False, it does nothing.
 
     The package rich is imported only when something is shown, because its import takes as long as
     tracking forty frames. A bar appears at its first step.
@@ -29,7 +29,7 @@ class Console:
 
     @contextmanager
     def progress_bar(self, total: int | None) -> Iterator[Callable[[TrackResult], None]]:
-        """Show frames, frames per second, tracking state and remaining time.
+        """Show a bar with the progress, speed, tracking state and remaining time of a run.
 
         The method yields a function, which must be called with the result of each frame.
 
@@ -42,14 +42,21 @@ class Console:
 
     @contextmanager
     def render_bar(self) -> Iterator[Callable[[int, int], None]]:
-        """Yield a function, which must be called with the number of rendered frames and of all
-        frames."""
+        """Show a bar for rendering.
+
+        The method yields a function, which must be called with the number of rendered frames and
+        the number of all frames.
+        """
         with self._bar("rendering", fps=True) as update:
             yield lambda done, total: update(total=total, completed=done)
 
     @contextmanager
     def training_bar(self) -> Iterator[Callable[[int, int, int, float], None]]:
-        """Yield a function, which must be called with epoch, step, steps per epoch and loss."""
+        """Show a bar for training.
+
+        The method yields a function, which must be called with the epoch, the step, the steps per
+        epoch and the loss.
+        """
         with self._bar("epoch {task.fields[epoch]}", ("loss {task.fields[loss]:.3f}",)) as update:
             yield lambda epoch, step, steps, loss: update(
                 anew=step == 1, total=steps, completed=step, epoch=epoch, loss=loss
@@ -57,7 +64,10 @@ class Console:
 
     @contextmanager
     def count_bar(self, what: str, total: int) -> Iterator[Callable[[], None]]:
-        """Yield a function, which must be called when one of ``total`` items is done."""
+        """Show a bar that counts items.
+
+        The method yields a function, which must be called when one of ``total`` items is done.
+        """
         with self._bar(what) as update:
             update(total=total)
             yield lambda: update(advance=1)
@@ -66,9 +76,10 @@ class Console:
     def _bar(
         self, before: str = "", after: tuple[str, ...] = (), *, fps: bool = False
     ) -> Iterator[Callable[..., None]]:
-        """Yield a function with the arguments of rich's ``Progress.update``.
+        """Show a bar, and yield a function that updates it.
 
-        Its additional argument ``anew`` restarts the bar.
+        This function has the arguments of rich's ``Progress.update``. Its additional argument
+        ``anew`` restarts the bar.
         """
         if not self._shown:
             yield lambda **changes: None

@@ -76,7 +76,10 @@ def doctor(
 
 
 def _free(path: Path) -> Path:
-    """The path if it does not exist. Otherwise, the first of ``doctor-2.html``, ``doctor-3.html``,
-    ... that does not exist."""
+    """Return a path at which no file exists.
+
+    This is the given path if it is free. Otherwise, it is the first free path of ``doctor-2.html``,
+    ``doctor-3.html``, ...
+    """
     numbered = (path.with_stem(f"{path.stem}-{n}") for n in count(2))
     return next(one for one in chain((path,), numbered) if not one.exists())

@@ -1,4 +1,4 @@
-"""The work of ``vslam run`` after it has checked its options."""
+"""The work of ``vslam run`` after the options have been checked."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Output:
-    """Options for what a run shows and writes. A resumed run may change these options."""
+    """Options that determine what a run shows and writes.
+
+    They may be changed when a run is resumed.
+    """
 
     record: bool
     view: Literal["native", "web"] | None
@@ -117,7 +120,7 @@ def drive(
 
 
 def _open(options: RunOptions, console: Console) -> tuple[Source, Perturbation]:
-    """Open the images and create their perturbation.
+    """Open the images of a run, and create the perturbation that is applied to them.
 
     Raises:
         InputError: the images cannot be read, or data that the perturbation needs is missing.
@@ -131,7 +134,10 @@ def _open(options: RunOptions, console: Console) -> tuple[Source, Perturbation]:
 
 
 def _fixes(path: Path, antenna: tuple[float, ...] | None, source: Source) -> Fixes:
-    """Read the GPS fixes of ``--gps``. Their times must overlap with the times of the images."""
+    """Read the GPS fixes from the file of ``--gps``.
+
+    The times of the fixes must overlap with the times of the images.
+    """
     from vslam.datasets.fixes import read_fixes, require_overlap
 
     fixes = read_fixes(path, antenna)
@@ -140,11 +146,11 @@ def _fixes(path: Path, antenna: tuple[float, ...] | None, source: Source) -> Fix
 
 
 def _georeferenced(outcome: RunOutcome, fixes: Fixes) -> tuple[RunOutcome, str]:
-    """Georeference the trajectory of an outcome.
+    """Georeference the trajectory of a finished run.
 
     Returns:
-        The outcome with the georeferenced trajectory, and an error message. The message is empty on
-        success.
+        The outcome of the run with the georeferenced trajectory, and an error message. The message
+        is empty on success.
     """
     from vslam.plugins import reason
     from vslam.run.gps import locate
@@ -172,7 +178,7 @@ def _refuse_live_source(source: Source, resume: Path | None) -> None:
 def _unfinished(
     options: RunOptions, source: Source, resume: Path | None, lock: ExitStack
 ) -> Unfinished | None:
-    """The saved state of the run to resume. None for a new run.
+    """Find the saved state of the run to resume. None for a new run.
 
     Raises:
         InputError: there is no saved state, or the map to continue was made with another camera.
@@ -232,7 +238,7 @@ def _recorder(
     moments: Recorder,
     pictures: LoopPictureRecorder,
 ) -> Recorder:
-    """A recorder for the recording file, the viewer and the report of a run."""
+    """Return a recorder for the recording file, the viewer and the report of a run."""
     from vslam.run.recorder import Recorder, RerunRecorder, SeveralRecorders
 
     recorders: list[Recorder] = []

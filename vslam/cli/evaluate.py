@@ -100,7 +100,10 @@ def evaluate_files(
 
 
 def _files_of_run(folder: Path, gt: Path | None, times: Path | None) -> tuple[Path, Path, str]:
-    """The trajectory of a run, the ground truth in a matching format, and the alignment."""
+    """Return the files of the trajectory and of the ground truth of a run, and the alignment.
+
+    Both files have the same format.
+    """
     from vslam.report.schema import ReportJson
     from vslam.run.outcome import alignment_of
     from vslam.trajectory import trajectory_format

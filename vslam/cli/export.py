@@ -224,18 +224,18 @@ def ros(
 
 
 def _beside(run: Path, name: str) -> Path:
-    """The path of a file to write into the folder of a run.
+    """Return the path of a file to write into the folder of a run.
 
-    If ``run`` is a map file, the path is next to it, with the same stem.
+    If ``run`` is a map file, the new path is in the folder of the map file, with the same stem.
     """
     return run / name if run.is_dir() else run.with_suffix(Path(name).suffix)
 
 
 def _graph(run: Path) -> tuple[PoseGraph, Map]:
-    """The pose graph and the map of a run, or of a map file.
+    """Return the pose graph and the map of a run or of a map file.
 
-    The edges are weighted by the thresholds of the run. For a map file, these are the thresholds of
-    its last drive.
+    The weights of the edges depend on the thresholds of the run. For a map file, the thresholds of
+    its last drive are used.
     """
     from vslam.backend.pose_graph import essential_graph
     from vslam.config import as_config, load_config
@@ -290,10 +290,10 @@ def _export_images(
     link: bool,
     quiet: bool,
 ) -> None:
-    """Write the images of the keyframes of a run into a new folder, then call ``save`` to write the
-    model.
+    """Write the images of the keyframes of a run into a new folder, and then write the model.
 
-    ``save`` gets the folder, the map, the names of the images and the colours of the landmarks.
+    The model is written by the function ``save``. It is called with the folder, the map, the names
+    of the images and the colours of the landmarks.
     """
     from vslam.maps.formats import landmark_colours, save_image
     from vslam.maps.new_output import new_output
@@ -322,7 +322,7 @@ def _export_images(
 
 
 def _image_of(frame: TimedFrame) -> NDArray[np.uint8]:
-    """The left image of a frame. It is in colour if the source has colour images."""
+    """Read the left image of a frame. It is in colour if the source has colour images."""
     return frame.read(map)[0] if frame.colour is None else frame.colour()
 
 

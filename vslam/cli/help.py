@@ -56,7 +56,7 @@ def show_help(command: Any, context: Any) -> None:
 
 
 def describe_parameters(command: Any, context: Any) -> str:
-    """Sentences that describe the arguments of a command and list its options."""
+    """Return sentences that describe the arguments of a command and list its options."""
     arguments, options = [], []
     for parameter in command.get_params(context):
         if parameter.param_type_name == "option":
@@ -68,7 +68,7 @@ def describe_parameters(command: Any, context: Any) -> str:
 
 
 def _name(parameter: Any) -> str:
-    """The name of a parameter in the help: ``--record/--no-record``, ``--map FILE`` or ``RUN``."""
+    """Return the name of a parameter in the help, such as ``--map FILE`` or ``RUN``."""
     if parameter.param_type_name == "argument":
         name = parameter.metavar or parameter.name.upper()
         return f"{name}..." if parameter.nargs != 1 else str(name)
@@ -77,7 +77,7 @@ def _name(parameter: Any) -> str:
 
 
 def _described(parameter: Any) -> Text:
-    """The description of a parameter, followed by its default or by the word required."""
+    """Return the description of a parameter, followed by its default or by the word required."""
     text = Text.from_markup(parameter.help or "")
     default = parameter.default
     if isinstance(parameter.show_default, str):

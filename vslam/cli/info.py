@@ -58,7 +58,7 @@ def info(
 
 
 def _numba_caches() -> dict[Path, int]:
-    """Folders that contain compiled kernels, and their sizes in bytes."""
+    """Return the folders that contain compiled kernels, and their sizes in bytes."""
     import platformdirs
 
     import vslam

@@ -49,8 +49,10 @@ _UsageError: Any = typer.BadParameter.__base__  # typer does not export it
 
 
 class _Command(TyperCommand):
-    """A command with vslam's own help. Its error messages suggest a correction for a wrong
-    option."""
+    """A command with vslam's own help.
+
+    If an option is wrong, the error message suggests a correction.
+    """
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         from vslam.cli.help import show_help
@@ -81,7 +83,10 @@ class _Group(TyperGroup):
 
 
 def _plain(message: str) -> str:
-    """The error message of the parser in plain words, with a suggestion for a misspelt name."""
+    """Rephrase an error message of the parser in plain words.
+
+    For a misspelt name, a suggestion is added.
+    """
     message = plain_reason(message)
     word, found, choices = message.partition(" is not one of ")
     if not found:
@@ -92,7 +97,7 @@ def _plain(message: str) -> str:
 
 
 def application(groups: Collection[ModuleType]) -> typer.Typer:
-    """Create an application with the commands of some modules."""
+    """Create a command line application from the commands that some modules define."""
     made = typer.Typer(
         help="Visual SLAM in pure Python.",
         cls=_Group,
@@ -123,7 +128,7 @@ app = application(_GROUPS)
 
 
 def _treat_as_ctrl_c(signal_number: int, stack: FrameType | None) -> None:
-    """Treat SIGTERM as Ctrl-C. A machine sends SIGTERM when it shuts down."""
+    """Treat SIGTERM as Ctrl-C. The operating system sends SIGTERM when the machine shuts down."""
     handler = signal.getsignal(signal.SIGINT)
     if not callable(handler):  # background jobs of a shell ignore Ctrl-C
         raise KeyboardInterrupt

@@ -84,7 +84,7 @@ def _contents(map_: Map, reconstruction: Reconstruction) -> Rows:
 
 
 def _weakest_place(map_: Map) -> Rows:
-    """The keyframe that shares the fewest landmarks with earlier keyframes."""
+    """Return the keyframe that shares the fewest landmarks with earlier keyframes."""
     from vslam.backend.pose_graph import connectivity
 
     living = map_.living_keyframes()[1:]
@@ -174,8 +174,10 @@ def merge(
 
 
 def _thresholds_of(stored: list[StoredMap], files: list[Path]) -> Config:
-    """The thresholds of the first map. A message lists the maps that were made with other
-    thresholds."""
+    """Return the thresholds of the first map.
+
+    If other maps were made with other thresholds, a message lists these maps.
+    """
     from vslam.config import as_config
 
     thresholds = stored[0].thresholds

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def _with_plugins(names: tuple[str, ...], group: str) -> tuple[str, ...]:
-    """vslam's own names, followed by the names of plug-ins (docs/howto/plugins.md)."""
+    """Return vslam's own names, followed by the names of plug-ins (docs/howto/plugins.md)."""
     return (*names, *(name for name in plugins.find_plugins(group) if name not in names))
 
 
@@ -44,19 +44,19 @@ INPUT, METHOD, MAP, OUTPUT, EXECUTION = "Input", "Method", "Map", "Output", "Exe
 def option(
     panel: str, metavar: str, text: str, *names: str, unset: str | bool = True, **more: Any
 ) -> Any:
-    """An option in a panel of ``--help``. The text ``unset`` is shown as the default."""
+    """Define an option in a panel of ``--help``. The text ``unset`` is shown as the default."""
     return typer.Option(
         *names, metavar=metavar, help=text, show_default=unset, rich_help_panel=panel, **more
     )
 
 
 def flag(panel: str, text: str, *names: str) -> Any:
-    """An option without a value."""
+    """Define an option without a value."""
     return typer.Option(*names, help=text, rich_help_panel=panel)
 
 
 def threads(unset: str, text: str = "Number of threads. It does not change the result.") -> Any:
-    """The option ``--threads`` of a command whose default is ``unset``."""
+    """Define the option ``--threads``. The text ``unset`` is shown as the default."""
     return option(EXECUTION, "N", text, min=1, unset=unset)
 
 
@@ -161,17 +161,17 @@ _WITHOUT_DATA = """there is no data to read; give your data, or use rendered ima
 
 
 def names_in(text: str) -> list[str]:
-    """The names in a comma-separated list, in order and without repetitions."""
+    """Return the names in a comma-separated list, in order and without repetitions."""
     return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
 def kitti_root() -> str:
-    """The default folder of KITTI's data."""
+    """Return the default folder of the KITTI data."""
     return os.environ.get("KITTI_ROOT") or KITTI_ROOT
 
 
 def sequences(default: str) -> Any:
-    """The option ``--seqs`` of a command whose default is ``default``."""
+    """Define the option ``--seqs``. Its default is ``default``."""
     return option(
         INPUT,
         "LIST",
@@ -279,7 +279,7 @@ def _source_options(
         int | None, option(INPUT, "N", "Stop after N frames.", min=1, unset="all")
     ] = None,
 ) -> SourceOptions:
-    """Options of the source that the command line describes."""
+    """Define the options that describe the source of the images."""
     from vslam.datasets.sources import SourceOptions
 
     if source is not None and data is not None:
@@ -303,7 +303,10 @@ _NAMES = {"SourceOptions": object}  # annotations whose types are slow to import
 def reads_source(
     *, without: tuple[str, ...] = ()
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Decorator that replaces the parameter ``given`` of a command by the options for a source.
+    """Decorate a command that reads images.
+
+    The parameter ``given`` of the command is replaced by the options that describe the source of
+    the images.
 
     Args:
         without: options that the command does not have.
@@ -326,7 +329,7 @@ def reads_source(
 
 
 def _parameters(function: Callable[..., object]) -> list[inspect.Parameter]:
-    """The parameters of a function, with evaluated annotations."""
+    """Return the parameters of a function, with evaluated annotations."""
     hints = get_type_hints(function, localns=_NAMES, include_extras=True)
     return [
         parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY)
@@ -335,20 +338,20 @@ def _parameters(function: Callable[..., object]) -> list[inspect.Parameter]:
 
 
 def require_data(options: SourceOptions) -> None:
-    """Refuse a command without data, unless the default folder of KITTI's data exists.
+    """Check that the options name data, or that the default folder of the KITTI data exists.
 
     Raises:
-        InputError: there is no data to read.
+        InputError: there are no data to read.
     """
     if options.dataset is None and options.data == KITTI_ROOT and not Path(KITTI_ROOT).exists():
         raise InputError(_WITHOUT_DATA)
 
 
 def kind_of_source(options: SourceOptions) -> str:
-    """The kind of data that the options give, or the kind that is detected from the files.
+    """Return the kind of data that the options name, or detect it from the files.
 
     Raises:
-        InputError: there is no data to read, or its kind is unknown.
+        InputError: there are no data to read, or their kind is unknown.
     """
     from vslam.datasets.detection import detect_dataset
 
@@ -357,7 +360,9 @@ def kind_of_source(options: SourceOptions) -> str:
 
 
 def read_thresholds(given: str | None) -> Config:
-    """The thresholds of ``--config``. ``given`` is a file, values, or None for the defaults.
+    """Read the thresholds of ``--config``.
+
+    ``given`` is a file, a text with values, or None for the defaults.
 
     Raises:
         InputError: the file cannot be read, or a name or value is not valid.
@@ -374,10 +379,12 @@ def read_thresholds(given: str | None) -> Config:
 
 
 def open_given(options: SourceOptions, console: Console) -> Source:
-    """Open the source that the options describe, and show progress while a town is rendered.
+    """Open the source that the options describe.
+
+    If a synthetic town must be rendered first, the progress is shown.
 
     Raises:
-        InputError: there is no data to read, or it cannot be read.
+        InputError: there are no data to read, or they cannot be read.
     """
     from vslam.datasets.sources import open_source
 

@@ -242,8 +242,9 @@ _WITH_RESUME = {"resume", "record", "view", "keep_open", "pages", "ply", "save_m
 
 
 def _refuse_with_resume(context: typer.Context) -> None:
-    """Refuse options that cannot be combined with ``--resume``, because a resumed run keeps its
-    options.
+    """Refuse options that cannot be combined with ``--resume``.
+
+    A resumed run keeps these options.
 
     Raises:
         InputError: such an option was given.
@@ -258,7 +259,7 @@ def _refuse_with_resume(context: typer.Context) -> None:
 
 
 def _antenna(text: str) -> tuple[float, float, float]:
-    """The position that ``--gps-antenna`` gives."""
+    """Parse the position of the antenna that ``--gps-antenna`` gives."""
     try:
         right, down, ahead = map(float, text.split(","))
     except ValueError:
@@ -272,7 +273,7 @@ def _antenna(text: str) -> tuple[float, float, float]:
 
 
 def _compared(names: str, detector: str) -> tuple[str, ...]:
-    """The detectors of ``--compare``, without repetitions."""
+    """Return the detectors that ``--compare`` lists, without repetitions."""
     from vslam.loopclosure.registry import require_detector
 
     found = tuple(names_in(names))
@@ -286,9 +287,10 @@ def _compared(names: str, detector: str) -> tuple[str, ...]:
 def _map_to_continue(
     file: Path, detector: DetectorName | None
 ) -> tuple[Path, DetectorName, dict[str, object]]:
-    """The map in a file or in the folder of a run, and its detector and thresholds.
+    """Find the map to continue, and read the detector and the thresholds with which it was made.
 
-    The path is absolute, because ``runs/latest`` changes when this run creates its folder.
+    The map is a file, or it lies in the folder of a run. Its path is made absolute, because
+    ``runs/latest`` changes when this run creates its folder.
     """
     from vslam.maps.storage import made_with, map_file_of
 

@@ -1,5 +1,4 @@
-"""The command ``vslam stress``, which finds the strength of each perturbation at which a run
-fails."""
+"""The command ``vslam stress``, which tests how strong each perturbation can be."""
 
 from __future__ import annotations
 
@@ -118,7 +117,7 @@ def stress(
     out: Annotated[Path, option(OUTPUT, "FOLDER", "Folder to write to.")] = Path("stress"),
     quiet: Quiet = False,
 ) -> None:
-    """Find the strength of each perturbation at which a run fails."""
+    """For each perturbation, find the strength at which a run fails."""
     from vslam.cli.tables import show_sections
     from vslam.datasets.frames import first_frames
     from vslam.lab.bench import execute
@@ -205,7 +204,7 @@ def foreign(
 
 
 def _fitting(laws: list[str], opened: Mapping[str, Source]) -> tuple[list[str], list[str]]:
-    """The perturbations that can be applied to every sequence.
+    """Find the perturbations that can be applied to every sequence.
 
     Returns:
         These perturbations, and a note on each perturbation that cannot be applied.

@@ -34,8 +34,10 @@ def print_rows(rows: Rows) -> None:
 
 
 def print_summary(report: ReportJson, folder: Path) -> None:
-    """Print the first sections of the report of a run, and the most important files in its
-    folder."""
+    """Print the first sections of the report of a run.
+
+    The most important files in the folder of the run are printed, too.
+    """
     from vslam.report.run_page import run_page
     from vslam.run.autosave import MAP
 
@@ -50,7 +52,10 @@ def print_summary(report: ReportJson, folder: Path) -> None:
 
 
 def _how_to_compare(report: ReportJson) -> Rows:
-    """A hint on how to compare detectors, if the data has ground truth."""
+    """Return a hint on how to compare detectors.
+
+    The hint is empty if ``--compare`` was used or cannot be used, and if there is no ground truth.
+    """
     refused = report.realtime or report.map is not None  # --compare would be refused
     if report.detectors or report.compare or report.alignment is None or refused:
         return []

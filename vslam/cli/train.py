@@ -186,9 +186,10 @@ def train(
 
 
 def _require_libraries(command: str) -> None:
-    """Refuse a command if a package of the extra ``train`` is missing.
+    """Check that all packages of the extra ``train`` are installed.
 
-    This is checked at the start, because training needs the package onnxscript only hours later.
+    This is checked at the start. Otherwise, a missing package such as onnxscript would be noticed
+    only after hours of training.
 
     Raises:
         InputError: a package is not installed.

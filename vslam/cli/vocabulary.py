@@ -136,7 +136,10 @@ def info(
 
 
 def _find(images: list[str]) -> list[Path]:
-    """The image files of all folders and globs, sorted by name and without repetitions."""
+    """Return the image files of all folders and glob patterns.
+
+    The files are sorted by name, without repetitions.
+    """
     import glob
 
     from vslam.datasets.image_files import is_image
@@ -157,7 +160,10 @@ def _find(images: list[str]) -> list[Path]:
 
 
 def _extract_all(paths: list[Path], config: OrbConfig) -> Iterator[NDArray[np.uint8] | None]:
-    """Yield the ``(n, 32)`` descriptors of each image in order. None if an image cannot be read."""
+    """Yield the ORB descriptors of each image in order, as ``(n, 32)`` arrays.
+
+    None is yielded for an image that cannot be read.
+    """
     from concurrent.futures import ThreadPoolExecutor
 
     from vslam.datasets.image_files import read_grey

@@ -54,7 +54,8 @@ def write_page(
 ) -> None:
     """Write a self-contained HTML page about a calibration.
 
-    ``about`` is shown below the title. ``text`` is the content of the calibration file.
+    ``about`` is a line that is shown below the title. ``text`` is the content of the calibration
+    file.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -135,17 +136,20 @@ def _kept(check: str, n: int, dropped: Sequence[tuple[str, float]]) -> Finding:
 
 
 def _cells(fit: CameraFit) -> NDArray[np.int64]:
-    """The cell of the image in which each corner of all views lies. Cells are numbered column by
-    column."""
+    """Divide the image into cells, and return the cell in which each corner of all views lies.
+
+    Cells are numbered column by column.
+    """
     xy = np.concatenate([view.xy for view in fit.views]) / (fit.model.width, fit.model.height)
     x, y = (xy * _CELLS).astype(np.int64).clip(0, np.subtract(_CELLS, 1)).T
     return np.asarray(x * _CELLS[1] + y, np.int64)
 
 
 def _shared(cells: NDArray[np.int64], residuals: Array) -> float:
-    """The share of the squared residuals that the mean residual of each cell explains.
+    """Return the fraction of the squared residuals that is systematic.
 
-    It is about 0 for noise, and close to 1 for a camera model that does not fit the lens.
+    This is the fraction that the mean residual of each image cell explains. It is about 0 for
+    noise, and close to 1 for a camera model that does not fit the lens.
     """
     n = np.bincount(cells)
     sums = np.stack([np.bincount(cells, weights=column) for column in residuals.T], axis=1)

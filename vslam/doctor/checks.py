@@ -1,4 +1,4 @@
-"""The checks of a data set, as functions of images, matches and timestamps.
+"""The checks of a data set. They examine images, matches and timestamps.
 
 The checks are short and share this file, so that their thresholds are in one place.
 """
@@ -66,7 +66,10 @@ _REACH = 16, 48  # px, vertical and horizontal search range; the sensors are sid
 
 
 def check_rectification(matches: Matches) -> Finding:
-    """Check by their median row difference that matches lie in the same rows."""
+    """Check the rectification of a stereo pair, using the median row difference of matches.
+
+    In a rectified pair, both points of a match lie in the same row.
+    """
     rows = float(np.median(np.abs(matches.left[:, 1] - matches.right[:, 1])))
     return judge(
         "rectification",
@@ -77,7 +80,10 @@ def check_rectification(matches: Matches) -> Finding:
 
 
 def check_sides(matches: Matches) -> Finding:
-    """Check the sign of the disparities. It is wrong if the left and right images are swapped."""
+    """Check that the left and right images are not swapped.
+
+    If they are swapped, disparities have the wrong sign.
+    """
     disparity = matches.left[:, 0] - matches.right[:, 0]
     in_front = float(np.mean(disparity > -ROWS_PX))
     middle = float(np.median(disparity))
@@ -141,7 +147,8 @@ def check_focal_length(fit: FocalFit | None, camera: Camera) -> Finding:
     """Check whether the rotations of the camera fit the calibrated focal length.
 
     Args:
-        fit: the fitted focal length. None if too few frames have points in common.
+        fit: the focal length that fits the motion of the camera best. None if too few frames have
+            points in common.
     """
     if fit is None:
         return Finding("focal length", "unknown", "too few frames have points in common")
@@ -175,12 +182,13 @@ def check_exposure(pairs: Sequence[tuple[Image, Image]], several: Sequence[Match
 
 
 def check_synchronisation(rows_of_lag: Mapping[int, float]) -> tuple[Finding, int]:
-    """Check whether the cameras are synchronised, or whether the right image of another frame fits
-    better.
+    """Check whether the two cameras are synchronised.
+
+    They are not synchronised if the right image of another frame fits the left image better.
 
     Args:
-        rows_of_lag: median vertical error (px) for each lag. The lag is the delay of the right
-            image in frames. It is empty if no frame has matches at all lags.
+        rows_of_lag: median vertical error of stereo matches (px) by lag. The lag is the delay of
+            the right image in frames. The dictionary is empty if no frame has matches for all lags.
 
     Returns:
         The finding, and the best lag. The lag is 0 if the camera hardly moves.
@@ -220,7 +228,7 @@ def check_features(images: Sequence[Image], config: OrbConfig) -> Finding:
 
 
 def check_sharpness(images: Sequence[Image]) -> Finding:
-    """Check the ``sharpness`` of images."""
+    """Check that images are not blurred, using the median of their ``sharpness``."""
     values = [sharpness(image) for image in images]
     middle = float(np.median(values))
     return judge(
@@ -232,10 +240,9 @@ def check_sharpness(images: Sequence[Image]) -> Finding:
 
 
 def sharpness(image: Image) -> float:
-    """Contrast of pixels with their neighbours, relative to the contrast with a wider
-    neighbourhood.
+    """Compare the contrast of neighbouring pixels with the contrast in a wider neighbourhood.
 
-    It is 0 for an image without fine detail, and about 1 for white noise.
+    The ratio is 0 for an image without fine detail, and about 1 for white noise.
     """
     grey = image.astype(np.float32)
     fine, wide = (grey - cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1.0, 4.0))
@@ -243,7 +250,7 @@ def sharpness(image: Image) -> float:
 
 
 def check_times(timestamps: Times) -> list[Finding]:
-    """Check the order, gaps and jitter of timestamps (s). They may be out of order."""
+    """Check timestamps (s) for wrong order, gaps and jitter. They need not be sorted."""
     steps = np.diff(timestamps)
     if len(steps) < 3:
         return [Finding("times", "unknown", f"{len(timestamps)} frames are too few")]
@@ -285,9 +292,9 @@ def check_times(timestamps: Times) -> list[Finding]:
 
 
 def check_depth(images: Sequence[Image], depths: Sequence[Depth]) -> list[Finding]:
-    """Check the range of the depth, and whether it is registered to the images.
+    """Check the range of depth images, and whether they are registered to the colour images.
 
-    If the depth is registered, depth edges fit the image edges best without a shift.
+    If they are registered, depth edges fit the image edges best without a shift.
     """
     depths = [np.nan_to_num(depth.astype(np.float32)) for depth in depths]
     share = float(np.mean([np.mean(depth > 0) for depth in depths]))
@@ -310,7 +317,7 @@ def check_depth(images: Sequence[Image], depths: Sequence[Depth]) -> list[Findin
 
 
 def _registration(fit: NDArray[np.float32], views: Callable[[], int]) -> Finding:
-    """Check whether the best shift is 0.
+    """Check whether depth edges fit the image edges best without a shift.
 
     Another shift is a fault only if it is the single clear peak inside the search range, and if
     more than one view was examined.
@@ -339,7 +346,11 @@ def _registration(fit: NDArray[np.float32], views: Callable[[], int]) -> Finding
 
 
 def _edge_fit(image: Image, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """``(33, 97)`` mean edge strength of the image at the shifted depth edges, for each shift."""
+    """Compute how well the depth edges fit the image edges, for each shift in the search range.
+
+    Returns:
+        ``(33, 97)`` mean edge strength of the image at the shifted depth edges.
+    """
     down, across = _REACH
     grey = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32)
     strength = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
@@ -352,9 +363,9 @@ def _edge_fit(image: Image, depth: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def depth_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """``(H, W)`` bool, True for pixels where the depth jumps by more than a tenth.
+    """Find the pixels at which the depth jumps by more than a tenth, as ``(H, W)`` bool.
 
-    A depth of 0 means that the depth is missing.
+    A depth of 0 means that the depth is unknown.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         log = np.where(depth > 0, np.log(depth), np.nan)

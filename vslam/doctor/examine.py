@@ -1,7 +1,7 @@
-"""Examination of a sequence.
+"""Examination of a sequence by the checks of ``vslam doctor``.
 
-All timestamps and a few frames are checked. The frames are spread over the sequence. The result is
-a table of findings, and pictures.
+All timestamps are checked, and a few frames that are spread over the sequence. The result is a
+table of findings, and pictures.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _GREEN, _RED = (80, 200, 60), (60, 60, 230)  # BGR
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture for the page. ``image`` is ``(H, W, 3)`` uint8, BGR."""
+    """A picture for the HTML page. ``image`` is ``(H, W, 3)`` uint8 in BGR order."""
 
     caption: str
     image: Image
@@ -47,7 +47,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The findings in the order of the checks, and pictures that illustrate them."""
+    """The result of an examination: the findings in the order of the checks, and pictures."""
 
     findings: list[Finding]
     pictures: list[Picture] = field(default_factory=list)
@@ -104,9 +104,9 @@ def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
 
 
 def _examine_mask(sequence: Source, lefts: dict[int, Image]) -> tuple[list[Finding], list[Picture]]:
-    """Measure which share of the first image the mask hides, and draw this part in red.
+    """Measure the fraction of the first image that the mask hides, and draw this part in red.
 
-    The two lists of the result are empty if there is no mask.
+    The two lists of the result, findings and pictures, are empty if there is no mask.
     """
     frame = next(iter(lefts), None)
     read = None if frame is None else sequence.stored[frame].mask
@@ -133,12 +133,15 @@ class _Pair:
 
     @property
     def rows(self) -> float:
-        """Median vertical error of the matches (px)."""
+        """Median vertical error of the stereo matches (px)."""
         return float(np.median(np.abs(self.matches.left[:, 1] - self.matches.right[:, 1])))
 
 
 def _pairs(sequence: Source, lefts: dict[int, Image], lag: int) -> list[_Pair]:
-    """Pair each left image with the right image ``lag`` frames later, if this image can be read."""
+    """Match each left image with the right image ``lag`` frames later.
+
+    Pairs whose right image is missing or cannot be read are left out.
+    """
     found = []
     for frame, left in lefts.items():
         try:
@@ -182,7 +185,7 @@ def _examine_stereo(
 
 
 def _examine_focal_length(sequence: Source, found: list[Finding]) -> list[Finding]:
-    """Check the focal length, unless another fault would distort the result."""
+    """Check the focal length, unless a fault that was found earlier would distort the result."""
     if any(finding.verdict == "fault" for finding in found):
         return []
     last = len(sequence) - 1 - _LATER
@@ -193,7 +196,7 @@ def _examine_focal_length(sequence: Source, found: list[Finding]) -> list[Findin
 
 
 def _track(sequence: Source, frame: int) -> Moved | None:
-    """Find points of a frame, their disparities, and their positions a few frames later.
+    """Find points in a frame, their disparities, and their positions a few frames later.
 
     The result is None if there are too few points or if an image cannot be read.
     """
@@ -217,7 +220,10 @@ def _track(sequence: Source, frame: int) -> Moved | None:
 def _disparities(
     xy: NDArray[np.float32], left: Image, second: Image | DepthImage, camera: Camera
 ) -> NDArray[np.float64]:
-    """``(N,)`` disparities of ``(N, 2)`` keypoints of the left image. An unknown disparity is 0."""
+    """Compute the ``(N,)`` disparities of ``(N, 2)`` keypoints of the left image.
+
+    An unknown disparity is 0.
+    """
     if second.dtype != np.uint8:
         x, y = np.rint(xy).astype(int).T
         depth = np.asarray(second, np.float64)[y, x]
@@ -233,7 +239,11 @@ def _disparities(
 
 
 def _rows_by_lag(by_lag: dict[int, list[_Pair]]) -> dict[int, float]:
-    """Median vertical error for each lag. Only frames that have matches at all lags are used."""
+    """Return the median vertical error of stereo matches (px) for each lag.
+
+    The lag is the delay of the right image in frames. Only frames that have matches for all lags
+    are used.
+    """
     rows = {
         lag: {pair.frame: pair.rows for pair in pairs if len(pair.matches)}
         for lag, pairs in by_lag.items()
@@ -247,8 +257,10 @@ def _rows_by_lag(by_lag: dict[int, list[_Pair]]) -> dict[int, float]:
 
 
 def _stereo_picture(pair: _Pair) -> Picture:
-    """Draw both images side by side, with a line for each match. The line is green if the rows
-    agree."""
+    """Draw both images of a stereo pair side by side, with a line for each match.
+
+    The line is green if the rows of the two points agree.
+    """
     left, right, matches = pair.left, pair.right, pair.matches
     height, width = left.shape
     begin = width + _GAP  # first column of the right image
@@ -273,7 +285,7 @@ def _stereo_picture(pair: _Pair) -> Picture:
 
 
 def _depth_picture(image: Image, depth: checks.Depth) -> Picture:
-    """Draw the depth edges over the image."""
+    """Draw the edges of a depth image over the colour image."""
     drawn = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     drawn[checks.depth_edges(np.nan_to_num(depth.astype(np.float32)))] = _RED
     caption = "Depth edges in red. They lie on the edges of objects if the depth is registered."
@@ -281,8 +293,9 @@ def _depth_picture(image: Image, depth: checks.Depth) -> Picture:
 
 
 def write_page(diagnosis: Diagnosis, title: str, path: Path) -> None:
-    """Write the page as self-contained HTML. Faults and their fixes come first, then the other
-    checks.
+    """Write the result of an examination as self-contained HTML.
+
+    Faults and their fixes come first. The other checks follow.
 
     Raises:
         ResultsError: the file cannot be written.

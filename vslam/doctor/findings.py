@@ -1,4 +1,4 @@
-"""The results of checks, and their text for the terminal and for the page."""
+"""The results of checks, and their text for the terminal and for the HTML page."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Finding:
         check: name of the check.
         verdict: ``good``, ``fault``, or ``unknown`` if the images do not allow a verdict.
         measured: the measurement, with units.
-        fix: what the user can do. It is empty if there is no fault.
+        fix: advice on how to remove the fault. It is empty if there is no fault.
     """
 
     check: str
@@ -30,7 +30,10 @@ class Finding:
 
 
 def judge(check: str, wrong: bool, measured: str, fix: str) -> Finding:
-    """Make a finding. It is a ``fault`` with its fix if ``wrong``. Otherwise, it is ``good``."""
+    """Create the finding of a check.
+
+    It is a ``fault`` with the given fix if ``wrong`` is True. Otherwise, it is ``good``.
+    """
     return Finding(check, "fault", measured, fix) if wrong else Finding(check, "good", measured)
 
 
@@ -43,8 +46,10 @@ def lines(findings: Iterable[Finding]) -> Iterator[str]:
 
 
 def sections(findings: Sequence[Finding]) -> list[Section]:
-    """Format findings as sections of a page. Faults and their fixes come first, then the other
-    checks."""
+    """Format findings as sections of a page.
+
+    Faults and their fixes come first. The other checks follow.
+    """
     faults = [
         Alert(f"{f.check.capitalize()}: {f.measured}.", f.fix and f"Fix: {f.fix}.")
         for f in findings

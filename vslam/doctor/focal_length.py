@@ -46,13 +46,13 @@ class Moved:
 
 @dataclass(frozen=True)
 class FocalFit:
-    """The focal length that fits the motion of the camera best.
+    """The focal length that best explains how points move when the camera moves.
 
     Attributes:
         factor: ratio of this focal length to the calibrated focal length.
         sigma: standard deviation of the logarithm of ``factor``.
-        turned: largest rotation about an axis perpendicular to the optical axis, in degrees. Only
-            frames whose points agree with ``factor`` are considered.
+        turned: largest rotation of the camera between two frames about an axis perpendicular to the
+            optical axis, in degrees. Only frames whose points agree with ``factor`` are considered.
     """
 
     factor: float
@@ -61,12 +61,13 @@ class FocalFit:
 
 
 def fit_focal_length(several: Sequence[Moved], camera: Camera) -> FocalFit:
-    """Find the focal length that fits the motion best.
+    """Find the focal length that best explains how points move when the camera moves.
 
     The search covers 0.5 to 2 times the calibrated focal length.
 
     Args:
-        several: at least one pair of frames, each with at least three points.
+        several: points that were seen in two frames, for at least one pair of frames. Each pair has
+            at least three points.
         camera: stereo or RGB-D camera. The disparities of an RGB-D camera are computed with its
             virtual baseline.
     """
@@ -104,7 +105,7 @@ def fit_focal_length(several: Sequence[Moved], camera: Camera) -> FocalFit:
 def _best_pose(
     moved: Moved, camera: Camera, factor: float, start: Vectors
 ) -> tuple[Vectors, float]:
-    """Optimise the motion by Gauss-Newton with a Cauchy loss.
+    """Optimise the motion between two frames by Gauss-Newton with a Cauchy loss.
 
     Returns:
         The motion as ``(6,)`` rotation vector and translation, and its loss.
@@ -126,7 +127,7 @@ def _best_pose(
 
 
 def _fits(moved: Moved, camera: Camera, factor: float, pose: Vectors) -> bool:
-    """Whether most points agree with a motion."""
+    """Return whether most points agree with a motion between two frames."""
     error, variance, _ = _errors(moved, camera, factor, pose)
     return float(np.median((error**2).sum(axis=1) / variance)) < _CAUCHY
 
@@ -134,10 +135,11 @@ def _fits(moved: Moved, camera: Camera, factor: float, pose: Vectors) -> bool:
 def _errors(
     moved: Moved, camera: Camera, factor: float, pose: Vectors
 ) -> tuple[Vectors, Vectors, Vectors]:
-    """``(N, 2)`` reprojection errors, their ``(N,)`` variances, and ``(N, 3)`` points in the later
-    frame.
+    """Compute the reprojection errors of points for a motion between two frames.
 
-    The variances include the uncertainty of the depths of the points.
+    Returns:
+        ``(N, 2)`` reprojection errors, their ``(N,)`` variances, and ``(N, 3)`` points in the later
+        frame. The variances include the uncertainty of the depths of the points.
     """
     projected, points = _project(moved.before, moved.disparity, camera, factor, pose)
     nearer, _ = _project(moved.before, moved.disparity + _DISPARITY, camera, factor, pose)
@@ -156,7 +158,11 @@ def _project(
 
 
 def _jacobian(points: Vectors, camera: Camera, factor: float, pose: Vectors) -> Vectors:
-    """``(N, 2, 6)`` derivatives of the pixel positions with respect to rotation and translation."""
+    """Compute the derivatives of pixel positions with respect to the motion of the camera.
+
+    Returns:
+        ``(N, 2, 6)`` derivatives with respect to rotation and translation.
+    """
     x, y, z = points.T
     z = np.maximum(z, 1e-3 * camera.baseline)
     zero = np.zeros_like(z)

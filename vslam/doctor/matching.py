@@ -40,7 +40,7 @@ class Matches:
 
 
 def match_images(left: Image, right: Image) -> Matches:
-    """Find ORB matches that satisfy one epipolar geometry, and refine them by optical flow.
+    """Find ORB matches that satisfy one epipolar geometry, and refine them using optical flow.
 
     If there are fewer than twelve matches, no matches are returned.
     """
@@ -72,7 +72,7 @@ def match_images(left: Image, right: Image) -> Matches:
 
 
 def count_views(images: Sequence[Image]) -> int:
-    """Number of clearly different views in a sequence of images."""
+    """Count the clearly different views in a sequence of images."""
     views: list[Image] = []
     for image in images:
         if not any(_same_view(image, view) for view in views):
@@ -95,8 +95,10 @@ def joined(several: list[Matches]) -> Matches:
 
 
 def _normalised(image: Image, model: Image) -> Image:
-    """Give an image the brightness and contrast of another image, because optical flow assumes
-    this."""
+    """Give an image the brightness and contrast of another image.
+
+    Optical flow assumes that both images have the same brightness and contrast.
+    """
     gain = float(model.std()) / max(float(image.std()), 1.0)
     shifted = (image.astype(np.float32) - image.mean()) * gain + model.mean()
     return np.clip(np.rint(shifted), 0, 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Explanation why a run tracked no frame. A few of its frames are examined."""
+"""Explanation of why a run tracked no frame. A few frames of the run are examined."""
 
 from __future__ import annotations
 
@@ -48,8 +48,10 @@ def why_nothing_was_tracked(outcome: RunOutcome) -> str | None:
 
 
 def _negative_disparity(source: Source) -> float | None:
-    """Median disparity (px) of a few frames if left and right seem to be swapped; otherwise
-    None."""
+    """Return the median disparity (px) of a few frames if left and right seem to be swapped.
+
+    The disparity is negative in this case. Otherwise, the result is None.
+    """
     found = []
     try:
         for frame in islice(source.frames(), _FRAMES):

@@ -1,7 +1,8 @@
-"""Evaluation of loops: where the camera revisited a place, and whether a loop was closed there.
+"""Evaluation of loop closures: which revisited places were recognised, and which loops are wrong.
 
-ATE alone does not show this. Without drift, a missed loop causes no error. A wrong loop may distort
-only a part of the map with few frames. Therefore, each loop and each revisit is judged separately.
+The ATE alone does not show this. Without drift, a missed loop causes no error. A wrong loop may
+distort only a part of the map with few frames. Therefore, each loop and each revisit is judged
+separately.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ class Revisits:
 
     Attributes:
         first, last: ``(M,)`` first and last frame of each stretch.
-        first_match, last_match: ``(M,)`` earlier frames at the same places as ``first`` and
-            ``last``.
+        first_match, last_match: ``(M,)`` earlier frames that were taken at the same places as
+            ``first`` and ``last``.
         length_m: ``(M,)`` length of each stretch in metres.
     """
 
@@ -59,14 +60,14 @@ class Revisits:
 
 @dataclass(frozen=True)
 class LoopEvaluation:
-    """The assessment of loops and revisits.
+    """The result of comparing the loops of a run with the ground truth.
 
     Attributes:
-        revisits: M stretches.
+        revisits: the M stretches of the path on which the camera revisits places.
         loop_frame: ``(M,)`` query frame of the first correct loop that was closed on each stretch.
             It is -1 if no correct loop was closed there.
-        right: whether the relative pose of each edge is right, including rejected edges. None if
-            the edge has no pose or its frames have no ground truth.
+        right: for each loop edge, whether its relative pose is right. Rejected edges are included.
+            None if the edge has no pose or its frames have no ground truth.
         n_wrong: number of accepted edges whose relative pose is wrong.
     """
 
@@ -77,7 +78,7 @@ class LoopEvaluation:
 
     @property
     def n_found(self) -> int:
-        """Number of stretches on which a correct loop was closed.
+        """Number of revisited stretches of the path on which a correct loop was closed.
 
         One loop per stretch is enough, because tracking then continues in the old map.
         """
@@ -85,12 +86,12 @@ class LoopEvaluation:
 
     @property
     def n_missed(self) -> int:
-        """Number of stretches on which no correct loop was closed."""
+        """Number of revisited stretches of the path on which no correct loop was closed."""
         return len(self.revisits) - self.n_found
 
 
 def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
-    """Judge the loops of a run by the ground truth of its frames.
+    """Compare the loops of a run with the ground truth of its frames.
 
     The result is None if a frame has no ground truth, because revisits cannot be found on a path
     with gaps.
@@ -111,10 +112,11 @@ def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
 
 
 def metres_per_unit(T_wc: Poses, T_wc_true: Poses) -> NDArray[np.float64]:
-    """``(N,)`` metres per map unit of a monocular map at the time of each frame.
+    """Return the length of the unit of a monocular map at each frame, as ``(N,)`` metres.
 
-    It is the median ratio of the true distance to the estimated distance between consecutive
-    frames, over the 41 frames around each frame. It is 1 if the camera did not move.
+    For consecutive frames, the true distance is divided by the estimated distance. The result is
+    the median of these ratios over the 41 frames around each frame. It is 1 if the camera did not
+    move.
 
     Args:
         T_wc: ``(N, 4, 4)`` poses at the time of tracking.
@@ -145,12 +147,12 @@ def revisits(T_wc: Poses, timestamps: NDArray[np.float64]) -> Revisits:
     """Find the stretches on which the camera revisits places in the same direction.
 
     A frame is a revisit if the camera passed within ``MAX_LATERAL_M`` of the same position earlier,
-    with a heading that differed by at most ``MAX_HEADING_DEG``. The earlier passage must be at
-    least ``MIN_SECONDS`` and ``MIN_PATH_M`` before. The path between two frames is assumed to be
-    straight.
+    with a heading that differed by at most ``MAX_HEADING_DEG``. Between the two passages, there
+    must be at least ``MIN_SECONDS`` and a path of at least ``MIN_PATH_M``. The path between two
+    frames is assumed to be straight.
 
     Args:
-        T_wc: ``(N, 4, 4)`` ground truth.
+        T_wc: ``(N, 4, 4)`` true poses.
         timestamps: ``(N,)`` seconds.
     """
     none = np.zeros(0, np.int64)
@@ -191,10 +193,11 @@ def judge_loops(
     """Determine whether each loop edge is right, and whether each revisit was found by a loop.
 
     An edge is right if ``T_query_match`` agrees with the ground truth within ``MAX_TRANSLATION_M``
-    and ``MAX_ROTATION_DEG``. A right and accepted edge finds a stretch under two conditions. Its
-    match must belong to an earlier passage, not to the frames directly before. Its query must lie
-    on the stretch or within ``MAX_INTERRUPTION_M`` of it, because a camera also sees a place
-    shortly before and after it is there.
+    and ``MAX_ROTATION_DEG``. An accepted edge that is right finds a stretch under two conditions.
+    First, the match of the edge must belong to an earlier passage, not to the frames directly
+    before the query. Second, the query of the edge must lie on the stretch or within
+    ``MAX_INTERRUPTION_M`` of it. This tolerance is needed because the camera sees a place shortly
+    before it reaches the place and shortly after it leaves the place.
 
     Args:
         edges: accepted and rejected loops.
@@ -225,9 +228,10 @@ def judge_loops(
 
 
 def is_right_loop(edge: LoopEdge, frames: Indices, T_wc: Poses) -> bool | None:
-    """Whether the relative pose of a loop agrees with the ground truth, as in ``judge_loops``.
+    """Return whether the relative pose of a loop agrees with the ground truth.
 
-    The result is None if the loop has no pose or if its frames have no ground truth.
+    The tolerances are ``MAX_TRANSLATION_M`` and ``MAX_ROTATION_DEG``. The result is None if the
+    loop has no pose or if its frames have no ground truth.
     """
     if edge.T_query_match is None or edge.query < 0:
         return None
@@ -247,9 +251,10 @@ def is_right_loop(edge: LoopEdge, frames: Indices, T_wc: Poses) -> bool | None:
 def _earlier_passage(
     T_wc: Poses, timestamps: NDArray[np.float64], path: NDArray[np.float64]
 ) -> Indices:
-    """``(S,)`` index of the nearest sample of an earlier passage, for each sample of the path.
+    """For each of S samples of the path, find the nearest sample of an earlier passage.
 
-    The index is -1 if the camera was not there before.
+    Returns:
+        ``(S,)`` indices of samples. The index is -1 if the camera was not at this place earlier.
     """
     from scipy.spatial import cKDTree
 
@@ -287,6 +292,6 @@ def _long_ago(
     query: Indices | int,
     match: Indices | int,
 ) -> NDArray[np.bool_]:
-    """Whether a match is early enough before its query to belong to an earlier passage."""
+    """Return whether a match is old enough to belong to an earlier passage than its query."""
     apart = path[query] - path[match] >= MIN_PATH_M
     return apart & (timestamps[query] - timestamps[match] >= MIN_SECONDS)

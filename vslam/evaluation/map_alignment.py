@@ -1,8 +1,8 @@
 """The transformation from a map to its ground truth, and the error of localisation in the map.
 
 A trajectory is usually aligned with its ground truth before both are compared. Frames that were
-localised in a map are not aligned in this way. They are transformed by the alignment of the map, so
-their error includes the error of the map.
+localised in a map are not aligned in this way. They are transformed by the alignment of the map.
+Therefore, their error includes the error of the map.
 """
 
 from __future__ import annotations
@@ -16,15 +16,16 @@ from vslam.run.outcome import RunOutcome
 
 
 def name_of_world(outcome: RunOutcome) -> str:
-    """Name of the world frame of the ground truth of a run.
+    """Return the name of the world frame of the ground truth of a run.
 
-    All rendered drives along a route have the same name, even if their light or traffic differ.
+    All rendered drives along the same route have the same name, even if their light or traffic
+    differ.
     """
     return f"{outcome.sequence.dataset} {outcome.sequence.name.partition('+')[0]}"
 
 
 def truth_alignment_of(outcome: RunOutcome, evaluation: Evaluation) -> TruthAlignment:
-    """The transformation from a map to its ground truth.
+    """Return the transformation from a map to its ground truth.
 
     It is the alignment of the trajectory of the run that made the map.
     """
@@ -36,10 +37,10 @@ def truth_alignment_of(outcome: RunOutcome, evaluation: Evaluation) -> TruthAlig
 
 
 def error_in_map(outcome: RunOutcome) -> float | None:
-    """Position RMSE in metres of the frames that were localised in the map that a run continued.
+    """Compute the error of localisation in the map that a run continued.
 
-    The result is None if the transformation from this map to the ground truth of the run is
-    unknown.
+    The error is the position RMSE in metres of the frames that were localised in this map. The
+    result is None if the transformation from this map to the ground truth of the run is unknown.
     """
     alignment, truth = outcome.truth_alignment, outcome.ground_truth
     if alignment is None or truth is None or outcome.in_map is None:
@@ -53,7 +54,10 @@ def error_in_map(outcome: RunOutcome) -> float | None:
 
 
 def _similarity(T_wc: Matrix, aligned: Matrix) -> Matrix:
-    """``(4, 4)`` similarity that maps ``(N, 4, 4)`` poses to the ``(N, 4, 4)`` aligned poses."""
+    """Fit the ``(4, 4)`` similarity that maps poses to aligned poses.
+
+    Both arguments are ``(N, 4, 4)``.
+    """
     spread, aligned_spread = (
         np.linalg.norm(T[:, :3, 3] - T[:, :3, 3].mean(axis=0)) for T in (T_wc, aligned)
     )

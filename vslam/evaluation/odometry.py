@@ -1,4 +1,4 @@
-"""Errors of odometry over short motions, compared with the errors that its covariances predict."""
+"""Errors of odometry over short motions, and a comparison with the predicted covariances."""
 
 from __future__ import annotations
 
@@ -31,11 +31,10 @@ class MotionErrors:
 
     @property
     def nees(self) -> NDArray[np.float64]:
-        """``(M,)`` normalised estimation errors squared (NEES), divided by the six degrees of
-        freedom.
+        """``(M,)`` normalised estimation errors squared (NEES), divided by 6 degrees of freedom.
 
-        Their mean is 1 if the covariances are right (Bar-Shalom et al., Estimation with
-        Applications to Tracking and Navigation, 2001, 5.4).
+        The mean of these values is 1 if the covariances are right (Bar-Shalom et al., Estimation
+        with Applications to Tracking and Navigation, 2001, 5.4).
         """
         solved = np.linalg.solve(self.covariance, self.xi[:, :, None])[:, :, 0]
         return np.asarray((self.xi * solved).sum(axis=1) / 6.0, np.float64)
@@ -61,7 +60,7 @@ def motion_errors(
             are not used.
         truth: true poses at the times of some or all frames.
         interval_s: duration of a motion in seconds. The motion ends at the first frame that is at
-            least this much later.
+            least this long after its first frame.
     """
     true_pose = dict(zip(truth.timestamps.tolist(), truth.T_wc, strict=True))
     usable = [

@@ -1,7 +1,7 @@
-"""Error metrics of a trajectory by their usual definitions: ATE, RPE and KITTI's drift.
+"""Error metrics of a trajectory: ATE, RPE and KITTI's drift, as they are usually defined.
 
-The package evo (Grupp, 2017) computes ATE and RPE. Therefore, its command line reproduces them.
-Only this module imports evo.
+The package evo (Grupp, 2017) computes ATE and RPE. Therefore, the command line of evo gives the
+same values. Only this module imports evo.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _EVO_FLAGS = {"se3": " --align", "sim3": " --align --correct_scale", "none": ""}
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Errors of an estimate against the ground truth over N matched frames.
+    """Errors of an estimated trajectory relative to the ground truth, over N matched frames.
 
     Attributes:
         frames: number N of compared frames.
@@ -39,7 +39,8 @@ class Evaluation:
         errors_m: ``(N,)`` distance of each aligned position from the ground truth, in metres.
         T_wc_aligned: ``(N, 4, 4)`` poses of the estimate, aligned with the ground truth.
         distances_m: ``(N,)`` path length along the ground truth up to each frame, in metres.
-        rpe_m, rpe_deg: RMSE of the motion from one frame to the next, in metres and degrees.
+        rpe_m, rpe_deg: RMSE of the translation (metres) and the rotation (degrees) from one frame
+            to the next.
         t_rel_percent, r_rel_deg_per_100m: KITTI's drift over 100 to 800 m. None if the path is
             shorter than 100 m.
     """
@@ -60,7 +61,7 @@ class Evaluation:
     r_rel_deg_per_100m: float | None
 
     def summary(self) -> dict[str, float | int | str | None]:
-        """The fields that are not arrays, for JSON."""
+        """Return the fields that are not arrays, for JSON."""
         return {
             name: value for name, value in vars(self).items() if not isinstance(value, np.ndarray)
         }
@@ -71,7 +72,8 @@ def evaluate_trajectory(
 ) -> Evaluation:
     """Compare an estimated trajectory with the ground truth.
 
-    The alignment is ``se3``, ``sim3``, or ``none`` to compare without alignment.
+    The alignment is ``se3`` or ``sim3``. With ``none``, the trajectories are compared without
+    alignment.
 
     Trajectories with the same timestamps are compared frame by frame. Otherwise, each pose is
     compared with the true pose that is nearest in time, if the two timestamps differ by at most 10
@@ -133,7 +135,7 @@ def evaluate_trajectory(
 
 
 def _align(estimate: Any, reference: Any, with_scale: bool) -> bool:
-    """Align a trajectory of evo in place, and return whether its positions lie on one line.
+    """Align an evo trajectory in place, and return whether its positions lie on one line.
 
     Positions on a line do not determine the rotation about the line. In this case, a point to the
     right of each camera and a point below it are aligned together with the positions.
@@ -156,7 +158,10 @@ def _align(estimate: Any, reference: Any, with_scale: bool) -> bool:
 
 
 def _with_axes(trajectory: Any) -> NDArray[np.float64]:
-    """``(3, 3N)`` positions, and for each of them a point to its right and a point below it."""
+    """Return the positions of a trajectory, and two further points for each pose.
+
+    The further points lie to the right of the camera and below it. The result is ``(3, 3N)``.
+    """
     T_wc = np.array(trajectory.poses_se3)
     position = T_wc[:, :3, 3]
     short = 1e-3 * np.linalg.norm(position.std(axis=0))
@@ -165,7 +170,14 @@ def _with_axes(trajectory: Any) -> NDArray[np.float64]:
 
 
 def path_length(T_wc: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``(N,)`` distance travelled up to each of ``(N, 4, 4)`` poses, in metres."""
+    """Return the distance travelled up to each pose.
+
+    Args:
+        T_wc: ``(N, 4, 4)`` poses.
+
+    Returns:
+        ``(N,)`` metres.
+    """
     steps = np.linalg.norm(np.diff(T_wc[:, :3, 3], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
@@ -173,11 +185,11 @@ def path_length(T_wc: NDArray[np.float64]) -> NDArray[np.float64]:
 def kitti_drift(
     T_wc: NDArray[np.float64], T_wc_ground_truth: NDArray[np.float64]
 ) -> tuple[float, float] | None:
-    """Average drift over segments of 100 to 800 m, as the KITTI development kit defines it.
+    """Compute the average drift over segments of 100 to 800 m, as in the KITTI development kit.
 
-    Segments of 100, 200, ..., 800 m start at every tenth frame and end at the first frame that is
-    farther along the ground truth than this length. The error of the motion over a segment is
-    divided by the length of the segment [Geiger et al., CVPR 2012].
+    Segments of 100, 200, ..., 800 m start at every tenth frame. A segment ends at the first frame
+    at which the true path is longer than the length of the segment. The error of the motion over a
+    segment is divided by the length of the segment [Geiger et al., CVPR 2012].
 
     Args:
         T_wc: ``(N, 4, 4)`` estimate.
@@ -235,7 +247,7 @@ def read_pair(
 def evo_command(
     estimate: Path | str, ground_truth: Path | str, alignment: str, format_: Literal["kitti", "tum"]
 ) -> str:
-    """The ``evo_ape`` command that reproduces the ATE of two files of the same format."""
+    """Return the ``evo_ape`` command that reproduces the ATE of two files of the same format."""
     files = shlex.join([str(ground_truth), str(estimate)])
     return f"evo_ape {format_} {files}{_EVO_FLAGS[alignment]}"
 
@@ -248,7 +260,7 @@ def _associate(estimate: Trajectory, ground_truth: Trajectory) -> tuple[Trajecto
         times, true_times, rtol=0.0, atol=MAX_TIME_DIFFERENCE_S
     ):
         return estimate, ground_truth
-    if len(true_times) > len(times):  # evo also looks up the shorter in the longer
+    if len(true_times) > len(times):  # evo also looks up the shorter trajectory in the longer one
         matched, true = matching_time_indices(times, true_times, MAX_TIME_DIFFERENCE_S)
     else:
         true, matched = matching_time_indices(true_times, times, MAX_TIME_DIFFERENCE_S)

@@ -1,1 +1,1 @@
-"""Maps on disk."""
+"""Map files, and the export of maps to other programs."""

@@ -1,5 +1,7 @@
-"""Construction of a map from the arrays of a file. Everything that kernels rely on is checked
-first."""
+"""Construction of a map from the arrays of an untrusted file.
+
+Everything that kernels rely on is checked first.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,7 @@ _SIZES = {"keyframe": "K", "landmark": "L", "row": "R"}
 
 
 def _layout(name: str, in_file: str) -> tuple[type, tuple[str | int, ...]]:
-    """Type and shape that a column of the map must have in the file."""
+    """Return the type and shape that an array of a map must have in the file."""
     empty = (Arrays()._asdict() | KeyframeTable()._asdict())[name]
     size = "K+1" if name == "first_row" else _SIZES[in_file.partition("_")[0]]
     return empty.dtype.type, (size, *empty.shape[1:])
@@ -92,7 +94,7 @@ def _scalars(entry: dict[str, Any]) -> Scalars:
 
 
 def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
-    """Build a map from the arrays and the header of a file. Neither of them is trusted.
+    """Check the arrays and the header of an untrusted map file, and build a map from them.
 
     Raises:
         DamagedMapError, KeyError, TypeError, ValueError, AttributeError: the file is damaged. The
@@ -136,7 +138,7 @@ def _check_shapes(data: dict[str, NDArray]) -> dict[str, int]:
     """Check that every array exists, is finite and has the right type and shape.
 
     Returns:
-        The sizes K, L, R, ... by name.
+        The sizes of the arrays by name, such as the number of keyframes K.
     """
     sizes: dict[str, int] = {}
     for name, (dtype, shape) in ARRAYS.items():
@@ -207,7 +209,10 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
 
 
 def _check_merges(merged_into: NDArray[np.int32], alive: NDArray[np.bool_]) -> None:
-    """Check that every chain of ``merged_into`` ends at a living landmark or at -1."""
+    """Check the chains of landmarks that were merged into other landmarks.
+
+    Every chain of ``merged_into`` must end at a landmark that was not culled, or at -1.
+    """
     n = len(merged_into)
     _check_ids("landmark_merged_into", merged_into, n, least=NONE)
     _require(bool((merged_into[alive] == NONE).all()), "a merged landmark that is not culled")
@@ -264,7 +269,7 @@ def _per_keyframe(data: dict[str, NDArray], name: str, n: int) -> PerKeyframe:
 
 
 def camera_of(header: dict[str, Any]) -> Camera:
-    """The camera in the header of a map file.
+    """Read the camera from the header of a map file.
 
     Raises:
         DamagedMapError, KeyError, TypeError, ValueError: the header is damaged.

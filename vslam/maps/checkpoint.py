@@ -1,4 +1,4 @@
-"""The form of a checkpoint (``vslam.states.Checkpoint``) in a map file."""
+"""Storage of a checkpoint of SLAM (``vslam.states.Checkpoint``) in a map file."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _MAPPER_FIELDS = ("reference", "last_frame", "last_timestamp")
 
 
 def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
-    """The arrays of a checkpoint, named as in ``ARRAYS``."""
+    """Return the arrays of a checkpoint, under their names in ``ARRAYS``."""
     tracker, patches = checkpoint.tracker, checkpoint.mapper.patches
     no_pixels, no_shift = np.empty((0, PATCH_PIXELS), np.uint8), np.empty((0, 2), np.float32)
     return {
@@ -59,7 +59,7 @@ def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
 
 
 def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
-    """The rest of a checkpoint, without its arrays, as a JSON object.
+    """Return the data of a checkpoint that are not arrays, as a JSON object.
 
     JSON preserves float64 numbers exactly.
     """
@@ -89,7 +89,7 @@ def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
 def checked_checkpoint(
     arrays: dict[str, NDArray], entry: dict[str, Any], map_: Map, n_frames: int
 ) -> Checkpoint:
-    """Build a checkpoint from its arrays and its JSON entry in a file. Neither of them is trusted.
+    """Check the arrays and the JSON entry of an untrusted file, and build a checkpoint from them.
 
     Args:
         map_: the map of the same file, which has been checked.

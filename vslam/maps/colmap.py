@@ -26,9 +26,10 @@ _TRACK = np.dtype([("image", "<u4"), ("point2d", "<u4")])
 
 
 class _Image(NamedTuple):
-    """An image.
+    """An image of COLMAP's sparse model.
 
-    ``pose`` is ``(7,)`` qw qx qy qz tx ty tz of ``T_cw``. ``points`` has the type ``_POINT2D``.
+    ``pose`` is ``(7,)`` qw qx qy qz tx ty tz of ``T_cw``. ``points`` are the keypoints and have the
+    type ``_POINT2D``.
     """
 
     id: int
@@ -38,9 +39,10 @@ class _Image(NamedTuple):
 
 
 class _Point(NamedTuple):
-    """A point.
+    """A 3D point of COLMAP's sparse model.
 
-    ``error`` is the mean reprojection error in pixels. ``track`` has the type ``_TRACK``.
+    ``error`` is the mean reprojection error in pixels. ``track`` lists the observations of the
+    point and has the type ``_TRACK``.
     """
 
     id: int
@@ -58,15 +60,15 @@ def save_colmap(
     *,
     text: bool = False,
 ) -> None:
-    """Write ``cameras.bin``, ``images.bin`` and ``points3D.bin``. With ``text``, write ``.txt``
-    files.
+    """Write a map as a sparse model in COLMAP's format.
 
-    Only keypoints that observe a landmark are written.
+    The files are ``cameras.bin``, ``images.bin`` and ``points3D.bin``. With ``text``, they have the
+    extension ``.txt``. Only keypoints that observe a landmark are written.
 
     Args:
         folder: an existing folder, usually ``sparse/0`` of a COLMAP project.
-        names: name of the image of each keyframe.
-        colours: ``(L, 3)`` RGB of each landmark.
+        names: file name of the image of each keyframe.
+        colours: ``(L, 3)`` RGB colours of the landmarks.
 
     Raises:
         OSError: a file cannot be written.
@@ -106,7 +108,10 @@ def _parameters(camera: Camera) -> tuple[float, float, float, float]:
 
 
 def _write_binary(folder: Path, camera: Camera, images: list[_Image], points: list[_Point]) -> None:
-    """Write little-endian files in the format of COLMAP's ``reconstruction_io_binary.cc``."""
+    """Write COLMAP's binary files.
+
+    They are little-endian, as in COLMAP's ``reconstruction_io_binary.cc``.
+    """
     (folder / "cameras.bin").write_bytes(
         struct.pack("<QIi2Q", 1, _CAMERA_ID, _PINHOLE, camera.width, camera.height)
         + struct.pack("<4d", *_parameters(camera))
@@ -145,5 +150,8 @@ def _write_text(folder: Path, camera: Camera, images: list[_Image], points: list
 
 
 def _words(values: tuple[float, ...] | list[float]) -> str:
-    """Numbers separated by spaces, with so many digits that they can be read back exactly."""
+    """Format numbers as text, separated by spaces.
+
+    The numbers have enough digits to be read back exactly.
+    """
     return " ".join(map(repr, values))

@@ -30,9 +30,9 @@ def save_nerfstudio(
 
     The format is described at https://docs.nerf.studio/quickstart/data_conventions.html.
 
-    Cameras look along -z with y up (OpenGL). ``transform_matrix`` is camera to world, and the z
-    axis of the world frame points up. ``applied_transform`` maps vslam's world frame to the world
-    frame of both files.
+    Cameras look along -z with y up (OpenGL). ``transform_matrix`` is the pose of a camera (camera
+    to world). The z axis of the world frame points up. ``applied_transform`` maps vslam's world
+    frame to the world frame of both files.
 
     Pixel coordinates begin at the corner of the image, as in COLMAP. The rays of nerfstudio go
     through ``column + 0.5`` (``Cameras.get_image_coords``), although its documentation suggests
@@ -41,7 +41,7 @@ def save_nerfstudio(
     Args:
         folder: an existing folder.
         names: path of the image of each keyframe, relative to the folder.
-        colours: ``(L, 3)`` RGB of each landmark.
+        colours: ``(L, 3)`` RGB colours of the landmarks.
 
     Raises:
         OSError: a file cannot be written.
@@ -83,9 +83,9 @@ def save_g2o(
     ``VERTEX_SE3:QUAT`` and ``EDGE_SE3:QUAT`` contain x y z qx qy qz qw. An edge also has the upper
     triangle of its information matrix, row by row, with the translation first.
 
-    The information of rotations is per square radian, as GTSAM, the examples of Ceres and SE-Sync
-    expect. g2o itself measures the error of a rotation by qx qy qz. For small angles, this error is
-    half the angle. Therefore, g2o gives rotations a quarter of the weight.
+    The information of rotations is per square radian. GTSAM, SE-Sync and the examples of Ceres
+    expect this unit. g2o itself measures the error of a rotation by qx qy qz. For small angles,
+    this error is half the angle. Therefore, rotations have only a quarter of their weight in g2o.
 
     Args:
         ids: ``(N,)`` ids of the vertices.
@@ -113,7 +113,7 @@ def save_g2o(
 
 
 def _poses(T: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Convert poses to ``(N, 7)`` rows x y z qx qy qz qw with qw >= 0."""
+    """Convert poses to an ``(N, 7)`` array of x y z qx qy qz qw, with qw >= 0."""
     from scipy.spatial.transform import Rotation
 
     if not len(T):  # SciPy rejects an empty array
@@ -159,7 +159,7 @@ def save_image(image: NDArray[np.uint8], path: Path) -> None:
     """Write an image as PNG.
 
     Args:
-        image: ``(H, W)`` grey or ``(H, W, 3)`` red, green, blue.
+        image: ``(H, W)`` grey or ``(H, W, 3)`` RGB image.
 
     Raises:
         OSError: the file cannot be written.
@@ -175,11 +175,12 @@ def save_image(image: NDArray[np.uint8], path: Path) -> None:
 def landmark_colours(
     reconstruction: Reconstruction, images: Iterable[NDArray[np.uint8]]
 ) -> NDArray[np.uint8]:
-    """``(L, 3)`` uint8 RGB colour of each landmark, from its observation with the median
-    brightness.
+    """Return the RGB colour of each landmark as ``(L, 3)`` uint8.
+
+    The colour is taken from the observation of median brightness.
 
     Args:
-        images: ``(H, W)`` grey or ``(H, W, 3)`` red, green, blue image of each keyframe, in order.
+        images: ``(H, W)`` grey or ``(H, W, 3)`` RGB image of each keyframe, in order.
     """
     r = reconstruction
     colours = np.empty((len(r.xy), 3), np.uint8)

@@ -14,12 +14,14 @@ from vslam.errors import InputError, ResultsError
 
 @contextmanager
 def new_output(path: Path, *, folder: bool = False) -> Iterator[Path]:
-    """Yield the path of a temporary file to write, or of an empty temporary folder if ``folder``.
+    """Yield the path of a temporary file to write, or of an empty temporary folder.
 
-    At the end, the file or folder is renamed to ``path``. After an error, it is removed.
+    If the block succeeds, the file or folder is renamed to ``path``. If the block fails, the file
+    or folder is removed.
 
     Raises:
-        InputError: ``path`` exists already. If ``folder``, an existing empty folder is accepted.
+        InputError: ``path`` exists already. If a folder is written, an existing empty folder is
+            accepted.
         ResultsError: the output cannot be written, for example because the disk is full.
     """
     empty = path.is_dir() and not path.is_symlink() and not any(path.iterdir())
@@ -44,9 +46,10 @@ def new_output(path: Path, *, folder: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def replaced_file(path: Path) -> Iterator[BinaryIO]:
-    """Yield the path of a temporary file to write, which replaces ``path`` atomically at the end.
+    """Yield the path of a temporary file to write. At the end, it replaces ``path`` atomically.
 
-    The file is synced to the disk before. After an error, ``path`` is unchanged.
+    Before it replaces ``path``, the temporary file is synced to the disk. After an error, ``path``
+    is unchanged.
 
     Raises:
         OSError: the file cannot be written, for example because the disk is full.
@@ -101,9 +104,9 @@ def require_free(path: Path) -> None:
 
 
 def _beside(path: Path) -> Path:
-    """A hidden path in the same folder.
+    """Return a hidden path in the same folder as ``path``.
 
-    It is on the same file system, so that renaming is atomic.
+    Both paths are on the same file system, so that renaming is atomic.
     """
     path = path.absolute()
     return path.with_name(f".{path.name}.{os.getpid()}.part")

@@ -18,9 +18,10 @@ PIXEL_CENTRE = 0.5
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """The living keyframes and landmarks of a map, numbered without gaps, and their observations.
+    """The keyframes, landmarks and observations of a map, without culled entries.
 
-    There are K keyframes, L landmarks and N observations. All observations are in left images.
+    There are K keyframes and L landmarks, which are numbered without gaps, and N observations. All
+    observations are in left images.
 
     Attributes:
         camera: camera of all keyframes. The centre of the upper left pixel is (0, 0), as in OpenCV.
@@ -31,7 +32,7 @@ class Reconstruction:
             once.
         keyframe, landmark: ``(N,)`` int64, the keyframe and the landmark of each observation. They
             are sorted by keyframe.
-        xy: ``(N, 2)`` float64 position in pixels at which the keyframe observes the landmark.
+        xy: ``(N, 2)`` float64 position of each observation in the image, in pixels.
     """
 
     camera: Camera
@@ -45,23 +46,23 @@ class Reconstruction:
 
     @property
     def T_wc(self) -> NDArray[np.float64]:
-        """``(K, 4, 4)`` float64 poses, camera to world."""
+        """``(K, 4, 4)`` float64 poses of the keyframes (camera to world)."""
         return inverses(self.T_cw)
 
     def observations_of(self, keyframe: int) -> slice:
-        """The observations of a keyframe, as a slice of ``landmark`` and ``xy``."""
+        """Return the indices of the observations of a keyframe, as a slice."""
         first, last = np.searchsorted(self.keyframe, [keyframe, keyframe + 1])
         return slice(int(first), int(last))
 
     def reprojection_errors(self) -> NDArray[np.float64]:
-        """``(N,)`` distance in pixels from each observation to the projection of its landmark."""
+        """Return the reprojection error of each observation as ``(N,)`` distances in pixels."""
         T_cw = self.T_cw[self.keyframe]
         p_c = np.einsum("nij,nj->ni", T_cw[:, :3, :3], self.xyz[self.landmark]) + T_cw[:, :3, 3]
         return np.linalg.norm(self.camera.project(p_c)[:, :2] - self.xy, axis=1)
 
 
 def reconstruction_of(map_: Map, camera: Camera) -> Reconstruction:
-    """The living keyframes of a map and the landmarks that they observe."""
+    """Extract the keyframes of a map that were not culled, and the landmarks that they observe."""
     a = map_.arrays
     keyframes = map_.living_keyframes()
     rows = np.flatnonzero(a.landmark[: map_.n_rows] >= 0)

@@ -1,4 +1,4 @@
-"""ROS 2 messages from poses and landmarks, and bags of such messages. ROS is not needed.
+"""Conversion of poses and landmarks to ROS 2 messages and bags. ROS need not be installed.
 
 The frames follow REP 105: ``map`` -> ``odom`` -> ``base_link`` -> ``camera_optical``. Their axes
 follow REP 103. In ``map``, ``odom`` and ``base_link``, x points forward, y left and z up. In
@@ -7,7 +7,8 @@ is at the left camera. ``map`` and ``odom`` are at the first pose of ``base_link
 metres, or in the unit of a monocular map.
 
 The argument ``types`` is a function that returns the message class for the name of a message. Files
-are written with classes of the package rosbags. A node uses classes of ROS (``examples/ros2``).
+are written with classes of the package rosbags. A ROS node uses the classes of ROS
+(``examples/ros2``).
 """
 
 from __future__ import annotations
@@ -53,8 +54,12 @@ class FramePose:
 
     Attributes:
         stamp: time of the image in nanoseconds.
-        T_odom_camera, T_map_odom: ``(4, 4)`` as in ``TrackResult``.
-        near, covariance: ``(6, 6)`` as in ``PoseUncertainty``. None if they are unknown.
+        T_odom_camera: ``(4, 4)`` pose of the camera in the odometry frame.
+        T_map_odom: ``(4, 4)`` transformation from the odometry frame to the map frame.
+        near: ``(6, 6)`` covariance of the pose relative to the landmarks around the camera. None if
+            it is unknown.
+        covariance: ``(6, 6)`` covariance of the pose relative to the start of the drive. None if it
+            is unknown.
     """
 
     stamp: int
@@ -65,7 +70,7 @@ class FramePose:
 
     @classmethod
     def of(cls, result: TrackResult, stamp: int) -> FramePose:
-        """The pose of a frame, from the result of ``Slam.step``.
+        """Create the pose of a frame from the result of ``Slam.step``.
 
         ``stamp`` is given in nanoseconds, because ROS looks up transforms by exact times. Unix time
         in float64 seconds has a resolution of only 0.2 us.
@@ -95,10 +100,10 @@ def in_ros_axes(T: Matrix) -> Matrix:
 
 
 def odometry_message(types: Types, pose: FramePose, before: FramePose | None) -> Any:
-    """``nav_msgs/Odometry`` with the pose of ``base_link`` in ``odom``, and its mean velocity.
+    """Create ``nav_msgs/Odometry`` with the pose and the mean velocity of ``base_link``.
 
-    The velocity is given in the axes of ``base_link``. It is the mean since the frame ``before``,
-    or zero if ``before`` is None.
+    The pose is given in the frame ``odom``. The velocity is given in the axes of ``base_link``. It
+    is the mean velocity since the frame ``before``. If ``before`` is None, the velocity is zero.
     """
     twist, R = np.zeros(6), T_BASE_OPTICAL[:3, :3]
     if before is not None:
@@ -120,7 +125,7 @@ def odometry_message(types: Types, pose: FramePose, before: FramePose | None) ->
 
 
 def tf_message(types: Types, pose: FramePose) -> Any:
-    """``tf2_msgs/TFMessage`` with ``map`` -> ``odom`` and ``odom`` -> ``base_link``."""
+    """Create ``tf2_msgs/TFMessage`` with ``map`` -> ``odom`` and ``odom`` -> ``base_link``."""
     transforms = [
         _transform(types, pose.stamp, MAP, ODOM, in_ros_axes(pose.T_map_odom)),
         _transform(types, pose.stamp, ODOM, BASE, pose.T_odom_base),
@@ -129,13 +134,13 @@ def tf_message(types: Types, pose: FramePose) -> Any:
 
 
 def static_tf_message(types: Types, stamp: int) -> Any:
-    """``tf2_msgs/TFMessage`` with ``base_link`` -> ``camera_optical``."""
+    """Create ``tf2_msgs/TFMessage`` with ``base_link`` -> ``camera_optical``."""
     transform = _transform(types, stamp, BASE, OPTICAL, T_BASE_OPTICAL)
     return types("tf2_msgs/msg/TFMessage")(transforms=[transform])
 
 
 def path_message(types: Types, trajectory: Trajectory) -> Any:
-    """``nav_msgs/Path`` with the poses of ``base_link`` in ``map``."""
+    """Create ``nav_msgs/Path`` with the poses of ``base_link`` in ``map``."""
     stamps = [nanoseconds(timestamp) for timestamp in trajectory.timestamps.tolist()]
     poses = [
         types("geometry_msgs/msg/PoseStamped")(
@@ -147,7 +152,7 @@ def path_message(types: Types, trajectory: Trajectory) -> Any:
 
 
 def points_message(types: Types, stamp: int, xyz: NDArray[np.float64]) -> Any:
-    """``sensor_msgs/PointCloud2`` in the frame ``map``.
+    """Create ``sensor_msgs/PointCloud2`` in the frame ``map``.
 
     ``xyz`` are ``(N, 3)`` points in the world frame of vslam.
     """
@@ -249,11 +254,12 @@ def save_bag(
 def frame_poses(
     odometry: Trajectory, trajectory: Trajectory, covariances: dict[str, tuple[Matrix, Matrix]]
 ) -> list[FramePose]:
-    """The poses of the frames of a run.
+    """Combine the results of a run into the poses of its frames.
 
     Args:
-        odometry, trajectory: ``T_odom_camera`` and ``T_map_camera`` of the same frames.
-        covariances: ``near`` and ``covariance`` by timestamp (``read_covariances``).
+        odometry: poses of the camera in the odometry frame.
+        trajectory: poses of the camera in the map frame, for the same frames as in ``odometry``.
+        covariances: the two covariances of each frame by timestamp (``read_covariances``).
 
     Raises:
         InputError: ROS cannot represent a time.
@@ -269,8 +275,9 @@ def frame_poses(
 
 
 def _covariance(matrix: Matrix | None, R: Matrix) -> NDArray[np.float64]:
-    """``(36,)`` covariance of ``[x, y, z, rx, ry, rz]`` after rotating the axes by ``R``, row by
-    row.
+    """Convert a covariance to the axes of ROS.
+
+    The axes of ``[x, y, z, rx, ry, rz]`` are rotated by ``R``. The result is ``(36,)``, row by row.
 
     An unknown covariance (None) becomes all zeros, which is the convention of ``sensor_msgs``.
     """
@@ -282,10 +289,10 @@ def _covariance(matrix: Matrix | None, R: Matrix) -> NDArray[np.float64]:
 
 
 def _velocity_covariance(pose: FramePose, before: FramePose | None) -> Matrix | None:
-    """``(6, 6)`` covariance of the mean velocity between two frames, in the frame of the camera.
+    """Return the ``(6, 6)`` covariance of the mean velocity between two frames.
 
-    The errors of the two poses relative to the landmarks are independent. The error of the
-    landmarks is common to both poses and cancels.
+    It refers to the frame of the camera. The errors of the two poses relative to the landmarks are
+    independent. Both poses have the same error of the landmarks, which therefore cancels.
     """
     if before is None or before.near is None or pose.near is None:
         return None

@@ -1,7 +1,8 @@
-"""Map files: ``.npz`` files that are written atomically and checked when they are read.
+"""Reading and writing of map files. A map file is an ``.npz`` file.
 
-Arrays are not compressed. A map consists mostly of descriptors, which do not compress well, and it
-should load within a second.
+A map file is written atomically, and it is checked when it is read. The arrays are not compressed,
+for two reasons. They are mostly descriptors, which do not compress well. In addition, a map should
+load within a second.
 """
 
 from __future__ import annotations
@@ -33,14 +34,14 @@ _FOREIGN = "not a map of vslam; give a map.npz or the folder of a run"
 
 
 def save_map(path: Path | str, stored: StoredMap, *, resumable: bool = False) -> None:
-    """Write a map. An existing file is replaced.
+    """Write a map to a file. An existing file is replaced.
 
     After an error or a power cut, an existing file is unchanged. The file contains the JSON text
-    ``header`` (schema, camera, detector, drives, thresholds, versions), the arrays of ``ARRAYS``,
-    and the data of the detector and the images for each keyframe (``PerKeyframe``):
-    ``detector_NAME_first``, ``detector_NAME_values``, ``image_first`` and ``image_values``.
-    Observations are sorted by landmark. The observations of one landmark are in the order of its
-    linked list.
+    ``header`` with the schema, camera, detector, drives, thresholds and versions. It also contains
+    the arrays of ``ARRAYS``. The data of the loop detector for each keyframe (``PerKeyframe``) are
+    stored as ``detector_NAME_first`` and ``detector_NAME_values``. The images of the keyframes are
+    stored as ``image_first`` and ``image_values``. Observations are sorted by landmark. The
+    observations of one landmark are in the order of the linked list of the landmark.
 
     Args:
         path: the file.
@@ -58,7 +59,9 @@ def save_map(path: Path | str, stored: StoredMap, *, resumable: bool = False) ->
 
 
 def load_map(path: Path | str) -> StoredMap:
-    """Read a map, check everything that kernels rely on, and remove culled keyframes and landmarks.
+    """Read a map from a file, and remove culled keyframes and landmarks.
+
+    Everything that kernels rely on is checked.
 
     Raises:
         InputError: the file is missing or damaged, is not a map, or has another schema version.
@@ -68,13 +71,16 @@ def load_map(path: Path | str) -> StoredMap:
 
 
 def load_checkpoint(path: Path | str) -> StoredMap:
-    """Read a map like ``load_map``, but keep culled entries if the map has a checkpoint.
+    """Read a map from which a run can be resumed.
+
+    If the map has a checkpoint, culled keyframes and landmarks are kept. Otherwise, they are
+    removed. Everything that kernels rely on is checked.
 
     Args:
         path: a map file, or the folder of a run that has a map file.
 
     Raises:
-        InputError: for the same reasons as in ``load_map``.
+        InputError: the file is missing or damaged, is not a map, or has another schema version.
     """
     path = map_file_of(path)
     data, header = _read(path)
@@ -154,7 +160,10 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
 
 
 def map_file_of(path: Path | str) -> Path:
-    """The map file in the folder of a run. Any other path is returned unchanged."""
+    """Return the path of the map file in the folder of a run.
+
+    Any other path is returned unchanged.
+    """
     path = Path(path)
     return path / "map.npz" if path.is_dir() else path
 
@@ -171,7 +180,7 @@ def made_with(path: Path | str) -> MadeWith:
     """Read the camera, detector and thresholds of a map without reading its arrays.
 
     Raises:
-        InputError: for the same reasons as in ``load_map``.
+        InputError: the file is missing or damaged, is not a map, or has another schema version.
     """
     path = Path(path)
     with _opened(path) as (_, header), _damage_reported(path):
@@ -187,7 +196,7 @@ def _read(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Open a map file of this schema version. The archive and the header are yielded."""
+    """Open a map file of the current schema version, and yield its archive and its header."""
     try:
         require_memory(path, "a map of vslam")
         with np.load(path, allow_pickle=False) as file:

@@ -1,4 +1,7 @@
-"""A map with all data that a later run needs to continue it. It usually has no culled entries."""
+"""A map with all data that a later run needs to continue the map.
+
+Usually, culled keyframes and landmarks have been removed.
+"""
 
 from __future__ import annotations
 
@@ -29,13 +32,13 @@ from vslam.states import Checkpoint
 
 @dataclass(frozen=True)
 class TruthAlignment:
-    """The transformation of a map into the frame of a ground truth.
+    """The transformation from a map to the frame of a ground truth.
 
     Attributes:
         name: name of the data set and the sequence of the ground truth.
         S_truth_world: ``(4, 4)`` transformation from the world frame of the map to the world frame
-            of the ground truth. It aligns the first drive with the ground truth. It is a rigid
-            motion, or a similarity for a monocular map.
+            of the ground truth. It aligns the trajectory of the first drive with the ground truth.
+            It is a rigid motion, or a similarity for a monocular map.
     """
 
     name: str
@@ -49,14 +52,15 @@ class StoredMap:
     Attributes:
         map: keyframes, landmarks and observations.
         camera: camera of all keyframes.
-        loops: closed loops in the present unit of the map, without features and landmarks.
+        loops: closed loops, without features and landmarks. Their translations are in the present
+            unit of the map.
         detector: data that the loop detector has stored about the keyframes.
-        images: JPEG files (uint8) of the keyframes whose images learned descriptors may need. None
-            without learned descriptors.
+        images: JPEG files (uint8) of keyframes, from which learned descriptors can be computed.
+            None if the run used no learned descriptors.
         frames: frame poses of the last drive. None if they were not kept.
         drives: source of the images of each drive, such as "kitti 06".
         thresholds: thresholds of the last drive that differed from the defaults, by dotted name.
-        truth_alignment: the transformation of the map into the frame of a ground truth. None
+        truth_alignment: the transformation from the map to the frame of a ground truth. None
             without ground truth.
         checkpoint: state from which the last drive continues with the same results as an
             uninterrupted run. A map with a checkpoint includes culled keyframes and landmarks, with
@@ -75,10 +79,11 @@ class StoredMap:
     checkpoint: Checkpoint | None = None
 
     def compact(self, *, copy: bool = True) -> StoredMap:
-        """A copy with only the living keyframes and landmarks, numbered without gaps.
+        """Copy the map without its culled keyframes and landmarks.
 
-        Poses relative to a culled keyframe become relative to its parent. Landmarks are ordered by
-        the first living keyframe that observes them.
+        The remaining keyframes and landmarks are numbered without gaps. Poses relative to a culled
+        keyframe become relative to the parent of this keyframe. Landmarks are ordered by the first
+        remaining keyframe that observes them.
 
         Args:
             copy: if False and if all keypoints are kept, the arrays of keypoints are views instead
@@ -87,13 +92,15 @@ class StoredMap:
         return self.select(self.map.living_keyframes(), copy=copy)
 
     def select(self, keyframes: NDArray[np.int64], *, copy: bool = True) -> StoredMap:
-        """A copy like that of ``compact``, but with only some keyframes and the landmarks that they
-        observe.
+        """Copy a part of the map: some keyframes, and the landmarks that they observe.
+
+        Keyframes and landmarks are numbered without gaps.
 
         Args:
-            keyframes: ``(K,)`` ids of living keyframes, in ascending order. The frame poses are
-                kept only if all living keyframes are selected.
-            copy: as in ``compact``.
+            keyframes: ``(K,)`` ids of keyframes that were not culled, in ascending order. The poses
+                of frames are kept only if all such keyframes are selected.
+            copy: if False and if all keypoints are kept, the arrays of keypoints are views instead
+                of copies.
         """
         map_ = self.map
         whole = len(keyframes) == np.count_nonzero(map_.arrays.keyframe_alive[: map_.n_keyframes])
@@ -119,10 +126,10 @@ class StoredMap:
 
 
 def selected(map_: Map, keyframes: NDArray[np.int64], *, copy: bool = True) -> Map:
-    """A copy of a map with only some living keyframes and the landmarks that they observe.
+    """Copy a part of a map: some keyframes, and the landmarks that they observe.
 
-    The ids of the keyframes are given as ``(K,)``, in ascending order. In the copy, keyframes and
-    landmarks are numbered without gaps.
+    The ids of the keyframes are given as ``(K,)``, in ascending order. These keyframes must not
+    have been culled. In the copy, keyframes and landmarks are numbered without gaps.
 
     The parent of a keyframe is its nearest selected ancestor. If no ancestor is selected, it is the
     first selected keyframe.
@@ -181,12 +188,15 @@ def selected(map_: Map, keyframes: NDArray[np.int64], *, copy: bool = True) -> M
 def observations(
     rows: NDArray[np.int64], first: NDArray[np.int64], u_right: NDArray[np.float32]
 ) -> dict[str, NDArray]:
-    """The columns of ``Arrays`` that represent observations.
+    """Create the arrays of ``Arrays`` that represent observations.
 
     Args:
-        rows: ``(O,)`` rows that observe the landmarks, sorted by landmark. Each row occurs once.
-        first: ``(L + 1,)`` offset of each landmark in ``rows``. A culled landmark has no rows.
-        u_right: ``(R,)`` columns in the right image, for all rows. NaN without a stereo match.
+        rows: ``(O,)`` indices of the keypoints that observe the landmarks, sorted by landmark. Each
+            keypoint occurs at most once.
+        first: ``(L + 1,)`` offset of each landmark in ``rows``. No keypoint observes a culled
+            landmark.
+        u_right: ``(R,)`` columns of the stereo matches of all keypoints in the right image. NaN
+            without a stereo match.
     """
     count = np.diff(first)
     landmark, next_row = (np.full(len(u_right), NONE, np.int32) for _ in range(2))
@@ -210,7 +220,10 @@ def observations(
 
 
 def appended(one: StoredMap, other: StoredMap) -> StoredMap:
-    """Append a map to another map, as a sub-map at an unknown place. Neither has culled entries."""
+    """Append a map to another map, as a sub-map at an unknown place.
+
+    Neither of the two maps may contain culled keyframes or landmarks.
+    """
     a, b = one.map, other.map
     n, drives = a.n_keyframes, a.scalars.session + 1
     shift = {
@@ -254,7 +267,7 @@ def appended(one: StoredMap, other: StoredMap) -> StoredMap:
 def _spanning_tree(
     map_: Map, keyframes: NDArray[np.int64], new_id: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """``parent`` and ``restart`` of the selected keyframes."""
+    """Return the columns ``parent`` and ``restart`` of the selected keyframes."""
     n, parents = len(keyframes), map_.parents.tolist()
     parent = np.full(n, NONE, np.int64)
     for k, keyframe in enumerate(keyframes.tolist()):
@@ -280,7 +293,10 @@ def _spanning_tree(
 
 
 def _renumbered(frames: FrameTable, map_: Map, new_id: NDArray[np.int64]) -> FrameTable:
-    """Make frame poses relative to living keyframes, with the new ids of these keyframes."""
+    """Make the poses of frames relative to keyframes that were not culled.
+
+    The new ids of these keyframes are used.
+    """
     reference = frames.reference.copy()
     T_c_reference, unit = frames.T_c_reference.copy(), frames.unit_scale.copy()
     table = map_.keyframes
@@ -297,7 +313,7 @@ def _renumbered(frames: FrameTable, map_: Map, new_id: NDArray[np.int64]) -> Fra
 
 
 def in_box(map_: Map, box: Sequence[float]) -> NDArray[np.int64]:
-    """Ids of the living keyframes in a box, in ascending order.
+    """Return the ids of the keyframes in a box, in ascending order, without culled keyframes.
 
     ``box`` is the range of x followed by the range of z, in metres.
     """
@@ -307,7 +323,7 @@ def in_box(map_: Map, box: Sequence[float]) -> NDArray[np.int64]:
 
 
 def near_point(map_: Map, point: Sequence[float], within: float) -> NDArray[np.int64]:
-    """Ids of the living keyframes near a point, in ascending order.
+    """Return the ids of the keyframes near a point, in ascending order, without culled keyframes.
 
     Args:
         map_: the map.
@@ -321,10 +337,10 @@ def near_point(map_: Map, point: Sequence[float], within: float) -> NDArray[np.i
 def near_frames(
     map_: Map, drive: int, first: float, last: float, within: float
 ) -> NDArray[np.int64]:
-    """Ids of the living keyframes near some frames of a drive, in ascending order.
+    """Return the ids of the keyframes near some frames of a drive, without culled keyframes.
 
-    A keyframe is included if its distance from a keyframe that was made from the frames ``first``
-    to ``last`` is at most ``within`` metres.
+    The frames ``first`` to ``last`` contain some keyframes. A keyframe is included if it is at most
+    ``within`` metres from one of them. The ids are in ascending order.
     """
     from scipy.spatial import cKDTree
 
@@ -338,6 +354,6 @@ def near_frames(
 
 
 def _places(map_: Map) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Living keyframes, and their ``(N, 2)`` positions x and z."""
+    """Return the keyframes that were not culled, and their ``(N, 2)`` positions x and z."""
     keyframes = map_.living_keyframes()
     return keyframes, inverses(map_.arrays.T_cw[keyframes])[:, [0, 2], 3]

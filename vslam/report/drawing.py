@@ -1,7 +1,8 @@
 """The common style of the figures in reports, and functions that save figures as PNG and SVG.
 
-Every figure is drawn once, in the colours of a light theme. In the SVG, neutral colours become CSS
-variables. Therefore, a figure in the HTML page follows the light or dark theme of the reader.
+Every figure is drawn once, in the colours of a light theme. In the SVG, neutral colours are
+replaced by CSS variables. Therefore, a figure in the HTML page follows the light or dark theme of
+the reader.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ Drawing = tuple[str, str, Figure]  # name, caption and figure
 
 
 def new_figure(title: str, x_label: str, y_label: str, height: float) -> tuple[Figure, Axes]:
-    """A figure with one plot. The title is at the left, and ``height`` is in inches."""
+    """Create a figure with one plot. The title is at the left, and ``height`` is in inches."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
@@ -88,7 +89,7 @@ def add_legend(figure: Figure, axes: Axes) -> None:
 
 
 def _legend_columns(labels: Sequence[str]) -> int:
-    """The largest number of columns for which the legend is not wider than the figure."""
+    """Return the largest number of columns for which the legend is not wider than the figure."""
     lengths = np.array([len(label) + _HANDLE_CHARACTERS for label in labels])
     columns = len(lengths)
     while columns > 1 and (
@@ -113,10 +114,10 @@ def plain_ticks(axis: Axis) -> None:
 
 
 def draw(drawings: Iterable[Drawing]) -> list[page.Figure]:
-    """Save drawings in the style of reports.
+    """Save figures in the style of reports.
 
-    If ``drawings`` is a generator, it makes its figures while this function runs, so that they have
-    this style, too.
+    If ``drawings`` is a generator, it creates its figures while this function runs. Therefore,
+    these figures have the same style.
     """
     # after_reset ignores the user's matplotlibrc. Therefore, equal runs give equal figures.
     with style.context(STYLE, after_reset=True):

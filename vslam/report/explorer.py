@@ -1,10 +1,10 @@
-"""The interactive explorer in a report.
+"""The interactive explorer in the HTML report of a run.
 
 It shows the pose, state and error of every frame, and images of some keyframes.
 
-A frame adds 47 bytes to the page. An image with its keypoints adds about 10,000 bytes.
-``explorer.js`` uses no plotting library, because a library such as Plotly (4.7 MB) would be larger
-than the rest of the page.
+A frame adds 47 bytes to the page. An image with keypoints adds about 10,000 bytes. ``explorer.js``
+uses no plotting library, because a library such as Plotly (4.7 MB) would be larger than the rest of
+the page.
 """
 
 from __future__ import annotations
@@ -29,9 +29,14 @@ if TYPE_CHECKING:
 def explorer(
     outcome: RunOutcome, evaluation: Evaluation | None, moments: Collection[Moment]
 ) -> list[Section]:
-    """The section with the explorer. There is no section if fewer than two frames were tracked.
+    """Return the section of the report with the interactive explorer.
 
-    The arguments are the same as for ``explorer_data``.
+    The result is empty if fewer than two frames were tracked.
+
+    Args:
+        outcome: the run.
+        evaluation: errors of ``outcome.trajectory``. None if they cannot be computed.
+        moments: images of keyframes, from a `vslam.run.moments.MomentRecorder`.
     """
     data = explorer_data(outcome, evaluation, moments)
     if data is None:
@@ -45,7 +50,7 @@ def explorer(
 def explorer_data(
     outcome: RunOutcome, evaluation: Evaluation | None, moments: Collection[Moment]
 ) -> dict[str, Any] | None:
-    """Numbers and images for ``explorer.js``, in a form that can be written as JSON.
+    """Return the numbers and images for ``explorer.js``, in a form that can be written as JSON.
 
     The result is None if fewer than two frames were tracked.
 
@@ -54,8 +59,8 @@ def explorer_data(
 
     Args:
         outcome: the run.
-        evaluation: errors of ``outcome.trajectory``; None if they cannot be computed.
-        moments: images from a `vslam.run.moments.MomentRecorder`.
+        evaluation: errors of ``outcome.trajectory``. None if they cannot be computed.
+        moments: images of keyframes, from a `vslam.run.moments.MomentRecorder`.
     """
     n = len(outcome.trajectory)
     if outcome.n_tracked < 2 or len(outcome.tracks) != n:
@@ -99,6 +104,9 @@ def _encoded(moment: Moment) -> dict[str, Any]:
 
 
 def _packed(values: NDArray[Any], kind: str) -> str:
-    """An array in base64. It takes a third of the size of the numbers in JSON, and can contain
-    NaN."""
+    """Encode an array in base64.
+
+    The text is a third as long as the same numbers in JSON. In contrast to JSON, the array may
+    contain NaN.
+    """
     return b64encode(values.astype(kind).tobytes()).decode()

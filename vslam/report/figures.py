@@ -46,12 +46,12 @@ _MAX_BINS = 240  # in the plot of stacked times; a bin is then one or two pixels
 def draw_figures(
     outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
 ) -> list[page.Figure]:
-    """Draw all figures for which the run has data, in the order of the report.
+    """Draw all figures of the report for which the run has data.
 
     Args:
         outcome: the run.
-        evaluation: errors of ``outcome.trajectory``; None if they cannot be computed.
-        verdict: evaluation of ``outcome.loops``; None if a frame has no ground truth.
+        evaluation: errors of ``outcome.trajectory``. None if they cannot be computed.
+        verdict: evaluation of ``outcome.loops``. None if a frame has no ground truth.
     """
     return draw(_drawings(outcome, evaluation, verdict))
 
@@ -195,8 +195,10 @@ def _tracked_points(outcome: RunOutcome) -> Figure:
 
 
 def _usable_features(outcome: RunOutcome) -> tuple[str, list[int]]:
-    """The name of the features that can become landmarks with this sensor, and their number in each
-    frame."""
+    """Return the features that can become landmarks: their name, and their number in each frame.
+
+    Both depend on the sensor.
+    """
     sensor = outcome.sequence.camera.sensor
     if sensor == "mono":
         return "features", [track.n_features for track in outcome.tracks]
@@ -255,6 +257,10 @@ def _stage_colors(names: list[str]) -> list[str]:
 
 
 def _intervals(at: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """``(M, 2)`` first and last index of each interval of True values in ``(N,)`` ``at``."""
+    """Find the intervals in which an ``(N,)`` bool array is True.
+
+    Returns:
+        ``(M, 2)`` first and last index of each interval.
+    """
     steps = np.diff(np.concatenate([[False], at, [False]]).astype(np.int8))
     return np.stack([np.flatnonzero(steps == 1), np.flatnonzero(steps == -1) - 1], axis=1)

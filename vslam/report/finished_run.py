@@ -1,4 +1,4 @@
-"""The folder of a finished run: its map and its images."""
+"""Reading of a finished run from its folder: the report, the map and the images."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _WITHOUT_IMAGES = "export g2o, euroc or ply --no-colours, which need no images"
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """The content of the folder of a run.
+    """The content of the folder of a finished run.
 
-    ``map`` contains no culled keyframes. ``loops`` are the closed loops, with the relative poses
-    that verification measured.
+    ``map`` contains no culled keyframes. ``loops`` are the closed loops. They have the relative
+    poses that were measured when the loops were verified.
     """
 
     folder: Path
@@ -64,7 +64,8 @@ def open_images(
     Args:
         data: the new location of the data if it has been moved. With None, the location in
             ``run.json`` is used.
-        on_render: as in ``vslam.datasets.open_sequence``.
+        on_render: function that is called while a synthetic sequence is rendered. Its arguments are
+            the number of frames rendered so far and the total number.
 
     Raises:
         InputError: the images are missing, belong to another camera or came from a live camera, or
@@ -88,10 +89,10 @@ def open_images(
 
 
 def keyframe_frames(run: FinishedRun, source: Source) -> Iterator[TimedFrame]:
-    """The frames that became the keyframes of a run, in the order of the map.
+    """Return the frames that became the keyframes of a run, in the order of the map.
 
     Raises:
-        InputError: the timestamps differ from the timestamps of the run.
+        InputError: the timestamps of the images differ from the timestamps of the run.
     """
     frames = frames_at(source, run.map.frames.tolist())
     for frame, time in zip_longest(frames, run.map.timestamps.tolist()):

@@ -40,11 +40,11 @@ def create_run_folder(
     detector: str,
     thresholds: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Create ``out/<YYYYmmdd-HHMMSS>-<dataset>-<sequence>-<perturb>-<detector>``.
+    """Create the folder ``out/<YYYYmmdd-HHMMSS>-<dataset>-<sequence>-<perturb>-<detector>``.
 
-    If thresholds differ from the defaults, the first changed threshold and the number of the other
-    changed thresholds are appended. If the name is in use, a number is appended. ``out/latest``
-    becomes a symbolic link to the folder if the file system supports such links.
+    If thresholds differ from the defaults, the first changed threshold is appended to the name,
+    followed by the number of other changed thresholds. If the name is in use, a number is appended.
+    ``out/latest`` becomes a symbolic link to the folder if the file system supports such links.
 
     Raises:
         InputError: the folder cannot be created.
@@ -73,7 +73,7 @@ def create_run_folder(
 
 
 def _safe(part: str) -> str:
-    """Make a text a valid part of a file name."""
+    """Turn a text into a valid part of a file name."""
     return re.sub(r"[^A-Za-z0-9.+=-]+", "_", part)[:_LONGEST_PART]
 
 
@@ -87,7 +87,7 @@ def write_results(
     ply: bool = False,
     map_file: Path | None = None,
 ) -> ReportJson:
-    """Evaluate a complete or interrupted run and write all results.
+    """Evaluate a complete or interrupted run, and write all results into its folder.
 
     The most valuable files are written first. If a file cannot be written, the other files are
     still written. These are the files:
@@ -96,7 +96,7 @@ def write_results(
       ``keyframes.tum``, ``trajectory_causal.tum`` (poses at the time of tracking),
       ``covariance.csv`` (covariances of these poses), ``trajectory_odom.tum`` (poses from odometry,
       which never jump), and ``trajectory_<detector>.tum`` for each detector of ``--compare``. With
-      GPS, also ``trajectory_enu.tum``, ``trajectory_gps.csv`` and ``gps.json``;
+      GPS, ``trajectory_enu.tum``, ``trajectory_gps.csv`` and ``gps.json`` are also written;
     - maps: ``map.npz``, ``map.ply``;
     - numbers: ``frames.csv``, ``config.json`` (which ``--config`` can read), ``report.json``;
     - pages: ``figures/*.png``, ``report.md``, ``report.html`` (self-contained).
@@ -130,8 +130,7 @@ def write_results(
 
 
 class Results:
-    """Writes the results of a run. If a result cannot be written, it continues with the other
-    results."""
+    """Writes the results of a run, even if some of them cannot be written."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -139,7 +138,7 @@ class Results:
 
     @contextlib.contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Run a part of the work. An exception is recorded instead of raised."""
+        """Run a part of the work. An exception of the block is recorded instead of raised."""
         try:
             yield
         except Exception as error:
@@ -147,8 +146,10 @@ class Results:
 
     @contextlib.contextmanager
     def file(self, name: str) -> Iterator[Path]:
-        """Yield the path at which to write a file or folder. If writing fails, the file or folder
-        is removed."""
+        """Yield the path at which to write a file or folder.
+
+        If writing fails, the file or folder is removed.
+        """
         path = self.folder / name
         with self.part(name):
             try:
@@ -159,7 +160,7 @@ class Results:
                 raise
 
     def require_all(self) -> None:
-        """Check that all parts have succeeded.
+        """Check that all parts of the work have succeeded.
 
         Raises:
             ResultsError: some parts failed. The message names these parts and their errors.
@@ -257,11 +258,10 @@ def _config_text(outcome: RunOutcome) -> str:
 
 
 def write_trajectories(written: Results, outcome: RunOutcome) -> None:
-    """Write the final trajectory in the formats of KITTI and TUM, and the ground truth of the same
-    frames.
+    """Write the final trajectory and the ground truth of its frames.
 
-    If some frames have no ground truth, the ground truth is written only in TUM's format, because
-    only this format has timestamps.
+    Both are written in the formats of KITTI and TUM. If some frames have no ground truth, the
+    ground truth is written only in TUM's format, because only this format has timestamps.
     """
     with written.file("trajectory_kitti.txt") as file:
         write_kitti(file, outcome.trajectory.T_wc)
@@ -281,7 +281,10 @@ def write_trajectories(written: Results, outcome: RunOutcome) -> None:
 
 
 def _evo_command(folder: Path, outcome: RunOutcome, evaluation: Evaluation | None) -> str | None:
-    """The command that repeats the evaluation with evo; None if evo cannot evaluate this run."""
+    """Return the command that repeats the evaluation with evo.
+
+    The result is None if evo cannot evaluate this run.
+    """
     if evaluation is None or evaluation.on_one_line:
         return None
     if evaluation.frames == len(outcome.trajectory):

@@ -1,4 +1,4 @@
-"""``frames.csv`` and ``covariance.csv``: results of tracking for each frame, for scripts."""
+"""The tracking results of all frames, as the files ``frames.csv`` and ``covariance.csv``."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _AXES = ("x", "y", "z", "rx", "ry", "rz")
 def write_frames(path: Path, tracks: list[TrackResult]) -> None:
     """Write ``frames.csv``, which has a row for each frame.
 
-    The columns are the timestamp (s), the state, several counts, whether the frame became a
-    keyframe, standard deviations of position (m) and orientation (degrees), and the milliseconds of
-    each stage.
+    The first columns are the timestamp (s), the tracking state, several counts, and whether the
+    frame became a keyframe. Four standard deviations of position (m) and orientation (degrees)
+    follow. The last columns are the milliseconds of each stage.
 
-    The first two deviations are relative to the landmarks around the camera. The other two
-    deviations are relative to the start of the drive. A cell is empty if a deviation is unknown, or
+    The first two standard deviations are relative to the landmarks around the camera. The other two
+    are relative to the start of the drive. A field is empty if a standard deviation is unknown, or
     if a frame did not go through a stage.
     """
     stages = stage_names(tracks)
@@ -79,9 +79,9 @@ def write_covariances(path: Path, tracks: list[TrackResult]) -> None:
 def read_covariances(
     path: Path,
 ) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Read the two ``(6, 6)`` covariances of each frame from a file of ``write_covariances``.
+    """Read the two ``(6, 6)`` covariances of each frame from the file ``covariance.csv``.
 
-    The keys of the result are the timestamps, as they are written in the file.
+    The keys of the result are the timestamps, exactly as they are written in the file.
 
     Raises:
         InputError: the file is missing or damaged.

@@ -1,5 +1,7 @@
-"""Tables and pictures of loops. Their size is limited, even if there are hundreds of rejected
-candidates."""
+"""Tables and pictures of loops in a report.
+
+Their size is limited, even if there are hundreds of rejected candidates.
+"""
 
 from __future__ import annotations
 
@@ -23,9 +25,9 @@ _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
 def loop_sections(report: ReportJson) -> list[Section]:
-    """Sections about closed loops, revisits, reasons for rejections, and rejected candidates.
+    """Create the sections about closed loops, revisits, and rejected candidates with their reasons.
 
-    Only the rejected candidates with the most inliers are listed.
+    Only those rejected candidates that have the most inliers are listed.
     """
     return [
         Section("Loops closed", [_closed(report)]),
@@ -121,8 +123,10 @@ def _evidence(loop: LoopEntry) -> Row:
 
 
 def _shared_reason(loops: list[LoopEntry]) -> str:
-    """One text for reasons that differ only in their numbers. The numbers are replaced by
-    ranges."""
+    """Combine reasons that differ only in their numbers into one text.
+
+    The numbers are replaced by their ranges.
+    """
     columns = zip(*(_NUMBER.findall(loop.reason) for loop in loops), strict=True)
     ends = [(min(column, key=float), max(column, key=float)) for column in columns]
     ranges = iter([low if low == high else f"{low}-{high}" for low, high in ends])
@@ -142,8 +146,8 @@ def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[Fi
     """Draw a few closed loops. Wrong loops come first, then loops verified by learned descriptors.
 
     Args:
-        report: the numbers of the run.
-        pictures: pictures of the closed loops of which both images were kept.
+        report: the content of ``report.json``, which lists the loops of the run.
+        pictures: pictures of closed loops. Only loops whose two images were kept have a picture.
     """
     closed = {(loop.query_frame, loop.match_frame): loop for loop in report.loops if loop.accepted}
     shown = [
@@ -164,7 +168,7 @@ def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[Fi
 
 
 def seen_note(report: ReportJson, seen: Collection[Figure]) -> str:
-    """A note on the content of the pictures, and on the number of closed loops that are shown."""
+    """Return a note that explains the pictures and says how many of the closed loops are shown."""
     note = "Lines connect matched points; at most 60 matches are drawn."
     if len(seen) < report.loops_closed:
         note += f" {len(seen)} of the {report.loops_closed} closed loops are shown."

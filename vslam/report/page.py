@@ -1,7 +1,8 @@
-"""A page of results: sections of text, tables and figures.
+"""The content of a page of results: sections of text, tables and figures.
 
-Every report of vslam is such a page. ``vslam.report.render`` writes it as Markdown, as HTML and to
-a terminal. Each format omits the parts that it cannot show, and the sections that become empty.
+Every report of vslam is such a page. ``vslam.report.render`` writes a page as Markdown, as HTML and
+to a terminal. Each format omits the parts that it cannot show. Sections without parts are omitted,
+too.
 """
 
 from __future__ import annotations
@@ -32,14 +33,14 @@ class Table:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Pairs of a name and its value."""
+    """A list of names and their values."""
 
     rows: Sequence[tuple[str, str]]
 
 
 @dataclass(frozen=True)
 class Tile:
-    """One number of a summary. ``tone`` is ``good`` (green), ``bad`` (red) or empty."""
+    """One number of the summary of a page. ``tone`` is ``good`` (green), ``bad`` (red) or empty."""
 
     label: str
     value: str
@@ -49,13 +50,13 @@ class Tile:
 
 @dataclass(frozen=True)
 class Tiles:
-    """The numbers of a summary. Readers should see them first."""
+    """The most important numbers, which readers should see first."""
 
     tiles: Sequence[Tile]
 
     @property
     def rows(self) -> list[tuple[str, str, str]]:
-        """Label, value and note of each tile."""
+        """The label, value and note of each number."""
         return [(tile.label, tile.value, tile.note) for tile in self.tiles]
 
 
@@ -102,7 +103,7 @@ class Figure:
 
     @property
     def address(self) -> str:
-        """The image as a ``data:`` URL, for self-contained pages."""
+        """The image as a ``data:`` URL, for HTML pages that load no other files."""
         kind = "png" if self.image.startswith(b"\x89PNG") else "jpeg"
         return f"data:image/{kind};base64,{b64encode(self.image).decode()}"
 
@@ -119,11 +120,11 @@ Part = str | Table | Pairs | Tiles | Bullets | Alert | Code | Figure | Markup
 
 @dataclass(frozen=True)
 class Section:
-    """Parts under a heading.
+    """A part of a page under a heading.
 
     Attributes:
         title: the heading. If it is empty, HTML shows each part in its own card.
-        parts: the content. A string is a paragraph.
+        parts: the content, such as tables and figures. A string is a paragraph.
         folded: whether HTML shows only the heading until the reader opens the section.
         wide: whether HTML makes the section as wide as the page. Other sections share a row.
     """
@@ -136,7 +137,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """A whole report. ``about`` is shown in one line below the title."""
+    """A page with a whole report. ``about`` is shown in one line below the title."""
 
     title: str
     about: Sequence[str]
@@ -144,5 +145,5 @@ class Page:
 
 
 def number(value: float | None, form: str = "{}") -> str:
-    """A number as a cell of a table. None becomes ``n/a``."""
+    """Format a number as a cell of a table. None becomes ``n/a``."""
     return "n/a" if value is None else form.format(value)

@@ -50,14 +50,17 @@ def write_files(
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:
-    """Rows as comma-separated values. None becomes an empty cell."""
+    """Format rows as comma-separated values. None becomes an empty field."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
 
 
 def markdown(page: Page) -> str:
-    """A page as Markdown. Its tables are aligned, so that they can also be read in a terminal."""
+    """Format a page as Markdown.
+
+    Its tables are aligned, so that they can also be read in a terminal.
+    """
     blocks = [f"# {page.title}", " · ".join(filter(None, page.about))]
     for section in page.sections:
         if parts := [text for part in section.parts if (text := _markdown_part(part))]:
@@ -67,7 +70,7 @@ def markdown(page: Page) -> str:
 
 
 def markdown_table(head: Row, rows: Iterable[Row]) -> list[str]:
-    """The lines of a Markdown table with aligned columns."""
+    """Return the lines of a Markdown table with aligned columns."""
     rows = [tuple(cell.replace("|", "\\|").replace("\n", " ") for cell in row) for row in rows]
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     rule = tuple("-" * max(width, 3) for width in widths)
@@ -98,12 +101,12 @@ def _markdown_part(part: Part) -> str:
 
 
 def html(page: Page) -> str:
-    """A page as self-contained HTML, which loads no other files."""
+    """Format a page as self-contained HTML, which loads no other files."""
     return fill_template("report.html.jinja", page=page)
 
 
 def fill_template(template: str, **values: object) -> str:
-    """Fill values into a template of this package. Text in the values is escaped."""
+    """Insert values into an HTML template of this package. Text in the values is escaped."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -121,12 +124,12 @@ def fill_template(template: str, **values: object) -> str:
 
 
 def _heading_lines(name: str) -> list[str]:
-    """The lines of a column heading. A heading is broken at commas and brackets."""
+    """Break a column heading into lines at commas and brackets."""
     return re.split(r", | (?=\()", name)
 
 
 def _is_shown(part: Part) -> bool:
-    """Whether a part has any content."""
+    """Return whether a part of a page has any content."""
     match part:
         case Table() | Pairs():
             return bool(part.rows)
@@ -136,7 +139,10 @@ def _is_shown(part: Part) -> bool:
 
 
 def _is_wide(table: Table) -> bool:
-    """Whether a table is too wide for a phone, even if headings and text are broken at spaces."""
+    """Return whether a table is too wide for a phone.
+
+    Headings and text may be broken at spaces.
+    """
     columns = zip(table.head, zip(*table.rows, strict=True), strict=True)
     width = 0
     for name, cells in columns:
@@ -146,7 +152,7 @@ def _is_wide(table: Table) -> bool:
 
 
 def show(sections: Iterable[Section], console: Console) -> None:
-    """Print sections to a terminal.
+    """Print sections of a page to a terminal.
 
     Sentences are wrapped at the width of the console. Tables and values are not wrapped, because a
     wrapped number cannot be read, and a wrapped command cannot be copied.
@@ -184,7 +190,7 @@ def show(sections: Iterable[Section], console: Console) -> None:
 
 
 def _columns(rows: Sequence[Row]) -> list[str]:
-    """The rows as lines of text. Each column is as wide as its widest cell."""
+    """Format rows as lines of text. Each column is as wide as its widest cell."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
@@ -193,7 +199,9 @@ def _columns(rows: Sequence[Row]) -> list[str]:
 
 
 def rich_table(table: Table, gap: int) -> RichTable:
-    """A ``rich`` table in which no cell is cut off. Headings are broken at commas and brackets.
+    """Create a ``rich`` table in which no cell is cut off.
+
+    Headings are broken at commas and brackets.
 
     Args:
         table: the cells.

@@ -1,4 +1,4 @@
-"""The page of one run with the numbers of ``report.json``. Lost frames come first."""
+"""The page about one run, which shows the numbers of ``report.json``."""
 
 from __future__ import annotations
 
@@ -55,8 +55,10 @@ _ABOUT_COMPARED = (
 
 
 def headlines(report: ReportJson) -> list[Tile]:
-    """The summary. Lost frames come first, because the ATE means little if many frames were
-    lost."""
+    """Create the summary of a run.
+
+    Lost frames come first, because the ATE means little if many frames were lost.
+    """
     lost, mono = report.lost_frames, report.sensor == "mono"
     share = f"{100.0 * lost / report.frames:.1f} % of" if lost else "of"
     alignment = _ALIGNMENTS[report.alignment] if report.alignment else ""
@@ -107,12 +109,15 @@ def _before_map(report: ReportJson) -> str:
 
 
 def _together(report: ReportJson) -> str:
-    """A remark that speed and memory cover several detectors. It is empty for a single detector."""
+    """Return a remark that the speed and memory are those of several detectors together.
+
+    The remark is empty for a single detector.
+    """
     return f", {len(report.detectors)} detectors together" if report.detectors else ""
 
 
 def advice(report: ReportJson) -> str:
-    """Advice to the user if many frames were lost. It is empty if few frames were lost."""
+    """Return advice to the user if many frames were lost. It is empty if few frames were lost."""
     if report.lost_frames <= _MANY_LOST * report.frames:
         return ""
     return "Many frames were lost; vslam doctor checks images, calibration and timestamps."
@@ -141,9 +146,9 @@ def _on_earth(report: ReportJson) -> list[Tile]:
 
 
 def _latency(report: ReportJson) -> list[Tile]:
-    """The latency of a real-time run.
+    """Return the latency of a real-time run, for the summary.
 
-    It is marked as bad if frames were dropped, because the machine is then too slow.
+    The latency is marked as bad if frames were dropped, because the machine is then too slow.
     """
     if report.latency_ms is None:
         return []
@@ -170,7 +175,7 @@ def _loops(report: ReportJson) -> Tile:
 
 
 def _revisits(report: ReportJson) -> str:
-    """The number of revisits that were found.
+    """Return the number of revisits that were found by loops, for the summary.
 
     If the drive has no revisits, the text gives the number of correct loops on shorter stretches.
     """
@@ -182,9 +187,10 @@ def _revisits(report: ReportJson) -> str:
 
 
 def detector_section(report: ReportJson) -> Section:
-    """A section with a row for each detector. The run's own detector comes first.
+    """Create a section that compares the detectors of a run with ``--compare``.
 
-    The result is empty without a comparison.
+    The table has a row for each detector. The detector of ``--detector`` comes first. The result is
+    empty without a comparison.
 
     Columns without any value are left out. The number of closed loops is shown only if there is no
     ground truth that shows which revisits were found.
@@ -215,7 +221,10 @@ def detector_section(report: ReportJson) -> Section:
 
 
 def _left_out(report: ReportJson) -> str:
-    """The reason why a requested comparison is missing. It is empty if nothing is missing."""
+    """Return the reason why a comparison of detectors that was requested is missing.
+
+    The reason is empty if nothing is missing.
+    """
     if report.detectors or not report.compare:
         return ""
     return (
@@ -232,14 +241,15 @@ def run_page(
     explorer: Collection[Section] = (),
     config: str = "",
 ) -> Page:
-    """The page of a run.
+    """Create the page about a run.
 
     Args:
-        report: the numbers.
-        figures: from :func:`vslam.report.figures.draw_figures`.
+        report: the content of ``report.json``.
+        figures: the figures of the report, from :func:`vslam.report.figures.draw_figures`.
         seen: pictures of closed loops, from :func:`vslam.report.loop_tables.seen_loops`.
         recordings: names of the recordings in the folder of the page.
-        explorer: from :func:`vslam.report.explorer.explorer`.
+        explorer: the section with the interactive explorer, from
+            :func:`vslam.report.explorer.explorer`.
         config: text of ``config.json``, for the HTML page.
     """
     alerts = [Alert(f"Warning: {warning}") for warning in report.warnings]
@@ -296,7 +306,7 @@ def run_page(
 
 
 def _gps(report: ReportJson) -> Section:
-    """The section about the georeferenced trajectory. It is empty without GPS."""
+    """Create the section about the georeferenced trajectory. It is empty without GPS."""
     if (found := report.gps_track) is None:
         return Section("GPS", ())
     latitude, longitude, altitude = found.datum
@@ -323,8 +333,10 @@ def _gps(report: ReportJson) -> Section:
 
 
 def stage_rows(report: ReportJson) -> list[Row]:
-    """Rows with the name of a stage and its mean, median, 95th and 99th percentile in
-    milliseconds."""
+    """Return rows with the name of a stage and its mean, median, 95th and 99th percentile.
+
+    The times are in milliseconds.
+    """
     return [
         (name, f"{ms.mean:.2f}", f"{ms.median:.2f}", f"{ms.p95:.2f}", f"{ms.p99:.2f}")
         for name, ms in report.stage_ms.items()
@@ -332,7 +344,7 @@ def stage_rows(report: ReportJson) -> list[Row]:
 
 
 def option_rows(report: ReportJson) -> list[tuple[str, str]]:
-    """The options of the run, under their names on the command line."""
+    """Return rows with the options of the run, under their names on the command line."""
     names = ("dataset", "sequence", "perturb", "detector", "sensor", "seed", "threads", "start")
     options = [(name, str(getattr(report, name))) for name in (*names, "every")]
     limit = "all" if report.max_frames is None else str(report.max_frames)
@@ -352,7 +364,7 @@ def option_rows(report: ReportJson) -> list[tuple[str, str]]:
 
 
 def machine_rows(report: ReportJson) -> list[tuple[str, str]]:
-    """Rows that describe the machine, the packages and the time of the run."""
+    """Return rows that describe the machine, the packages and the time of the run."""
     machine = report.machine
     packages = {name: text for name, text in report.versions.items() if name != "python"}
     return [

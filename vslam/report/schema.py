@@ -16,19 +16,22 @@ from vslam.errors import InputError
 
 
 class Record(BaseModel):
-    """A part of a document. Unknown fields are errors."""
+    """A part of a JSON document of results. Unknown fields are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class Document(Record):
-    """A JSON file of results. A subclass sets ``schema_version`` to the version that it reads."""
+    """A JSON document of results.
+
+    A subclass sets ``schema_version`` to the version that it reads.
+    """
 
     schema_version: int
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Read a file that ``to_json`` wrote.
+        """Read a document from a JSON file.
 
         Raises:
             InputError: the file is missing or damaged, or has another schema version.
@@ -47,12 +50,15 @@ class Document(Record):
         )
 
     def to_json(self) -> str:
-        """The text of the file."""
+        """Return the document as JSON text."""
         return self.model_dump_json(indent=2) + "\n"
 
 
 class StageTime(Record):
-    """Time of one stage in milliseconds. It covers the frames that went through the stage."""
+    """Time that one stage takes per frame, in milliseconds.
+
+    Only frames that went through the stage are included.
+    """
 
     mean: float
     median: float
@@ -61,13 +67,15 @@ class StageTime(Record):
 
 
 class LoopEntry(Record):
-    """A loop candidate that was accepted or rejected, with frames of this run.
+    """A loop candidate that was accepted or rejected. It refers to frames of this run.
 
-    - ``query_frame``: frame of the query. None for a frame that did not become a keyframe.
-    - ``match_frame``: frame of the match. None for a keyframe of an earlier drive.
+    - ``query_frame``: index of the frame for which loops were searched. None for a frame that did
+      not become a keyframe.
+    - ``match_frame``: index of the earlier frame at the same place. None for a keyframe of an
+      earlier drive.
     - ``right``: whether the relative pose agrees with the ground truth. None if this is unknown.
-    - ``moved_m``: the largest distance by which the correction moved a keyframe, in metres or in
-      units of a monocular map. None for rejected candidates.
+    - ``moved_m``: the largest distance by which the correction moved a keyframe, in metres. In a
+      monocular map, it is in map units. None for rejected candidates.
     - ``correction_s``: the duration of the correction in seconds. None for rejected candidates.
     - ``matched_by``: the descriptors from which the relative pose was computed.
     - ``proposed_by``: the detectors that found the candidate, joined by ``+``.
@@ -88,7 +96,7 @@ class LoopEntry(Record):
 
 
 class RevisitEntry(Record):
-    """Frames in which, according to the ground truth, the camera drives along an earlier stretch.
+    """A range of frames in which the camera revisits places, according to the ground truth.
 
     ``loop_frame`` is the first of these frames in which a correct loop was closed. It is None if
     the revisit was missed.
@@ -132,10 +140,11 @@ class Measures(Record):
 
 
 class DetectorFigures(Measures):
-    """The results of one of the detectors that were compared on the same frames.
+    """The results of one detector, in a run that compares detectors on the same frames.
 
-    ``seconds`` is the wall time of tracking, of waiting for mapping, and of completing the map at
-    the end. It excludes reading images and extracting features, which the detectors share.
+    ``seconds`` is the wall time that this detector alone took. It includes tracking, waiting for
+    mapping, and completing the map at the end. It excludes reading images and extracting features,
+    because these are done only once for all detectors.
     """
 
     detector: str
@@ -145,15 +154,16 @@ class DetectorFigures(Measures):
 class MapFigures(Record):
     """The results of localisation in the map that a run continued.
 
-    - ``in_map_percent``: share of the frames whose final pose is in the map.
-    - ``weak_percent``: share of the frames whose pose is in the map but has few inliers (WEAK).
+    - ``in_map_percent``: percentage of frames whose final pose is in the map.
+    - ``weak_percent``: percentage of frames whose pose is in the map but has few inliers (WEAK).
     - ``first_fix_s``: seconds from the first frame to the first localised frame. None if no frame
       was localised.
     - ``sought``: number of frames at which the whole map was searched.
     - ``found``: number of these searches that succeeded.
-    - ``error_m``: RMSE of the positions in the map, in metres. The positions are transformed by the
-      alignment of the map, not by an alignment of their own. Therefore, the error includes an
-      offset of the whole run. None if the map was not aligned with a ground truth.
+    - ``error_m``: RMSE of the positions in the map, in metres. The trajectory of the run is not
+      aligned with the ground truth. Instead, the positions are transformed by the alignment of the
+      map. Therefore, a constant offset of all positions counts as an error. None if the map was not
+      aligned with a ground truth.
     """
 
     in_map_percent: float
@@ -165,7 +175,7 @@ class MapFigures(Record):
 
 
 class GpsFigures(Record):
-    """Numbers about the georeferenced trajectory. They are also written as ``gps.json``.
+    """Numbers about the georeferenced trajectory. They are also written to ``gps.json``.
 
     - ``datum``: origin of the local east-north-up frame, as latitude and longitude in degrees and
       altitude in metres. The origin is the first GPS fix.
@@ -174,7 +184,7 @@ class GpsFigures(Record):
     - ``fixes``: number of fixes at tracked frames.
     - ``refused``: number of these fixes that failed the chi-square test.
     - ``residual_m``: root mean square distance of the other fixes from the trajectory, in metres.
-    - ``metres_per_unit``: mean scale of the map, in metres per map unit.
+    - ``metres_per_unit``: mean length of a map unit, in metres.
     - ``ate_rmse_m``: ATE of ``trajectory_enu.tum`` after SE3 alignment. None without ground truth.
     - ``level``: False if the drive is so straight that GPS does not determine the rotation about
       its direction.
@@ -191,7 +201,9 @@ class GpsFigures(Record):
 
 
 class Machine(Record):
-    """The machine of the run. ``cores`` is the number of cores that the process may use."""
+    """The machine on which a run was made. ``cores`` is the number of cores that the process may
+    use.
+    """
 
     cpu: str
     cores: int
@@ -200,11 +212,11 @@ class Machine(Record):
 
 
 class ReportJson(Measures, Document):
-    """One run in numbers.
+    """The content of ``report.json``, which describes one run in numbers.
 
-    - ``frames``: number of processed frames. ``skipped_frames`` of these frames had an image that
-      could not be read. In a real-time run, ``dropped_frames`` of them were replaced by a newer
-      frame.
+    - ``frames``: number of processed frames. ``skipped_frames`` is the number of frames with an
+      image that could not be read. ``dropped_frames`` is the number of frames that were replaced by
+      a newer frame in a real-time run.
     - ``lost_before_map``: number of lost frames before the first tracked frame, in a run that began
       a new map. ``longest_loss_s`` is the longest time in seconds from a lost frame to the next
       tracked frame, or to the end.

@@ -1,4 +1,4 @@
-"""Computation of the numbers of a report from the outcome of a run."""
+"""Computation of the numbers in ``report.json`` from the outcome of a run."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ def summarize(
 
     Args:
         outcome: the run.
-        evaluation: errors of ``outcome.trajectory``; None if they cannot be computed.
-        verdict: evaluation of ``outcome.loops``; None if a frame has no ground truth.
-        evo_command: command that repeats the evaluation; None if evo cannot evaluate the run.
+        evaluation: errors of ``outcome.trajectory``. None if they cannot be computed.
+        verdict: evaluation of ``outcome.loops``. None if a frame has no ground truth.
+        evo_command: command that repeats the evaluation. None if evo cannot evaluate the run.
         remark: the reason why there is no evaluation, or the number of frames that it covers.
     """
     frames = len(outcome.tracks)
@@ -108,10 +108,10 @@ def summarize(
 
 
 def _scale_warnings(outcome: RunOutcome, evaluation: Evaluation | None) -> list[str]:
-    """A warning about a trajectory of wrong scale.
+    """Return a warning if the trajectory has a wrong scale.
 
-    The warning is given if the trajectory fits the ground truth only after it is scaled, although
-    the sensor measures the scale.
+    The warning is given if the sensor measures the scale, but the trajectory fits the ground truth
+    only after it is scaled.
     """
     camera, ground_truth = outcome.sequence.camera, outcome.ground_truth
     if evaluation is None or ground_truth is None or camera.monocular:
@@ -155,10 +155,12 @@ def _longest_loss_s(tracks: list[TrackResult]) -> float:
 
 
 def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
-    """The errors of the final trajectory of a run, and a remark. Both can be None.
+    """Compute the errors of the final trajectory of a run.
 
-    The remark gives the reason why there are no errors. If the errors do not cover all frames, it
-    gives the number of frames that they cover.
+    Returns:
+        The errors and a remark. The errors are None if they cannot be computed, and the remark then
+        gives the reason. If the errors do not cover all frames, the remark gives the number of
+        frames that they cover. Otherwise, the remark is None.
     """
     ground_truth = outcome.ground_truth
     if ground_truth is None:
@@ -175,7 +177,7 @@ def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
 
 
 def causal_ate(outcome: RunOutcome) -> float | None:
-    """ATE of the poses at the time of tracking. None if it cannot be computed."""
+    """Compute the ATE of the poses at the time of tracking. None if it cannot be computed."""
     ground_truth = outcome.ground_truth
     if ground_truth is None or not outcome.tracks:
         return None
@@ -189,7 +191,7 @@ def causal_ate(outcome: RunOutcome) -> float | None:
 def _measures(
     outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
 ) -> dict[str, Any]:
-    """The fields of ``vslam.report.schema.Measures``."""
+    """Compute the fields of ``vslam.report.schema.Measures``."""
     errors = ("ate_rmse_m", "rpe_m", "rpe_deg", "t_rel_percent", "r_rel_deg_per_100m")
     return {
         "lost_frames": sum(track.state == TrackingState.LOST for track in outcome.tracks),
@@ -206,9 +208,9 @@ def _measures(
 def _detectors(
     outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
 ) -> list[DetectorFigures]:
-    """The results of the compared detectors. The run's own detector comes first.
+    """Compute the results of all detectors of a run with ``--compare``.
 
-    The result is empty without a comparison.
+    The detector of ``--detector`` comes first. The result is empty without a comparison.
     """
     if not outcome.compared:
         return []
@@ -241,7 +243,7 @@ def _figures_in_map(outcome: RunOutcome) -> MapFigures | None:
 
 
 def gps_figures(outcome: RunOutcome) -> GpsFigures | None:
-    """Numbers about the georeferenced trajectory. None without GPS."""
+    """Compute the numbers about the georeferenced trajectory. None without GPS."""
     if (track := outcome.gps_track) is None:
         return None
     ate, ground_truth = None, outcome.ground_truth
@@ -263,7 +265,7 @@ def gps_figures(outcome: RunOutcome) -> GpsFigures | None:
 
 
 def stage_names(tracks: list[TrackResult]) -> list[str]:
-    """Names of the stages, in the order in which the run first went through them."""
+    """Return the names of the stages, in the order in which the run first went through them."""
     return list(dict.fromkeys(name for track in tracks for name in track.stage_ms))
 
 
@@ -294,8 +296,10 @@ def _loops(outcome: RunOutcome, verdict: LoopEvaluation | None) -> list[LoopEntr
 
 
 def _frame(frames: NDArray[np.int64], keyframe: int) -> int | None:
-    """The frame of this run that became a keyframe. None for -1 and for keyframes of earlier
-    drives."""
+    """Return the index of the frame of this run that became a keyframe.
+
+    The result is None for -1 and for keyframes of earlier drives.
+    """
     return int(frames[keyframe]) if keyframe >= 0 and frames[keyframe] >= 0 else None
 
 
@@ -332,7 +336,7 @@ def _stage_time(ms: list[float]) -> StageTime:
 
 
 def this_machine() -> Machine:
-    """The machine on which this process runs."""
+    """Describe the machine on which this process runs."""
     return Machine(
         cpu=cpu_name(),
         cores=available_cores(),

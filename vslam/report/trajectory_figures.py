@@ -44,8 +44,8 @@ def top_view(
 ) -> Figure:
     """Draw the estimate, the ground truth, weak and lost frames, closed loops and missed revisits.
 
-    The trajectories of the detectors of ``--compare`` are dashed. Each of them is shown after its
-    own alignment.
+    The trajectories of the detectors of ``--compare`` are dashed. Each of these trajectories is
+    aligned separately.
     """
     figure, axes = _new_map("Top view", outcome, evaluation)
     path = _aligned(outcome, evaluation, outcome.trajectory.T_wc[:, :3, 3])
@@ -102,10 +102,10 @@ def top_view(
 
 
 def loop_closing(outcome: RunOutcome, evaluation: Evaluation | None) -> Figure:
-    """Draw the keyframes before the first correction and at the end.
+    """Draw the keyframes before the first loop was closed and at the end of the run.
 
-    Both are transformed to the frame of the ground truth by the alignment of the final trajectory.
-    Therefore, every difference between them is an effect of loop closing.
+    Both sets of positions are transformed to the frame of the ground truth by the alignment of the
+    final trajectory. Therefore, every difference between the two sets is an effect of loop closing.
     """
     figure, axes = _new_map("Map before and after loop closing", outcome, evaluation)
     before = _aligned(outcome, evaluation, _centres(outcome.corrections[0].T_cw_before))
@@ -165,22 +165,27 @@ def _centres(T_cw: NDArray[np.float64]) -> Points:
 
 
 def _lines(ends: Points) -> Collection[Points]:
-    """x and z of ``(M, 2, 3)`` lines, as one polyline. The lines are separated by NaN."""
+    """Convert ``(M, 2, 3)`` line segments to the x and z of one polyline.
+
+    The segments are separated by NaN.
+    """
     gaps = np.full((len(ends), 1, 3), np.nan)
     points = np.concatenate([ends, gaps], axis=1).reshape(-1, 3)
     return points[:, 0], points[:, 2]
 
 
 def _at_frames(outcome: RunOutcome, path: Points, frames: NDArray[np.int64]) -> Points:
-    """``(F, 3)`` positions of some frames of the run, taken from the ``path`` of all frames."""
+    """Return the ``(F, 3)`` positions of some frames of the run.
+
+    ``path`` contains the positions of all frames.
+    """
     times = np.array([outcome.tracks[k].timestamp for k in frames])
     index = np.searchsorted(outcome.trajectory.timestamps, times)
     return path[np.minimum(index, len(path) - 1)]
 
 
 def _aligned(outcome: RunOutcome, evaluation: Evaluation | None, points: Points) -> Points:
-    """Transform ``(N, 3)`` points from the estimated world frame to the frame of the ground
-    truth."""
+    """Transform ``(N, 3)`` points from the world frame of the run to that of the ground truth."""
     if evaluation is None:
         return points
     S = truth_alignment_of(outcome, evaluation).S_truth_world

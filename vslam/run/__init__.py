@@ -1,2 +1,1 @@
-"""A run over a sequence. A run prepares, tracks and records the frames, and collects the
-results."""
+"""A run over a sequence, which prepares, tracks and records the frames and collects the results."""

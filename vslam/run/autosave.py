@@ -1,11 +1,12 @@
-"""Save the state of a run at intervals, so that a killed run loses at most a minute of work.
+"""Saving of the state of a run at intervals, so that a killed run loses at most a minute of work.
 
 The pose of each tracked frame is appended to ``trajectory_online.tum`` as a line. At intervals, the
 map is copied between two frames, if possible while no keyframe is being mapped. A thread then
-writes two files. ``autosave_progress.npz`` contains the data about the frames so far that the
-report needs. ``autosave.npz`` contains the map and is an ordinary map file. Each file replaces the
-previous version atomically. If a run is killed between these two writes, the saved progress
-contains a few frames more than the saved map. A resumed run tracks these frames again.
+writes two files. ``autosave_progress.npz`` contains the data that the report needs about the frames
+processed so far. ``autosave.npz`` contains the map and is an ordinary map file. Each file replaces
+the previous version atomically. If a run is killed between these two writes, the saved progress
+contains a few frames more than the saved map. When the run is resumed, these frames are tracked
+again.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Unfinished:
-    """The saved state of an interrupted run: a map file, and the progress at the same frame."""
+    """The saved state of an interrupted run: a map file, and the progress up to the same frame."""
 
     map: Path
     progress: Progress
@@ -64,8 +65,8 @@ def lock_run(folder: Path) -> Iterator[None]:
 def find_unfinished(folder: Path) -> Unfinished:
     """Find the saved state from which a run can be resumed.
 
-    A resumed run tracks the frames after the saved state again. The poses of these frames are
-    removed from ``trajectory_online.tum``.
+    When the run is resumed, the frames after the saved state are tracked again. The poses of these
+    frames are removed from ``trajectory_online.tum``.
 
     Raises:
         InputError: nothing was saved, or a file is damaged.
@@ -89,7 +90,7 @@ def _keep_poses(path: Path, frames: int) -> None:
 
 
 class Autosave:
-    """Interface for saving a run. This base class saves nothing."""
+    """Interface for saving a run at intervals. This base class saves nothing."""
 
     def frame(self, result: TrackResult) -> None:
         """Append the pose of a tracked frame. This method is called for every frame in order."""
@@ -98,10 +99,12 @@ class Autosave:
         """Save the run if saving is due. This method is called after ``frame``."""
 
     def close(self, slam: Slam, progress: Callable[[], Progress], *, resumable: bool) -> None:
-        """End saving.
+        """End the saving of a run.
 
-        ``resumable`` says whether the run ended early with a complete map, so that it can be
-        resumed.
+        Args:
+            slam: the SLAM system of the run.
+            progress: function that returns the progress of the run.
+            resumable: whether the run ended early with a complete map, so that it can be resumed.
         """
 
 
@@ -116,9 +119,12 @@ class FolderAutosave(Autosave):
     """
 
     def __init__(self, folder: Path, seconds: float, drive: str) -> None:
-        """
+        """Prepare to save the state of a run.
+
         Args:
-            seconds: a killed run loses at most the work of this time. With 0, no map is saved.
+            folder: the folder of the run.
+            seconds: interval between two saved maps. A killed run loses at most the work of this
+                time. With 0, no map is saved.
             drive: name of the drive in the map file.
         """
         self._folder, self._seconds, self._drive = folder, seconds, drive
@@ -193,7 +199,7 @@ class FolderAutosave(Autosave):
 
 
 def remove_autosave(folder: Path) -> None:
-    """Remove the files that are needed only to resume a run, and partly written files.
+    """Remove partly written files, and the files that are needed only to resume a run.
 
     Call this function after the results have been written.
     """
@@ -204,7 +210,7 @@ def remove_autosave(folder: Path) -> None:
 
 
 def _copy(stored: StoredMap) -> StoredMap:
-    """A copy of the map, which is not compacted. The writing thread compacts it later."""
+    """Copy the map of a run without compacting it. The writing thread compacts it later."""
     tables = {
         name: replace(table, first=table.first.copy(), values=table.values.copy())
         for name, table in stored.detector.tables.items()

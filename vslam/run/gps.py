@@ -25,16 +25,16 @@ class GpsTrack:
     """A drive in the local east-north-up frame (ENU) of a datum.
 
     Attributes:
-        trajectory: poses of the frames, camera to ENU, in metres.
+        trajectory: poses of the frames (camera to ENU), in metres.
         geodetic: ``(N, 3)`` latitude and longitude (degrees) and altitude (m) of the frames.
-        datum: ``(3,)`` latitude, longitude and altitude of the origin of the frame ENU. The origin
+        datum: ``(3,)`` latitude, longitude and altitude of the origin of the ENU frame. The origin
             is the first GPS fix.
         visual: ``(N, 3)`` positions of the trajectory without GPS. The whole trajectory is aligned
             with the fixes by one transformation.
-        fixes: ``(M, 3)`` positions of the antenna in ENU, from the fixes within the time of tracked
-            frames.
+        fixes: ``(M, 3)`` positions of the antenna in ENU. Only fixes that were measured during the
+            tracked frames are included.
         antenna: ``(3,)`` position of the antenna in the frame of the camera, in metres.
-        anchored: the poses of the keyframes in ENU, and the fixes that were used.
+        anchored: the poses of the keyframes in ENU, and the fixes from which they were computed.
     """
 
     trajectory: Trajectory
@@ -47,10 +47,10 @@ class GpsTrack:
 
 
 def locate(stored: StoredMap, fixes: Fixes, config: PoseGraphConfig) -> GpsTrack:
-    """Georeference a finished drive. The map is not changed.
+    """Georeference a finished drive using GPS fixes. The map is not changed.
 
     Args:
-        stored: the map, with the poses of the frames of its last drive.
+        stored: the map, which contains the poses of the frames of its last drive.
 
     Raises:
         InputError: fewer than three fixes belong to tracked frames, or the drive is too short.
@@ -83,7 +83,7 @@ def locate(stored: StoredMap, fixes: Fixes, config: PoseGraphConfig) -> GpsTrack
 def _in_map(
     table: FrameTable, T_kw: NDArray[np.float64], scale: NDArray[np.float64] | None = None
 ) -> Trajectory:
-    """The poses of all frames, computed from the poses of their keyframes.
+    """Compute the poses of all frames from the poses of their keyframes.
 
     The poses of lost frames are interpolated.
 
@@ -105,11 +105,11 @@ def _in_map(
 def _positions(
     table: FrameTable, T_kw: NDArray[np.float64], fixes: Fixes
 ) -> tuple[Positions, NDArray[np.float64]]:
-    """The fixes that lie between two tracked frames, and the datum.
+    """Return the fixes that lie in time between two tracked frames, and the datum.
 
     For each fix, the positions of the camera and the antenna are interpolated at the time of the
-    fix. They are given in the frame of a keyframe, which is the keyframe that the pose of the
-    previous frame is relative to.
+    fix. The positions are given in the frame of a keyframe. It is the reference keyframe of the
+    frame before the fix.
     """
     at = np.searchsorted(table.timestamp, fixes.times, "right") - 1
     at[fixes.times == table.timestamp[-1]] -= 1

@@ -1,4 +1,4 @@
-"""Pictures of closed loops. A picture shows both images side by side, with the verified matches."""
+"""Pictures of closed loops. A picture shows both images of a loop, with the verified matches."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class LoopPicture:
     """The data from which the picture of a closed loop is drawn.
 
     Attributes:
-        query_frame: the frame of this run that closed the loop.
-        match_frame: the earlier frame of this run that shows the same place.
-        query_jpeg, match_jpeg: left images of these frames as JPEG, in grey and reduced in size.
+        query_frame: index of the frame of this run that closed the loop.
+        match_frame: index of the earlier frame of this run that shows the same place.
+        query_jpeg, match_jpeg: left images of these frames as JPEG, in grey and at reduced size.
         query_xy, match_xy: ``(N, 2)`` float64 positions (pixels) of the same landmarks in the two
             reduced images.
     """
@@ -43,13 +43,12 @@ class LoopPicture:
 def loop_matches(
     map_: Map, edge: LoopEdge, camera: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The positions of the same landmarks in the images of the two keyframes of a closed loop.
+    """Return the positions of landmarks in the images of both keyframes of a closed loop.
 
     After a loop is closed, the inlier features of the query observe the landmarks of the matched
     place. If the matched keyframe itself does not observe such a landmark, the landmark is
     projected into its image. Features that lost their landmark in the bundle adjustment after the
-    loop are left out. Landmarks that lie outside the view of the matched keyframe are left out,
-    too.
+    loop are left out. Landmarks outside the view of the matched keyframe are left out, too.
 
     Args:
         map_: the map after the correction of the loop.
@@ -123,7 +122,7 @@ def draw_picture(picture: LoopPicture) -> bytes:
 
 
 def _panel(jpeg: bytes) -> tuple[NDArray[np.uint8], float]:
-    """The image, scaled to the width of a panel, and the scale factor."""
+    """Scale an image to the width of a panel, and return it with the scale factor."""
     image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
     assert image is not None
     scale = _PANEL_WIDTH / image.shape[1]

@@ -1,4 +1,4 @@
-"""Small images of keyframes for the report. They show a sample of the run, and the closed loops."""
+"""Small images of keyframes for the report, which show a sample of the run and the closed loops."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MOST_MATCHES = 60  # more lines would hide the images
 
 @dataclass(frozen=True)
 class Moment:
-    """A keyframe as the report shows it.
+    """The image of a keyframe and its keypoints, as the report shows them.
 
     Attributes:
         frame: index of the keyframe's frame in the run.
@@ -49,9 +49,9 @@ class Moment:
 
 
 class MomentRecorder(Recorder):
-    """Keeps the images of at most 96 keyframes, which are spread evenly over a run of any length.
+    """Keeps the images of at most 96 keyframes, which are spread evenly over the run.
 
-    When there are more images, every second image is dropped.
+    Whenever there are more images, every second image is dropped.
     """
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class MomentRecorder(Recorder):
         self._n_keyframes = 0
 
     def keyframe(self, result: TrackResult, image: Image, xy: NDArray, tracked: NDArray) -> None:
-        """See `vslam.run.recorder.Recorder.keyframe`."""
+        """Keep a small image of a keyframe (`vslam.run.recorder.Recorder.keyframe`)."""
         if self._n_keyframes % self._every == 0:
             if len(self.moments) == _MOST:
                 self.moments = self.moments[::2]
@@ -88,9 +88,9 @@ def _moment(
 class LoopPictureRecorder(Recorder):
     """Keeps a small image of each keyframe, and the data for a picture of each closed loop.
 
-    A loop has no picture if its earlier image was not kept. Images of earlier drives are not
-    available. If a run was resumed, images from before the interruption are not available either. A
-    very long run keeps only every second image.
+    A loop has no picture if the image of its earlier keyframe was not kept. Images of earlier
+    drives are not available. If a run was resumed, images from before the interruption are not
+    available either. In a very long run, only every second image is kept.
 
     Attributes:
         pictures: pictures of the closed loops, in order.
@@ -102,11 +102,11 @@ class LoopPictureRecorder(Recorder):
         self._camera: Camera | None = None
 
     def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None:
-        """See `vslam.run.recorder.Recorder.begin`."""
+        """Store the camera of the run (`vslam.run.recorder.Recorder.begin`)."""
         self._camera = camera
 
     def keyframe(self, result: TrackResult, image: Image, xy: NDArray, tracked: NDArray) -> None:
-        """See `vslam.run.recorder.Recorder.keyframe`."""
+        """Keep a small image of a keyframe (`vslam.run.recorder.Recorder.keyframe`)."""
         if len(self._jpegs) == _MOST_LOOP_IMAGES:
             self._jpegs = dict(list(self._jpegs.items())[::2])
         s = _LOOP_SCALE
@@ -115,7 +115,7 @@ class LoopPictureRecorder(Recorder):
         self._jpegs[result.index] = jpeg.tobytes()
 
     def loops(self, edges: Collection[LoopEdge], map_: Map) -> None:
-        """See `vslam.run.recorder.Recorder.loops`."""
+        """Add pictures of newly closed loops (`vslam.run.recorder.Recorder.loops`)."""
         assert self._camera is not None
         for edge in edges:
             if not edge.accepted or map_.sessions[edge.match] != map_.scalars.session:

@@ -17,9 +17,9 @@ OPTIONS = "run.json"
 
 
 class RunOptions(SourceOptions):
-    """The options of ``vslam run`` as they were given on the command line.
+    """The options of ``vslam run``, as given on the command line.
 
-    In ``run.json``, paths are absolute.
+    In the file ``run.json``, all paths are absolute.
 
     Attributes:
         plugins: the package of each plug-in that the other options use. It is set only in
@@ -44,7 +44,7 @@ class RunOptions(SourceOptions):
 
 
 def write_options(folder: Path, options: RunOptions) -> None:
-    """Write ``run.json``.
+    """Write the options of a run to the file ``run.json`` in its folder.
 
     Raises:
         InputError: the file cannot be written.
@@ -72,11 +72,12 @@ def write_options(folder: Path, options: RunOptions) -> None:
 
 
 def resumed_options(folder: Path) -> RunOptions:
-    """The options of a run that is to be resumed.
+    """Read the options of a run that is to be resumed.
 
     Raises:
         InputError: ``run.json`` cannot be read, a plug-in of the run is not installed, or the
-            folder contains a symbolic link, through which the run would write outside the folder.
+            folder contains a symbolic link. Through such a link, the run would write outside the
+            folder.
     """
     for path in folder.rglob("*"):
         if path.is_symlink():
@@ -96,7 +97,7 @@ def resumed_options(folder: Path) -> RunOptions:
 
 
 def read_options(folder: Path) -> RunOptions:
-    """Read ``run.json`` of the folder of a run.
+    """Read the options of a run from the file ``run.json`` in its folder.
 
     Raises:
         InputError: the file is missing or damaged.

@@ -1,4 +1,4 @@
-"""The outcome of a finished run, from which reports are made."""
+"""The outcome of a finished run, from which its report is made."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def alignment_of(sensor: str) -> str:
-    """The alignment for a trajectory of a sensor.
+    """Return how trajectories of a sensor are aligned with the ground truth.
 
     It is ``sim3`` for a monocular trajectory, whose scale is arbitrary, and ``se3`` for all other
     trajectories.
@@ -32,24 +32,24 @@ def alignment_of(sensor: str) -> str:
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """All data about a run that the report needs.
+    """All data that the report needs about a run.
 
     Attributes:
-        settings: the options of the run. The perturbation has its canonical name.
+        settings: the options of the run, with the canonical name of the perturbation.
         trajectory: final pose of every processed frame, including lost frames. If there is no
             complete map, these are the poses at the time of tracking.
         keyframes: final poses of the keyframes.
         tracks: result of tracking each frame.
         warnings: problems of the images and of the stereo rig that the run detected, as sentences.
         skipped: a message for each frame whose images could not be read.
-        latency_ms: milliseconds from the arrival of each tracked frame to its pose, in a real-time
-            run.
+        latency_ms: milliseconds from the arrival of each tracked frame until its pose is known, in
+            a real-time run.
         wall_s, cpu_s: wall and CPU seconds from reading the first frame until the last frame is
             tracked and mapped. If several detectors are compared, this is the time for all of them
             together.
-        step_s: wall seconds of the run with this detector alone. They include tracking, waiting for
-            mapping, and completing the map at the end. They exclude reading images and extracting
-            features.
+        step_s: wall seconds of the run with this detector alone. This time includes tracking,
+            waiting for mapping, and completing the map at the end. It excludes reading images and
+            extracting features.
         startup_s: seconds from the start of the process to the first frame.
         peak_memory_mb: peak memory of the process, in MB.
         n_landmarks, n_keyframes: size of the final map.
@@ -57,9 +57,10 @@ class RunOutcome:
         truth_alignment: transformation from the frame of the continued map to the frame of its
             ground truth. None if it is unknown.
         in_map: ``(N,)`` bool, True for frames that were tracked in the map that the run continued,
-            or in sub-maps that loops joined to this map. None for a run that started a new map.
-        stored: the map with all data that a later run needs to continue it. None if the run only
-            localised in the map.
+            or in sub-maps that are joined to this map by loops. None for a run that started a new
+            map.
+        stored: the map with all data that a later run needs to continue this map. None if the run
+            only localised in the map.
         loops: accepted and rejected loop candidates, in the order of the decisions.
         corrections: corrections of the map by the accepted loops, in order.
         keyframe_frames: ``(K,)`` int64, the frame of this run that became each keyframe, including
@@ -69,7 +70,7 @@ class RunOutcome:
         gps_track: the georeferenced drive. None if the run has no GPS.
         interrupted: the reason why the run ended early, such as "Ctrl-C" or a truncated file. None
             if the run did not end early.
-        compared: the runs of the detectors of ``settings.compare`` on the same frames, without
+        compared: the outcomes of the detectors of ``settings.compare`` on the same frames, without
             their maps. It is empty for a resumed run.
     """
 
@@ -102,7 +103,7 @@ class RunOutcome:
 
     @property
     def alignment(self) -> str:
-        """The alignment of the trajectory with the ground truth, before both are compared."""
+        """The kind of transformation that aligns the trajectory with the ground truth."""
         return alignment_of(self.sequence.camera.sensor)
 
     @property
@@ -113,7 +114,7 @@ class RunOutcome:
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:
-        """The ground truth of the frames of the trajectory. None if there is no ground truth."""
+        """The ground truth for the frames of the trajectory. None if there is no ground truth."""
         truth = ground_truth_of(self.sequence)
         if truth is None:
             return None
@@ -122,7 +123,7 @@ class RunOutcome:
 
 
 def causal_trajectory(tracks: list[TrackResult]) -> Trajectory:
-    """The pose of each frame at the time of tracking.
+    """Return the pose of each frame at the time of tracking.
 
     Later corrections by bundle adjustment or loop closing are not included. A lost or dropped frame
     has its predicted pose.
@@ -133,7 +134,10 @@ def causal_trajectory(tracks: list[TrackResult]) -> Trajectory:
 
 
 def odometry_trajectory(tracks: list[TrackResult]) -> Trajectory:
-    """The pose of each frame from odometry, which never jumps (``TrackResult.T_odom_camera``)."""
+    """Return the pose of each frame from odometry (``TrackResult.T_odom_camera``).
+
+    These poses never jump.
+    """
     known = [track for track in tracks if track.T_odom_camera is not None]
     times = np.array([track.timestamp for track in known], np.float64)
     poses = [track.T_odom_camera for track in known]
@@ -141,7 +145,7 @@ def odometry_trajectory(tracks: list[TrackResult]) -> Trajectory:
 
 
 def ground_truth_of(source: Source) -> Trajectory | None:
-    """The poses of all frames that have ground truth. None if no frame has ground truth."""
+    """Return the poses of all frames that have ground truth. None if no frame has ground truth."""
     if source.ground_truth is None:
         return None
     known = np.flatnonzero(np.isfinite(source.ground_truth).all((1, 2)))

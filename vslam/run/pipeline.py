@@ -1,4 +1,4 @@
-"""Run SLAM on a sequence or stream: prepare frames, track them in order and record them."""
+"""Runs of SLAM on a sequence or stream. Frames are prepared, tracked in order and recorded."""
 
 from __future__ import annotations
 
@@ -60,28 +60,30 @@ def run_sequence(
 ) -> RunOutcome:
     """Run SLAM over a whole sequence, or over a stream until it ends.
 
-    A frame that cannot be read is skipped: it gets a predicted pose, counts as lost and is listed
+    A frame that cannot be read is skipped. It gets a predicted pose, counts as lost and is listed
     in the outcome. A frame that is dropped in a real-time run gets an interpolated pose.
 
-    The run ends early after Ctrl-C (after the current frame), when the source ends unexpectedly, or
-    when a part of the run fails, such as a detector of another package. All results so far are
-    kept. If mapping failed, the map is incomplete: the outcome then contains no map, and the poses
-    as they were tracked.
+    The run ends early after Ctrl-C, when the source ends unexpectedly, or when a part of the run
+    fails, such as a detector of another package. After Ctrl-C, the current frame is completed
+    first. All results obtained so far are kept. If mapping failed, the map is incomplete. The
+    outcome then contains no map, and the poses are those at the time of tracking.
 
-    The detectors of ``settings.compare`` run on the same frames as the main detector, so images are
-    read and features extracted only once. Each detector has its own map, from which only the
-    trajectory, the tracking results and the loops are kept. If one detector fails, the others
-    continue. A resumed run continues without these detectors, because their maps were not saved.
+    The detectors of ``settings.compare`` run on the same frames as the main detector. Therefore,
+    images are read and features are extracted only once. Each detector has its own map. From this
+    map, only the trajectory, the tracking results and the loops are kept. If one detector fails,
+    the others continue. A resumed run continues without these detectors, because their maps were
+    not saved.
 
     Args:
         autosave: saves the state of the run at intervals.
-        resume: the saved state of an unfinished run. This run continues at the next frame, and its
+        resume: the saved state of an unfinished run. This run continues at the next frame. Its
             outcome covers both parts.
-        slam: the result of ``begin`` for the same settings; None calls ``begin`` here.
+        slam: the result of ``begin`` for the same settings. With None, this function calls
+            ``begin``.
 
     Raises:
-        InputError: before the first frame: the images cannot be read or are not those of the
-            resumed run, or ``begin`` fails. Later errors end the run early instead.
+        InputError: before the first frame, the images cannot be read or are not the images of the
+            resumed run, or ``begin`` fails. Errors after the first frame end the run early instead.
     """
     cv2.setNumThreads(1)  # the thread pool already uses all cores
     slam = slam or begin(sequence.camera, settings, None if resume is None else resume.map)
@@ -90,7 +92,7 @@ def run_sequence(
     recorder.begin(sequence.camera, ground_truth_of(sequence))
     main = _Run(slam, settings, Progress() if resume is None else resume.progress)
     n_recorded = 0  # loops passed to the recorder so far
-    end_reasons: list[str] = []  # why the run ended early; the first one counts
+    end_reasons: list[str] = []  # why the run ended early; the first reason counts
     with _stop_on_interrupt() as interrupted:
         frames = perturbed(_until_broken(sequence.frames(), end_reasons), perturbation)
         frames = _following(frames, main.before.tracks.timestamps)
@@ -122,7 +124,7 @@ def run_sequence(
                     if not sequence.live:  # for a live source, Ctrl-C is the usual end
                         end_reasons.append("Ctrl-C")
                     break
-        except Exception as error:  # keep the results so far
+        except Exception as error:  # keep the results obtained so far
             if isinstance(error, InputError) and not main.has_begun:
                 raise
             main.fail(f"frame {len(main.tracks)}", error)
@@ -148,15 +150,19 @@ def run_sequence(
 
 
 def _compared(camera: Camera, settings: RunOptions) -> list[_Run]:
-    """New runs of the detectors of ``settings.compare``. They use the shipped weights, because
-    ``settings.weights`` belongs to the main detector."""
+    """Begin the runs of the detectors of ``settings.compare``.
+
+    They use the shipped weights, because ``settings.weights`` belongs to the main detector.
+    """
     common: dict[str, object] = {"weights": None, "compare": ()}
     each = [settings.model_copy(update={**common, "detector": name}) for name in settings.compare]
     return [_Run(begin(camera, one), one, Progress()) for one in each]
 
 
 class _Run:
-    """The SLAM of one detector and its results, including those before the run was resumed.
+    """The SLAM of one detector and its results.
+
+    For a resumed run, the results include the part before the interruption.
 
     Attributes:
         step_s: wall seconds that this detector alone took (``RunOutcome.step_s``).
@@ -177,7 +183,7 @@ class _Run:
 
     @property
     def problem(self) -> str | None:
-        """A short description of the failure that ends the run; None if nothing failed."""
+        """A short description of the failure that ends the run. None if nothing failed."""
         return self._failure or problem_of(self.slam.detector)
 
     @property
@@ -195,8 +201,10 @@ class _Run:
         return True
 
     def fail(self, what: str, error: Exception) -> None:
-        """Record a failure that ends the run. Only the first one is kept, because it may have
-        caused the others."""
+        """Record a failure that ends the run.
+
+        Only the first failure is kept, because it may have caused later failures.
+        """
         if self._failure is not None:
             return
         if sys.flags.dev_mode:
@@ -206,19 +214,22 @@ class _Run:
 
     @contextmanager
     def recording_failure(self, what: str) -> Iterator[None]:
-        """Record an exception as the failure of this run, so that its results so far are kept."""
+        """Record an exception of the block as the failure of this run.
+
+        The results obtained so far are kept.
+        """
         try:
             yield
         except Exception as error:
             self.fail(what, error)
 
     def trajectory(self) -> Trajectory:
-        """The pose of each processed frame, according to the present map."""
+        """Return the pose of each processed frame, according to the present map."""
         # A step that failed may have added a pose without a result.
         return self.slam.trajectory().select(np.arange(len(self.tracks)))
 
     def step(self, played: Played[PreparedFrame]) -> TrackResult:
-        """Track a prepared frame, or skip one that was dropped or cannot be read."""
+        """Track a prepared frame. A frame that was dropped or cannot be read is skipped."""
         start = time.perf_counter()
         timestamp, frame = played.timestamp, played.prepared
         if frame is None or frame.dropped:
@@ -235,23 +246,23 @@ class _Run:
         return result
 
     def _add_latency(self, arrived: float, _: TrackResult) -> None:
-        """In a real-time run, measure the time from the arrival of a frame to its pose."""
+        """In a real-time run, record the time from the arrival of a frame until its pose."""
         if self.settings.realtime:
             self.latency_ms.append(1e3 * (time.perf_counter() - arrived))
 
     def finish(self) -> None:
-        """Complete all mapping."""
+        """Complete all mapping of the run."""
         start = time.perf_counter()
         self.slam.finish()
         self.step_s += time.perf_counter() - start
 
     def seconds(self) -> tuple[float, float]:
-        """Wall and CPU time of all frames."""
+        """Wall and CPU time of all frames, in seconds."""
         wall, cpu = time.perf_counter() - self._wall, time.process_time() - self._cpu
         return self.before.wall_s + wall, self.before.cpu_s + cpu
 
     def so_far(self) -> Progress:
-        """A copy of the results so far, for an autosave."""
+        """Return a copy of the results obtained so far, for an autosave."""
         slam, before = self.slam, self.before
         frames = _frames_of_this_run(slam.map)
         loops, corrections = in_frames(slam.loops, slam.corrections, frames)
@@ -274,8 +285,11 @@ def _record_frame(
     played: Played[PreparedFrame],
     n_recorded: int,
 ) -> int:
-    """Record a frame, and the map if mapping does not change it now; returns the number of recorded
-    loops."""
+    """Record a frame, and also the map if mapping is not changing it.
+
+    Returns:
+        The new number of recorded loops.
+    """
     recorder.frame(result)
     images = None if played.prepared is None else played.prepared.images
     if result.is_keyframe and slam.frame is not None and images is not None:
@@ -287,7 +301,7 @@ def _record_frame(
 
 
 def _following(frames: Iterator[TimedFrame], before: NDArray[np.float64]) -> Iterator[TimedFrame]:
-    """The frames after the first N ones, which the resumed run has already tracked.
+    """Yield the frames after the first N frames, which were tracked before the run was resumed.
 
     Args:
         before: ``(N,)`` times of the tracked frames.
@@ -312,7 +326,10 @@ def _outcome(
     seconds: tuple[float, float],
     interrupted: str | None,
 ) -> RunOutcome:
-    """The outcome of a run; ``seconds`` are the wall and the CPU time of all frames."""
+    """Create the outcome of a run.
+
+    ``seconds`` are the wall time and the CPU time of all frames.
+    """
     keyframes = [track for track in run.tracks if track.is_keyframe]
     outcome = RunOutcome(
         settings=run.settings,
@@ -343,7 +360,7 @@ def _outcome(
 
 
 def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
-    """Add the results that need a complete map."""
+    """Add the results that need a complete map to the outcome of a run."""
     slam, settings, source = run.slam, run.settings, outcome.sequence
     loops, corrections, keyframe_frames = _with_earlier(run.before, slam)
     return replace(
@@ -369,13 +386,13 @@ def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
 
 
 def _source_warnings(source: Source, settings: RunOptions) -> list[str]:
-    """Warnings about images that were left out and about the calibration."""
+    """Return warnings about images that were left out, and about the calibration."""
     left_out = source.pairing.warnings() if source.pairing is not None else []
     return [*left_out, *calibration_warnings(source.camera, settings.calib, source.name)]
 
 
 def _map_warnings(slam: Slam, camera: Camera) -> list[str]:
-    """Warnings about faults of the rig that the map reveals."""
+    """Return warnings about problems of the stereo rig that the map reveals."""
     try:
         residuals = measure_rig(slam.map, camera)
         return delay_warnings(slam.rig.delay, camera) or residual_warnings(residuals, camera)
@@ -386,11 +403,13 @@ def _map_warnings(slam: Slam, camera: Camera) -> list[str]:
 def _with_earlier(
     before: Progress, slam: Slam
 ) -> tuple[list[LoopEdge], list[LoopCorrection], NDArray[np.int64]]:
-    """Loops and corrections of a whole run, including the part before it was resumed, and the frame
-    of each keyframe that they refer to.
+    """Return the loops and corrections of a whole run, including the part before it was resumed.
 
-    Loops before the resumption refer to frames. Each of these frames gets a keyframe number after
-    those of the map.
+    Loops of the earlier part refer to frames instead of keyframes. Each of these frames gets a
+    keyframe number after the numbers of the keyframes in the map.
+
+    Returns:
+        The loops, the corrections, and the frame of each keyframe number.
     """
     frames = _frames_of_this_run(slam.map)
     if not before.loops:
@@ -409,10 +428,13 @@ def _with_earlier(
 
 
 def begin(camera: Camera, settings: RunOptions, saved: Path | None = None) -> Slam:
-    """Create the ``Slam`` of a run: with a new map, or with ``settings.map_file``.
+    """Create the ``Slam`` of a run.
+
+    It begins a new map, or continues in the map ``settings.map_file``.
 
     Args:
-        saved: the map file of an interrupted run; the ``Slam`` continues after its last frame.
+        saved: the map file of an interrupted run. The ``Slam`` continues after the last frame of
+            this run.
 
     Raises:
         InputError: the map does not exist or was made with another camera, detector or image
@@ -436,7 +458,7 @@ def require_camera(map_file: Path, camera: Camera) -> None:
     """Check that a map was made with a camera.
 
     Raises:
-        InputError: the cameras differ, or there is no such map.
+        InputError: the map was made with another camera, or there is no such map.
     """
     of_map = made_with(map_file).camera
     if not same_camera(of_map, camera):
@@ -452,20 +474,26 @@ def _frames_of_this_run(map_: Map) -> NDArray[np.int64]:
 
 
 def _until_broken(frames: Iterator[TimedFrame], end_reasons: list[str]) -> Iterator[TimedFrame]:
-    """The frames of a source until reading fails; the reason is then appended to
-    ``end_reasons``."""
+    """Yield the frames of a source until reading fails.
+
+    The reason for the failure is appended to ``end_reasons``.
+    """
     try:
         yield from frames
     except BrokenSourceError as error:
         end_reasons.append(str(error).rstrip("."))
     except InputError:
         raise
-    except Exception as error:  # the frames that were read before must still be tracked
+    except Exception as error:  # the frames that were already read must still be tracked
         end_reasons.append(f"reading the images failed, {reason(error)}")
 
 
 def _record_loops(recorder: Recorder, slam: Slam, n_recorded: int) -> int:
-    """Record all loops but the first ``n_recorded``; returns the new number of recorded loops."""
+    """Record all loops except the first ``n_recorded`` loops, which are already recorded.
+
+    Returns:
+        The new number of recorded loops.
+    """
     if len(slam.loops) > n_recorded:
         recorder.loops(slam.loops[n_recorded:], slam.map)
     return len(slam.loops)
@@ -473,8 +501,10 @@ def _record_loops(recorder: Recorder, slam: Slam, n_recorded: int) -> int:
 
 @contextmanager
 def _stop_on_interrupt() -> Iterator[threading.Event]:
-    """Turn the first Ctrl-C into a flag, so that the current frame is completed; a second one ends
-    the program at once."""
+    """Set an event at the first Ctrl-C, so that the current frame can be completed.
+
+    A second Ctrl-C ends the program at once.
+    """
     interrupted = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield interrupted

@@ -1,9 +1,9 @@
-"""Decoding and perturbation of frames and extraction of their features, a few frames ahead of
-tracking.
+"""Preparation of frames before tracking: decoding, perturbation and feature extraction.
 
-Each frame is prepared independently of the others, so that the result does not depend on the number
-of threads. In real time, a frame is prepared when it arrives, its two images in parallel. Frames
-that arrive too fast are dropped, and it depends on the machine which frames these are.
+A few frames are prepared in advance. Each frame is prepared independently of the other frames.
+Therefore, the result does not depend on the number of threads. In a real-time run, a frame is
+prepared when it arrives, and its two images are processed in parallel. Frames that arrive too fast
+are dropped. Which frames are dropped depends on the speed of the machine.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class Played(Generic[T]):
 
     Attributes:
         timestamp: seconds.
-        prepared: the prepared frame; None if the frame was dropped.
-        arrived: time of arrival by ``time.perf_counter``.
+        prepared: the prepared frame. None if the frame was dropped.
+        arrived: time of arrival, measured with ``time.perf_counter``.
     """
 
     timestamp: float
@@ -61,23 +61,26 @@ def play(
     *,
     live: bool = False,
 ) -> Iterator[Played[T]]:
-    """Play frames in real time; if several are waiting, only the newest is prepared.
+    """Play frames in real time. If several frames are waiting, only the newest frame is prepared.
 
-    One frame is prepared while the previous one is used, so that a frame waits for at most one
-    other frame. Dropped frames are not kept in memory.
+    One frame is prepared while the previous frame is being used. Therefore, a frame waits for at
+    most one other frame. Dropped frames are not kept in memory.
 
     Args:
-        frames: frames to play; the first one arrives at once, the others at their timestamps.
-        prepare: prepares a frame after its arrival; called in a separate thread. Its first argument
-            is the number of frames that arrived before, including dropped ones.
-        threads: with 1, a frame is prepared only after the previous one was used.
-        live: each frame arrives when ``frames`` yields it, whatever its timestamp.
+        frames: frames to play. The first frame arrives at once. The other frames arrive at their
+            timestamps.
+        prepare: function that prepares a frame after its arrival, in a separate thread. Its first
+            argument is the number of frames that arrived earlier, including dropped frames.
+        threads: number of threads. With 1, a frame is prepared only after the previous frame has
+            been used.
+        live: whether each frame arrives when ``frames`` yields it, regardless of its timestamp.
 
     Yields:
-        Every frame in order; dropped frames come just before the frame that replaced them.
+        Every frame in order. Dropped frames come directly before the frame that replaced them.
 
     Raises:
-        Exception: raised by ``prepare`` or ``frames``, after all earlier frames were yielded.
+        Exception: ``prepare`` or ``frames`` raised an exception. It is raised after all earlier
+            frames have been yielded.
     """
     free = threading.Semaphore(min(threads, 2))
     mailbox = _Mailbox()
@@ -141,20 +144,23 @@ def play(
 
 
 class _Mailbox:
-    """Passes the newest frame from the thread that receives frames to the one that uses them."""
+    """Passes the newest frame from the thread that receives frames to the thread that uses them."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._newest: _Arrival | None = None
-        self._dropped: list[float] = []  # times of frames dropped since the last one was taken
+        self._dropped: list[float] = []  # times of frames dropped since the last frame was taken
         self._first = True
         self._ended = False
         self.stopped = False
         self.error: Exception | None = None
 
     def put(self, arrival: _Arrival) -> None:
-        """Replace the newest frame. After the first frame of a run, which must not be replaced,
-        wait until it has been taken."""
+        """Replace the frame in the mailbox with a newer frame.
+
+        The first frame of a run must not be replaced. Therefore, after putting the first frame,
+        this method waits until the frame has been taken.
+        """
         with self._changed:
             if self._newest is not None:
                 self._dropped.append(self._newest.frame.timestamp)
@@ -163,7 +169,10 @@ class _Mailbox:
             self._changed.wait_for(lambda: not self._first or self.stopped)
 
     def take(self) -> tuple[list[float], _Arrival | None]:
-        """The times of the dropped frames, and the newest frame (None after the last one)."""
+        """Return the times of the dropped frames, and the newest frame.
+
+        After the last frame, None takes the place of the newest frame.
+        """
         with self._changed:
             self._changed.wait_for(lambda: self._newest or self._ended or self.stopped)
             newest, self._newest = (None if self.stopped else self._newest), None
@@ -173,12 +182,15 @@ class _Mailbox:
             return dropped, newest
 
     def wait_until(self, when: float) -> None:
-        """Sleep until a time of ``time.perf_counter``, or until stopped."""
+        """Sleep until a time of ``time.perf_counter``, or until ``stop`` is called."""
         with self._changed:
             self._changed.wait_for(lambda: self.stopped, max(0.0, when - time.perf_counter()))
 
     def end(self, error: Exception | None) -> None:
-        """Announce the end of the frames, with the error that caused it."""
+        """Announce that there are no more frames.
+
+        ``error`` is the exception that ended the frames, or None.
+        """
         with self._changed:
             self._ended, self.error = True, error
             self._changed.notify_all()
@@ -195,9 +207,9 @@ class PreparedFrame:
     """A frame that is ready to be tracked, or the reason why it cannot be read.
 
     Attributes:
-        images: the images and their features; None if the frame cannot be read.
-        stage_ms: milliseconds of reading and extraction.
-        problem: why the frame cannot be read; None if it can.
+        images: the images and their features. None if the frame cannot be read.
+        stage_ms: milliseconds that reading and extraction took.
+        problem: the reason why the frame cannot be read. None if it can be read.
         dropped: whether the frame is missing because a perturbation dropped it.
     """
 
@@ -217,14 +229,15 @@ def at_their_times(
     begin: int = 0,
     next_extraction: Callable[[], int] = lambda: -1,
 ) -> Iterator[Played[PreparedFrame]]:
-    """Yield prepared frames in order, each with its time of arrival. In real time, a frame arrives
-    at its timestamp; otherwise, all frames arrive at the start.
+    """Yield prepared frames in order, each with its time of arrival.
+
+    In real time, a frame arrives at its timestamp. Otherwise, all frames arrive at the start.
 
     Args:
-        workers: prepare frames and extract features in advance.
+        workers: threads that prepare frames and extract features in advance.
         begin: index of the first frame.
-        next_extraction: returns ``Slam.next_extraction``, the index of the frame whose features
-            will be needed next and are therefore extracted in advance.
+        next_extraction: function that returns ``Slam.next_extraction``. This is the index of the
+            frame whose features will be needed next. These features are extracted in advance.
     """
     if settings.realtime:
         with ThreadPoolExecutor(2, "side") as pool:
@@ -252,8 +265,10 @@ def prepared_frames(
     begin: int = 0,
     next_extraction: Callable[[], int] = lambda: -1,
 ) -> Iterator[tuple[float, PreparedFrame]]:
-    """Yield timestamps and prepared frames in order. If there are several threads, some frames are
-    prepared in advance."""
+    """Yield timestamps and prepared frames in order.
+
+    If there are several threads, some frames are prepared in advance.
+    """
     ahead: deque[tuple[float, Job[PreparedFrame]]] = deque()
     n_ahead = _AHEAD * workers.threads if workers.threads > 1 else 1
     requested = -1
@@ -281,8 +296,11 @@ def prepared_frames(
 def prepare_frame(
     frame: TimedFrame, context: TrackingContext, image_map: ImageMap = map
 ) -> PreparedFrame:
-    """Read one frame and extract its features. If tracking uses patches, reading the right image
-    and extracting features are left to tracking, which needs them only for some frames."""
+    """Read one frame and extract its features.
+
+    If tracking uses patches, it needs the right image and the features only for some frames. In
+    this case, the right image is not read and no features are extracted here.
+    """
     start = time.perf_counter()
     try:
         read_second: Callable[[], Image | DepthImage | None]

@@ -1,7 +1,8 @@
-"""The progress of a run: arrays in a file with the data about its frames that the report needs.
+"""The progress of a run: the data that the report needs about the frames processed so far.
 
-An interrupted run leaves this file next to its map. A resumed run continues from both files. Each
-tracked frame is appended to the arrays, so saving the progress only copies them.
+The data are arrays in a file. An interrupted run leaves this file next to its map. A resumed run
+continues from both files. Each tracked frame is appended to the arrays, so saving the progress only
+copies them.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ class TrackTable:
     """Tracking results of N frames, in order.
 
     Attributes:
-        rows: ``(N, 82)`` float64. Each row contains ``T_wc`` row by row, then the timestamp, the
-            state, the numbers of features, stereo features, matches and inliers, and flags (1 for a
-            keyframe, 2 for a relocalised frame). ``T_odom_camera`` row by row and
-            ``PoseUncertainty.numbers`` follow. Unknown numbers are NaN.
+        rows: ``(N, 82)`` float64. Each row describes one frame. It contains ``T_wc`` row by row,
+            then the timestamp, the state, the numbers of features, stereo features, matches and
+            inliers, and flags (1 for a keyframe, 2 for a relocalised frame). ``T_odom_camera`` row
+            by row and ``PoseUncertainty.numbers`` follow. Unknown numbers are NaN.
         stages: names of the timed stages.
         stage_ms: ``(N, S)`` float64 milliseconds. NaN for a stage that a frame skipped.
     """
@@ -54,11 +55,11 @@ class TrackTable:
         return self.rows[:, _POSE]
 
     def until(self, frames: int) -> TrackTable:
-        """The first ``frames`` frames."""
+        """Return the results of the first ``frames`` frames."""
         return replace(self, rows=self.rows[:frames], stage_ms=self.stage_ms[:frames])
 
     def results(self) -> list[TrackResult]:
-        """The results of the frames as tracking returned them."""
+        """Return the result of each frame as tracking returned it."""
         return [
             _track(index, row, dict(zip(self.stages, ms, strict=True)))
             for index, (row, ms) in enumerate(zip(self.rows, self.stage_ms.tolist(), strict=True))
@@ -66,7 +67,7 @@ class TrackTable:
 
 
 class TrackLog:
-    """A ``TrackTable`` to which frames can be appended."""
+    """A table of tracking results to which frames can be appended."""
 
     def __init__(self, before: TrackTable) -> None:
         self._rows = array("d", before.rows.tobytes())
@@ -77,7 +78,7 @@ class TrackLog:
         self._n = len(before)
 
     def append(self, track: TrackResult) -> None:
-        """Append the next frame."""
+        """Append the tracking result of the next frame."""
         self._rows.extend(track.T_wc.ravel())
         self._rows.extend((
             track.timestamp, _STATES.index(track.state), track.n_features, track.n_stereo,
@@ -94,7 +95,7 @@ class TrackLog:
         self._n += 1
 
     def table(self) -> TrackTable:
-        """A copy of all frames."""
+        """Return a copy of the results of all frames."""
         columns = [np.array(column) for column in self._stage_ms.values()]
         return TrackTable(
             np.array(self._rows).reshape(self._n, _POSE + _NUMBERS),
@@ -105,14 +106,18 @@ class TrackLog:
 
 @dataclass(frozen=True)
 class Progress:
-    """The data that a report needs about the first frames of a run.
+    """The data that a report needs about the frames that a run has processed so far.
 
     Attributes:
         tracks: results of the frames.
-        skipped, latency_ms, wall_s, cpu_s: see ``RunOutcome``.
+        skipped: a message for each frame whose images could not be read.
+        latency_ms: milliseconds from the arrival of each tracked frame until its pose is known, in
+            a real-time run.
+        wall_s, cpu_s: wall and CPU time of the frames, in seconds.
         loops: loops between frames of the run, with frame numbers in place of keyframe ids. The
             number -1 stands for a keyframe of an earlier drive.
-        corrections: corrections by the accepted loops, with the same frame numbers.
+        corrections: corrections of the map by the accepted loops, with frame numbers in place of
+            keyframe ids.
     """
 
     tracks: TrackTable = field(default_factory=TrackTable)
@@ -124,7 +129,7 @@ class Progress:
     corrections: list[LoopCorrection] = field(default_factory=list)
 
     def until(self, frames: int) -> Progress:
-        """The progress after the first ``frames`` frames."""
+        """Return the progress after the first ``frames`` frames."""
         return replace(
             self,
             tracks=self.tracks.until(frames),
@@ -139,7 +144,7 @@ def _frame_of(message: str) -> int:
 
 
 def frames_of(loops: list[LoopEdge], frames: NDArray[np.int64]) -> list[LoopEdge]:
-    """The loops with frame numbers in place of keyframe ids, and without features and landmarks.
+    """Replace the keyframe ids of loops with frame numbers, and remove features and landmarks.
 
     Args:
         frames: ``(K,)`` frame number of each keyframe.
@@ -159,7 +164,11 @@ def frames_of(loops: list[LoopEdge], frames: NDArray[np.int64]) -> list[LoopEdge
 def in_frames(
     loops: list[LoopEdge], corrections: list[LoopCorrection], frames: NDArray[np.int64]
 ) -> tuple[list[LoopEdge], list[LoopCorrection]]:
-    """Apply ``frames_of`` to loops and to their corrections."""
+    """Replace the keyframe ids of loops and of their corrections with frame numbers.
+
+    Args:
+        frames: ``(K,)`` frame number of each keyframe.
+    """
     edges = frames_of([one.edge for one in corrections], frames)
     moved = [
         replace(one, edge=edge, keyframes=frames[one.keyframes])

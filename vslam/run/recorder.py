@@ -1,9 +1,8 @@
 """The recording of a run for the Rerun viewer.
 
-A recording is replayed later with ``rerun recording.rrd``, or shown live during the run.
+A recording can be replayed later with ``rerun recording.rrd``, or shown live during the run.
 
-This is the only module that imports rerun. The methods of a ``Recorder`` are called from one thread
-only.
+Only this module imports rerun. The methods of a ``Recorder`` are called from one thread only.
 """
 
 from __future__ import annotations
@@ -67,12 +66,13 @@ _STATE_COLORS = {TrackingState.OK: _GREEN, TrackingState.WEAK: _AMBER, TrackingS
 
 @dataclass(frozen=True)
 class _Pace:
-    """How often data is sent.
+    """How often data are sent to the recording.
 
     Attributes:
         frames: number of frames in a batch.
-        keyframes: number of keyframes between two maps.
-        corrected_keyframes: number of keyframes between two maps after a correction of the map.
+        keyframes: number of new keyframes after which the map is sent again.
+        corrected_keyframes: number of new keyframes after which a map that a loop has corrected is
+            sent again.
     """
 
     frames: int
@@ -102,7 +102,7 @@ class Recorder:
         """
 
     def frame(self, result: TrackResult) -> None:
-        """Log one frame. This takes 0.1 ms."""
+        """Log the result of tracking one frame. This takes 0.1 ms."""
 
     def keyframe(self, result: TrackResult, image: Image, xy: NDArray, tracked: NDArray) -> None:
         """Log the image and keypoints of a keyframe. This method is called after ``frame``.
@@ -115,19 +115,19 @@ class Recorder:
         """
 
     def map(self, map_: Map) -> None:
-        """Log the map if enough keyframes were added since the last time.
+        """Log the map if enough keyframes were added since it was last logged.
 
-        This method is called after a frame, while mapping does not change the map.
+        This method is called after a frame. No mapping job is running at this time.
         """
 
     def loops(self, edges: Collection[LoopEdge], map_: Map) -> None:
         """Log new loops, which may have been accepted or rejected.
 
-        This method is called after ``frame``, while mapping does not change the map.
+        This method is called after ``frame``. No mapping job is running at this time.
 
         Args:
             edges: the loops since the last call.
-            map_: the map after these loops have corrected it.
+            map_: the map, which has already been corrected by these loops.
         """
 
     def finish(self, trajectory: Trajectory, map_: Map | None) -> None:
@@ -140,7 +140,7 @@ class Recorder:
 class SeveralRecorders(Recorder):
     """Forwards every call to several recorders.
 
-    If a recorder raises an error, a warning is logged, and the recorder is not called again.
+    If a recorder raises an error, a warning is logged, and this recorder is not called again.
     """
 
     def __init__(self, recorders: Sequence[Recorder]) -> None:
@@ -179,8 +179,8 @@ class Viewer:
     """A viewer that has been started.
 
     Attributes:
-        address: URL of the viewer's page; empty for a window.
-        sink: rerun's object to which a recording is sent.
+        address: URL of the page that shows the viewer. It is empty for a window.
+        sink: the rerun object to which a recording is sent.
     """
 
     address: str
@@ -191,7 +191,8 @@ def open_viewer(kind: str) -> Viewer:
     """Start the Rerun viewer.
 
     Args:
-        kind: ``native`` for a window, ``web`` for a page that can only be opened on this machine.
+        kind: ``native`` opens a window. ``web`` serves a page that can only be opened on this
+            machine.
 
     Raises:
         InputError: the viewer cannot be started on this machine.
@@ -242,7 +243,10 @@ def _has_display() -> bool:
 
 
 def _executable() -> str:
-    """The viewer of the installed rerun package. Another version may be on the path."""
+    """Return the path of the viewer in the installed rerun package.
+
+    The search path may contain another version of the viewer.
+    """
     spec = find_spec("rerun_cli")
     folder = Path(spec.origin).parent if spec and spec.origin else Path()
     found = [path for name in ("rerun", "rerun.exe") if (path := folder / name).is_file()]
@@ -255,7 +259,7 @@ def _listens(port: int) -> bool:
 
 
 def _free_port(wanted: int) -> int:
-    """The port ``wanted`` if it is free, otherwise any free port."""
+    """Return the port ``wanted`` if it is free, otherwise any free port."""
     for port in (wanted, 0):
         with socket.socket() as probe:
             try:
@@ -269,7 +273,7 @@ def _free_port(wanted: int) -> int:
 def _guarded(
     method: Callable[Concatenate[RerunRecorder, _P], None],
 ) -> Callable[Concatenate[RerunRecorder, _P], None]:
-    """Decorate a method of the recorder.
+    """Decorate a method of the recorder, so that an error in it does not end the run.
 
     If the method raises an error, the recording ends, and the error is not passed on. After the
     recording has ended, the method does nothing.
@@ -315,7 +319,7 @@ class RerunRecorder(Recorder):
 
     A recording that cannot be written never ends a run. Rerun writes in its own thread and reports
     errors only at a later flush, and this flush may never return. Therefore, the recording ends
-    with a warning in the log when the disk has less than 64 MB left. Everything up to this frame is
+    with a warning in the log when the disk has less than 64 MB left. Everything recorded before is
     in the file. The recording also ends with a warning if a flush fails, if a flush takes longer
     than 5 s, or if the viewer was closed. In these cases, the last message in the file may be
     incomplete.
@@ -464,8 +468,10 @@ class RerunRecorder(Recorder):
         self._close()
 
     def _log_trajectory(self, trajectory: Trajectory) -> None:
-        """Log the final trajectory up to each of a hundred frames, so that it grows during the
-        replay."""
+        """Log the final trajectory, so that it grows during the replay.
+
+        The part up to each of a hundred frames is logged.
+        """
         import rerun as rr
 
         n = len(trajectory)
@@ -500,7 +506,7 @@ class RerunRecorder(Recorder):
     def _log_lines(
         self, name: str, edges: list[LoopEdge], map_: Map, color: tuple[int, ...]
     ) -> None:
-        """Log a line from the query to the match of each loop whose query is in the map."""
+        """Log a line between the two keyframes of each loop whose query keyframe is in the map."""
         import rerun as rr
 
         ends = [(edge.match, edge.query) for edge in edges if edge.query >= 0]
@@ -510,8 +516,10 @@ class RerunRecorder(Recorder):
         self._recording.log(f"world/loops/{name}", lines)
 
     def _log_pictures(self) -> None:
-        """Log the pictures of new loops. If there are several pictures, the last picture stays
-        visible."""
+        """Log the pictures of new loops.
+
+        If there are several pictures, the last picture stays visible.
+        """
         import rerun as rr
 
         new = self._pictures[self._n_pictures :]

@@ -1,4 +1,4 @@
-"""Detection of problems of a stereo rig during a run, and sentences about them for the report."""
+"""Detection of problems of a stereo rig during a run, and warnings about them for the report."""
 
 from __future__ import annotations
 
@@ -81,14 +81,17 @@ def measure_rig(map_: Map, camera: Camera) -> RigResiduals | None:
 def fit(
     residual: NDArray[np.float64], speed: NDArray[np.float64], disparity: NDArray[np.float64]
 ) -> tuple[float, float, float]:
-    """The delay (s), the offset (pixels) and the relative error of the disparity.
+    """Fit a delay, an offset and a relative error of the disparity to residuals of stereo columns.
 
-    They minimise the Huber loss.
+    The fit minimises the Huber loss.
 
     Args:
         residual: ``(N,)`` measured minus predicted columns, in pixels.
         speed: ``(N,)`` image speeds in pixels per second.
         disparity: ``(N,)`` disparities in pixels.
+
+    Returns:
+        The delay in seconds, the offset in pixels, and the relative error of the disparity.
     """
     A = np.stack([speed, np.ones_like(speed), disparity], axis=1)
     x = np.zeros(3)
@@ -99,9 +102,9 @@ def fit(
 
 
 def _twists(map_: Map) -> NDArray[np.float64]:
-    """``(K, 6)`` velocity (twist) of the camera at each keyframe.
+    """Return the velocity of the camera at each keyframe as ``(K, 6)`` twists.
 
-    It is NaN if the neighbouring keyframes are too far apart in time. Drives are treated
+    A twist is NaN if the neighbouring keyframes are too far apart in time. Drives are treated
     separately, because each drive has its own clock.
     """
     T_cw, times = map_.arrays.T_cw, map_.timestamps
@@ -120,7 +123,7 @@ def _twists(map_: Map) -> NDArray[np.float64]:
 
 
 def calibration_warnings(camera: Camera, calib: Sequence[Path], name: str) -> list[str]:
-    """Warnings about an implausible calibration.
+    """Return warnings about an implausible calibration.
 
     Args:
         camera: the calibrated camera.
@@ -132,8 +135,7 @@ def calibration_warnings(camera: Camera, calib: Sequence[Path], name: str) -> li
 
 
 def delay_warnings(delay: SideDelay, camera: Camera) -> list[str]:
-    """A warning if the measured delay of the right camera differs from the delay in the
-    calibration.
+    """Return a warning if the measured delay of the right camera differs from the calibrated delay.
 
     Args:
         delay: the delay that was measured from the rows of stereo matches.
@@ -152,7 +154,10 @@ def delay_warnings(delay: SideDelay, camera: Camera) -> list[str]:
 
 
 def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
-    """A warning if the residuals show a delay between the cameras or an offset of disparities."""
+    """Return a warning if stereo residuals show a delay or a constant error of the disparities.
+
+    The delay is the delay of the right camera relative to the left camera.
+    """
     if found is None:
         return []
     warnings = []
@@ -174,8 +179,10 @@ def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
 
 
 def rig_warnings(sides: ComparedSides) -> list[str]:
-    """Warnings about a camera whose images were black, or darker than the images of the other
-    camera."""
+    """Return warnings about a camera with bad images.
+
+    These are black images, and images that are darker than those of the other camera.
+    """
     warnings = []
     for side, other, black in (
         ("left", "right", sides.n_black_left),

@@ -1,7 +1,7 @@
-"""Compile all kernels before the first frame, so that the time of a run excludes compilation.
+"""Compilation of all kernels before the first frame, so that it does not slow down the run.
 
 Compilation takes most of the time of a first run. A process compiles one kernel at a time, because
-Numba holds a lock. Therefore, two processes share the work through Numba's cache:
+Numba holds a lock. Therefore, two processes share the work through Numba's cache. They run
 ``python -m vslam.run.warmup first`` and ``python -m vslam.run.warmup second``. The process of the
 run then calls ``EVERYTHING``, which loads the compiled kernels. This process compiles only missing
 kernels, so it does not need the memory of the compiler. Later runs load a kernel when they first
@@ -106,7 +106,7 @@ def compile_kernels(*, processes: int = 2, load: bool = False) -> None:
 
 
 def is_cold() -> bool:
-    """Whether kernels must be compiled.
+    """Return whether kernels must be compiled before a run.
 
     This is the case if one of ``COLD_PROBES`` is missing in Numba's cache or is older than its
     source.
@@ -130,7 +130,7 @@ def mark_warm() -> None:
 
 
 def cached(kernel: tuple[ModuleType, str]) -> tuple[Path, list[Path]]:
-    """The source of a kernel, and its index files in Numba's cache."""
+    """Return the source file of a kernel, and the index files of this kernel in Numba's cache."""
     module, name = kernel
     source = Path(str(module.__file__))
     folder = Path(getattr(module, name).stats.cache_path)
@@ -138,10 +138,10 @@ def cached(kernel: tuple[ModuleType, str]) -> tuple[Path, list[Path]]:
 
 
 def compile_shares() -> None:
-    """Run each of ``COMPILE_SHARES`` in its own process and wait for both processes.
+    """Compile each of ``COMPILE_SHARES`` in its own process, and wait for both processes.
 
-    If a process fails, the caller must compile its kernels. An exception such as Ctrl-C ends both
-    processes.
+    If a process fails, the caller must compile the kernels of this process. An exception such as
+    Ctrl-C ends both processes.
     """
     # The executable of a frozen application is not Python.
     if not sys.executable or getattr(sys, "frozen", False):
@@ -211,7 +211,7 @@ def run_slam(config: Config, frames: int) -> None:
 
 
 def compile_depth() -> None:
-    """Compile the kernels that give keypoints the depths of a depth image."""
+    """Compile the kernels that take the depths of keypoints from a depth image."""
     depth, scale = np.ones((8, 8), np.float32), np.ones(1)
     columns_of_depth(np.zeros((1, 2), np.float32), scale, depth, CAMERA, DepthConfig())
 
@@ -227,7 +227,7 @@ def compile_local_mapping() -> None:
 
 
 def map_synthetic(keyframes: int) -> tuple[Map, Features]:
-    """Map a camera that moves sideways past a cloud of points, without images.
+    """Build the map of a camera that moves sideways past a cloud of points. No images are needed.
 
     Every keyframe observes all points. The first half of the points have a stereo match. The other
     points must be triangulated. ``redundant_ratio`` is so small that a single landmark makes a
@@ -313,7 +313,7 @@ def compile_correction() -> None:
 
 
 def smallest_vocabulary() -> Vocabulary:
-    """A vocabulary of two words."""
+    """Return a vocabulary of two words, which is enough to compile the kernels."""
     centres = np.array([[0] * 4, [0] * 4, [2**64 - 1] * 4], np.uint64)
     return from_children(2, 1, centres, np.array([2, 0, 0], np.uint8), np.ones(2, np.float32))
 

@@ -17,7 +17,8 @@ def columns_of_depth(
     camera: Camera,
     config: DepthConfig,
 ) -> NDArray[np.float32]:
-    """Column that each keypoint would have in the right image of a virtual stereo pair, in pixels.
+    """Convert depths to disparities: compute the column that each keypoint would have in the right
+    image of a virtual stereo pair, in pixels.
 
     A keypoint at column u whose nearest pixel has depth d gets the column ``u - fx b / d``. In this
     model, a constant error in pixels corresponds to a depth error that grows with the square of the
@@ -48,7 +49,7 @@ def columns_of_depth(
 
 @kernel
 def depth_around(xy, radius, depth, max_ratio):
-    """Depth at the nearest pixel of each keypoint, in metres.
+    """Look up the depth of each keypoint, in metres, at the nearest pixel of the depth image.
 
     Args:
         radius: ``(N,)`` int64, half width of the neighbourhood that is checked, pixels.

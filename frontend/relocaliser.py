@@ -1,5 +1,5 @@
-"""Relocalisation: finds the pose of a lost or doubtful frame anywhere in the map (ORB-SLAM, T-RO
-2015, V-C).
+"""Relocalisation: finds the pose of a lost or doubtful frame anywhere in the map (Mur-Artal et al.,
+ORB-SLAM, T-RO 2015, section V-C).
 
 A frame is doubtful if it has so few inliers that its matches may be wrong.
 """
@@ -35,11 +35,13 @@ Recognise = Callable[[Map, Image | None, Features, list[LoopCandidate]], Localis
 
 
 class MapAccess(Protocol):
-    """Access to the map while local mapping does not write to it."""
+    """Gives access to the map at times when local mapping does not write to it."""
 
     @property
     def is_merged(self) -> bool:
-        """Whether no keyframe is being mapped, so that tracking sees the whole map."""
+        """Whether local mapping has finished with all keyframes, so that tracking sees the whole
+        map.
+        """
         ...
 
     def merge(self) -> Map:
@@ -49,13 +51,15 @@ class MapAccess(Protocol):
 
 
 class Relocaliser:
-    """Relocalises frames at keyframes that look similar."""
+    """Relocalises lost and doubtful frames at keyframes that look similar. A frame is doubtful if
+    it has so few inliers that its matches may be wrong.
+    """
 
     def __init__(self, context: TrackingContext, locate: Locate, recognise: Recognise) -> None:
         """
         Args:
             locate: returns the keyframes that look similar to a frame, best first.
-            recognise: called if a frame cannot be located at any of these keyframes by ORB
+            recognise: called if a frame cannot be located at any of these keyframes using ORB
                 descriptors.
         """
         self._context = context
@@ -63,18 +67,19 @@ class Relocaliser:
         self._recognise = recognise
 
     def relocalise_if_needed(self, frame: Frame, found: Found, owner: MapAccess) -> Found:
-        """Relocalise a frame that is lost or doubtful.
+        """Relocalise a frame if it is lost or doubtful. A frame is doubtful if it has so few
+        inliers that its matches may be wrong.
 
         A lost frame is relocalised only if no keyframe is being mapped at the moment. For a
-        doubtful frame, the function waits until the keyframe is mapped. The doubtful frame keeps
-        its tracked pose unless relocalisation finds more than ``relocalization.better`` times as
-        many inliers.
+        doubtful frame, the method waits until the keyframe is mapped. A doubtful frame usually
+        keeps its tracked pose. It takes the pose of the relocalisation only if this pose has more
+        than ``relocalization.better`` times as many inliers.
 
         Args:
             found: the result of tracking the frame.
 
         Returns:
-            The new result, or ``found`` if the frame keeps its tracked pose.
+            The result of the relocalisation, or ``found`` if the frame was not relocalised.
         """
         if found.is_lost:
             return self._find(frame, owner.merge()) if owner.is_merged else found
@@ -89,7 +94,9 @@ class Relocaliser:
         return found
 
     def _find(self, frame: Frame, map_: Map) -> Found:
-        """Relocalise a frame at the candidates: first by ORB descriptors, then by ``recognise``."""
+        """Relocalise a frame at keyframes that look similar. ORB descriptors are tried first. If
+        they fail, ``recognise`` is called.
+        """
         config = self._context.config.relocalization
         candidates = self._locate(frame.image, frame.features, map_)
         for candidate in candidates[: config.max_candidates]:
@@ -120,8 +127,8 @@ def relocalise(
 
     The descriptors of the frame are matched with the landmarks of the place. A pose is estimated
     from the matches by P3P inside RANSAC, which needs no stereo. Then all landmarks of the
-    surroundings are searched for near their projections, first in wide windows, then in windows of
-    the usual size.
+    surroundings are searched for near their projections. The search first uses wide windows and
+    then windows of the usual size.
 
     Args:
         frame: receives the pose and the matches. On failure, both are reset.

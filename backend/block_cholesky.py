@@ -248,8 +248,7 @@ def add_product(S, start, pivot, end, row, place, update):
 @inner_kernel
 def factor_panel(S, base, width):
     """Factorise the diagonal block of a column, and divide the blocks below it by the factor.
-    Returns False if the diagonal block is not positive definite.
-    """
+    Returns False if the diagonal block is not positive definite."""
     begin, columns = np.uintp(base), np.uintp(width)
     for j in range(np.uintp(BLOCK)):
         own = begin + j * columns

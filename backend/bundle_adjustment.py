@@ -52,8 +52,7 @@ class BundleProblem:
 
     def disparity_weights(self) -> NDArray[np.float64]:
         """Return ``disparity_weight``, or the ratio in ``intrinsics`` for all observations if
-        ``disparity_weight`` is None. The result is ``(O,)`` float64.
-        """
+        ``disparity_weight`` is None. The result is ``(O,)`` float64."""
         if self.disparity_weight is not None:
             return self.disparity_weight
         return np.full(len(self.camera), self.intrinsics[5])
@@ -136,8 +135,7 @@ def adjust(
 
 def observations_of(problem: BundleProblem, use: NDArray[np.bool_] | None) -> Observations:
     """Convert the observations of a bundle problem to arguments of kernels. ``use`` is an ``(O,)``
-    bool mask of the observations that are used; None uses all observations.
-    """
+    bool mask of the observations that are used; None uses all observations."""
     return Observations(
         problem.first,
         problem.camera,
@@ -151,8 +149,7 @@ def observations_of(problem: BundleProblem, use: NDArray[np.bool_] | None) -> Ob
 
 def empty_equations(n_free: int, n_points: int, n_observations: int) -> NormalEquations:
     """Allocate arrays for the normal equations. W is set to 0, because its blocks for fixed cameras
-    and unused observations are never written.
-    """
+    and unused observations are never written."""
     return NormalEquations(
         np.zeros((n_observations, 3, 6)),
         np.empty((n_points, 3, 3)),
@@ -171,8 +168,7 @@ def _in_camera(T, p, q):
 @kernel
 def robust_cost(T_cw, points, observations, inlier):
     """Compute half the sum of the Huber losses. The function also writes into ``inlier`` whether
-    each observation passes the chi-square test.
-    """
+    each observation passes the chi-square test."""
     first, camera, uvr, inverse_sigma2, disparity_weight, used, intrinsics = observations
     fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
     cost = 0.0
@@ -233,8 +229,7 @@ def _adjust(T_start, n_free, points_start, observations, equations, iterations, 
 @kernel
 def linearise(T_cw, n_free, points, observations, equations):
     """Linearise the reprojection errors at the current estimate, and write the normal equations
-    into ``equations``.
-    """
+    into ``equations``."""
     first, camera, uvr, inverse_sigma2, disparity_weight, used, intrinsics = observations
     W, V, g, U, b = equations
     fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
@@ -307,8 +302,7 @@ def linearise(T_cw, n_free, points, observations, equations):
 def reduce_points(n_free, observations, equations, damping, S, rhs, V_inverse):
     """Eliminate the points from the normal equations by the Schur complement. The function writes
     the upper triangle of S and the right-hand side of the reduced camera system ``S x = rhs``. It
-    also writes the inverses of the damped point blocks.
-    """
+    also writes the inverses of the damped point blocks."""
     first, camera, used = observations.first, observations.camera, observations.used
     W, V, g, U, b = equations
     S[:] = 0.0
@@ -349,8 +343,7 @@ def reduce_points(n_free, observations, equations, damping, S, rhs, V_inverse):
 @inner_kernel
 def invert_damped(V, damping, N):
     """Damp the diagonal of a point's ``(3, 3)`` block, and write the inverse of the block into
-    ``N``. If the block is singular, zeros are written, so that the point does not move.
-    """
+    ``N``. If the block is singular, zeros are written, so that the point does not move."""
     scale = 1.0 + damping
     v00, v11, v22 = V[0, 0] * scale, V[1, 1] * scale, V[2, 2] * scale
     v01, v02, v12 = V[0, 1], V[0, 2], V[1, 2]
@@ -403,8 +396,7 @@ def step_cameras(n_free, camera_step, T_cw, T_trial):
 def cholesky_solve(S, x):
     """Solve the linear system ``S x = rhs`` in place. ``x`` holds the right-hand side on entry and
     the solution on return. Only the upper triangle of S is read. Returns False if S is not positive
-    definite.
-    """
+    definite."""
     n = len(x)
     for i in range(n):
         row = S[i]

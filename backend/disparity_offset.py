@@ -39,8 +39,7 @@ TOLERANCE = 1e-5  # least relative decrease of the cost; STEP changes it by some
 
 def map_and_calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
     """Run local mapping for a new keyframe (``map_keyframe``). For a stereo camera, the disparity
-    offset of the map is also updated after every ``stereo.offset_keyframes`` keyframes.
-    """
+    offset of the map is also updated after every ``stereo.offset_keyframes`` keyframes."""
     map_keyframe(map_, keyframe, camera, config)
     if config.stereo.offset_sigma > 0.0 and camera.sensor == "stereo":
         _calibrate(map_, keyframe, camera, config)

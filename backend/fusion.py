@@ -1,6 +1,5 @@
 """Fusion: merges landmarks that represent the same point in the world (section VI-C of the ORB-SLAM
-paper).
-"""
+paper)."""
 
 from __future__ import annotations
 
@@ -92,8 +91,7 @@ def fuse_loop(
 def _fuse_pairs(a, rows, landmarks, keyframe):
     """Assign each of the given landmarks to a feature of a keyframe. If the feature already
     observes another landmark, the two landmarks are merged. ``rows`` gives the row of each feature
-    in the observation arrays of the map. Returns the number of fusions.
-    """
+    in the observation arrays of the map. Returns the number of fusions."""
     fused = 0
     for i in range(len(rows)):
         row, landmark = rows[i], landmarks[i]
@@ -114,8 +112,7 @@ def fuse_into(
     map_: Map, landmarks: NDArray[np.int32], keyframe: int, camera: Camera, config: Config
 ) -> int:
     """Project ``(N,)`` landmarks into a keyframe, and fuse them with its features and landmarks.
-    Returns the number of fusions.
-    """
+    Returns the number of fusions."""
     a, rows = map_.arrays, map_.rows(keyframe)
     grid = FeatureGrid.of_positions(a.xy[rows], camera.width, camera.height)
     return _fuse(

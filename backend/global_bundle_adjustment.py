@@ -150,8 +150,7 @@ def working_order(first, rank, n_cameras):
 @kernel
 def coupled_cameras(first, camera, n_free):
     """Find all pairs of free cameras that observe a common point. Returns ``(M, 2)`` int64 indices.
-    Each pair occurs once.
-    """
+    Each pair occurs once."""
     start, points = points_of_cameras(first, camera, n_free)
     met = np.empty(n_free, np.int64)
     last = np.full(n_free, -1)  # the last camera ``i`` that each camera was paired with

@@ -121,8 +121,7 @@ def merge_solution(map_: Map, snapshot: GlobalSnapshot, solution: BundleSolution
 def remove_unchanged(a, rows, landmarks):
     """Remove N observations that still exist unchanged. ``rows`` gives their ``(N,)`` rows in the
     observation arrays of the map. An observation is removed only if it still belongs to the given
-    landmark.
-    """
+    landmark."""
     for i in range(len(rows)):
         if a.landmark[rows[i]] == landmarks[i]:
             unlink(a, rows[i])

@@ -94,8 +94,7 @@ class Positions:
     @property
     def crowding(self) -> Array:
         """Count the positions in a time window of ``CORRELATION_S`` around each position. Returns
-        ``(M,)`` numbers. The position itself is counted, too.
-        """
+        ``(M,)`` numbers. The position itself is counted, too."""
         times = np.sort(self.seconds)
         first = np.searchsorted(times, self.seconds - 0.5 * CORRELATION_S, "left")
         last = np.searchsorted(times, self.seconds + 0.5 * CORRELATION_S, "right")
@@ -282,15 +281,13 @@ def _umeyama(p: Array, q: Array, up: Array, fixed: float | None) -> Array:
 
 def _mapped(S: Array, points: Array) -> Array:
     """Transform ``(M, 3)`` points by ``(..., 4, 4)`` similarities. The result has the shape ``(...,
-    M, 3)``.
-    """
+    M, 3)``."""
     return points @ np.swapaxes(S[..., :3, :3], -2, -1) + S[..., None, :3, 3]
 
 
 def _aligned(T_wk: Array, S_enu_w: Array) -> tuple[Array, Array]:
     """Apply the similarity transform ``S_enu_w`` to the poses of the keyframes. Returns the new
-    poses ``T_enu_k`` and the scales.
-    """
+    poses ``T_enu_k`` and the scales."""
     scale = float(scale_of(S_enu_w))
     T_enu_k = S_enu_w @ T_wk
     T_enu_k[:, :3, :3] /= scale
@@ -304,8 +301,7 @@ def _points(T: Array, points: Array) -> Array:
 
 def _antenna(positions: Positions, scale: Array) -> Array:
     """Compute the ``(M, 3)`` positions of the antenna, in metres. Each position is given in the
-    frame of its keyframe.
-    """
+    frame of its keyframe."""
     return positions.arm * scale[positions.keyframe, None] + positions.lever
 
 
@@ -372,8 +368,7 @@ def _likeliest(
 def _log_determinant(factors: Any, values: Any) -> float:
     """Return the logarithm of the determinant of the normal matrix. It is NaN if GTSAM cannot
     factorise the matrix. This happens if the standard deviations of the edges are much smaller than
-    those of the priors, for example on a drive of less than a metre.
-    """
+    those of the priors, for example on a drive of less than a metre."""
     try:
         # GTSAM returns the log determinant of the triangular root.
         return 2.0 * float(factors.linearize(values).eliminateMultifrontal().logDeterminant())

@@ -48,8 +48,7 @@ def refresh_keyframe(map_: Map, keyframe: int) -> None:
 
 def cull_recent_landmarks(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
     """Erase recently created landmarks that tracking rarely finds, or that too few keyframes
-    observe.
-    """
+    observe."""
     a, n = map_.arrays, map_.n_landmarks
     first = int(np.searchsorted(a.first_keyframe[:n], keyframe - RECENT_KEYFRAMES))
     # A stereo observation counts twice. In a stereo map, one stereo and one monocular observation
@@ -98,8 +97,7 @@ def local_window(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
     """Select the keyframes and landmarks of local bundle adjustment. Returns the ids of the
     keyframes that are optimised, the ids of the keyframes that are held fixed, and the ids of the
-    landmarks.
-    """
+    landmarks."""
     strong = strong_neighbours(map_, keyframe, config)
     window = np.concatenate([[keyframe], strong])[: config.mapping.max_ba_keyframes]
     landmarks, others = window_landmarks(
@@ -192,8 +190,7 @@ def assemble(
 @kernel
 def remove_observations(a, rows):
     """Remove N observations. ``rows`` gives their ``(N,)`` rows in the observation arrays of the
-    map. Rows that no longer hold an observation are skipped.
-    """
+    map. Rows that no longer hold an observation are skipped."""
     for row in rows:
         if a.landmark[row] >= 0:
             unlink(a, row)

@@ -69,8 +69,7 @@ def carry_landmarks_by(map_: Map, motion: NDArray[np.float64], moved: NDArray[np
 @kernel
 def _motions(T_cw_old, T_cw_new, moved):
     """Compute the ``(K, 4, 4)`` motion of each keyframe in the world frame. A point p that is fixed
-    to the keyframe moves to ``motion p``.
-    """
+    to the keyframe moves to ``motion p``."""
     motion = np.zeros((len(moved), 4, 4))
     for k in range(len(moved)):
         if moved[k]:
@@ -101,8 +100,7 @@ def _carry(a, landmarks, motion, moved):
 @inner_kernel
 def anchor_of(a, landmark):
     """Return the id of the anchor of a landmark, which is the keyframe that the landmark moves
-    with. Returns -1 if no keyframe of the map observes the landmark.
-    """
+    with. Returns -1 if no keyframe of the map observes the landmark."""
     first = a.first_keyframe[landmark]
     if a.keyframe_alive[first]:
         return first

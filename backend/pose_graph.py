@@ -178,8 +178,7 @@ def connectivity(map_: Map) -> NDArray[np.int64]:
 
 def _spans(pair: tuple[int, int], keyframes: NDArray[np.int64]) -> bool:
     """Return whether any of the ids ``keyframes`` is greater than the first id of the pair and not
-    greater than the second id of the pair. ``keyframes`` must be sorted.
-    """
+    greater than the second id of the pair. ``keyframes`` must be sorted."""
     low, high = np.searchsorted(keyframes, pair, side="right")
     return bool(low < high)
 
@@ -230,8 +229,7 @@ def edge_sigmas(
 
 def parts_of(edges: NDArray[np.int64], n: int) -> NDArray[np.int64]:
     """Find the connected part of the graph that each node belongs to, using union-find. A part is
-    denoted by its first node, so the result is the ``(n,)`` int64 index of this node.
-    """
+    denoted by its first node, so the result is the ``(n,)`` int64 index of this node."""
     part = list(range(n))
 
     def first_of(node: int) -> int:
@@ -248,8 +246,7 @@ def parts_of(edges: NDArray[np.int64], n: int) -> NDArray[np.int64]:
 
 def load_optimiser() -> None:
     """Import GTSAM before the first loop is closed. The import takes a tenth of a second. During a
-    loop closure, this would be too long, because frames of a live camera would have to wait.
-    """
+    loop closure, this would be too long, because frames of a live camera would have to wait."""
     import gtsam  # noqa: F401
 
 
@@ -314,8 +311,7 @@ def optimised_values(
 
 def minimised(factors: Any, start: Any, config: PoseGraphConfig) -> Any:
     """Find the ``gtsam.Values`` that minimise the error of a ``gtsam.NonlinearFactorGraph``, using
-    Levenberg-Marquardt.
-    """
+    Levenberg-Marquardt."""
     import gtsam
 
     parameters = gtsam.LevenbergMarquardtParams()
@@ -353,8 +349,7 @@ def check_edge_errors(
     config: PoseGraphConfig,
 ) -> GraphCheck:
     """Test whether an optimised graph is plausible, as ``check_pose_graph`` does, from the ``(E,)``
-    chi-squares of the edges before and after the optimisation.
-    """
+    chi-squares of the edges before and after the optimisation."""
     loop = graph.kind == LOOP
     loop_error = np.where(loop, after, np.nan)
     strain = float(after[~loop & (graph.kind != WEAK)].sum())
@@ -376,8 +371,7 @@ def check_edge_errors(
 def edge_errors(T_cw, edges, T_i_j, sigmas):
     """Compute the ``(E,)`` chi-square of each edge. The residual motion of the edge is expressed as
     a twist. The twist is divided by the standard deviations. The chi-square is the squared norm of
-    the result.
-    """
+    the result."""
     chi2 = np.empty(len(edges))
     for e in range(len(edges)):
         T = compose(T_cw[edges[e, 0]], inverse(T_cw[edges[e, 1]]))

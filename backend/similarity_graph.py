@@ -34,8 +34,7 @@ from vslam.map_kernels import refresh_landmarks
 
 def similarity(T_a_b: Matrix, scale: NDArray[np.float64] | float) -> Matrix:
     """Compose ``(..., 4, 4)`` similarities from ``(..., 4, 4)`` rigid motions and ``(...,)``
-    scales.
-    """
+    scales."""
     S = T_a_b.copy()
     S[..., :3, :3] *= np.asarray(scale)[..., None, None]
     return S
@@ -48,8 +47,7 @@ def scale_of(S: Matrix) -> NDArray[np.float64]:
 
 def rigid(S: Matrix) -> Matrix:
     """Convert ``(..., 4, 4)`` similarities to ``(..., 4, 4)`` rigid motions by setting their scale
-    to 1.
-    """
+    to 1."""
     return similarity(S, 1.0 / scale_of(S))
 
 
@@ -102,16 +100,14 @@ def check_similarity_graph(
     graph: PoseGraph, S_wc_before: Matrix, S_wc: Matrix, config: PoseGraphConfig
 ) -> GraphCheck:
     """Test whether an optimised graph is plausible, as ``check_pose_graph`` does, from the
-    similarities before and after the optimisation.
-    """
+    similarities before and after the optimisation."""
     before, after = (edge_errors(graph, S, config) for S in (S_wc_before, S_wc))
     return check_edge_errors(graph, before, after, config)
 
 
 def edge_errors(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfig) -> NDArray[np.float64]:
     """Compute the ``(E,)`` chi-square of each edge from the rotation, translation and scale of its
-    residual.
-    """
+    residual."""
     i, j = graph.edges.T
     S_i_j = np.linalg.inv(S_wc[i]) @ S_wc[j]
     residual = np.linalg.inv(similarity(graph.T_i_j, graph.scale)) @ S_i_j

@@ -86,8 +86,7 @@ def triangulate_with_neighbours(
 
 def median_depth(map_: Map, keyframe: int) -> float:
     """Return the median depth of the landmarks that a keyframe observes. It measures the scale of
-    the scene.
-    """
+    the scene."""
     points, T_cw = map_.arrays.xyz[map_.landmarks_of(keyframe)], map_.arrays.T_cw[keyframe]
     return float(np.median(points @ T_cw[2, :3] + T_cw[2, 3]))
 
@@ -95,8 +94,7 @@ def median_depth(map_: Map, keyframe: int) -> float:
 @inner_kernel
 def unmapped_rows(a, keyframe):
     """Find the features of a keyframe that do not observe a landmark. Returns their ``(N,)`` int64
-    rows in the observation arrays of the map.
-    """
+    rows in the observation arrays of the map."""
     first, last = a.first_row[keyframe], a.first_row[keyframe + 1]
     return first + np.flatnonzero(a.landmark[first:last] < 0)
 
@@ -221,8 +219,7 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
 @kernel
 def perpendicular(t):
     """Return ``(2, 3)``: two unit vectors that are orthogonal to the vector ``t`` and to each
-    other.
-    """
+    other."""
     across = np.zeros((2, 3))
     least = 0
     for i in range(1, 3):
@@ -326,8 +323,7 @@ def dot3(a, b):
 @inner_kernel
 def world_ray(T_cw, xy, intrinsics, ray):
     """Compute the viewing ray of a pixel, and write it into ``ray``, with shape ``(3,)``. The ray
-    is in the world frame. Its length is such that z = 1 in the camera frame.
-    """
+    is in the world frame. Its length is such that z = 1 in the camera frame."""
     x = (xy[0] - intrinsics[2]) / intrinsics[0]
     y = (xy[1] - intrinsics[3]) / intrinsics[1]
     for i in range(3):
@@ -387,8 +383,7 @@ def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_
 @inner_kernel
 def agrees(T, p, xy, u_right, scale, intrinsics):
     """Return whether a point agrees with an observation: it lies in front of the camera, and its
-    reprojection error passes the chi-square test.
-    """
+    reprojection error passes the chi-square test."""
     z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
     if z <= 0.0:
         return False

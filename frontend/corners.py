@@ -214,8 +214,7 @@ def spread(x, y, score, width, height, quota):
 @inline
 def cell_of(x, y, inverse, columns):
     """Return the index of the grid cell that contains a pixel. ``inverse`` is 1 divided by the cell
-    size, because multiplication is much faster than division.
-    """
+    size, because multiplication is much faster than division."""
     half = np.float32(0.5)
     return int((y + half) * inverse) * columns + int((x + half) * inverse)
 

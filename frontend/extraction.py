@@ -102,8 +102,7 @@ class FrameImages:
     @cached_property
     def corners(self) -> Corners:
         """The features that a corner detector finds, and their stereo matches. The first access
-        reads the second image (right image or depth image).
-        """
+        reads the second image (right image or depth image)."""
         return self._find_corners() if self._started is None else self._started.result()
 
     @cached_property
@@ -113,8 +112,7 @@ class FrameImages:
 
     def extracted_with(self, keypoints: Keypoints) -> Extracted:
         """Return the features of the frame, and additional features at the given positions and
-        pyramid levels of the left image.
-        """
+        pyramid levels of the left image."""
         return matched(self.corners, self._context, keypoints)
 
     @cached_property

@@ -34,8 +34,7 @@ class FeatureSource(Protocol):
 
     def extracted_with(self, keypoints: Keypoints) -> Extracted:
         """Return the features of the frame, and additional features at the given positions and
-        pyramid levels of the left image.
-        """
+        pyramid levels of the left image."""
         ...
 
     @property
@@ -110,7 +109,8 @@ class Frame:
         timestamp: float = 0.0,
         image: NDArray[np.uint8] | None = None,
     ) -> Frame:
-        """Create a frame that is not tracked yet. Its pose is the identity, and it has no matches."""
+        """Create a frame that is not tracked yet. Its pose is the identity, and it has no
+        matches."""
         features, n = extracted.features, len(extracted.features)
         return cls(
             index=index,
@@ -174,8 +174,7 @@ class Frame:
     @property
     def can_become_keyframe(self) -> bool:
         """Whether the frame can become a keyframe. It cannot if its features come from the right
-        image, which happens when the left image is black.
-        """
+        image, which happens when the left image is black."""
         return self.side == Side.LEFT
 
     @property
@@ -187,8 +186,7 @@ class Frame:
 
     def refined_features(self) -> Features:
         """Return the features, moved to their aligned positions where their matches were aligned.
-        Disparities are unchanged.
-        """
+        Disparities are unchanged."""
         aligned = self.aligned
         if self.shift is None or not aligned.any():
             return self.features
@@ -200,8 +198,7 @@ class Frame:
     @property
     def n_stereo(self) -> int:
         """Number of features with a stereo match. In an RGB-D frame, it is the number of features
-        with a depth.
-        """
+        with a depth."""
         return int(np.count_nonzero(np.isfinite(self.features.u_right)))
 
 

@@ -208,8 +208,7 @@ def normalised(xy: Matrix) -> tuple[Matrix, Matrix]:
 
 def fit_homographies(x_1: Matrix, x_2: Matrix) -> Matrix:
     """Fit a homography to each of B samples of M matches, using the DLT (Hartley and Zisserman,
-    section 4.1). The points have shape ``(B, M, 2)``. Returns ``(B, 3, 3)`` matrices.
-    """
+    section 4.1). The points have shape ``(B, M, 2)``. Returns ``(B, 3, 3)`` matrices."""
     x, y, u, v = x_1[..., 0], x_1[..., 1], x_2[..., 0], x_2[..., 1]
     zero, one = np.zeros_like(x), np.ones_like(x)
     above = np.stack([zero, zero, zero, -x, -y, -one, v * x, v * y, v], axis=-1)
@@ -232,8 +231,7 @@ def fit_fundamentals(x_1: Matrix, x_2: Matrix) -> Matrix:
 
 def _null_vectors(A: Matrix) -> Matrix:
     """For each of B matrices A, find the unit vector h that minimises ``|A h|``. Each h is reshaped
-    to a 3x3 matrix, so the result has shape ``(B, 3, 3)``.
-    """
+    to a 3x3 matrix, so the result has shape ``(B, 3, 3)``."""
     _, vectors = np.linalg.eigh(A.swapaxes(1, 2) @ A)
     return vectors[:, :, 0].reshape(-1, 3, 3)
 
@@ -242,8 +240,7 @@ def score_homographies(
     H: Matrix, xy_1: Matrix, xy_2: Matrix, sigma: Matrix
 ) -> tuple[Matrix, NDArray[np.bool_]]:
     """Score B homographies by the symmetric transfer error (section IV of the ORB-SLAM paper).
-    Returns ``(B,)`` scores and a ``(B, N)`` bool mask of the inliers.
-    """
+    Returns ``(B,)`` scores and a ``(B, N)`` bool mask of the inliers."""
     with np.errstate(all="ignore"):  # collinear samples give NaN errors, which score 0
         error_2 = _squared(_transferred(H, xy_1) - xy_2) / sigma**2
         error_1 = _squared(_transferred(_adjugates(H), xy_2) - xy_1) / sigma**2
@@ -273,8 +270,7 @@ def score_fundamentals(
 
 def _score(error_1: Matrix, error_2: Matrix, limit: float) -> tuple[Matrix, NDArray[np.bool_]]:
     """Compute ``(B,)`` scores and a ``(B, N)`` bool mask of the inliers for B models. The arguments
-    are the ``(B, N)`` chi-square errors in view 1 and in view 2, and the inlier threshold.
-    """
+    are the ``(B, N)`` chi-square errors in view 1 and in view 2, and the inlier threshold."""
     score = np.zeros(len(error_1))
     for error in (error_2, error_1):
         score += np.where(error < limit, CHI2_MONO - error, 0.0).sum(axis=1)
@@ -288,8 +284,7 @@ def _transferred(H: Matrix, xy: Matrix) -> Matrix:
 
 def _adjugates(H: Matrix) -> Matrix:
     """Compute the adjugates of ``(B, 3, 3)`` matrices. An adjugate is the inverse up to scale. It
-    exists even for a singular matrix.
-    """
+    exists even for a singular matrix."""
     a, b, c = H[:, 0], H[:, 1], H[:, 2]
     return np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
 
@@ -300,8 +295,7 @@ def _squared(x: Matrix) -> Matrix:
 
 def motions_of_essential(E: Matrix) -> list[Matrix]:
     """Return the four candidate motions ``T_2_1`` of an essential matrix (Hartley and Zisserman,
-    section 9.6.2).
-    """
+    section 9.6.2)."""
     U, _, Vt = np.linalg.svd(E)
     W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     s = np.linalg.det(U) * np.linalg.det(Vt)
@@ -312,8 +306,7 @@ def motions_of_essential(E: Matrix) -> list[Matrix]:
 def motions_of_homography(A: Matrix) -> list[Matrix]:
     """Return the eight candidate motions ``T_2_1`` of a calibrated homography (Faugeras and
     Lustman, "Motion and structure from motion in a piecewise planar environment", 1988). The list
-    is empty for a pure rotation.
-    """
+    is empty for a pure rotation."""
     U, (d1, d2, d3), Vt = np.linalg.svd(A)
     if d1 / d2 < 1.00001 or d2 / d3 < 1.00001:
         return []

@@ -1,6 +1,5 @@
 """Decides when a frame becomes a keyframe. The rules follow section III-E of the ORB-SLAM2 paper.
-For monocular cameras, they follow section V-E of the ORB-SLAM paper.
-"""
+For monocular cameras, they follow section V-E of the ORB-SLAM paper."""
 
 from __future__ import annotations
 
@@ -51,8 +50,7 @@ class KeyframeEvidence:
 
     def ahead(self, frames: int) -> KeyframeEvidence:
         """Predict the evidence some frames later. It is assumed that the number of tracked close
-        points continues to change by the factor ``close_ratio`` per frame.
-        """
+        points continues to change by the factor ``close_ratio`` per frame."""
         close = round(self.tracked_close * self.close_ratio**frames)
         n_inliers = self.n_inliers + close - self.tracked_close
         return replace(self, tracked_close=close, n_inliers=n_inliers)
@@ -197,8 +195,7 @@ class KeyframePolicy:
 
     def wants_keyframe(self, evidence: KeyframeEvidence) -> bool:
         """Return whether the frame should become a keyframe. This method does not test whether the
-        place is already mapped. ``is_known`` tests this.
-        """
+        place is already mapped. ``is_known`` tests this."""
         camera = self._context.camera
         if camera.monocular:
             return needs_monocular_keyframe(evidence, self._config)

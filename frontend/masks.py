@@ -36,8 +36,7 @@ class Mask:
     @classmethod
     def of(cls, mask: NDArray[np.uint8] | NDArray[np.bool_], config: OrbConfig) -> Self:
         """Create a mask from an ``(H, W)`` array. Pixels whose value is 0 in the array are not to
-        be used.
-        """
+        be used."""
         used = mask > 0
         levels = build_pyramid(used * np.uint8(255), config)
         for index in range(config.n_levels):
@@ -61,7 +60,6 @@ class Mask:
 
     def filled(self, image: Image) -> Image:
         """Copy an ``(H, W)`` uint8 image and give all masked pixels the mean grey value of the
-        other pixels. The copy is for networks that read the whole image.
-        """
+        other pixels. The copy is for networks that read the whole image."""
         mean = np.uint8(image[self.used].mean()) if self.used.any() else np.uint8(0)
         return np.where(self.used, image, mean)

@@ -131,8 +131,7 @@ def extract_at(found: Extraction, xy: NDArray[np.float32], octave: NDArray[np.ui
 @kernel
 def _is_free(pixel, existing):
     """Return ``(N,)`` bool, True for pixels that are far from all existing features. ``pixel`` has
-    shape ``(N, 2)``, and ``existing`` has shape ``(M, 2)``.
-    """
+    shape ``(N, 2)``, and ``existing`` has shape ``(M, 2)``."""
     free = np.ones(len(pixel), np.bool_)
     for i in range(len(pixel)):
         x, y = pixel[i, 0], pixel[i, 1]
@@ -146,16 +145,14 @@ def _is_free(pixel, existing):
 
 def scale_factors(config: OrbConfig) -> NDArray[np.float64]:
     """Return the ``(L,)`` float64 scale of each pyramid level, in full-resolution pixels per pixel
-    of the level. The scale of level 0 is 1.
-    """
+    of the level. The scale of level 0 is 1."""
     return config.scale_factor ** np.arange(config.n_levels, dtype=np.float64)
 
 
 @cache
 def features_per_level(config: OrbConfig) -> NDArray[np.int64]:
     """Return the ``(L,)`` int64 maximum number of features of each pyramid level. ``n_features`` is
-    divided among the levels in proportion to 1 / scale (section V-A of the ORB-SLAM paper).
-    """
+    divided among the levels in proportion to 1 / scale (section V-A of the ORB-SLAM paper)."""
     weights = 1.0 / scale_factors(config)
     share = config.n_features * weights / weights.sum()
     quota = np.floor(share).astype(np.int64)
@@ -179,8 +176,7 @@ def _layout(
 
 def level_shapes(size: tuple[int, int], config: OrbConfig) -> NDArray[np.int64]:
     """Return the ``(L, 2)`` heights and widths of the pyramid levels of an image. ``size`` is the
-    height and width of the image.
-    """
+    height and width of the image."""
     return _layout(*size, config)[2]
 
 
@@ -251,8 +247,8 @@ def extract_levels(
 @kernel
 def detect_corners(pixels, allowed, quota, threshold, threshold_min, cell):
     """Detect up to ``quota`` FAST-9 corners in one pyramid level. The corners are evenly spread
-    over the ``allowed`` pixels. Returns their ``(n, 2)`` float32 x and y, in pixels of the level.
-    """
+    over the ``allowed`` pixels. Returns their ``(n, 2)`` float32 x and y, in pixels of the
+    level."""
     height, width = pixels.shape
     if min(height, width) <= 2 * MARGIN or quota == 0:
         return np.empty((0, 2), np.float32)
@@ -271,8 +267,7 @@ def detect_corners(pixels, allowed, quota, threshold, threshold_min, cell):
 
 def disc(radius: int) -> NDArray[np.int16]:
     """Create a ``(2 radius + 1, LANES)`` mask that is 1 inside a disc. The centre of the disc is in
-    column ``radius``.
-    """
+    column ``radius``."""
     x = np.arange(LANES) - radius
     y = np.arange(-radius, radius + 1)[:, None]
     return (abs(x) <= np.floor(np.sqrt(radius**2 - y**2 + 0.5))).astype(np.int16)
@@ -284,8 +279,8 @@ DISC = disc(PATCH_RADIUS)
 @kernel
 def orientations(pixels, corners, inside):
     """Compute the ``(n,)`` float32 orientation of each corner, in radians. It is the direction from
-    the corner to the intensity centroid of the disc around the corner (Rublee et al., section 3.2).
-    """
+    the corner to the intensity centroid of the disc around the corner (Rublee et al., section
+    3.2)."""
     n = len(corners)
     angles = np.empty(n, np.float32)
     height, width = pixels.shape
@@ -318,8 +313,7 @@ def orientations(pixels, corners, inside):
 @kernel
 def describe(smooth, corners, angles, pattern):
     """Compute the ``(n, 32)`` uint8 rotated BRIEF descriptor of each corner (Rublee et al., section
-    4). Bit 0 of byte 0 is the result of the first test.
-    """
+    4). Bit 0 of byte 0 is the result of the first test."""
     n = len(corners)
     height, width = smooth.shape
     flat = smooth.reshape(height * width)

@@ -90,8 +90,7 @@ class RecentPatches:
 
     def add(self, patches: KeyframePatches) -> None:
         """Store the patches of one more keyframe. If ``capacity`` keyframes are stored, the patches
-        of the oldest one are replaced.
-        """
+        of the oldest one are replaced."""
         slot, n = self._next, len(patches.pixels)
         if n > self._shift.shape[1]:
             self._pixels = _widened(self._pixels, n)
@@ -102,8 +101,7 @@ class RecentPatches:
 
     def all(self) -> tuple[KeyframePatches, ...]:
         """Return the stored patches of all keyframes, oldest keyframe first, to save them in a
-        checkpoint.
-        """
+        checkpoint."""
         slots = np.roll(np.arange(len(self._keyframes)), -self._next)
         return tuple(
             KeyframePatches(

@@ -128,8 +128,7 @@ def _dot(rays, i, j):
 @inner_kernel
 def _cross(points, out):
     """Compute the normal of the triangle of three points, and write it into ``out``. The length of
-    the normal is twice the area of the triangle.
-    """
+    the normal is twice the area of the triangle."""
     for k in range(3):
         m, n = (k + 1) % 3, (k + 2) % 3
         out[k] = (points[1, m] - points[0, m]) * (points[2, n] - points[0, n])
@@ -148,8 +147,7 @@ def _determinant(A):
 @inner_kernel
 def _mixed(A, B):
     """Compute the coefficient of g in the polynomial det(A + g B). It is the sum, over all entries
-    of B, of the entry times the corresponding cofactor of A.
-    """
+    of B, of the entry times the corresponding cofactor of A."""
     total = 0.0
     for i in range(3):
         for j in range(3):
@@ -161,8 +159,7 @@ def _mixed(A, B):
 @inner_kernel
 def _real_root(c3, c2, c1, c0):
     """Compute a real root of ``c3 x^3 + c2 x^2 + c1 x + c0`` in closed form, and refine it by
-    Newton's method.
-    """
+    Newton's method."""
     b, c, d = c2 / c3, c1 / c3, c0 / c3
     shift = b / 3.0
     p = c - b * b / 3.0
@@ -192,8 +189,7 @@ def _real_root(c3, c2, c1, c0):
 @inner_kernel
 def _refine_depths(depth, a12, a13, a23, b12, b13, b23):
     """Refine the depths of the three points by Newton's method. The equations are the law of
-    cosines for each pair of points (section 3.6 of the Lambda Twist paper).
-    """
+    cosines for each pair of points (section 3.6 of the Lambda Twist paper)."""
     for _ in range(5):
         l1, l2, l3 = depth[0], depth[1], depth[2]
         r1 = l1 * l1 + l2 * l2 - 2.0 * b12 * l1 * l2 - a12
@@ -220,8 +216,7 @@ def _refine_depths(depth, a12, a13, a23, b12, b13, b23):
 @inner_kernel
 def _pose_of_triangle(points, rays, depth, T):
     """Compute the pose that maps three points in the world frame to their positions on the three
-    rays, and write it into ``T``.
-    """
+    rays, and write it into ``T``."""
     placed = np.empty((3, 3))
     for i in range(3):
         for k in range(3):
@@ -246,8 +241,7 @@ def _pose_of_triangle(points, rays, depth, T):
 def _triad(points, axes):
     """Compute an orthonormal frame of a triangle, and write its axes into the rows of ``axes``. The
     rows are the direction of the first side, the normal, and the cross product of these two
-    vectors.
-    """
+    vectors."""
     _cross(points, axes[1])
     for k in range(3):
         axes[0, k] = points[1, k] - points[0, k]

@@ -1,6 +1,5 @@
 """Optimises a camera pose from matched landmarks (motion-only bundle adjustment, section III-C of
-the ORB-SLAM2 paper).
-"""
+the ORB-SLAM2 paper)."""
 
 from __future__ import annotations
 
@@ -262,8 +261,7 @@ def normal_equations(T, points, uvr, inverse_sigma2, disparity_weight, intrinsic
 @inner_kernel
 def classify(T, points, uvr, inverse_sigma2, disparity_weight, intrinsics, inlier):
     """Test each observation with the chi-square test at pose ``T``. The results are written into
-    ``inlier``: True for observations that pass the test.
-    """
+    ``inlier``: True for observations that pass the test."""
     fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
     for i in range(len(points)):
         p = points[i]

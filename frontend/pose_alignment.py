@@ -183,8 +183,7 @@ def _align(image, before, points, T_start, intrinsics, ratio_x, ratio_y):
 @inner_kernel
 def _corner(point, intrinsics, ratio_x, ratio_y):
     """Project a point into a pyramid level, and return the column and the row of the first pixel of
-    the window around it.
-    """
+    the window around it."""
     u = intrinsics[0] * point[0] / point[2] + intrinsics[2]
     v = intrinsics[1] * point[1] / point[2] + intrinsics[3]
     middle = 0.5 + 0.5 * (WINDOW - 1)
@@ -245,8 +244,7 @@ def _draw_template(before, point, intrinsics, ratio_x, ratio_y, template, jacobi
 def _read_window(image, T, p, intrinsics, ratio_x, ratio_y, seen):
     """Move a point by ``T``, project it, and read the grey values of the window around it. The grey
     values minus their mean are written into ``seen``. Returns False if the window is not inside the
-    image.
-    """
+    image."""
     height, width = image.shape
     x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
     y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]

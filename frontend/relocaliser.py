@@ -40,8 +40,7 @@ class MapAccess(Protocol):
     @property
     def is_merged(self) -> bool:
         """Whether local mapping has finished with all keyframes, so that tracking sees the whole
-        map.
-        """
+        map."""
         ...
 
     def merge(self) -> Map:
@@ -52,8 +51,7 @@ class MapAccess(Protocol):
 
 class Relocaliser:
     """Relocalises lost and doubtful frames at keyframes that look similar. A frame is doubtful if
-    it has so few inliers that its matches may be wrong.
-    """
+    it has so few inliers that its matches may be wrong."""
 
     def __init__(self, context: TrackingContext, locate: Locate, recognise: Recognise) -> None:
         """
@@ -95,8 +93,7 @@ class Relocaliser:
 
     def _find(self, frame: Frame, map_: Map) -> Found:
         """Relocalise a frame at keyframes that look similar. ORB descriptors are tried first. If
-        they fail, ``recognise`` is called.
-        """
+        they fail, ``recognise`` is called."""
         config = self._context.config.relocalization
         candidates = self._locate(frame.image, frame.features, map_)
         for candidate in candidates[: config.max_candidates]:

@@ -56,8 +56,7 @@ class RigCalibration:
 
     def extract(self, frame: Frame, twist: Matrix | None) -> None:
         """Extract the features of a frame, unless this has already been done, and correct them
-        using ``prepare``. The difference in exposure between its two images is recorded.
-        """
+        using ``prepare``. The difference in exposure between its two images is recorded."""
         source = frame.source
         frame.extract(self._camera)
         if source is not None and source.sides is not None:
@@ -89,8 +88,7 @@ class RigCalibration:
 
     def correct_offset(self, frame: Frame) -> None:
         """Apply the current disparity offset to a frame. It replaces the offset that was applied to
-        the frame earlier.
-        """
+        the frame earlier."""
         change = self.disparity_offset - frame.disparity_offset
         if change == 0.0:
             return
@@ -100,8 +98,7 @@ class RigCalibration:
 
     def mark_corrected(self, frame: Frame) -> None:
         """Mark a frame that was restored from a checkpoint as corrected. Its columns in the right
-        image were corrected before the frame was saved.
-        """
+        image were corrected before the frame was saved."""
         frame.disparity_offset, frame.delay_removed = self.disparity_offset, True
 
     def observe(self, frame: Frame, twist: Matrix | None) -> None:
@@ -115,8 +112,7 @@ class RigCalibration:
 
     def state(self) -> RigState:
         """Return the measurements obtained so far, to store them in a map file or a checkpoint. The
-        disparity offset is not included, because it is part of the map.
-        """
+        disparity offset is not included, because it is part of the map."""
         return RigState(self.delay.state().numbers(), self.sides.numbers())
 
     def restore(self, state: RigState) -> None:

@@ -240,8 +240,7 @@ class SideDelay:
     @property
     def is_wrong(self) -> bool:
         """Whether the measured delay differs significantly from the delay in the calibration
-        (``Camera.right_delay``).
-        """
+        (``Camera.right_delay``)."""
         least = max(self._config.least_delay, self._config.delay_sigmas * self.sigma)
         return abs(self.seconds - self._camera.right_delay) > least
 
@@ -309,8 +308,7 @@ class SideDelay:
 
     def _add_waiting(self, twist: Matrix) -> None:
         """Add the moments of the last frame to the current group of frames. ``twist`` is the
-        velocity of the camera at that frame.
-        """
+        velocity of the camera at that frame."""
         state = self._state
         if not state.waiting.any():
             return

@@ -99,8 +99,7 @@ def compare_sides(left: Grey, right: Grey, config: StereoConfig) -> Sides:
 
 def balanced(left: Grey, right: Grey, sides: Sides) -> tuple[Grey, Grey]:
     """Brighten the darker image of a stereo pair by the gain that ``compare_sides`` found. Returns
-    the left and the right image.
-    """
+    the left and the right image."""
     stops = sides.darker_stops
     if stops > 0:
         return left, _brightened(right, left, stops)
@@ -111,8 +110,7 @@ def balanced(left: Grey, right: Grey, sides: Sides) -> tuple[Grey, Grey]:
 
 def _shares(image: Grey) -> NDArray[np.float64]:
     """Compute the ``(256,)`` cumulative histogram of an image. For each grey value, it is the share
-    of the pixels whose grey value is at most as high.
-    """
+    of the pixels whose grey value is at most as high."""
     counts = np.bincount(image[::_STRIDE, ::_STRIDE].ravel(), minlength=256)
     return np.cumsum(counts) / counts.sum()
 
@@ -168,8 +166,7 @@ def _stops(left: NDArray[np.float64], right: NDArray[np.float64], config: Stereo
 def _proportional(left: NDArray[np.float64], right: NDArray[np.float64], top: float) -> bool:
     """Return whether the quantiles of both images up to ``top`` are proportional. The quantiles are
     proportional if the images differ only by a gain. They are not proportional if, for example,
-    only one of the images shows the sky beside a bridge.
-    """
+    only one of the images shows the sky beside a bridge."""
     at = np.linspace(_LOW, top, _N_QUANTILES)
     a, b = (np.array(_quantiles(shares, *at)) for shares in (left, right))
     a, b = a - a[0], b - b[0]
@@ -178,8 +175,7 @@ def _proportional(left: NDArray[np.float64], right: NDArray[np.float64], top: fl
 
 def _brightened(dark: Grey, bright: Grey, stops: float) -> Grey:
     """Brighten the darker image: multiply its grey values by ``2 ** stops``, and shift them so that
-    both images have the same lower quantile.
-    """
+    both images have the same lower quantile."""
     (low,), (target,) = _quantiles(_shares(dark), _LOW), _quantiles(_shares(bright), _LOW)
     table = (np.arange(256) + 0.5 - low) * 2.0**stops + target - 0.5
     return np.clip(np.rint(table), 0, 255).astype(np.uint8)[dark]

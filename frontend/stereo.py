@@ -36,8 +36,7 @@ class StereoMatches(NamedTuple):
 
     def joined(self, other: StereoMatches, order: NDArray[np.int64]) -> StereoMatches:
         """Concatenate these matches and the other matches, and sort the result. Entry i of
-        ``order`` is the index, before sorting, of the match that becomes match i.
-        """
+        ``order`` is the index, before sorting, of the match that becomes match i."""
         u_right = np.concatenate([self.u_right, other.u_right])[order]
         return StereoMatches(self.right, u_right, np.concatenate([self.sad, other.sad])[order])
 
@@ -122,8 +121,7 @@ def rows_to_features(xy, octave, scales, height):
 def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, half, reach):
     """Match each left feature with a right feature. Returns the ``(N,)`` float32 column of each
     match in the right image, and the ``(N,)`` float32 sum of absolute differences (SAD) of each
-    match. For features without a match, the column is NaN and the SAD is -1.
-    """
+    match. For features without a match, the column is NaN and the SAD is -1."""
     xy_l, octave_l, descriptors_l, pixels_l = left
     xy_r, octave_r, descriptors_r, pixels_r = right
     n = len(xy_l)
@@ -283,8 +281,7 @@ def add_differences(image_l, image_r, x_l, y_l, x_r, half, reach, costs):
 @inline
 def difference(a, b):
     """Return the absolute difference of two bytes. The difference is computed in bytes, so that a
-    vector register holds many differences.
-    """
+    vector register holds many differences."""
     return np.uint16(np.uint8(max(a, b) - min(a, b)))
 
 

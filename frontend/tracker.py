@@ -241,8 +241,7 @@ class Tracker:
 
     def state(self) -> TrackerState | None:
         """Return the state between two frames, to save it in a checkpoint. Returns None before the
-        first frame is tracked.
-        """
+        first frame is tracked."""
         last = self.last
         if last is None:
             return None
@@ -349,8 +348,7 @@ def result_of(
     odometry: Odometry,
 ) -> TrackResult:
     """Create the ``TrackResult`` of a frame, which the library returns to its caller. ``stage_ms``
-    is the time that each stage took, in milliseconds.
-    """
+    is the time that each stage took, in milliseconds."""
     return TrackResult(
         index=frame.index,
         timestamp=frame.timestamp,

@@ -53,8 +53,7 @@ class TrackingContext:
     def tracks_patches(self) -> bool:
         """Whether frames are tracked using image patches when possible. RGB-D cameras are excluded:
         for them, patch-based tracking is less accurate and not faster
-        (docs/research/performance.md).
-        """
+        (docs/research/performance.md)."""
         method, camera = self.config.tracking.method, self.camera
         if method == "auto":
             return camera.sensor == "stereo"
@@ -62,7 +61,8 @@ class TrackingContext:
 
     @property
     def close_depth(self) -> float:
-        """Depth below which a stereo point is close, metres (section III-A of the ORB-SLAM2 paper)."""
+        """Depth below which a stereo point is close, metres (section III-A of the ORB-SLAM2
+        paper)."""
         return self.config.stereo.close_depth_baselines * self.camera.baseline
 
     @property
@@ -80,8 +80,7 @@ class TrackingContext:
 
 def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:
     """Compute the ``(N,)`` float64 stereo depth of each feature, in metres. It is NaN for features
-    without a stereo match.
-    """
+    without a stereo match."""
     return camera.bf / (features.xy[:, 0].astype(np.float64) - features.u_right)
 
 
@@ -338,8 +337,7 @@ def _observed_points(
     frame: Frame, matched: NDArray[np.integer], context: TrackingContext
 ) -> tuple[NDArray[np.float64], ...]:
     """Return the arguments of ``optimise_pose`` that follow the pose. They describe the points that
-    the features ``matched`` track. Aligned matches have their aligned positions.
-    """
+    the features ``matched`` track. Aligned matches have their aligned positions."""
     uvr, weight = observations(frame, matched, context)
     certainty = np.ones(len(matched))
     if frame.shift is not None:
@@ -356,8 +354,7 @@ def observations(
     frame: Frame, feature: NDArray[np.integer], context: TrackingContext
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return two arrays for ``(N,)`` features of a frame: their ``(N, 3)`` float64 u, v and
-    u_right, in pixels, and the ``(N,)`` float64 inverse variances of u and v.
-    """
+    u_right, in pixels, and the ``(N,)`` float64 inverse variances of u and v."""
     features = frame.features
     uvr = stack_uvr(features.xy[feature], features.u_right[feature])
     return uvr, context.scales[features.octave[feature]] ** -2.0

@@ -148,15 +148,13 @@ def _is_faint(image: Grey, config: WeakImageConfig) -> bool:
 
 def detail(image: Grey) -> float:
     """Compute the mean absolute second difference of the grey values along the rows, in grey
-    levels. It measures how much fine detail an image has.
-    """
+    levels. It measures how much fine detail an image has."""
     return float(np.abs(np.diff(image[::2].astype(np.int16), 2, axis=1)).mean())
 
 
 def contrast(image: Grey) -> float:
     """Measure the contrast of an image, in grey levels. The standard deviation of the grey values
-    is computed in each block of the image. The result is the median over all blocks.
-    """
+    is computed in each block of the image. The result is the median over all blocks."""
     rows, columns = (side // _BLOCK * _BLOCK for side in image.shape)
     if not rows or not columns:
         return 0.0

@@ -14,8 +14,8 @@ def beyond_reach(map_: Map, keyframe: int, config: SiameseConfig) -> NDArray[np.
 
     The result is the distance between the camera and each keyframe, minus a bound on the position
     error of odometry. The bound is a constant plus a fraction of the distance driven since the
-    keyframe. A monocular map has no metric scale, and its scale drifts. There, the bound is a
-    larger fraction of the distance driven, with no constant term.
+    keyframe. A monocular map has no metric scale, and its scale drifts. In a monocular map, the
+    bound is therefore a larger fraction of the distance driven, with no constant term.
 
     Keyframes of other sub-maps are always within reach. The camera was lost between the sub-maps,
     so their relative pose is unknown. In a monocular map, their relative scale is unknown as well.

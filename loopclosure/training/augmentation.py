@@ -1,5 +1,5 @@
-"""Random changes of an image that still shows the same place: viewpoint, light, occlusion,
-sensor."""
+"""Augments images by random changes of viewpoint, lighting, occlusion and sensor. A changed image
+still shows the same place."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ _TURNED, _ZOOMED = 0.5, 0.5  # shares of images that are rotated and zoomed, if 
 
 
 class Augmentation(BaseModel):
-    """Strengths of the random changes. A strength of 0 disables a change.
+    """Strengths of the random changes that are applied to training images. A strength of 0 disables
+    a change.
 
-    The paper changes perspective and luminance, and masks parts of the image.
+    The original paper changes perspective and luminance, and masks parts of the image.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -58,10 +59,10 @@ STRONG = Augmentation(
 def augment(
     image: NDArray[np.uint8], strength: Augmentation, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Apply random changes to an ``(H, W)`` image.
+    """Apply random changes to an ``(H, W)`` uint8 image.
 
-    The changes are applied in the order in which an image is formed: viewpoint, occlusion, light,
-    lens, sensor, quantisation to 8 bits.
+    The changes are applied in the order in which an image is formed: viewpoint, occlusion,
+    lighting, lens, sensor, quantisation to 8 bits.
     """
     import cv2
 

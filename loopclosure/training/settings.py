@@ -1,4 +1,4 @@
-"""The settings of a training run, and presets."""
+"""The settings of a training run, and the presets of these settings."""
 
 from __future__ import annotations
 
@@ -121,7 +121,8 @@ PRESETS = {
 
 
 def load_settings(path: Path) -> TrainSettings:
-    """Read settings from a JSON file. Keys that are missing keep their defaults.
+    """Read the settings of a training run from a JSON file. Settings that are missing in the file
+    keep their defaults.
 
     Raises:
         InputError: the file is missing or not JSON, a key is unknown, or a value is out of range.

@@ -1,4 +1,4 @@
-"""Sub-pixel alignment of matches: each landmark's patch is registered to the image.
+"""Sub-pixel alignment of matches: an image patch of each landmark is registered to the new image.
 
 FAST places a corner at a whole pixel of a pyramid level, so a corner is typically off by half a
 pixel. When the camera approaches the scene, this error is biased towards the focus of expansion
@@ -6,9 +6,9 @@ pixel. When the camera approaches the scene, this error is biased towards the fo
 
 To remove the error, the patch is taken from a keyframe that observed the landmark. The patch is
 warped into the view of the frame and shifted until it agrees with the image. This is the "feature
-alignment" of SVO (Forster et al., ICRA 2014, III-B), solved by inverse compositional Lucas-Kanade
-(Baker and Matthews, IJCV 2004, section 3.2). Changes of brightness and contrast are estimated
-together with the shift.
+alignment" of SVO (Forster et al., ICRA 2014, section III-B). The method is inverse compositional
+Lucas-Kanade (Baker and Matthews, IJCV 2004, section 3.2). Changes in brightness and contrast are
+estimated together with the shift.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def find_patches(
     intrinsics: NDArray[np.float64],
     config: AlignmentConfig,
 ) -> NDArray[np.float32]:
-    """Find the patches of N landmarks near their expected positions in an image.
+    """Find the image patches of N landmarks near their expected positions in an image.
 
     Args:
         pyramid: the pyramid of the image.
@@ -97,7 +97,7 @@ def find_patches(
         octave: ``(N,)`` pyramid levels in which the patches are searched for.
         T_cw: ``(4, 4)`` pose of the camera that took the image (world to camera).
         xyz: ``(N, 3)`` positions of the landmarks, in the world frame.
-        known: patches of landmarks.
+        known: image patches of landmarks.
         at: ``(N,)`` index of each landmark's patch in ``known``.
         scales: ``(levels,)`` full-resolution pixels per pixel of each octave.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
@@ -126,7 +126,7 @@ def warps(T_cw, xyz, T_seen, view, size_seen, size, intrinsics):
     """Compute affine warps from image patches of a frame to image patches of keyframes.
 
     The surface around a landmark is approximated by a plane perpendicular to the viewing direction
-    of the keyframe (SVO, III-B).
+    of the keyframe (section III-B of the SVO paper).
 
     Args:
         T_cw: ``(4, 4)`` pose of the frame's camera (world to camera).
@@ -267,7 +267,7 @@ def draw(patch, centre, warp, out):
 def prepare(wide, template, slope_x, slope_y):
     """Compute the template and its gradients from a warped window.
 
-    The mean of the template is subtracted. The gradients are made orthogonal to changes of
+    The mean of the template is subtracted. The gradients are made orthogonal to changes in
     brightness and contrast, so that such changes do not affect the shift.
 
     Returns:
@@ -308,8 +308,8 @@ def prepare(wide, template, slope_x, slope_y):
 
 @inner_kernel
 def compare(image, x, y, template, slope_x, slope_y):
-    """Compare a template with the window of an image that is ``x, y`` pixels from the middle of the
-    image.
+    """Compare a template with a window of an image. The middle of the window is ``x, y`` pixels
+    from the middle of the image.
 
     Returns:
         The sum of squares of the window after its mean is subtracted; the inner product of the

@@ -22,8 +22,9 @@ def fast_scores(pixels, height, width):
     there is none.
 
     For an arc of 9 bright pixels, this score is the smallest value in the arc minus c. The score of
-    the pixel is the maximum over all 16 arcs and both polarities. Arcs share the minima over runs
-    of 2, 4 and 8 pixels, which leaves 31 minima and maxima per polarity.
+    the pixel is the maximum over all 16 arcs and both polarities. The minima over runs of 2, 4 and
+    8 pixels are used for several arcs. Therefore, only 31 minima and maxima are computed for each
+    polarity.
 
     Indices are unsigned. The compiler then needs no test for negative indices and vectorises the
     loop over bytes.
@@ -97,8 +98,8 @@ def local_maxima(scores, margin, threshold, threshold_min, cell):
     Args:
         scores: ``(height, width)`` uint8, see ``fast_scores``.
         margin: width of the border without corners, pixels.
-        threshold: corners with a higher score are strong, the others are weak.
-        threshold_min: pixels with this score or a lower one are not corners.
+        threshold: corners with a higher score are strong; all other corners are weak.
+        threshold_min: pixels whose score is at most this value are not corners.
         cell: side of the square cells into which the image is divided, pixels.
 
     Returns:

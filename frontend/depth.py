@@ -1,4 +1,5 @@
-"""Converts depth images to the right view of a virtual stereo pair (ORB-SLAM2, section III-A)."""
+"""Converts the depths of keypoints to columns in the right image of a virtual stereo pair (section
+III-A of the ORB-SLAM2 paper)."""
 
 from __future__ import annotations
 
@@ -22,12 +23,12 @@ def columns_of_depth(
 
     A keypoint at column u whose nearest pixel has depth d gets the column ``u - fx b / d``. In this
     model, a constant error in pixels corresponds to a depth error that grows with the square of the
-    depth. This agrees with the errors of structured-light cameras.
+    depth. This relation agrees with the errors of structured-light cameras.
 
     The depth of a corner at a depth discontinuity is ambiguous. Where the contour of a near object
-    crosses the background, the corner is not a point of the scene. Instead, it slides along the
-    contour as the camera moves. Stereo matching rejects most of these corners. Here they get no
-    column.
+    crosses the background, the corner is not a point of the scene. Instead, the corner slides along
+    the contour as the camera moves. Stereo matching rejects most of these corners. With a depth
+    image, corners at a depth discontinuity get no column.
 
     Args:
         xy: ``(N, 2)`` keypoints of the left image, pixels.

@@ -1,4 +1,4 @@
-"""Initialises a monocular map from two views (ORB-SLAM, section IV).
+"""Initialises a monocular map from two views (section IV of the ORB-SLAM paper).
 
 If the scene is planar or the camera only rotates, the fundamental matrix is not determined. In all
 other cases, a homography does not explain the matches. Therefore, both models are fitted to the
@@ -7,8 +7,8 @@ same random samples, and the model with the better score is used.
 A reconstruction is accepted only if one motion explains clearly more points than any other motion.
 The reason is that a map with a wrong start cannot be repaired later.
 
-All samples are fitted and scored in one batch. Here NumPy is as fast as a Numba kernel and needs no
-compilation.
+All samples are fitted and scored in one batch. For this batch, NumPy is as fast as a Numba kernel,
+and NumPy needs no compilation.
 """
 
 from __future__ import annotations

@@ -127,7 +127,7 @@ def count_close(
     tracks. Returns the new state.
 
     ``tracked_close`` is the number of close points that the frame with index ``frame`` tracks. The
-    state changes only if this is the first frame after a keyframe.
+    state changes only if this frame is the first frame after a keyframe.
 
     A single frame may track few close points by chance. Close points are scarce only if several
     frames in a row track few of them. Therefore, the running mean is an exponential moving average.
@@ -202,8 +202,8 @@ class KeyframePolicy:
         return needs_keyframe(evidence, self._config, depth=camera.depth)
 
     def is_known(self, *, n_inliers: int, n_shared: int, n_place: int) -> bool:
-        """Return whether the place is already mapped, so that a new keyframe would repeat an old
-        one.
+        """Return whether the place that the frame shows is already mapped, so that a new keyframe
+        would repeat an old one.
 
         Two conditions must hold. The frame must track as many landmarks as is expected of a frame
         next to the old keyframe. It must also share enough of these landmarks with the old

@@ -35,8 +35,8 @@ class Extraction:
     """Features of one image, sorted by octave. ``vslam.features.Features`` describes the fields.
 
     At every pyramid level, coordinate 0 is the centre of the first pixel. If the image is ``w``
-    times wider than a level, the column x of the level corresponds to the column ``(x + 0.5) w -
-    0.5`` of the image.
+    times wider than a level, column x of the level corresponds to column ``(x + 0.5) w - 0.5`` of
+    the image.
     """
 
     xy: NDArray[np.float32]

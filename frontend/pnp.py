@@ -300,12 +300,12 @@ def ransac_pose(points, uvr, inverse_sigma2, intrinsics, seed, min_inliers, max_
         seed: uint64; the same seed gives the same result.
         min_inliers: least number of inliers of an acceptable pose.
         max_draws: maximum number of samples.
-        confidence: a probability. Sampling ends when, with this probability, no better pose with at
-            least ``min_inliers`` inliers has been missed.
+        confidence: a probability. Sampling ends when the probability that no better pose with at
+            least ``min_inliers`` inliers was missed reaches this value.
 
     Returns:
-        ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers of the best pose. The number of inliers may be
-        smaller than ``min_inliers``.
+        The best pose ``T_cw``, ``(4, 4)``, and an ``(N,)`` bool mask of its inliers. The number of
+        inliers may be smaller than ``min_inliers``.
     """
     fx, fy, cx, cy, _, _ = intrinsics
     n = len(points)

@@ -42,8 +42,8 @@ def optimise_pose(
             standard deviation of the disparity; None uses the ratio in ``intrinsics``.
 
     Returns:
-        ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers. There are no inliers if fewer than three
-        observations are left.
+        The pose ``T_cw``, ``(4, 4)``, and an ``(N,)`` bool mask of the inliers. There are no
+        inliers if fewer than three observations are left.
     """
     if disparity_weight is None:
         disparity_weight = np.full(len(points), intrinsics[5])
@@ -118,9 +118,8 @@ def offset_effect(
     """Compute how an error in the disparity offset of a stereo camera affects its estimated motion.
     The effect is linearised.
 
-    Suppose that all disparities are too large by one pixel. A point at depth z then seems too near
-    by a fraction of ``z / bf``. The point suggests a translation that is too short by the same
-    fraction.
+    If all disparities are too large by one pixel, a point at depth z seems too near by a fraction
+    of ``z / bf``. The translation that this point suggests is then too short by the same fraction.
 
     Args:
         T_cw: ``(4, 4)`` optimised pose.

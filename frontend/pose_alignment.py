@@ -2,12 +2,13 @@
 landmarks.
 
 The motion of the camera is optimised until small windows around all landmarks of the last frame
-agree with the new image (SVO: Forster et al., ICRA 2014, III-A, and T-RO 2017, IV-A). The images
-are reduced in size, and the coarsest one is aligned first. Therefore, the prediction may be off by
-about twenty pixels, for example at the beginning of a turn.
+agree with the new image (SVO: Forster et al., ICRA 2014, section III-A, and T-RO 2017, section
+IV-A). The images are reduced in size, and the smallest image is aligned first. Therefore, the
+predicted pose may be wrong by about twenty pixels in the image, for example at the beginning of a
+turn.
 
-The light may change between two frames. So the mean of each window is subtracted, and one contrast
-factor for all windows is estimated.
+The lighting may change between two frames. Therefore, the mean of each window is subtracted, and a
+common contrast factor of all windows is estimated.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ def coarse_shapes(shapes: NDArray[np.int64]) -> NDArray[np.int64]:
 def coarse_pyramid(
     pixels: NDArray[np.uint8], shapes: NDArray[np.int64], size: tuple[int, int]
 ) -> Pyramid:
-    """Rebuild the result of ``coarse_levels`` from the pixels and shapes of its levels.
+    """Rebuild the result of ``coarse_levels`` from the stored pixels and shapes of its levels.
 
     Args:
         size: height and width of the whole image, pixels.
@@ -195,8 +196,8 @@ def _draw_template(before, point, intrinsics, ratio_x, ratio_y, template, jacobi
     """Compute the template of the window around a projected point. Returns False if the window is
     not inside the image.
 
-    Grey values are written into ``template``, and their derivatives with respect to the motion into
-    ``jacobian``. The mean over the window is subtracted from both.
+    The grey values are written into ``template``. Their derivatives with respect to the motion are
+    written into ``jacobian``. The mean over the window is subtracted from both.
     """
     height, width = before.shape
     x, y, z = point[0], point[1], point[2]

@@ -68,10 +68,10 @@ class Relocaliser:
         """Relocalise a frame if it is lost or doubtful. A frame is doubtful if it has so few
         inliers that its matches may be wrong.
 
-        A lost frame is relocalised only if no keyframe is being mapped at the moment. For a
-        doubtful frame, the method waits until the keyframe is mapped. A doubtful frame usually
-        keeps its tracked pose. It takes the pose of the relocalisation only if this pose has more
-        than ``relocalization.better`` times as many inliers.
+        A lost frame is relocalised only if no keyframe is being mapped at the moment. If the frame
+        is doubtful, the method first waits until no keyframe is being mapped. A doubtful frame
+        usually keeps its tracked pose. It takes the pose of the relocalisation only if this pose
+        has more than ``relocalization.better`` times as many inliers.
 
         Args:
             found: the result of tracking the frame.
@@ -135,7 +135,7 @@ def relocalise(
 
     Returns:
         Number of inliers, or 0 if the pose was not found. A pose is accepted if it has at least
-        ``relocalization.min_inliers`` inliers and they do not all lie on one object
+        ``relocalization.min_inliers`` inliers and the inliers do not all lie on a single object
         (``count_elsewhere``).
     """
     inliers = _locate(frame, place, surroundings, context, seed)

@@ -10,10 +10,10 @@ adjustment cannot absorb it. Therefore, the delay is measured from the row shift
 needed.
 
 A wrong calibration also shifts the rows, but by the same amount at every speed. A polynomial of the
-image position models this part.
+image position models this part of the row shift.
 
 The measured delay is reported, but it is not corrected during the run. The reason is that the delay
-is known only after some seconds, when the map is already distorted. To correct it, set
+is known only after some seconds, when the map is already distorted. To correct the delay, set
 ``Camera.right_delay`` in the calibration. The delay is then corrected in every frame whose motion
 is known.
 """
@@ -155,9 +155,9 @@ class DelayState:
         n_group: number of frames in the group that is being filled.
         length: number of frames in a full group.
         solution: ``(1 + P,)`` the delay in seconds, followed by the P coefficients of the
-            polynomial that models a wrong calibration. All were estimated when the last group
-            became full.
-        twist: ``(6,)`` velocity before the last frame, see ``Frame.twist``.
+            polynomial that models a wrong calibration. The delay and the coefficients were
+            estimated when the last group became full.
+        twist: ``(6,)`` velocity of the camera before the last frame, see ``Frame.twist``.
         waiting: ``(7 + P, 7 + P)`` moments of the last frame, which has not been added to a group
             yet.
         group: ``(2 + P, 2 + P)`` moments of the group that is being filled.

@@ -27,7 +27,8 @@ class StereoMatches(NamedTuple):
         right: the features of the right image.
         u_right: ``(N,)`` float32 column in the right image, pixels; NaN for features without a
             match.
-        sad: ``(N,)`` float32 sum of absolute differences (SAD), -1 for features without a match.
+        sad: ``(N,)`` float32 sum of absolute differences (SAD) of each match, -1 for features
+            without a match.
     """
 
     right: Extraction
@@ -51,8 +52,9 @@ def match_stereo(
     by at most one. The disparity is between 0 and the disparity of a point at a distance of one
     baseline.
 
-    The candidate with the closest descriptor is chosen. Then a SAD window at the level of the left
-    feature is shifted along the row, to locate the match with sub-pixel accuracy.
+    The candidate with the closest descriptor is chosen. Then a window around the right feature is
+    shifted along the row, at the pyramid level of the left feature. The shift with the least sum of
+    absolute differences (SAD) gives the match with sub-pixel accuracy.
     """
     u_right, sad = _match(
         _Side.of_extraction(left),

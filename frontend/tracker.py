@@ -79,7 +79,8 @@ class Found:
 
     @property
     def relocalised(self) -> bool:
-        """Whether the frame was found by a search of the whole map."""
+        """Whether the pose of the frame was found by relocalisation, which is a search of the whole
+        map."""
         return self.keyframe >= 0
 
 
@@ -130,7 +131,7 @@ class Tracker:
             frames: poses of all earlier frames, including lost frames.
 
         Returns:
-        ``(4, 4)`` pose ``T_cw`` (world to camera).
+            ``(4, 4)`` pose ``T_cw`` (world to camera).
         """
         if not len(frames):
             return view.T_reference

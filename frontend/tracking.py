@@ -1,4 +1,4 @@
-"""Tracking of one frame against the map (ORB-SLAM2, section III; ORB-SLAM, section V).
+"""Tracks one frame against the map (ORB-SLAM2 paper, section III; ORB-SLAM paper, section V).
 
 All functions depend only on the frame, the previous frame and a ``LocalMap``. The map itself is
 never accessed, so local mapping can write to it at the same time.
@@ -92,9 +92,9 @@ def track_motion(
     The points are projected with the predicted pose and matched near their projections. Then the
     pose is optimised.
 
-    The points are the landmarks of the previous frame and its close stereo points that are not in
-    the map (the visual-odometry points of ORB-SLAM2). The stereo points stabilise the pose and are
-    then discarded.
+    The points are the landmarks of the previous frame, and those close stereo points of the
+    previous frame that are not in the map (the visual-odometry points of ORB-SLAM2). The stereo
+    points stabilise the pose and are then discarded.
 
     Args:
         frame: receives the pose and the matches.
@@ -292,7 +292,8 @@ def refine(
     context: TrackingContext,
     shift: NDArray[np.float32] | None = None,
 ) -> int:
-    """Optimise the pose from all matches, drop the outliers, and return the number of inliers.
+    """Optimise the pose of a frame using all its matches, drop the outliers, and return the number
+    of inliers.
 
     Args:
         T_cw: ``(4, 4)`` initial pose of the left camera (world to camera).
@@ -317,9 +318,10 @@ def uncertainty_of(
         offset_sigma: standard deviation of the disparity offset, pixels; 0 for cameras without one.
 
     Returns:
-        ``(6, 6)`` covariance of the pose ``T_cw`` relative to the points that the frame tracks
-        (``pose_covariance``). ``(6, 3)`` effect on the motion if the disparity offset is wrong by
-        ``offset_sigma`` (``offset_effect``); None if ``offset_sigma`` is 0.
+        Two matrices. The first is the ``(6, 6)`` covariance of the pose ``T_cw`` relative to the
+        points that the frame tracks (``pose_covariance``). The second is the ``(6, 3)`` effect on
+        the motion if the disparity offset is wrong by ``offset_sigma`` (``offset_effect``). It is
+        None if ``offset_sigma`` is 0.
     """
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
     observed = _observed_points(frame, matched, context)
@@ -337,7 +339,8 @@ def _observed_points(
     frame: Frame, matched: NDArray[np.integer], context: TrackingContext
 ) -> tuple[NDArray[np.float64], ...]:
     """Return the arguments of ``optimise_pose`` that follow the pose. They describe the points that
-    the features ``matched`` track. Aligned matches have their aligned positions."""
+    the features ``matched`` track. For matches that were aligned, the aligned positions are
+    used."""
     uvr, weight = observations(frame, matched, context)
     certainty = np.ones(len(matched))
     if frame.shift is not None:

@@ -91,12 +91,12 @@ def grain(image, stride, least):
     """Estimate the noise and the spikes of an ``(H, W)`` uint8 image from every ``stride``-th row.
 
     Noise is estimated from the median of absolute second differences along a row. The median is
-    robust to edges. The mean (Immerkaer, CVIU 1996) is not.
+    robust to edges. The mean, which Immerkaer (CVIU 1996) uses, is not robust to edges.
 
     Returns:
         Standard deviation of the noise, in grey levels; share of the pixels that are spikes. A
-        spike is brighter than both neighbours, or darker than both. The difference must exceed
-        ``least`` grey levels and four standard deviations.
+        spike is brighter than both of its neighbours, or darker than both of them. The difference
+        must exceed ``least`` grey levels and four standard deviations.
     """
     height, width = image.shape
     counts = np.zeros(1021, np.int64)
@@ -128,8 +128,9 @@ def grain(image, stride, least):
 def is_faint(images: Sequence[Grey], counts: Sequence[int], config: Config) -> bool:
     """Return whether any of the images has few corners because of low contrast.
 
-    An image that is out of focus also has few corners. It is not counted as faint, because raising
-    its contrast would only amplify rounding errors. An image that shows nothing at all is ignored.
+    An image that is out of focus also has few corners. Such an image is not counted, because
+    raising its contrast would only amplify rounding errors. An image that shows nothing at all is
+    ignored.
 
     Args:
         counts: number of features of each image.

@@ -2,9 +2,9 @@
 
 The structure of the matrix is analysed once for all iterations of an optimiser. The analysis
 computes a minimum degree elimination order (George and Liu, "The evolution of the minimum degree
-ordering algorithm", SIAM Review 1989) and the fill-in. It simulates the elimination on bit sets,
-which is feasible for a few thousand keyframes. The degrees are therefore exact. The neighbours that
-a keyframe still has when it is eliminated give the nonzero blocks of its column in the factor.
+ordering algorithm", SIAM Review 1989) and the fill-in. It simulates the elimination on bit sets, so
+that the degrees are exact. This is feasible for a few thousand keyframes. The neighbours that a
+keyframe still has when it is eliminated give the nonzero blocks of its column in the factor.
 
 The numeric factorisation is left-looking (Davis, "Direct Methods for Sparse Linear Systems",
 section 4.8) and works on blocks. The result is deterministic: the same input produces
@@ -133,8 +133,8 @@ def _analyse(n, pairs):
 
 @kernel
 def panel(structure, column):
-    """Return the index in the matrix array ``S`` at which the panel of a column begins, and the
-    width of the panel.
+    """Return where the panel of a matrix column begins in the array ``S``, and the width of the
+    panel.
 
     A panel holds the transposed blocks of one column side by side. Element (i, j) of the k-th block
     is ``S[begin + j * width + 6 * k + i]``. In this layout, the rows of a panel are long, which
@@ -146,7 +146,8 @@ def panel(structure, column):
 
 @kernel
 def factor_solve(structure, S, x):
-    """Solve ``S x = rhs`` in place. Returns False if S is not positive definite.
+    """Solve the sparse linear system ``S x = rhs`` in place by Cholesky factorisation. Returns
+    False if S is not positive definite.
 
     Args:
         structure: the ``Structure`` of S.

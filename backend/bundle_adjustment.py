@@ -75,7 +75,7 @@ class NormalEquations(NamedTuple):
     """The block-wise normal equations of Gauss-Newton.
 
     Attributes:
-        W: ``(O, 3, 6)`` blocks that couple a point and a camera, one per observation.
+        W: ``(O, 3, 6)`` blocks that couple a point and a camera, one block for each observation.
         V, g: ``(P, 3, 3)`` Hessian and ``(P, 3)`` right-hand side of the points.
         U, b: ``(K, 6, 6)`` Hessian and ``(K, 6)`` right-hand side of the free cameras.
     """
@@ -113,7 +113,7 @@ def adjust(
     use: NDArray[np.bool_] | None = None,
     tolerance: float = 1e-6,
 ) -> BundleSolution:
-    """Minimise the robust reprojection error by Levenberg-Marquardt.
+    """Run bundle adjustment: minimise the robust reprojection error by Levenberg-Marquardt.
 
     Args:
         iterations: maximum number of iterations.
@@ -380,7 +380,7 @@ def step_points(n_free, observations, equations, camera_step, V_inverse, points,
 
 @kernel
 def step_cameras(n_free, camera_step, T_cw, T_trial):
-    """Move each free camera by its twist.
+    """Move each free camera by its step, which is a twist.
 
     Matrices are copied element by element, because Numba takes seconds to compile the broadcasting
     check of a whole-array assignment.

@@ -73,11 +73,12 @@ def offset_sigma(information: float, config: StereoConfig) -> float:
     """Compute the standard deviation of the disparity offset, in pixels, that is caused by the
     noise of the measurements.
 
-    The prior of mean 0 also makes the estimate smaller than the true offset. The result does not
-    include this error.
+    The offset is estimated with a prior of mean 0, which makes the estimate smaller than the true
+    offset. The result does not include this error.
 
     Args:
-        information: information of the measurements, see ``Scalars.offset_information``.
+        information: sum of the information (inverse variance) of the measurements, see
+            ``Scalars.offset_information``.
     """
     if information <= 0.0:
         return 0.0

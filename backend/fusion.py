@@ -22,8 +22,8 @@ def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config)
 
     The landmarks of the keyframe are projected into its neighbours, and the landmarks of the
     neighbours into the keyframe. If a projected landmark matches a feature that observes another
-    landmark, the two landmarks are merged. If it matches a feature without a landmark, an
-    observation is added.
+    landmark, the two landmarks are merged. If a projected landmark matches a feature without a
+    landmark, an observation is added.
     """
     neighbours = fusion_neighbours(map_, keyframe, config)
     for neighbour in neighbours:
@@ -36,9 +36,9 @@ def fusion_neighbours(map_: Map, keyframe: int, config: Config) -> list[int]:
     """Find the neighbours of a keyframe whose landmarks are fused with the landmarks of the
     keyframe (ORB-SLAM2). Returns the ids of the neighbours.
 
-    They are the ``mapping.fuse_neighbours`` keyframes that share the most landmarks with the
-    keyframe. For each of these neighbours, the five keyframes that share the most landmarks with
-    the neighbour are included as well.
+    The neighbours are the ``mapping.fuse_neighbours`` keyframes that share the most landmarks with
+    the keyframe. For each of these neighbours, the five keyframes that share the most landmarks
+    with the neighbour are included as well.
     """
     first, _ = map_.covisible(keyframe)
     chosen = first[: config.mapping.fuse_neighbours].tolist()

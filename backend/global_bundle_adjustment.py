@@ -1,9 +1,9 @@
-"""Bundle adjustment of hundreds of keyframes with loops.
+"""Global bundle adjustment: optimises hundreds of keyframes whose trajectory contains loops.
 
 The problem, the loss and the optimisation steps are those of ``bundle_adjustment``. Only the
 reduced camera system is solved differently. Keyframes that share no landmark are not coupled in
-this system. It is therefore stored as sparse 6x6 blocks and factorised by ``block_cholesky``
-(Triggs et al., "Bundle adjustment - a modern synthesis", section 6.3).
+this system. The system is therefore stored as sparse 6x6 blocks and factorised by
+``block_cholesky`` (Triggs et al., "Bundle adjustment - a modern synthesis", section 6.3).
 """
 
 from __future__ import annotations
@@ -288,7 +288,7 @@ def reduce_points_sparsely(
 
 @inner_kernel
 def subtract_coupling(Y, W, o, S, offset, width):
-    """Subtract ``Y' W[o]`` from the block of ``S`` that starts at ``offset``."""
+    """Subtract the product ``Y' W[o]`` from the block of ``S`` that starts at ``offset``."""
     start, step = np.uintp(offset), np.uintp(width)
     for i in range(np.uintp(6)):
         y0, y1, y2 = Y[0, i], Y[1, i], Y[2, i]

@@ -45,7 +45,8 @@ class GlobalSnapshot:
 
 
 def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
-    """Copy all keyframes and landmarks that have not been culled into a bundle problem.
+    """Copy the map into a bundle problem for global bundle adjustment. Keyframes and landmarks that
+    have been culled are left out.
 
     The first keyframe of each connected part of the map is held fixed, because nothing else
     determines the position of the part. Two keyframes are connected if they observe a common
@@ -92,12 +93,13 @@ def connected_parts(a, landmarks, n_keyframes):
 
 
 def merge_solution(map_: Map, snapshot: GlobalSnapshot, solution: BundleSolution) -> None:
-    """Apply the solution of a snapshot to the map. The map may have changed since the snapshot.
+    """Apply the result of global bundle adjustment to the map. The map may have changed since the
+    snapshot.
 
     Keyframes and landmarks of the snapshot that still exist are moved to their new positions. Newer
     keyframes keep their pose relative to their parent in the spanning tree (Mur-Artal and Tardós,
-    ORB-SLAM2, III-D). Newer landmarks move with their anchor keyframe. An observation that failed
-    the chi-square test is removed if its feature still observes the same landmark.
+    ORB-SLAM2, section III-D). Newer landmarks move with their anchor keyframe. An observation that
+    failed the chi-square test is removed if its feature still observes the same landmark.
     """
     a = map_.arrays
     T_cw_old = a.T_cw[: map_.n_keyframes].copy()

@@ -1,22 +1,23 @@
 """Georeferences a finished map by adding GPS fixes to its pose graph.
 
 First, RANSAC with Umeyama's closed form (TPAMI 1991) aligns the map frame with the local
-east-north-up frame (ENU). Parts of the map that tracking did not connect are aligned separately.
-Then the poses of the keyframes are optimised in a pose graph. The graph has the edges of the
-essential graph and a GPS factor for each fix. No keyframe is held fixed.
+east-north-up frame (ENU). If tracking was lost, the map consists of parts that tracking did not
+connect. These parts are aligned separately. Then the poses of the keyframes are optimised in a pose
+graph. The graph has the edges of the essential graph and a GPS factor for each fix. No keyframe is
+held fixed.
 
 At first, fixes have a Cauchy loss with a large scale. The scale shrinks from one optimisation to
 the next. In this way, even a map that has drifted far is pulled to its fixes. Afterwards, fixes
 that fail a chi-square test are discarded, and the remaining fixes have a Gaussian loss.
 
-The error of GPS is mostly a bias that changes slowly (atmosphere, reflections). A hundred fixes in
-ten seconds therefore provide little more information than one. For this reason, all fixes within
-``CORRELATION_S`` together have the weight of a single fix.
+The error of GPS is mostly a bias that changes slowly, which is caused by the atmosphere and by
+reflections. A hundred fixes in ten seconds therefore provide little more information than a single
+fix. For this reason, all fixes within ``CORRELATION_S`` together have the weight of a single fix.
 
 The drift of a metric map depends on the camera, its calibration and the loops that were closed.
 However, the pose graph has a single drift model for all maps. With this model, a map with little
 drift would be bent towards the bias of the fixes. Therefore, the standard deviations of the drift
-model are multiplied by a factor. The factor is chosen for which the fixes are most likely
+model are multiplied by a factor. The factor is chosen so that the fixes become most likely
 (empirical Bayes: MacKay, Bayesian Interpolation, 1992).
 """
 
@@ -199,12 +200,13 @@ class Alignment:
 
 
 def align(T_wk: Array, positions: Positions, *, metric: bool, seed: int = 0) -> Alignment:
-    """Align a map with its fixes by RANSAC.
+    """Align a map with its GPS fixes using RANSAC.
 
-    The scale of a metric map is estimated as well. If the calibrated baseline is 1 % too long, for
-    example, the map is 1 % too large. The estimate is a weighted mean of two scales: the scale that
-    the fixes suggest, and the scale of the calibration, which is 1. The weights are the inverse
-    variances. ``_METRIC`` is the standard deviation of the calibrated scale.
+    The scale of a metric map is estimated as well, because the calibration may be inaccurate. For
+    example, if the calibrated baseline is 1 % too long, the map is 1 % too large. The estimate is a
+    weighted mean of two scales: the scale that the fixes suggest, and the scale of the calibration,
+    which is 1. The weights are the inverse variances. ``_METRIC`` is the standard deviation of the
+    calibrated scale.
 
     Args:
         T_wk: ``(N, 4, 4)`` poses of the keyframes in the map (camera to world).
@@ -280,8 +282,8 @@ def _umeyama(p: Array, q: Array, up: Array, fixed: float | None) -> Array:
 
 
 def _mapped(S: Array, points: Array) -> Array:
-    """Transform ``(M, 3)`` points by ``(..., 4, 4)`` similarities. The result has the shape ``(...,
-    M, 3)``."""
+    """Transform ``(M, 3)`` points by ``(..., 4, 4)`` similarities. The result has the shape
+    ``(..., M, 3)``."""
     return points @ np.swapaxes(S[..., :3, :3], -2, -1) + S[..., None, :3, 3]
 
 
@@ -317,8 +319,8 @@ def _local_scale(T_wk: Array, T_enu_k: Array, scale: Array, part: NDArray[np.int
     """Estimate the scale of the map at each keyframe, as ``(N,)`` metres per unit of the map.
 
     The scale is the length of the path around the keyframe in ENU, divided by the length of the
-    same path in the map. The path stays within the keyframe's part of the map. Where its length is
-    0, the previous ``scale`` is returned.
+    same path in the map. The path stays within the keyframe's part of the map. Where the length of
+    the path is 0, the previous ``scale`` is returned.
     """
     scale = scale.copy()
     for label in np.unique(part):
@@ -377,7 +379,8 @@ def _log_determinant(factors: Any, values: Any) -> float:
 
 
 def _optimised(factors: _Factors, config: PoseGraphConfig) -> Array:
-    """Find the ``(N, 4, 4)`` poses that agree best with the edges and the fixes."""
+    """Find the ``(N, 4, 4)`` poses of the keyframes that agree best with the edges and the
+    fixes."""
     factors.vision.push_back(factors.fixes)
     return _poses(minimised(factors.vision, factors.start, config))
 
@@ -412,8 +415,8 @@ def _factors(
     stretch: float = 0.0,
     drift: float = 1.0,
 ) -> _Factors:
-    """Create the factors of the edges and of the fixes. The optimisation starts from the poses
-    ``T_enu_k``.
+    """Create the factors of a pose-graph optimisation with GPS: those of the edges and those of the
+    fixes. The optimisation starts from the poses ``T_enu_k``.
 
     Args:
         cauchy: scale of the Cauchy loss of the fixes, in standard deviations of the fixes; None

@@ -1,4 +1,4 @@
-"""Local mapping: updates the map after each new keyframe (ORB-SLAM, section VI)."""
+"""Local mapping: updates the map after each new keyframe (section VI of the ORB-SLAM paper)."""
 
 from __future__ import annotations
 
@@ -71,10 +71,10 @@ def _cull_landmarks(a, first, last, keyframe, min_found_ratio, too_few):
 def adjust_locally(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
     """Run local bundle adjustment around a keyframe (section VI-D of the ORB-SLAM paper).
 
-    The keyframe, its covisible keyframes and all landmarks that they observe are optimised. Other
-    keyframes that observe these landmarks are held fixed. The first keyframe of the map is also
-    held fixed, because it defines the world frame. Observations that fail the chi-square test
-    afterwards are removed.
+    The keyframe, its covisible keyframes and all landmarks that these keyframes observe are
+    optimised. Other keyframes that observe these landmarks are held fixed. The first keyframe of
+    the map is also held fixed, because it defines the world frame. After the optimisation,
+    observations that fail the chi-square test are removed.
     """
     free, fixed, landmarks = local_window(map_, keyframe, config)
     problem, rows = assemble(map_, free, fixed, landmarks, camera)
@@ -216,8 +216,8 @@ def cull_keyframes(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
 
 @kernel
 def count_redundant(a, keyframe, bf, close_depth):
-    """Count the close landmarks of a keyframe, and those of them that are redundant. Returns both
-    numbers.
+    """Count the close landmarks of a keyframe, and count how many of these landmarks are redundant.
+    Returns both numbers.
 
     A landmark is redundant if at least three other keyframes observe it at a finer or about the
     same scale. If ``bf`` is 0 (monocular camera), all landmarks count as close.

@@ -29,7 +29,7 @@ def move_keyframes(
         T_cw_new: ``(N, 4, 4)`` new poses of these keyframes (world to camera).
 
     Raises:
-        ValueError: a keyframe was culled and has no pose of its own.
+        ValueError: one of the keyframes was culled, so that its pose cannot be set.
     """
     a = map_.arrays
     if not a.keyframe_alive[keyframes].all():

@@ -1,9 +1,9 @@
 """Pose-graph optimisation after a loop closure, and a test of whether its result is plausible.
 
-The graph is the essential graph of ORB-SLAM (Mur-Artal et al., T-RO 2015, III-D and VII-C). It
-consists of the spanning tree, strong covisibility edges and loop edges. Poses are ``T_cw`` on input
-and output. GTSAM optimises the graph with its built-in factors. GTSAM is imported inside the
-functions that need it, because the import is slow.
+The graph is the essential graph of ORB-SLAM (Mur-Artal et al., T-RO 2015, sections III-D and
+VII-C). It consists of the spanning tree, strong covisibility edges and loop edges. Poses are
+``T_cw`` on input and output. GTSAM optimises the graph with its built-in factors. GTSAM is imported
+inside the functions that need it, because the import is slow.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ HOLD = 1e-6  # standard deviation of the prior that fixes a keyframe, m and rad
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """Keyframes and the measurements of their relative poses.
+    """A pose graph: keyframes, and measurements of their relative poses as edges.
 
     Attributes:
         keyframes: ``(N,)`` int64 ids, ascending.
@@ -84,7 +84,8 @@ def essential_graph(
     *,
     driven: bool = False,
 ) -> PoseGraph:
-    """Build the essential graph of a map. This must be done *before* the new loop changes the map.
+    """Build the essential graph of a map, including a new loop. The graph must be built *before*
+    the new loop changes the map.
 
     The measurements of tree and covisibility edges are taken from the poses in the map. If
     landmarks of the new loop were already fused, keyframes on both sides of the loop would be
@@ -160,12 +161,12 @@ def essential_graph(
 
 
 def connectivity(map_: Map) -> NDArray[np.int64]:
-    """Measure how well each keyframe is connected to the earlier part of the map. Returns
-    ``(n_keyframes,)`` int64.
+    """Measure how well each keyframe and all later keyframes are connected to the earlier
+    keyframes. Returns ``(n_keyframes,)`` int64.
 
-    To compute the value for a keyframe, the map is divided into the keyframes before this keyframe,
-    and the keyframe itself with all later ones. The value is the largest number of landmarks that
-    two keyframes from different sides share. The value is 0 for the first keyframe.
+    The value of a keyframe is the largest number of landmarks that two keyframes share, where one
+    of them is earlier than this keyframe, and the other is this keyframe or a later one. The value
+    is 0 for the first keyframe.
     """
     living = map_.living_keyframes()
     pairs, shared = covisible_pairs(map_.arrays, living, map_.n_keyframes, 1)
@@ -201,8 +202,8 @@ def edge_sigmas(
     model, regardless of their number.
 
     The translation of a GAP edge may be wrong by a share of the predicted distance, or by the
-    distance that a slow car drives in the elapsed time. The larger of these two errors is used.
-    Almost nothing is known about a WEAK edge.
+    distance that a slow car drives in the elapsed time. The larger of these two errors is used. A
+    WEAK edge has very large standard deviations, because almost nothing is known about it.
 
     Args:
         seconds: ``(E, 2)`` timestamps of the ends of the edges.
@@ -245,8 +246,9 @@ def parts_of(edges: NDArray[np.int64], n: int) -> NDArray[np.int64]:
 
 
 def load_optimiser() -> None:
-    """Import GTSAM before the first loop is closed. The import takes a tenth of a second. During a
-    loop closure, this would be too long, because frames of a live camera would have to wait."""
+    """Import GTSAM, so that it need not be imported during the first loop closure. The import takes
+    a tenth of a second. During a loop closure, this would be too long, because frames of a live
+    camera would have to wait."""
     import gtsam  # noqa: F401
 
 
@@ -326,13 +328,13 @@ def check_pose_graph(
     """Test whether an optimised graph is plausible. If it is not, the new loop is wrong and must be
     rejected.
 
-    There are two tests. The first test is the residual of each loop edge. A loop edge whose
-    residual is still large contradicts the other loops, or too much of the path.
+    There are two tests. The first test checks the residual of each loop edge. A loop edge whose
+    residual is still large contradicts the other loops, or a large part of the path.
 
-    The second test is the strain: the total chi-square of the tree, covisibility and gap edges. If
-    the drift follows the model, the strain has six degrees of freedom per closed loop. If the
-    strain is several times larger, no plausible drift explains the loop. A single loop across a
-    WEAK edge always passes the tests, because it causes no strain.
+    The second test checks the strain, which is the total chi-square of the tree, covisibility and
+    gap edges. If the drift follows the model, the strain has six degrees of freedom per closed
+    loop. If the strain is several times larger, no plausible drift explains the loop. A single loop
+    across a WEAK edge always passes the tests, because it causes no strain.
 
     Args:
         T_cw: ``(N, 4, 4)`` poses that ``optimise`` returned.

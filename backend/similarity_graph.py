@@ -150,8 +150,8 @@ def move_keyframes_similarly(
 
 
 def loop_in_new_units(edge: LoopEdge, growth: NDArray[np.float64]) -> LoopEdge:
-    """Convert a loop edge after a correction. ``growth`` is the factor by which the correction
-    multiplied lengths around each keyframe."""
+    """Convert a loop edge to the new units of length after a correction of a monocular map.
+    ``growth`` is the factor by which the correction multiplied lengths around each keyframe."""
     assert edge.T_query_match is not None
     T = edge.T_query_match.copy()
     T[:3, 3] *= growth[edge.match]

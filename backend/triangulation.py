@@ -23,7 +23,7 @@ def map_stereo_points(
     """Create landmarks from the close stereo features of a keyframe that observe no landmark yet.
 
     If fewer than ``mapping.min_stereo_points`` features are close, the nearest
-    ``min_stereo_points`` stereo features are used instead (ORB-SLAM2, section III-E).
+    ``min_stereo_points`` stereo features are used instead (section III-E of the ORB-SLAM2 paper).
 
     Args:
         far: whether far features are used as well.
@@ -257,9 +257,9 @@ def sorted_about_epipole(x, y, gate, intrinsics, across):
 
     All epipolar planes contain the baseline. In a view along the baseline, each plane is therefore
     a line through the origin and has a direction. A feature matches planes that cross a square
-    around it. Half the side of this square is the square root of ``gate``. In the view along the
-    baseline, the square becomes a parallelogram, which covers an interval of directions. If the
-    epipole is inside the square, all directions are covered.
+    around the feature. Half the side of this square is the square root of ``gate``. In the view
+    along the baseline, the square becomes a parallelogram, which covers an interval of directions.
+    If the epipole is inside the square, all directions are covered.
 
     Args:
         x, y: ``(n,)`` float32, pixels.

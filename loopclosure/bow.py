@@ -1,10 +1,10 @@
-"""Loop detection by bag of words.
+"""Detects loops by comparing bags of visual words.
 
 Candidates are chosen as in ORB-SLAM (Mur-Artal et al., T-RO 2015, sections III-E and VII-A). A
 candidate meets three conditions. It shares many visual words with the query. It belongs to one of
 the groups of covisible keyframes with the highest total scores. Its score is at least the lowest
-score among the keyframes that are covisible with the query. One pass over the inverted index gives
-the scores of all keyframes.
+score among the keyframes that are covisible with the query. A single pass over the inverted index
+gives the scores of all keyframes.
 """
 
 from __future__ import annotations
@@ -155,12 +155,13 @@ class BowDetector:
 
 @inner_kernel
 def most_covisible(counts, minimum, keyframes, strength):
-    """Select the keyframes that share the most landmarks with a keyframe. ``counts`` is the number
-    of landmarks that each keyframe shares with it. Counts below ``minimum`` are ignored.
+    """Select the keyframes that share the most landmarks with a keyframe. ``counts`` gives the
+    number of landmarks that each other keyframe shares with this keyframe. Counts below ``minimum``
+    are ignored.
 
     Up to G keyframes are selected. Their ids are written into ``keyframes`` and their counts into
-    ``strength``, both ``(G,)`` int64. They are sorted by descending count and then by ascending id.
-    Returns the number of selected keyframes.
+    ``strength``, both ``(G,)`` int64. The selected keyframes are sorted by descending count and
+    then by ascending id. Returns the number of selected keyframes.
     """
     n = 0
     for k in range(len(counts)):

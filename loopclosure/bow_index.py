@@ -1,9 +1,10 @@
-"""Inverted index from visual words to keyframes (Galvez-Lopez and Tardos, T-RO 2012, IV).
+"""Inverted index from visual words to keyframes (Galvez-Lopez and Tardos, T-RO 2012, section IV).
 
-The L1 score of two bags of words is the sum, over their shared words, of the smaller of the two
-weights (vocabulary.py). Each posting therefore stores the weight of its word in the keyframe. One
-pass over the postings of a query's words then gives the number of shared words and the score of
-every keyframe.
+The L1 score of two bags of words is a sum over their shared words. Each shared word contributes the
+smaller of its two weights (vocabulary.py). A posting is an entry of the index for a word and a
+keyframe that contains the word. It stores the weight of the word in the keyframe. A single pass
+over the postings of a query's words then gives the number of shared words and the score of every
+keyframe.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ SHARED = 1 << 40  # added for each shared word; larger than any sum of weights
 
 
 def grown(array: NDArray, needed: int) -> NDArray:
-    """Return an array with room for at least ``needed`` items. It is the given array if this is
-    long enough. Otherwise, it is a copy with at least 1.5 times the length."""
+    """Return an array with room for at least ``needed`` items. The given array is returned if it is
+    long enough. Otherwise, a copy with at least 1.5 times the length is returned."""
     if needed <= len(array):
         return array
     bigger = np.empty((max(needed, len(array) * 3 // 2), *array.shape[1:]), array.dtype)
@@ -149,8 +150,8 @@ def post(postings, used, keyframe, words, weights):
 @kernel
 def compare_with_all(postings, n_keyframes, words, weights):
     """Compare the bag of words of an image with the bags of all keyframes. Returns ``(K,)`` int64:
-    for each keyframe, the number of shared words times ``SHARED``, plus the sum over the shared
-    words of the smaller of the two weights.
+    for each keyframe, the number of shared words times ``SHARED``, plus the score. The score is the
+    sum of the smaller weight of each shared word.
 
     Both quantities are stored in one integer, so that each posting needs only one addition.
     """

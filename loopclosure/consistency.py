@@ -1,4 +1,4 @@
-"""Temporal consistency of loops.
+"""Tests the temporal consistency of loops.
 
 A loop is accepted only if several keyframes propose the same place and their verified loops agree.
 
@@ -85,9 +85,10 @@ class LoopConsistency:
         """Accept a verified loop edge only if the loops of enough recent keyframes imply the same
         drift.
 
-        The drift that an edge implies is a motion of the world: it would move the query to where
-        the edge places it. Odometry between neighbouring keyframes is accurate compared with the
-        tolerances. True loops therefore imply the same drift, and false loops do not.
+        The drift that an edge implies is a motion of the world. This motion would move the query
+        keyframe to where the edge places it. Odometry between neighbouring keyframes is accurate
+        compared with the tolerances. True loops therefore imply the same drift, and false loops do
+        not.
 
         Returns:
             The edge. It is marked as not accepted if too few keyframes have agreed so far. A
@@ -112,8 +113,8 @@ class LoopConsistency:
     def confirmed_by_earlier(
         self, map_: Map, camera: Camera, config: VerificationConfig
     ) -> Iterator[LoopEdge]:
-        """Yield verified loops with which too few keyframes have agreed so far, but which an
-        earlier keyframe confirms. The newest loop comes first.
+        """Yield verified loops that an earlier keyframe confirms, although too few keyframes have
+        agreed with them so far. The newest loop comes first.
 
         An earlier keyframe confirms a loop if it meets three conditions. It is covisible with the
         query of the loop. It can be verified at the same place as the query. The two loops imply

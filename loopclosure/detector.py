@@ -29,8 +29,8 @@ class LoopDetector(Protocol):
     most similar keyframes. The local descriptors always come from the feature extractor of the
     capsule network, regardless of the network that proposed the candidates.
 
-    To compare detectors in isolation, set ``verification.descriptors`` to ``orb`` or ``both`` for
-    all of them.
+    To compare detectors in isolation, set ``verification.descriptors`` to the same value for all
+    detectors, either ``orb`` or ``both``.
     """
 
     name: str
@@ -85,7 +85,7 @@ def require_same(detector: DetectorMemory, memory: DetectorMemory) -> None:
 
 
 class NoDetector:
-    """A detector that never finds a loop. It is used for pure odometry."""
+    """A loop detector that never finds a loop. It is used for pure odometry."""
 
     name = "none"
 

@@ -44,14 +44,16 @@ class View(NamedTuple):
 
 
 class PoseEstimate(NamedTuple):
-    """A camera pose, and the landmarks of a place that should be visible from it.
+    """A camera pose that was estimated at a place, and the landmarks of the place that should be
+    visible from this pose.
 
     Attributes:
         landmarks: ``(M,)`` int32 ids of the landmarks that should be visible.
         uv: ``(M, 2)`` float64 predicted positions of these landmarks in the image, pixels.
         seen: ``(M,)`` bool, True for inliers: landmarks that were found at their predicted
             positions.
-        n_matches: number of matches near the predictions, including outliers.
+        n_matches: number of landmarks that were matched near their predicted positions, including
+            outliers.
         T_cw: ``(4, 4)`` pose of the camera (world to camera), in the world frame of the landmarks.
     """
 
@@ -71,7 +73,7 @@ def localise(
     config: LearnedMatchingConfig,
     seed: int,
 ) -> PoseEstimate | str:
-    """Estimate the pose of an image at a place.
+    """Estimate the pose of an image at a place of the map, using learned local descriptors.
 
     Args:
         query: local descriptors of the image.

@@ -229,7 +229,7 @@ def observed_features(
     position.
 
     If a feature already observes a landmark, the depths of both landmarks must agree. Otherwise, a
-    corner of a car could be paired with a corner of the facade behind it.
+    corner of a car could be paired with a corner of the facade behind the car.
 
     Returns:
         ``(N,)`` indices of features and ``(N,)`` ids of landmarks, without duplicates.

@@ -1,10 +1,11 @@
 """Coarse-to-fine matching of learned local descriptors, as in LoFTR (Sun et al., CVPR 2021).
 
 Each image is divided into cells, and each cell has a descriptor. A coarse match is a pair of cells
-in two images whose descriptors are mutual nearest neighbours. Fine matching searches the other
-image for each keypoint of one image. It searches in windows around the positions that nearby coarse
-matches predict. The other image needs no keypoints. The position is refined to a fraction of a
-cell. It is accepted only if the reverse search returns to the keypoint.
+in two images whose descriptors are mutual nearest neighbours. Fine matching searches the second
+image for each keypoint of the first image. The search windows lie around the positions that nearby
+coarse matches predict. The second image needs no keypoints. The position that is found is refined
+to a fraction of a cell. A position is accepted only if the reverse search, from the second to the
+first image, returns to the keypoint.
 """
 
 from __future__ import annotations
@@ -161,8 +162,8 @@ def homography_inliers(coarse: CoarseMatches, a: DescriptorMaps, b: DescriptorMa
     """Count the coarse matches that fit a single homography.
 
     A homography is not an exact model of a street. However, distant points fit it, and near points
-    deviate from it by only a cell or two. In images of different places, far fewer matches fit any
-    homography.
+    deviate from it by only a cell or two. In images of different places, far fewer matches fit a
+    common homography.
     """
     import cv2
 
@@ -213,7 +214,8 @@ def _interpolate(fine, x, y, out):
     """Interpolate the descriptor at (x, y), and write it into ``out``. Returns False if the
     position is outside the image.
 
-    The position is in cells. The descriptor is interpolated bilinearly and normalised to length 1.
+    The position is given in cells. The descriptor is interpolated bilinearly and normalised to
+    length 1.
     """
     rows, columns, channels = fine.shape
     if not (x >= 0.0 and y >= 0.0 and x <= columns - 1 and y <= rows - 1):
@@ -286,8 +288,8 @@ def _peak(fine, descriptor, j, i, best):
 @inner_kernel
 def _accept_if_mutual(fine_a, fine_b, descriptor, x, y, j, i, best, reach, other, found):
     """Refine the position of the best cell in b, and write it into ``found`` if the reverse search
-    confirms it. The reverse search from this position must end within 1.5 cells of the keypoint (x,
-    y) in a. ``other`` is a workspace."""
+    confirms it. The reverse search from this position must end within 1.5 cells of the keypoint at
+    ``(x, y)`` in a. ``other`` is a workspace."""
     peak_x, peak_y = _peak(fine_b, descriptor, j, i, best)
     if _interpolate(fine_b, peak_x, peak_y, other):
         back_j, back_i, _ = _search(fine_a, other, x, y, reach)

@@ -25,7 +25,7 @@ _METHODS = ("add", "query", "locate")
 class PlugInDetector:
     """A ``LoopDetector`` that forwards all calls to the detector of another package.
 
-    After the first failure of the other package's detector, this detector is not called again.
+    After that detector has failed once, it is not called again.
 
     Attributes:
         problem: one sentence about the failure; None if there was no failure. A run ends after a
@@ -124,7 +124,8 @@ def open_plugin(plugin: PlugIn, config: Config, weights: Path | None) -> PlugInD
 
 
 def _fault(candidates: object, query: int, map_: Map) -> str:
-    """Describe what is wrong with the candidates for a query. Returns "" if they are valid.
+    """Describe what is wrong with the candidates that the other package's detector returned for a
+    query. Returns "" if the candidates are valid.
 
     The check is needed because compiled kernels use the ids as indices without bounds checks.
     """

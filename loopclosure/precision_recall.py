@@ -1,4 +1,4 @@
-"""Precision, recall and derived measures for the scores of a loop detector.
+"""Computes precision, recall and derived measures from the scores of a loop detector.
 
 The definitions are those of published benchmarks. An example is recall at 100 % precision (Cummins
 and Newman, IJRR 2008). Tests check that the curves are identical to those of scikit-learn.
@@ -87,7 +87,8 @@ def recall_at_full_precision(curve: PrecisionRecall) -> float:
 
 
 def precision_at_recall(curve: PrecisionRecall, recall: float) -> float:
-    """Return the highest precision among all thresholds with at least the given recall."""
+    """Return the highest precision that any threshold gives at the given recall or a higher
+    recall."""
     return float(curve.precision[curve.recall >= recall].max())
 
 

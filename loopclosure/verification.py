@@ -7,10 +7,10 @@ The first steps are those of ORB-SLAM (T-RO 2015, section VII-B) and, for stereo
 RANSAC. Then all landmarks of the place are matched near their projections, and the pose is refined.
 
 ORB-SLAM then only counts inliers. However, if two different facades or cars look alike, there are
-many inliers, too. The tests in this module therefore also look for evidence against the loop. The
-inliers must be spread over the image. In addition, the landmarks on each side of the loop are
-projected into the keyframe on the other side. Most of the landmarks that should be visible in that
-keyframe must be found.
+many inliers, too. The tests in this module therefore also look for evidence against the loop. There
+are two such tests. First, the inliers must be spread over the image. Second, the landmarks on each
+side of the loop are projected into the keyframe on the other side. Most of the landmarks that
+should be visible in that keyframe must be found.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ class GuidedMatches(NamedTuple):
         feature: ``(M,)`` int32 index, within the keyframe, of the feature that matches each
             landmark and is an inlier; -1 if there is no such feature.
         uv: ``(M, 2)`` float64 predicted positions of the landmarks in the image, pixels.
-        n_matches: number of matches near the predictions, including outliers.
+        n_matches: number of landmarks that were matched near their predicted positions, including
+            outliers.
         T_cw: ``(4, 4)`` pose of the camera (world to camera), in the world frame of the landmarks.
     """
 
@@ -75,8 +76,8 @@ def verify(
     camera: Camera,
     config: VerificationConfig,
 ) -> LoopEdge:
-    """Decide whether the query keyframe shows the place of the match keyframe. The map is not
-    changed.
+    """Decide whether the query keyframe of a loop candidate shows the place of the match keyframe.
+    The map is not changed.
 
     Returns:
         A loop edge. It is accepted with the reason "verified", or rejected with a different reason.

@@ -3,8 +3,8 @@
 There are three verifiers. The first uses ORB descriptors. The second uses learned descriptors. The
 third uses ORB descriptors first, and learned descriptors if ORB descriptors fail.
 
-Loop closing uses only the interface of :class:`Verifier`. It is therefore the same for all
-verifiers.
+Loop closing uses only the interface of :class:`Verifier`. Therefore, loop closing is the same for
+all verifiers.
 """
 
 from __future__ import annotations

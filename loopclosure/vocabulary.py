@@ -1,4 +1,4 @@
-"""Visual words: a vocabulary tree of binary descriptors, and the bag of words of an image.
+"""Visual words: a vocabulary tree of binary descriptors, and bags of words of images.
 
 The tree is the hierarchical vocabulary of Nister and Stewenius (CVPR 2006), adapted to binary
 descriptors (Galvez-Lopez and Tardos, T-RO 2012, section III). Each node splits its descriptors into
@@ -111,9 +111,9 @@ def score(a: BowVector, b: BowVector) -> float:
     """Compute the L1 score of two images from their bags of words: 1 - |a - b| / 2, in [0, 1]
     (Galvez-Lopez and Tardos, T-RO 2012, equation 2).
 
-    The weights are positive and sum to 1. The score therefore equals the sum, over the shared
-    words, of the smaller of the two weights (Nister and Stewenius, section 4, equation 5,
-    rearranged).
+    The weights are positive and sum to 1. The score therefore equals a sum over the shared words,
+    in which each word contributes the smaller of its two weights (Nister and Stewenius, section 4,
+    equation 5, rearranged).
     """
     _, in_a, in_b = np.intersect1d(a.words, b.words, assume_unique=True, return_indices=True)
     return float(np.minimum(a.weights[in_a], b.weights[in_b]).sum(dtype=np.float64))

@@ -1,9 +1,9 @@
 """Reads and writes vocabularies in DBoW2's text format, for example ORB-SLAM's ``ORBvoc.txt``.
 
 The first line is ``k L scoring weighting``. Each further line describes a node by numbers. These
-numbers are the number of its parent, whether it is a leaf (0 or 1), the 32 bytes of its descriptor,
-and its weight. The weight of a leaf is the inverse document frequency. Nodes are numbered from 1,
-in the order of their lines. Node 0 is the root and has no line.
+numbers are the number of its parent, a flag that is 1 for a leaf and 0 otherwise, the 32 bytes of
+its descriptor, and its weight. The weight of a leaf is the inverse document frequency. Nodes are
+numbered from 1, in the order of their lines. Node 0 is the root and has no line.
 
 The reader accepts any order in which parents precede their children. The writer uses breadth-first
 order.
@@ -53,8 +53,8 @@ def write_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
 
 
 def is_text(path: Path) -> bool:
-    """Return whether a file name selects DBoW2's text format, because it ends in .txt. A name that
-    ends in .npz selects the format of vslam.
+    """Return True if a file name ends in .txt, which selects DBoW2's text format. Return False if
+    the name ends in .npz, which selects the format of vslam.
 
     Raises:
         InputError: the name has neither extension.

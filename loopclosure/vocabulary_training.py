@@ -195,7 +195,7 @@ def split_level(data, order, starts, branching, stream, iterations):
 
     Args:
         data: ``(M, 4)`` uint64 descriptors.
-        order: ``(M,)`` int64 indices into ``data``, grouped by node. They are overwritten.
+        order: ``(M,)`` int64 indices into ``data``, grouped by node. The array is overwritten.
         starts: ``(n + 1,)`` int64 start of the group of each node in ``order``. Descriptors in
             leaves of upper levels do not belong to these groups.
         stream: uint64 seed of the random numbers of this level.

@@ -27,8 +27,8 @@ class SiameseDetector:
 
     If the images of keyframes are stored (``images``), descriptors are computed on demand. The
     network computes the descriptor of a keyframe only when the camera comes within reach of the
-    keyframe (:func:`beyond_reach`) or is lost. On a drive that never returns to a place, the
-    network does not run at all.
+    keyframe (:func:`beyond_reach`), or when tracking is lost. On a drive that never returns to a
+    place, the network does not run at all.
 
     The descriptors are the rows of a matrix, which grows by half when it is full. The matrix has no
     columns until the network has computed the first descriptor.
@@ -46,10 +46,10 @@ class SiameseDetector:
         Args:
             learned: thresholds for local descriptors; None uses the defaults.
             images: the store of keyframe images. With a store, candidates must reach the similarity
-                ``config.offered``. The most similar keyframes are then ranked again by local
-                descriptors, because at night the correct place is often among them but not the
-                first. Without a store (None), candidates must reach ``config.threshold`` and are
-                ranked by similarity.
+                ``config.offered``. The most similar keyframes are then ranked again using local
+                descriptors. The reason is that at night, the correct place is often among these
+                keyframes, but it is often not ranked first. Without a store (None), candidates must
+                reach ``config.threshold`` and are ranked by similarity.
         """
         self.name = network.name
         self._network = network
@@ -61,7 +61,8 @@ class SiameseDetector:
         self._row = np.full(64, -1, np.int64)  # row of each keyframe; -1 if it has no descriptor
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
-        """Add a keyframe. A keyframe without an image can never be a query or a match."""
+        """Add a keyframe to the detector. A keyframe without an image can never be a query or a
+        match."""
         if keyframe >= len(self._row):
             more = max(keyframe + 1 - len(self._row), len(self._row) // 2)
             self._row = np.pad(self._row, (0, more), constant_values=-1)

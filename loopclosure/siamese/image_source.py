@@ -1,5 +1,5 @@
-"""The class ``ImageSource``, which all readers of image collections return, and functions that the
-readers share."""
+"""Defines ``ImageSource``, the type that all readers of image collections return, and functions
+that these readers share."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class ImageSource:
             if they show different places, and 0 if this is unknown. The diagonal is 1, because an
             image shows the same place as its augmented copies.
         unit: ``(N,)`` int32 label of the folder or stretch of road that an image belongs to. Images
-            of the same unit are not split between training and validation.
+            of the same unit are never split between training and validation.
         calibration: ``(8,)`` or ``(9,)`` camera model fx fy cx cy k1 k2 p1 p2 [k3]. None if the
             images are rectified.
         is_query: ``(N,)`` bool, True for images that a benchmark compares with all other images.

@@ -83,11 +83,12 @@ def turn_homography(width: int, height: int, degrees: float) -> NDArray[np.float
     """Compute the ``(3, 3)`` homography for a rotation of the camera to the right, without any
     translation.
 
-    It maps pixels of an image to pixels of the image that the camera would take after a rotation by
-    ``degrees``.
+    The homography maps pixels of an image to pixels of the image that the camera would take after a
+    rotation by ``degrees``.
 
     The horizontal field of view is assumed to be 80 degrees, which is common on cars. A homography
-    of this kind only scales vertical coordinates, so it also holds for squashed images.
+    of this kind only scales vertical coordinates. Therefore, the homography also holds for images
+    whose height was scaled.
     """
     focal = width / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])

@@ -28,8 +28,8 @@ _FIX = "write one with 'vslam export onnx', or name another file"
 class OnnxNetwork:
     """A Siamese network, loaded from a file that ``vslam export onnx`` wrote.
 
-    The file contains two graphs: one computes descriptors from images, and the other compares
-    descriptors.
+    The file contains two graphs. The first graph computes descriptors from images. The second graph
+    compares descriptors.
 
     Attributes:
         name: one of ``NETWORKS``.
@@ -149,7 +149,8 @@ def open_network(name: str, weights: Path | None = None) -> OnnxNetwork:
         weights: ONNX file; None uses the file that vslam ships.
 
     Raises:
-        InputError: the name is unknown, or the weights are missing or belong to another network.
+        InputError: the name is unknown, or the weights are missing or belong to a different
+            network.
     """
     path = find_weights(name, weights)
     network = OnnxNetwork(path)

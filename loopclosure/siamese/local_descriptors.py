@@ -145,7 +145,7 @@ class KeyframeImages:
     def glance(self, keyframe: int) -> DescriptorMaps:
         """Compute the coarse descriptors of the stored image of a keyframe, at half the width.
 
-        They take a quarter of the time that ``maps`` takes, and they stay in memory.
+        This takes a quarter of the time that ``maps`` takes. The descriptors stay in memory.
         """
         if keyframe not in self._glances:
             maps = self._described(keyframe, GLANCE_WIDTH)

@@ -119,8 +119,8 @@ def _shapes(model: ModelProto) -> dict[str, tuple[int, ...]]:
 
 
 def _compute_shapes(graph: GraphProto) -> None:
-    """Replace the nodes that compute shapes by their results. This is needed because the shape
-    inference of onnx does not evaluate divisions."""
+    """Replace the nodes of a graph that compute shapes with their results. This is needed because
+    the shape inference of onnx does not evaluate divisions."""
     known = {
         tensor.name: numpy_helper.to_array(tensor)
         for tensor in graph.initializer

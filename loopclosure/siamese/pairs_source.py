@@ -76,13 +76,13 @@ def relation_of_views(views: NDArray[np.float64]) -> NDArray[np.int8]:
     """Determine which images show the same place from their camera poses. Returns the ``(N, N)``
     int8 relation (see ``ImageSource``).
 
-    Two images show the same place if they are less than 5 m apart and their directions differ by
-    less than 35 degrees. They show different places if they are more than 40 m apart and do not
-    look along the same street. Otherwise, the relation is unknown.
+    Two images show the same place if they are less than 5 m apart and their viewing directions
+    differ by less than 35 degrees. Two images show different places if they are more than 40 m
+    apart and do not look along the same street. Otherwise, the relation is unknown.
 
-    Two images look along the same street if three conditions are met. Their directions are similar
-    or opposite. They are less than 160 m apart. One camera is less than 25 m to the side of the
-    line of sight of the other camera.
+    Two images look along the same street if three conditions are met. Their viewing directions are
+    similar or opposite. The images are less than 160 m apart. One camera is less than 25 m to the
+    side of the line of sight of the other camera.
 
     Args:
         views: ``(N, 3)`` x and z in metres, and yaw in degrees from z towards x.

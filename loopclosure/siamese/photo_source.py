@@ -75,8 +75,9 @@ def read_photos(folder: Path) -> list[ImageSource]:
     and the notes of the set are in ``folder/SET/NOTES.txt``.
 
     The first line of the notes states the kind of the set. In a set of kind (a), each subfolder
-    shows one place. In kind (b), each subfolder is a video, in which consecutive frames overlap. In
-    kind (c), the photographs are unrelated. ``_SPECIAL_SETS`` has further properties of some sets.
+    shows one place. In a set of kind (b), each subfolder is a video whose consecutive frames
+    overlap. In a set of kind (c), the photographs are unrelated. ``_SPECIAL_SETS`` has further
+    properties of some sets.
 
     Raises:
         InputError: there is no set of photographs, or the notes do not state the kind.

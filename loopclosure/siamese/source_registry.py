@@ -1,9 +1,9 @@
 """Opens sources of images by name. The sources are used to train networks and to compare loop
 detectors.
 
-A source is a set of images with a matrix. For each pair of images, the matrix states whether they
-show the same place (1) or different places (-1), or whether this is unknown (0). Unknown pairs are
-never used.
+A source is a set of images with a matrix. For each pair of images, the matrix states what the
+images show: the same place (1), different places (-1), or unknown (0). Unknown pairs are never
+used.
 
 Images of different sources show different places, unless the sources belong to the same family.
 Between sources of the same family, the relation is unknown. An example of a family is two sets of

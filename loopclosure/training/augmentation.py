@@ -16,7 +16,8 @@ class Augmentation(BaseModel):
     """Strengths of the random changes that are applied to training images. A strength of 0 disables
     a change.
 
-    The original paper changes perspective and luminance, and masks parts of the image.
+    Zhou and Sun (Sci Rep 15, 7644, 2025), whose network is trained here, change perspective and
+    luminance, and mask parts of the image.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -55,7 +55,8 @@ class Layout(NamedTuple):
 
 
 class CapsuleShape(BaseModel):
-    """The structure of a capsule branch. It is stored together with the weights."""
+    """The structure of a capsule branch, which is the part of a network that computes descriptors.
+    It is stored together with the weights."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -200,8 +201,8 @@ class CapsuleBranch(nn.Module):
 
     The descriptor consists of the flattened output capsules. With several views, it is the
     concatenation of the descriptors of the views, from left to right. The descriptor of each view
-    is scaled by the share of the view that shows texture. The reason is that fog or a covered lens
-    does not distinguish places.
+    is scaled by the share of the view that shows texture. The reason is that an area without
+    texture, for example fog or a covered lens, does not distinguish places.
 
     With the extractor lite0, the views are cut from the early features of the whole image. These
     features are computed only once. At the border of a view, the features depend on the
@@ -236,8 +237,8 @@ class CapsuleBranch(nn.Module):
         return (views * self._textured_share(texture)[:, :, None]).flatten(1)
 
     def routed(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the output capsules, ``(V N, J, D)``, and the coupling coefficients, ``(V N, J,
-        I)``, of V views of N images. The leftmost views of all images come first."""
+        """Compute the output capsules, ``(V N, J, D)``, and the coupling coefficients,
+        ``(V N, J, I)``, of V views of N images. The leftmost views of all images come first."""
         grey = self._unrolled(images)
         return self.capsules.routed(self._primary_capsules(grey, textured(grey)))
 
@@ -266,8 +267,8 @@ class CapsuleBranch(nn.Module):
         return torch.stack(shares, 1).clamp_min(_LEAST_SHARE)
 
     def _views(self, x: Tensor) -> Tensor:
-        """Cut ``(N, C, h, w)`` arrays into V views each. The result has the shape ``(V N, C, h,
-        v)``."""
+        """Cut ``(N, C, h, w)`` arrays into V views each. The result has the shape
+        ``(V N, C, h, v)``."""
         if self.views > 1:
             x = torch.cat([x[..., columns] for columns in self.shape.cuts])
         return x.contiguous(memory_format=torch.channels_last)

@@ -1,10 +1,10 @@
-"""Capsules and dynamic routing.
+"""Implements capsules and dynamic routing between them.
 
 The module implements equations 4 to 9 of Zhou and Sun, Sci Rep 15, 7644 (2025), which are based on
 Sabour et al., NIPS 2017. There are N images, I primary capsules of dimension A, and J output
 capsules of dimension D. Primary capsules have T types at P places. A type is a group of channels of
-the extractor, and a place is a cell of the feature grid. The index of a primary capsule is i = t P
-+ p.
+the extractor, and a place is a cell of the feature grid. The index of a primary capsule is
+``i = t P + p``.
 
 All places of a type share the same matrices. ``route`` therefore sums over the places first, and
 never computes the prediction vectors. ``tests/reference_routing.py`` implements the equations of
@@ -24,14 +24,14 @@ TINY = 1e-12  # added so that the square root is differentiable at 0
 
 
 def squash(s: Tensor) -> Tensor:
-    """Compute ``|s|² / (1 + |s|²) · s / |s|`` along the last axis (equation 8 of the paper). The
+    """Compute ``|s|² / (1 + |s|²) · s / |s|`` along the last axis (equation 8 of Zhou and Sun). The
     length of the result is below 1."""
     squared = (s * s).sum(-1, keepdim=True)
     return s * (torch.sqrt(squared + TINY) / (1.0 + squared))
 
 
 def length(v: Tensor) -> Tensor:
-    """Compute the L2 norm along the last axis (equation 9 of the paper). Its gradient at 0 is
+    """Compute the L2 norm along the last axis (equation 9 of Zhou and Sun). Its gradient at 0 is
     finite."""
     return torch.sqrt((v * v).sum(-1) + TINY)
 
@@ -44,7 +44,7 @@ def route(
 
     The sums are rearranged as ``s_j = Σ_t W_tj (Σ_p c_tpj u_tp)`` and
     ``û_j|i · v_j = u_tp · (W_tjᵀ v_j)``. In this form, sums over the places replace the prediction
-    vectors. The sums are vectors of size A, whereas the prediction vectors have ``I J D`` numbers,
+    vectors. The sums are vectors of size A. The prediction vectors would have ``I J D`` numbers,
     which would have to be written once and read five times.
 
     Args:
@@ -52,15 +52,16 @@ def route(
         W: ``(J, T, A, D)`` matrices, shared by the places of a type.
         iterations: number of iterations, at least 1.
         over: axis of the softmax. With ``primary``, the coupling coefficients sum to 1 over i, as
-            in the paper. With ``output``, they sum to 1 over j, as in Sabour et al.
-        alive: ``(I,)`` bool. Capsules where it is False are ignored, as if they were removed. None
-            uses all capsules.
+            in Zhou and Sun. With ``output``, the coefficients sum to 1 over j, as in Sabour et al.
+        alive: ``(I,)`` bool, False for primary capsules that are ignored, as if they were removed.
+            None uses all capsules.
 
     Returns:
-        Output capsules ``v`` ``(N, J, D)``, and the coupling coefficients as numerators ``e`` ``(N,
-        T, J, P)`` and denominators ``total`` ``(N, 1, J, 1)`` or ``(1,)``. :func:`couplings`
-        divides the numerators by the denominators. The coefficients are returned undivided, because
-        ``route`` itself divides only the sums over P, which needs a sixth of the divisions.
+        Three arrays: the output capsules ``v``, ``(N, J, D)``; the numerators of the coupling
+        coefficients ``e``, ``(N, T, J, P)``; the denominators of the coupling coefficients
+        ``total``, ``(N, 1, J, 1)`` or ``(1,)``. :func:`couplings` divides the numerators by the
+        denominators. The coefficients are returned undivided, because ``route`` itself divides only
+        the sums over P, which needs a sixth of the divisions.
     """
     n, types, places, size = u.shape
     outputs, _, _, depth = W.shape
@@ -83,7 +84,7 @@ def route(
         return torch.bmm(back, rows.transpose(1, 2)).view(n, types, outputs, places)
 
     def softmax_parts(b: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the numerators and the denominator of the softmax (equation 6 of the paper) of
+        """Compute the numerators and the denominator of the softmax (equation 6 of Zhou and Sun) of
         ``(N, T, J, P)`` logits. The logits are overwritten."""
         if over == "output":
             c = torch.softmax(b, dim=2)

@@ -69,7 +69,8 @@ def load_checkpoint(
     """Load a checkpoint into the network and the optimiser.
 
     Returns:
-        The progress, and the pairs of the current epoch. The pairs are None between epochs.
+        The progress, and the image pairs of the current epoch. The pairs are None if the checkpoint
+        was written between two epochs.
 
     Raises:
         InputError: the file is damaged, or comes from a different version of vslam, or was written

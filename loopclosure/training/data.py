@@ -33,8 +33,8 @@ class Collection:
         images: ``(N, H, W)`` uint8 grey images.
         relation: ``(N, N)`` int8 relation of each pair. The value is 1 for the same place, -1 for
             different places, and 0 if this is unknown.
-        unit: ``(N,)`` int64 label. Images with the same label are not split between training and
-            validation.
+        unit: ``(N,)`` int64 label of the group that an image belongs to. Images with the same label
+            are never split between training and validation.
         sources: name of each source, and its number of images.
     """
 
@@ -186,7 +186,8 @@ def draw_pairs(
     Args:
         chosen: ``(M,)`` indices of the images from which pairs are drawn.
         count: number of pairs.
-        hard: ``(M, K)`` similar images of other places, padded with -1; see :func:`mine`.
+        hard: ``(M, K)`` indices of similar images of other places for each chosen image, padded
+            with -1; see :func:`mine`.
         hard_share: share of the pairs of different places whose second image is drawn from
             ``hard``.
         same_share: share of the pairs that show the same place. These pairs are spread evenly over
@@ -244,8 +245,8 @@ def mine(
 
 
 def write_pairs(path: Path, collection: Collection, pairs: Pairs, seed: int) -> None:
-    """Write a list of pairs as a CSV file with the columns a, b, same. The first line states the
-    seed.
+    """Write a list of image pairs as a CSV file with the columns a, b, same. The first line states
+    the seed.
 
     Raises:
         ResultsError: the file cannot be written.

@@ -25,8 +25,8 @@ LIGHT_BLOCKS: tuple[Block, ...] = (
 
 
 class Separable(nn.Module):
-    """Depthwise and pointwise convolution, followed by batch normalisation (equation 1 of the
-    paper) and ReLU."""
+    """Depthwise and pointwise convolution, followed by batch normalisation (equation 1 of Zhou and
+    Sun) and ReLU."""
 
     def __init__(
         self,
@@ -78,8 +78,8 @@ class Stem(nn.Module):
 
 
 class PrimaryCapsules(nn.Module):
-    """A separable 7x7 convolution with stride 1, whose channels are grouped into squashed
-    capsules."""
+    """The layer of primary capsules: a separable 7x7 convolution with stride 1. Its output channels
+    are grouped into capsules, and each capsule is squashed."""
 
     def __init__(self, inputs: int, types: int, size: int) -> None:
         super().__init__()
@@ -94,8 +94,8 @@ class PrimaryCapsules(nn.Module):
 
 
 class LightExtractor(nn.Sequential):
-    """The light feature extractor of the paper: strided separable convolutions with dilations 1, 2
-    and 3. An image of 227x227 pixels becomes a grid of 15x15 cells.
+    """The light feature extractor of Zhou and Sun: strided separable convolutions with dilations 1,
+    2 and 3. An image of 227x227 pixels becomes a grid of 15x15 cells.
 
     Attributes:
         out_channels: number of channels of the feature grid.

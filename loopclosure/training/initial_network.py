@@ -99,8 +99,8 @@ def resized(network: SiameseNetwork, layout: Layout) -> SiameseNetwork:
 
     Convolutions and transforms stay the same. The gains of the places (cells of the feature grid)
     are interpolated over the new grid. In this way, most of the training can use small images,
-    which needs a third of the time (Howard's progressive resizing, as in the DAWNBench entry of
-    fast.ai, 2018).
+    which needs a third of the time (progressive resizing by Howard, DAWNBench entry of fast.ai,
+    2018).
 
     Raises:
         InputError: the network is pruned, or the views do not fit the image.

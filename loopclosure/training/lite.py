@@ -3,8 +3,9 @@ weights.
 
 Inverted residuals (Sandler et al., CVPR 2018) are depthwise-separable convolutions between an
 expansion and a projection. The extractor is therefore of the same kind as the light extractor of
-the paper, but it is pretrained on 1.3 million photographs. Its structure is that of EfficientNet
-(Tan and Le, ICML 2019) in its "Lite" form, with ReLU6 and without squeeze and excitation.
+Zhou and Sun (``extractors``), but it is pretrained on 1.3 million photographs. Its structure is
+that of EfficientNet (Tan and Le, ICML 2019) in its "Lite" form, with ReLU6 and without squeeze and
+excitation.
 """
 
 from __future__ import annotations

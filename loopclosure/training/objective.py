@@ -20,8 +20,8 @@ _MOST_SAME = 5  # a validation query is compared with at most this many images o
 
 
 def cross_entropy(logits: Tensor, same: Tensor) -> Tensor:
-    """Compute the binary cross-entropy from the logits of p (equation 3 of the paper). It is the
-    mean over all pairs of ``-(y log p + (1 - y) log(1 - p))``."""
+    """Compute the binary cross-entropy from the logits of p (equation 3 of Zhou and Sun, 2025). It
+    is the mean over all pairs of ``-(y log p + (1 - y) log(1 - p))``."""
     return functional.binary_cross_entropy_with_logits(logits, same.to(logits.dtype))
 
 
@@ -29,8 +29,8 @@ def contrast(alike: Tensor, same: Tensor, relation: Tensor, temperature: float) 
     """Compute the InfoNCE loss. This loss compares each pair of images of the same place with all
     images of other places in the batch.
 
-    The loss is that of van den Oord et al. (2018), in the symmetric form of CLIP. The paper does
-    not use this loss.
+    The loss is that of van den Oord et al. (2018), in the symmetric form of CLIP. Zhou and Sun
+    (2025) do not use this loss.
 
     Args:
         alike: ``(2 N, 2 N)`` cosine similarities of the images of N pairs. The first images of all
@@ -94,8 +94,8 @@ def validate(
     different places, as in a SLAM run. Every call uses the same augmentations and pairs.
 
     Returns:
-        The figures of :func:`vslam.loopclosure.precision_recall.summary`, and the scores and labels
-        of the pairs that the figures are computed from.
+        The measures of :func:`vslam.loopclosure.precision_recall.summary`, and the scores and
+        labels of the pairs from which these measures are computed.
     """
     images = collection.images[chosen]
     augmented = np.stack(
@@ -123,8 +123,8 @@ def blend(network: SiameseNetwork, before: dict[str, Tensor], share: float) -> N
     """Interpolate the weights of a network in place. Share 0 gives the weights ``before``, and
     share 1 gives the current weights.
 
-    Interpolated weights keep most of what fine-tuning has learned. They also forget less of what
-    the original network had learned (WiSE-FT, Wortsman et al., CVPR 2022).
+    Interpolated weights keep most of what fine-tuning has learned. They also keep more of what the
+    original network had learned (WiSE-FT, Wortsman et al., CVPR 2022).
     """
     after = network.state_dict()
     mixed = {
@@ -136,7 +136,8 @@ def blend(network: SiameseNetwork, before: dict[str, Tensor], share: float) -> N
 
 
 def calibrate(network: SiameseNetwork, score: NDArray, same: NDArray) -> None:
-    """Fit a and b of ``p = sigmoid(a - b d)`` in place, so that p is a calibrated probability.
+    """Fit the parameters a and b of the network's head, ``p = sigmoid(a - b d)``, in place, so that
+    p is a calibrated probability.
 
     The pairs of the same place and the pairs of different places get equal total weights. The order
     of the scores does not change, so average precision does not change either.

@@ -27,9 +27,9 @@ class Unrolling(nn.Module):
     horizontal shift.
 
     The method is that of Szeliski, Image Alignment and Stitching: A Tutorial, 2006, section 2.3. In
-    a flat image, objects become wider and taller towards the sides. A rotation by 30 degrees
-    therefore does not merely shift the image, so that no single shift aligns the whole image. The
-    paper does not use this projection.
+    a flat image, objects become wider and taller towards the sides. Therefore, a rotation of the
+    camera by 30 degrees does not merely shift the image, and no single shift aligns the whole
+    image. Zhou and Sun (2025) do not use this projection.
 
     Column ``x`` of the projected image, in [-1, 1], shows the direction ``x half_angle``. In this
     column, row ``y`` shows the row ``middle y / cos(x half_angle)`` of the flat image. The sides of

@@ -1,7 +1,8 @@
 """Pruning: removes the primary capsules with the lowest coupling coefficients.
 
-The original paper ranks primary capsules by their coupling coefficients. It sets the matrices W_ij
-of the lowest 20 % to 0. Multiplying by zeros saves no time, so these capsules are removed here.
+Zhou and Sun (Sci Rep 15, 7644, 2025) rank primary capsules by their coupling coefficients. They set
+the matrices W_ij of the lowest 20 % to 0. Multiplying by zeros saves no time, so this module
+removes these capsules.
 """
 
 from __future__ import annotations
@@ -44,12 +45,12 @@ def mean_couplings(network: SiameseNetwork, batches: Iterable[Tensor]) -> Tensor
 
 
 def lowest(activity: Tensor, fraction: float = 0.2) -> Tensor:
-    """Select the least active ``fraction`` of the primary capsules of each type. Returns a ``(T,
-    K)`` bool mask.
+    """Select the least active ``fraction`` of the primary capsules of each type. Returns a
+    ``(T, K)`` bool mask.
 
-    The paper does not say how many capsules are removed from each type. Here, the number is the
-    same for all types. A single dense product can then still compute all types together. If
-    capsules have equal activity, the capsule with the lower index is selected first.
+    Zhou and Sun (2025) do not say how many capsules they remove from each type. This function
+    selects the same number for all types. A single dense product can then still compute all types
+    together. If capsules have equal activity, the capsule with the lower index is selected first.
     """
     dropped = round(fraction * activity.shape[1])
     order = torch.argsort(activity, dim=1, stable=True)
@@ -90,8 +91,8 @@ def pruned(network: SiameseNetwork, drop: Tensor, name: str = "capsule-pruned") 
 
 
 def with_iterations(network: SiameseNetwork, iterations: int) -> SiameseNetwork:
-    """Copy a network and give the copy a different number of routing iterations. The paper does not
-    do this."""
+    """Copy a network and give the copy a different number of routing iterations. Zhou and Sun
+    (2025) do not do this."""
     copied = copy.deepcopy(network)
     branch = copied.branch
     branch.shape = branch.shape.model_copy(update={"iterations": iterations})

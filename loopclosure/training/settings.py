@@ -13,8 +13,8 @@ from vslam.loopclosure.training.branches import CapsuleShape
 
 
 class TrainSettings(BaseModel):
-    """The settings of a training run. ``settings.json`` stores them, and ``--settings`` reads
-    them."""
+    """The settings of a training run. The file ``settings.json`` stores the settings, and the
+    option ``--settings`` reads such a file."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

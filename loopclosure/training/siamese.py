@@ -33,7 +33,7 @@ def aligned(alike: Tensor, most: Tensor) -> Tensor:
 
     The result is the soft maximum of these similarities. A soft maximum is used because two shifts
     may fit about equally well. This happens if the camera has rotated by half the spacing of the
-    views, or has moved forwards. The result can slightly exceed 1. The original paper compares only
+    views, or has moved forwards. The result can slightly exceed 1. Zhou and Sun (2025) compare only
     whole images.
 
     Args:
@@ -74,7 +74,7 @@ def _lengths(views: Tensor) -> Tensor:
 
 class DistanceHead(nn.Module):
     """Computes the probability p that two images show the same place from the distance d of their
-    descriptors: ``p = sigmoid(a - b d)`` with a, b > 0 (equations 2 and 10 of the paper).
+    descriptors: ``p = sigmoid(a - b d)`` with a, b > 0 (equations 2 and 10 of Zhou and Sun, 2025).
 
     If the images have several views, d is computed from the cosine similarity after the views are
     aligned (:func:`aligned`).
@@ -89,8 +89,8 @@ class DistanceHead(nn.Module):
         self.log_b = nn.Parameter(torch.tensor(1.4))
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
-        """Compute the ``(N,)`` logits of N pairs of descriptors of norm 1. Both arguments are ``(N,
-        D)``."""
+        """Compute the ``(N,)`` logits of N pairs of descriptors of norm 1. Both arguments are
+        ``(N, D)``."""
         a, b = _by_view(a, self.views), _by_view(b, self.views)
         most = _lengths(a)[:, :, None] * _lengths(b)[:, None]
         return self.of_cosine(aligned(a @ b.transpose(1, 2), most))
@@ -172,7 +172,7 @@ def build_network(name: str, shape: CapsuleShape | None = None) -> SiameseNetwor
 
     Args:
         name: one of ``NETWORKS``.
-        shape: shape of the capsule branch; None uses the shape of the paper.
+        shape: shape of the capsule branch; None uses the shape of Zhou and Sun (2025).
 
     Raises:
         InputError: the name is unknown.

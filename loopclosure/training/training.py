@@ -100,8 +100,8 @@ def train(
     on_step: OnStep | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> TrainingOutcome:
-    """Train a network. Its weights, a log, the lists of pairs and checkpoints are written to a
-    folder.
+    """Train a Siamese network. The weights, a log, the lists of image pairs, and checkpoints are
+    written to a folder.
 
     Args:
         collection: the images and their relations.
@@ -111,9 +111,9 @@ def train(
         threads: number of threads that augment images.
         resume: whether training continues from the checkpoint in the folder, if there is one.
         start: network to start from instead of random weights (fine-tuning).
-        on_step: called after each step.
-        should_stop: called after each step. If it returns True, a checkpoint is written and
-            training stops.
+        on_step: called after each training step.
+        should_stop: called after each training step. If it returns True, a checkpoint is written
+            and training stops.
 
     Raises:
         InputError: there is too little data, the device or a source is unknown, the device does not

@@ -26,7 +26,7 @@ from vslam.workers import Job, Urgency, Workers
 
 class Corners(NamedTuple):
     """The features that a corner detector found in the images of a frame, and their stereo matches.
-    They do not depend on tracking.
+    Both are independent of tracking.
 
     Attributes:
         found: the features of the left image, or of the right image if the left one is black.
@@ -94,7 +94,7 @@ class FrameImages:
             self.coarse = coarse_levels(self.pyramid)
 
     def start_corners(self, workers: Workers) -> None:
-        """Start to compute ``corners`` in another thread, before they are needed."""
+        """Start computing ``corners`` in another thread, before the corners are needed."""
         if self._started is None:
             self._image_map = partial(workers.map, urgency=Urgency.CORNERS)
             self._started = workers.submit(self._find_corners, Urgency.CORNERS)

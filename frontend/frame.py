@@ -16,7 +16,8 @@ from vslam.geometry import Matrix, inverse
 
 
 class FeatureSource(Protocol):
-    """The images of a frame. Features are extracted from them when they are first needed.
+    """The images of a frame. Features are extracted from the images when the features are first
+    needed.
 
     Attributes:
         extracted: the features of the frame.

@@ -402,8 +402,8 @@ def weigh(a, b, c, d, e, f, g, out):
     """Write the weighted sum of seven image rows, or of seven shifted copies of one row, into
     ``out``.
 
-    The weights are those of a Gaussian with a sigma of 2, in 256ths. They are rounded to a sum of
-    256, as in OpenCV.
+    The weights of the seven rows are samples of a Gaussian with a sigma of 2, in 256ths. They are
+    rounded to a sum of 256, as in OpenCV.
     """
     for x in range(np.uintp(len(out))):
         out[x] = 18 * (a[x] + g[x]) + 34 * (b[x] + f[x]) + 48 * (c[x] + e[x]) + 56 * d[x]

@@ -93,7 +93,7 @@ class Relocaliser:
 
     def _find(self, frame: Frame, map_: Map) -> Found:
         """Relocalise a frame at keyframes that look similar. ORB descriptors are tried first. If
-        they fail, ``recognise`` is called."""
+        the frame cannot be located using ORB descriptors, ``recognise`` is called."""
         config = self._context.config.relocalization
         candidates = self._locate(frame.image, frame.features, map_)
         for candidate in candidates[: config.max_candidates]:

@@ -292,9 +292,9 @@ def refine_shift(image_l, image_r, x_l, y_l, x_r, shift, half):
     """Find the shift, in pixels, that minimises the sum of squared differences between two patches.
     ``shift`` is a first estimate in (-1, 1).
 
-    A parabola through three sums of absolute differences has a minimum that is biased towards whole
+    The minimum of a parabola through three sums of absolute differences is biased towards whole
     pixels. Two Gauss-Newton steps on the interpolated patch remove this bias (Lucas and Kanade,
-    IJCAI 1981). If they fail, ``shift`` is returned.
+    IJCAI 1981). If these steps fail, ``shift`` is returned.
     """
     start = shift
     width = image_r.shape[1]

@@ -92,9 +92,9 @@ def track_motion(
     The points are projected with the predicted pose and matched near their projections. Then the
     pose is optimised.
 
-    The points are the landmarks of the previous frame, and those close stereo points of the
-    previous frame that are not in the map (the visual-odometry points of ORB-SLAM2). The stereo
-    points stabilise the pose and are then discarded.
+    The points are the landmarks of the previous frame and its other close stereo points, which are
+    not in the map (the visual-odometry points of ORB-SLAM2). The stereo points stabilise the pose
+    and are then discarded.
 
     Args:
         frame: receives the pose and the matches.

@@ -79,8 +79,8 @@ def _analyse(n, pairs):
     position = np.full(n, -1, np.int64)
     first = np.zeros(n + 1, np.int64)
     for step in range(n):
-        # Choose a block of minimum degree. Of equal degrees, the lowest index (the oldest keyframe)
-        # wins.
+        # Choose a block of minimum degree. If several blocks have this degree, choose the one with
+        # the lowest index, which belongs to the oldest keyframe.
         chosen, least = -1, n
         for i in range(n):
             if position[i] < 0 and degree[i] < least:

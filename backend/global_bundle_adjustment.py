@@ -1,6 +1,6 @@
 """Global bundle adjustment: optimises hundreds of keyframes whose trajectory contains loops.
 
-The problem, the loss and the optimisation steps are those of ``bundle_adjustment``. Only the
+The problem, the loss and the optimisation steps are the same as in ``bundle_adjustment``. Only the
 reduced camera system is solved differently. Keyframes that share no landmark are not coupled in
 this system. The system is therefore stored as sparse 6x6 blocks and factorised by
 ``block_cholesky`` (Triggs et al., "Bundle adjustment - a modern synthesis", section 6.3).

@@ -368,9 +368,9 @@ def _likeliest(
 
 
 def _log_determinant(factors: Any, values: Any) -> float:
-    """Return the logarithm of the determinant of the normal matrix. It is NaN if GTSAM cannot
-    factorise the matrix. This happens if the standard deviations of the edges are much smaller than
-    those of the priors, for example on a drive of less than a metre."""
+    """Return the logarithm of the determinant of the normal matrix. The result is NaN if GTSAM
+    cannot factorise the matrix. This happens if the edges have much smaller standard deviations
+    than the priors, for example on a drive of less than a metre."""
     try:
         # GTSAM returns the log determinant of the triangular root.
         return 2.0 * float(factors.linearize(values).eliminateMultifrontal().logDeterminant())
@@ -415,8 +415,8 @@ def _factors(
     stretch: float = 0.0,
     drift: float = 1.0,
 ) -> _Factors:
-    """Create the factors of a pose-graph optimisation with GPS: those of the edges and those of the
-    fixes. The optimisation starts from the poses ``T_enu_k``.
+    """Create the factors of a pose-graph optimisation with GPS: factors for the edges and factors
+    for the fixes. The optimisation starts from the poses ``T_enu_k``.
 
     Args:
         cauchy: scale of the Cauchy loss of the fixes, in standard deviations of the fixes; None

@@ -55,8 +55,8 @@ def optimise_similarities(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfi
     """Find the ``(N, 4, 4)`` similarities that agree best with the edges. The optimisation starts
     from ``S_wc``.
 
-    The loss functions and the optimiser are those of ``pose_graph.optimise``. Fixed keyframes keep
-    their pose and their scale.
+    The loss functions and the optimiser are the same as in ``pose_graph.optimise``. Fixed keyframes
+    keep their pose and their scale.
     """
     import gtsam
 

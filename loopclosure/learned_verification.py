@@ -2,9 +2,9 @@
 
 Learned descriptors still match when the appearance has changed too much for ORB descriptors.
 
-The steps are those of :mod:`vslam.loopclosure.verification`. First, an initial pose is estimated.
-Then, guided matching uses all landmarks of the place, and the pose is refined. Finally, the same
-tests as with ORB descriptors reject places that only look similar.
+The steps are the same as in :mod:`vslam.loopclosure.verification`. First, an initial pose is
+estimated. Then, guided matching uses all landmarks of the place, and the pose is refined. Finally,
+the same tests as with ORB descriptors reject places that only look similar.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Computes precision, recall and derived measures from the scores of a loop detector.
 
-The definitions are those of published benchmarks. An example is recall at 100 % precision (Cummins
-and Newman, IJRR 2008). Tests check that the curves are identical to those of scikit-learn.
+The measures are defined as in published benchmarks. An example is recall at 100 % precision
+(Cummins and Newman, IJRR 2008). Tests check that the curves are identical to those of scikit-learn.
 """
 
 from __future__ import annotations

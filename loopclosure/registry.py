@@ -27,7 +27,7 @@ _ABOUT = {
     "capsule-pruned": "the Siamese capsule network, pruned",
     "capsule-paper": "the Siamese capsule network as the paper describes it",
 }
-# Detectors whose candidates are also verified by learned descriptors. The configuration can
+# Detectors whose candidates are also verified using learned descriptors. The configuration can
 # override this.
 LEARNED_VERIFICATION = ("both", *(name for name in NETWORKS if name != TO_THE_LETTER))
 

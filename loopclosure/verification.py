@@ -2,9 +2,9 @@
 
 Verification tests whether two keyframes show the same place, and estimates their relative pose.
 
-The first steps are those of ORB-SLAM (T-RO 2015, section VII-B) and, for stereo, of ORB-SLAM2 (T-RO
-2017, section III-D). The descriptors of two keyframes are matched, and a motion is estimated by
-RANSAC. Then all landmarks of the place are matched near their projections, and the pose is refined.
+The first steps follow ORB-SLAM (T-RO 2015, section VII-B) and, for stereo, ORB-SLAM2 (T-RO 2017,
+section III-D). The descriptors of two keyframes are matched, and a motion is estimated by RANSAC.
+Then all landmarks of the place are matched near their projections, and the pose is refined.
 
 ORB-SLAM then only counts inliers. However, if two different facades or cars look alike, there are
 many inliers, too. The tests in this module therefore also look for evidence against the loop. There
@@ -82,7 +82,7 @@ def verify(
     Returns:
         A loop edge. It is accepted with the reason "verified", or rejected with a different reason.
         The pose and the numbers of matches come from the last step that was completed. The inliers
-        are features of the query and landmarks of the place, without duplicates.
+        are pairs of a feature of the query and a landmark of the place, without duplicates.
     """
     query, match = candidate.query, candidate.match
     edge = LoopEdge.of(candidate)

@@ -77,10 +77,10 @@ def resized(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
 
 
 class KeyframeImages:
-    """Stores the images of keyframes as JPEG files in memory, about 40 kB each.
+    """Stores the images of keyframes as JPEG files in memory. An image takes about 40 kB.
 
-    Local descriptors would take thirty times as much memory. They are computed on demand, because
-    most of them are never needed.
+    The local descriptors of an image would take thirty times as much memory. They are computed on
+    demand, because most of them are never needed.
     """
 
     def __init__(self, network: LocalDescriptors) -> None:

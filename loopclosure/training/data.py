@@ -17,7 +17,7 @@ from vslam.errors import InputError, write_file
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN, ImageSource
 from vslam.loopclosure.siamese.images import Fit, Size
 
-# First and last frame of each sequence that training may use. Detectors are tested on the others.
+# First and last frame of each sequence that training may use. All other frames are test data.
 TRAINING_FRAMES = {"kitti00": (250, 1499)}
 # Groups of collections. Training may use only one collection of a group, because tests need the
 # other.

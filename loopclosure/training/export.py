@@ -79,7 +79,7 @@ def export_onnx(network: SiameseNetwork, path: Path, about: dict[str, Any] | Non
         from ONNX Runtime, for random images.
 
     Raises:
-        ResultsError: the file cannot be written, or its results differ from those of torch.
+        ResultsError: the file cannot be written, or ONNX Runtime and torch give different results.
     """
     parameters = network.n_parameters()
     network = for_inference(copy.deepcopy(network).cpu())

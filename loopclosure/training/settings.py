@@ -95,8 +95,8 @@ _BEST = TrainSettings(
     validation_images=400,
 )
 PRESETS = {
-    # The settings of the paper. The paper does not state the strengths of the augmentation or how
-    # pairs are mined.
+    # The settings of Zhou and Sun (2025). Their paper does not state the strengths of the
+    # augmentation or how pairs are mined.
     "paper": TrainSettings(),
     # The contrastive loss compares every image of a batch with every other image. The augmentation
     # is stronger. Most pairs show the same place, because this loss takes images of different

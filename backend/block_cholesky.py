@@ -2,9 +2,9 @@
 
 The structure of the matrix is analysed once for all iterations of an optimiser. The analysis
 computes a minimum degree elimination order (George and Liu, "The evolution of the minimum degree
-ordering algorithm", SIAM Review 1989) and the fill-in. It simulates the elimination on bit sets,
-which is feasible for a few thousand keyframes. The degrees are therefore exact. When a keyframe is
-eliminated, its remaining neighbours are the nonzero blocks of its column of the factor.
+ordering algorithm", SIAM Review 1989) and the fill-in. It simulates the elimination on bit sets, so
+that the degrees are exact. This is feasible for a few thousand keyframes. The neighbours that a
+keyframe still has when it is eliminated give the nonzero blocks of its column in the factor.
 
 The numeric factorisation is left-looking (Davis, "Direct Methods for Sparse Linear Systems",
 section 4.8) and works on blocks. The result is deterministic: the same input produces
@@ -30,14 +30,15 @@ class Structure(NamedTuple):
     in memory.
 
     Attributes:
-        order: ``(n,)`` int64, the caller's index of each block row, in elimination order.
+        order: ``(n,)`` int64. Entry i is the original index of the block row that is eliminated as
+            number i.
         first: ``(n + 1,)`` int64; the slots of column c are ``first[c]:first[c + 1]``.
-        row: ``(slots,)`` int32, block row of each slot, ascending within a column. The first slot
-            of a column is on the diagonal.
+        row: ``(slots,)`` int32 block row of each slot, ascending within a column. The first slot of
+            a column is on the diagonal.
         row_first: ``(n + 1,)`` int64; the blocks of row r to the left of the diagonal are
             ``row_slot[row_first[r]:row_first[r + 1]]``.
-        row_slot, row_column: ``(slots - n,)`` int32, slot and column of each block below the
-            diagonal. The blocks are sorted by row, then by column.
+        row_slot, row_column: ``(slots - n,)`` int32 slot and ``(slots - n,)`` int32 column of each
+            block below the diagonal. The blocks are sorted by row, then by column.
     """
 
     order: NDArray[np.int64]
@@ -49,12 +50,13 @@ class Structure(NamedTuple):
 
 
 def analyse(n: int, pairs: NDArray[np.int64]) -> Structure:
-    """Compute the elimination order and the fill-in of a system of ``n`` block rows.
+    """Compute the elimination order and the fill-in of a sparse system of ``n`` block rows.
 
-    This takes ``n * n / 8`` bytes of temporary memory.
+    The function takes ``n * n / 8`` bytes of temporary memory.
 
     Args:
-        pairs: ``(M, 2)`` block rows that are coupled, in any order; repetitions are allowed.
+        pairs: ``(M, 2)`` pairs of block rows that are coupled, in any order; repetitions are
+            allowed.
     """
     return Structure(*_analyse(n, np.ascontiguousarray(pairs, np.int64).reshape(-1, 2)))
 
@@ -77,8 +79,8 @@ def _analyse(n, pairs):
     position = np.full(n, -1, np.int64)
     first = np.zeros(n + 1, np.int64)
     for step in range(n):
-        # Choose a block of minimum degree. Of equal degrees, the lowest index (the oldest keyframe)
-        # wins.
+        # Choose a block of minimum degree. If several blocks have this degree, choose the one with
+        # the lowest index, which belongs to the oldest keyframe.
         chosen, least = -1, n
         for i in range(n):
             if position[i] < 0 and degree[i] < least:
@@ -131,11 +133,12 @@ def _analyse(n, pairs):
 
 @kernel
 def panel(structure, column):
-    """Index in ``S`` at which the panel of a column begins, and the width of the panel.
+    """Return where the panel of a matrix column begins in the array ``S``, and the width of the
+    panel.
 
     A panel holds the transposed blocks of one column side by side. Element (i, j) of the k-th block
-    is ``S[begin + j * width + 6 * k + i]``. The rows of a panel are therefore long, which suits
-    vector instructions.
+    is ``S[begin + j * width + 6 * k + i]``. In this layout, the rows of a panel are long, which
+    suits vector instructions.
     """
     first = structure.first[column]
     return BLOCK * BLOCK * first, BLOCK * (structure.first[column + 1] - first)
@@ -143,13 +146,14 @@ def panel(structure, column):
 
 @kernel
 def factor_solve(structure, S, x):
-    """Solve ``S x = rhs`` in place. Returns False if S is not positive definite.
+    """Solve the sparse linear system ``S x = rhs`` in place by Cholesky factorisation. Returns
+    False if S is not positive definite.
 
     Args:
         structure: the ``Structure`` of S.
-        S: ``(36 * slots,)`` float64, the lower triangle in elimination order, with one panel per
-            column (see ``panel``). The blocks of the fill-in are zero. Only the lower triangle of
-            diagonal blocks is read. S is overwritten with the factor.
+        S: ``(36 * slots,)`` float64, the lower triangle of the matrix in elimination order, with
+            one panel per column (see ``panel``). The blocks of the fill-in must be zero. Only the
+            lower triangle of diagonal blocks is read. S is overwritten with the factor.
         x: ``(n, 6)`` float64 right-hand side in elimination order. It is overwritten with the
             solution.
     """
@@ -205,8 +209,8 @@ def factor_solve(structure, S, x):
 
 @inner_kernel
 def add_product(S, start, pivot, end, row, place, update):
-    """Add the contribution of an earlier column to ``update``, which is later subtracted from the
-    current column. The slots of the earlier column are ``start:end``.
+    """Add the contribution of an earlier column of the factor to ``update``. The caller subtracts
+    ``update`` from the current column. The slots of the earlier column are ``start:end``.
 
     ``pivot`` is the slot of the earlier column whose row equals the index of the current column.
     Blocks that are adjacent in both columns are multiplied together, because long rows fill vector
@@ -244,8 +248,8 @@ def add_product(S, start, pivot, end, row, place, update):
 
 @inner_kernel
 def factor_panel(S, base, width):
-    """Factor the diagonal block of a column, and divide the blocks below it by the factor. Returns
-    False if the diagonal block is not positive definite."""
+    """Factorise the diagonal block of a column, and divide the blocks below it by the factor.
+    Returns False if the diagonal block is not positive definite."""
     begin, columns = np.uintp(base), np.uintp(width)
     for j in range(np.uintp(BLOCK)):
         own = begin + j * columns

@@ -21,13 +21,13 @@ from vslam.reprojection import chi_square, residual, unpacked
 
 @dataclass(frozen=True)
 class BundleProblem:
-    """The input of bundle adjustment: K cameras, P landmarks, and O observations sorted by
-    landmark.
+    """The input of bundle adjustment: K cameras, P landmarks, and O observations. The observations
+    are sorted by landmark.
 
     Attributes:
         T_cw: ``(K, 4, 4)`` poses of the cameras (world to camera).
-        n_free: number of cameras that are optimised. They come first. The other cameras are held
-            fixed.
+        n_free: number of cameras that are optimised. These cameras come first in ``T_cw``. All
+            other cameras are held fixed.
         points: ``(P, 3)`` landmarks in the world frame.
         first: ``(P + 1,)`` int64; the observations of point p are ``first[p]:first[p + 1]``.
         camera: ``(O,)`` int64, index of the camera of each observation.
@@ -51,7 +51,8 @@ class BundleProblem:
     disparity_weight: NDArray[np.float64] | None = None
 
     def disparity_weights(self) -> NDArray[np.float64]:
-        """``(O,)`` float64: ``disparity_weight``, or the default ratio from ``intrinsics``."""
+        """Return ``disparity_weight``, or the ratio in ``intrinsics`` for all observations if
+        ``disparity_weight`` is None. The result is ``(O,)`` float64."""
         if self.disparity_weight is not None:
             return self.disparity_weight
         return np.full(len(self.camera), self.intrinsics[5])
@@ -74,7 +75,7 @@ class NormalEquations(NamedTuple):
     """The block-wise normal equations of Gauss-Newton.
 
     Attributes:
-        W: ``(O, 3, 6)`` blocks that couple a point and a camera, one per observation.
+        W: ``(O, 3, 6)`` blocks that couple a point and a camera, one block for each observation.
         V, g: ``(P, 3, 3)`` Hessian and ``(P, 3)`` right-hand side of the points.
         U, b: ``(K, 6, 6)`` Hessian and ``(K, 6)`` right-hand side of the free cameras.
     """
@@ -112,7 +113,7 @@ def adjust(
     use: NDArray[np.bool_] | None = None,
     tolerance: float = 1e-6,
 ) -> BundleSolution:
-    """Minimise the robust reprojection error by Levenberg-Marquardt.
+    """Run bundle adjustment: minimise the robust reprojection error by Levenberg-Marquardt.
 
     Args:
         iterations: maximum number of iterations.
@@ -133,7 +134,8 @@ def adjust(
 
 
 def observations_of(problem: BundleProblem, use: NDArray[np.bool_] | None) -> Observations:
-    """The observations of a problem, as arguments of kernels. ``adjust`` explains ``use``."""
+    """Convert the observations of a bundle problem to arguments of kernels. ``use`` is an ``(O,)``
+    bool mask of the observations that are used; None uses all observations."""
     return Observations(
         problem.first,
         problem.camera,
@@ -146,8 +148,8 @@ def observations_of(problem: BundleProblem, use: NDArray[np.bool_] | None) -> Ob
 
 
 def empty_equations(n_free: int, n_points: int, n_observations: int) -> NormalEquations:
-    """Allocate the normal equations. W is set to 0, because the blocks of fixed cameras and of
-    unused observations are never written."""
+    """Allocate arrays for the normal equations. W is set to 0, because its blocks for fixed cameras
+    and unused observations are never written."""
     return NormalEquations(
         np.zeros((n_observations, 3, 6)),
         np.empty((n_points, 3, 3)),
@@ -165,8 +167,8 @@ def _in_camera(T, p, q):
 
 @kernel
 def robust_cost(T_cw, points, observations, inlier):
-    """Half the sum of the Huber losses. Writes into ``inlier`` whether each observation passes the
-    chi-square test."""
+    """Compute half the sum of the Huber losses. The function also writes into ``inlier`` whether
+    each observation passes the chi-square test."""
     first, camera, uvr, inverse_sigma2, disparity_weight, used, intrinsics = observations
     fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
     cost = 0.0
@@ -226,7 +228,8 @@ def _adjust(T_start, n_free, points_start, observations, equations, iterations, 
 
 @kernel
 def linearise(T_cw, n_free, points, observations, equations):
-    """Write the normal equations at the current estimate into ``equations``."""
+    """Linearise the reprojection errors at the current estimate, and write the normal equations
+    into ``equations``."""
     first, camera, uvr, inverse_sigma2, disparity_weight, used, intrinsics = observations
     W, V, g, U, b = equations
     fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
@@ -297,8 +300,9 @@ def linearise(T_cw, n_free, points, observations, equations):
 
 @inner_kernel
 def reduce_points(n_free, observations, equations, damping, S, rhs, V_inverse):
-    """Eliminate the points. Writes the reduced camera system ``S x = rhs`` (the upper triangle of
-    S) and the inverses of the damped point blocks."""
+    """Eliminate the points from the normal equations by the Schur complement. The function writes
+    the upper triangle of S and the right-hand side of the reduced camera system ``S x = rhs``. It
+    also writes the inverses of the damped point blocks."""
     first, camera, used = observations.first, observations.camera, observations.used
     W, V, g, U, b = equations
     S[:] = 0.0
@@ -338,8 +342,8 @@ def reduce_points(n_free, observations, equations, damping, S, rhs, V_inverse):
 
 @inner_kernel
 def invert_damped(V, damping, N):
-    """Damp the diagonal of a point's ``(3, 3)`` block and write the inverse into ``N``. If the
-    block is singular, zeros are written, so that the point does not move."""
+    """Damp the diagonal of a point's ``(3, 3)`` block, and write the inverse of the block into
+    ``N``. If the block is singular, zeros are written, so that the point does not move."""
     scale = 1.0 + damping
     v00, v11, v22 = V[0, 0] * scale, V[1, 1] * scale, V[2, 2] * scale
     v01, v02, v12 = V[0, 1], V[0, 2], V[1, 2]
@@ -355,7 +359,7 @@ def invert_damped(V, damping, N):
 
 @kernel
 def step_points(n_free, observations, equations, camera_step, V_inverse, points, points_trial):
-    """Back-substitution: compute the step of each point from the steps of the cameras."""
+    """Compute the step of each point from the steps of the cameras (back-substitution)."""
     first, camera, used = observations.first, observations.camera, observations.used
     W, g = equations.W, equations.g
     for p in range(len(points)):
@@ -376,7 +380,7 @@ def step_points(n_free, observations, equations, camera_step, V_inverse, points,
 
 @kernel
 def step_cameras(n_free, camera_step, T_cw, T_trial):
-    """Move each free camera by its twist.
+    """Move each free camera by its step, which is a twist.
 
     Matrices are copied element by element, because Numba takes seconds to compile the broadcasting
     check of a whole-array assignment.
@@ -390,8 +394,9 @@ def step_cameras(n_free, camera_step, T_cw, T_trial):
 
 @kernel
 def cholesky_solve(S, x):
-    """Solve ``S x = rhs`` in place. ``x`` holds the right-hand side on entry and the solution on
-    return. Only the upper triangle of S is read. Returns False if S is not positive definite."""
+    """Solve the linear system ``S x = rhs`` in place. ``x`` holds the right-hand side on entry and
+    the solution on return. Only the upper triangle of S is read. Returns False if S is not positive
+    definite."""
     n = len(x)
     for i in range(n):
         row = S[i]

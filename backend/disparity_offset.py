@@ -5,10 +5,10 @@ some hundredths of a degree, or a principal point may be wrong by a tenth of a p
 shift all disparities by nearly the same amount. Depths are then wrong by a fraction that grows with
 the depth.
 
-A single stereo pair does not reveal the offset. A moving camera does, because one motion must
-explain how both near and far points move in the image. So the offset becomes an additional unknown
-of bundle adjustment that is common to all keyframes (self-calibration: Triggs et al., "Bundle
-adjustment - a modern synthesis", section 10).
+The offset cannot be determined from a single stereo pair. It can be determined from a moving
+camera, because one motion must explain how both near and far points move in the image. Therefore,
+the offset becomes an additional unknown of bundle adjustment that is common to all keyframes
+(self-calibration: Triggs et al., "Bundle adjustment - a modern synthesis", section 10).
 
 The offset is estimated in disjoint windows of keyframes. The estimates are weighted by their
 information (inverse variance) and combined with a prior of mean 0.
@@ -38,8 +38,8 @@ TOLERANCE = 1e-5  # least relative decrease of the cost; STEP changes it by some
 
 
 def map_and_calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Run ``map_keyframe``. For a stereo camera, also update the disparity offset after every
-    ``stereo.offset_keyframes`` keyframes."""
+    """Run local mapping for a new keyframe (``map_keyframe``). For a stereo camera, the disparity
+    offset of the map is also updated after every ``stereo.offset_keyframes`` keyframes."""
     map_keyframe(map_, keyframe, camera, config)
     if config.stereo.offset_sigma > 0.0 and camera.sensor == "stereo":
         _calibrate(map_, keyframe, camera, config)
@@ -70,13 +70,15 @@ def _calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None
 
 
 def offset_sigma(information: float, config: StereoConfig) -> float:
-    """Standard deviation of the disparity offset due to the noise of its estimate, in pixels.
+    """Compute the standard deviation of the disparity offset, in pixels, that is caused by the
+    noise of the measurements.
 
-    The prior suppresses a share of a true offset. This share is an error of the calibration and is
-    not included.
+    The offset is estimated with a prior of mean 0, which makes the estimate smaller than the true
+    offset. The result does not include this error.
 
     Args:
-        information: information of the measurements, see ``Scalars.offset_information``.
+        information: sum of the information (inverse variance) of the measurements, see
+            ``Scalars.offset_information``.
     """
     if information <= 0.0:
         return 0.0
@@ -85,11 +87,12 @@ def offset_sigma(information: float, config: StereoConfig) -> float:
 
 
 def remaining_offset(problem: BundleProblem) -> tuple[float, float]:
-    """The offset that must be added to all disparities of a bundle problem, in pixels, and its
-    information (inverse variance). Returns 0, 0 if the problem does not determine the offset.
+    """Estimate the offset that must be added to all disparities of a bundle problem. Returns the
+    offset, in pixels, and its information (inverse variance). Returns 0, 0 if the problem does not
+    determine the offset.
 
-    After bundle adjustment, the cost is nearly quadratic in the offset. So a parabola is fitted to
-    the costs at three offsets.
+    After bundle adjustment, the cost is nearly quadratic in the offset. Therefore, a parabola is
+    fitted to the costs at three offsets.
     """
     first = adjust(problem, iterations=5)
     start = replace(problem, T_cw=first.T_cw, points=first.points)

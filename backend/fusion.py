@@ -1,4 +1,5 @@
-"""Fusion: merges landmarks that represent the same point in the world (ORB-SLAM, VI-C)."""
+"""Fusion: merges landmarks that represent the same point in the world (section VI-C of the ORB-SLAM
+paper)."""
 
 from __future__ import annotations
 
@@ -16,12 +17,13 @@ from vslam.reprojection import chi_square_ratio, unpacked
 
 
 def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Merge the landmarks of a keyframe and its neighbours that represent the same points.
+    """Fuse the landmarks of a keyframe with the landmarks of its neighbours. Landmarks that
+    represent the same point in the world are merged.
 
     The landmarks of the keyframe are projected into its neighbours, and the landmarks of the
     neighbours into the keyframe. If a projected landmark matches a feature that observes another
-    landmark, the two landmarks are merged. If it matches a feature without a landmark, an
-    observation is added.
+    landmark, the two landmarks are merged. If a projected landmark matches a feature without a
+    landmark, an observation is added.
     """
     neighbours = fusion_neighbours(map_, keyframe, config)
     for neighbour in neighbours:
@@ -31,11 +33,12 @@ def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config)
 
 
 def fusion_neighbours(map_: Map, keyframe: int, config: Config) -> list[int]:
-    """Ids of the keyframes near a keyframe whose landmarks are fused with its own (ORB-SLAM2).
+    """Find the neighbours of a keyframe whose landmarks are fused with the landmarks of the
+    keyframe (ORB-SLAM2). Returns the ids of the neighbours.
 
-    They are the ``mapping.fuse_neighbours`` keyframes that share the most landmarks with the
-    keyframe. For each of them, the five keyframes that share the most landmarks with it are
-    included as well.
+    The neighbours are the ``mapping.fuse_neighbours`` keyframes that share the most landmarks with
+    the keyframe. For each of these neighbours, the five keyframes that share the most landmarks
+    with the neighbour are included as well.
     """
     first, _ = map_.covisible(keyframe)
     chosen = first[: config.mapping.fuse_neighbours].tolist()
@@ -56,15 +59,16 @@ def fuse_loop(
     camera: Camera,
     config: Config,
 ) -> int:
-    """Fuse the landmarks of both sides of a loop that represent the same points (ORB-SLAM, VII-D).
+    """Fuse the landmarks on one side of a loop with the landmarks on the other side, after the loop
+    was corrected (section VII-D of the ORB-SLAM paper).
 
-    First, the pairs that loop verification matched are fused. Then the landmarks of each side are
-    projected into the keyframes of the other side.
+    First, the pairs of features and landmarks that loop verification matched are fused. Then the
+    landmarks of each side are projected into the keyframes of the other side.
 
     Args:
         edge: the loop. Its ``features`` and ``landmarks`` must be set.
-        query_side, match_side: ids of the keyframes around the two ends of the loop. Their poses
-            must already be corrected.
+        query_side, match_side: ids of the keyframes around the two ends of the loop. The poses of
+            these keyframes must already be corrected.
 
     Returns:
         Number of fusions.
@@ -85,8 +89,9 @@ def fuse_loop(
 
 @kernel
 def _fuse_pairs(a, rows, landmarks, keyframe):
-    """Make each row observe its landmark. If the row already observes another landmark, the two
-    landmarks are merged. Returns the number of fusions."""
+    """Assign each of the given landmarks to a feature of a keyframe. If the feature already
+    observes another landmark, the two landmarks are merged. ``rows`` gives the row of each feature
+    in the observation arrays of the map. Returns the number of fusions."""
     fused = 0
     for i in range(len(rows)):
         row, landmark = rows[i], landmarks[i]
@@ -106,8 +111,8 @@ def _fuse_pairs(a, rows, landmarks, keyframe):
 def fuse_into(
     map_: Map, landmarks: NDArray[np.int32], keyframe: int, camera: Camera, config: Config
 ) -> int:
-    """Fuse ``(N,)`` landmarks with the features and landmarks of a keyframe. Returns the number of
-    fusions."""
+    """Project ``(N,)`` landmarks into a keyframe, and fuse them with its features and landmarks.
+    Returns the number of fusions."""
     a, rows = map_.arrays, map_.rows(keyframe)
     grid = FeatureGrid.of_positions(a.xy[rows], camera.width, camera.height)
     return _fuse(

@@ -1,9 +1,9 @@
-"""Bundle adjustment of hundreds of keyframes with loops.
+"""Global bundle adjustment: optimises hundreds of keyframes whose trajectory contains loops.
 
-The problem, the loss and the optimisation steps are those of ``bundle_adjustment``. Only the
+The problem, the loss and the optimisation steps are the same as in ``bundle_adjustment``. Only the
 reduced camera system is solved differently. Keyframes that share no landmark are not coupled in
-this system. It is therefore stored as sparse 6x6 blocks and factorised by ``block_cholesky``
-(Triggs et al., "Bundle adjustment - a modern synthesis", section 6.3).
+this system. The system is therefore stored as sparse 6x6 blocks and factorised by
+``block_cholesky`` (Triggs et al., "Bundle adjustment - a modern synthesis", section 6.3).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def adjust_globally(
 ) -> BundleSolution:
     """Minimise the robust reprojection error of many keyframes.
 
-    The function does the same as ``bundle_adjustment.adjust``, but exploits the sparsity of the
+    The function does the same as ``bundle_adjustment.adjust``, but it exploits the sparsity of the
     problem. A keyframe must not observe a landmark more than once. The global interpreter lock is
     released nearly all the time.
 
@@ -149,7 +149,8 @@ def working_order(first, rank, n_cameras):
 
 @kernel
 def coupled_cameras(first, camera, n_free):
-    """``(M, 2)`` int64 pairs of free cameras that observe a common point. Each pair occurs once."""
+    """Find all pairs of free cameras that observe a common point. Returns ``(M, 2)`` int64 indices.
+    Each pair occurs once."""
     start, points = points_of_cameras(first, camera, n_free)
     met = np.empty(n_free, np.int64)
     last = np.full(n_free, -1)  # the last camera ``i`` that each camera was paired with
@@ -170,10 +171,10 @@ def coupled_cameras(first, camera, n_free):
 
 @inner_kernel
 def points_of_cameras(first, camera, n_free):
-    """The points that each free camera observes.
+    """List the points that each free camera observes.
 
     Returns:
-        ``start`` int64, and ``points`` ``(N,)`` int32. Camera k observes
+        ``start``, an int64 array, and ``points``, ``(N,)`` int32. Camera k observes
         ``points[start[k]:start[k + 1]]``.
     """
     start = np.zeros(n_free + 2, np.int64)
@@ -193,10 +194,11 @@ def points_of_cameras(first, camera, n_free):
 
 @inner_kernel
 def cameras_met(i, start, points, first, camera, n_free, last, met):
-    """Find the free cameras that observe a point in common with camera ``i`` and have a larger
-    index than ``i``.
+    """Find the free cameras that have a larger index than ``i`` and observe a point that camera
+    ``i`` also observes.
 
-    They are written into ``met``, and their number is returned. ``last`` prevents repetitions.
+    The indices of these cameras are written into ``met``, and their number is returned. ``last``
+    prevents repetitions.
     """
     n = 0
     for p in points[start[i] : start[i + 1]]:
@@ -211,7 +213,8 @@ def cameras_met(i, start, points, first, camera, n_free, last, met):
 
 @kernel
 def pair_slots(structure, first, camera, n_free):
-    """``(N,)`` int32 slot in the Cholesky factor for each pair of observations of a point.
+    """For each pair of observations of the same point, find the block that couples their two
+    cameras. Returns ``(N,)`` int32 slots of these blocks in the Cholesky factor.
 
     The pairs are in the order in which ``reduce_points_sparsely`` visits them. Cameras are in
     elimination order.
@@ -243,7 +246,8 @@ def pair_slots(structure, first, camera, n_free):
 def reduce_points_sparsely(
     structure, slots, n_free, observations, equations, damping, S, x, V_inverse
 ):
-    """Eliminate the points, which gives the reduced camera system ``S x = rhs``.
+    """Eliminate the points from the normal equations by the Schur complement, which gives the
+    reduced camera system ``S x = rhs``.
 
     ``S`` is written as panels of ``block_cholesky``. The right-hand side is written into ``x``.
     """
@@ -284,7 +288,7 @@ def reduce_points_sparsely(
 
 @inner_kernel
 def subtract_coupling(Y, W, o, S, offset, width):
-    """Subtract ``Y' W[o]`` from the block of ``S`` that starts at ``offset``."""
+    """Subtract the product ``Y' W[o]`` from the block of ``S`` that starts at ``offset``."""
     start, step = np.uintp(offset), np.uintp(width)
     for i in range(np.uintp(6)):
         y0, y1, y2 = Y[0, i], Y[1, i], Y[2, i]

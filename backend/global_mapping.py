@@ -26,13 +26,14 @@ class GlobalSnapshot:
     """A copy of the map as a bundle problem, with the ids of its cameras, points and observations.
 
     Attributes:
-        problem: the bundle problem. Free keyframes come first, followed by the fixed keyframes.
+        problem: the bundle problem. The keyframes that are optimised come first, followed by the
+            keyframes that are held fixed.
         keyframes: ``(K,)`` int64 keyframe id of each camera of the problem.
         landmarks: ``(P,)`` int32 landmark id of each point of the problem.
-        rows: ``(O,)`` int64 row of each observation in the map's arrays.
+        rows: ``(O,)`` int64 row of each observation in the observation arrays of the map.
         n_keyframes, n_landmarks: numbers of keyframes and landmarks that had ever been created at
-            the time of the snapshot. Keyframes and landmarks with an id of at least these numbers
-            are newer than the snapshot.
+            the time of the snapshot. A keyframe is newer than the snapshot if its id is at least
+            ``n_keyframes``. A landmark is newer if its id is at least ``n_landmarks``.
     """
 
     problem: BundleProblem
@@ -44,7 +45,8 @@ class GlobalSnapshot:
 
 
 def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
-    """Copy all keyframes and landmarks that have not been culled into a bundle problem.
+    """Copy the map into a bundle problem for global bundle adjustment. Keyframes and landmarks that
+    have been culled are left out.
 
     The first keyframe of each connected part of the map is held fixed, because nothing else
     determines the position of the part. Two keyframes are connected if they observe a common
@@ -62,9 +64,11 @@ def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
 
 @kernel
 def connected_parts(a, landmarks, n_keyframes):
-    """``(K,)`` int64: for each keyframe, the first keyframe of its connected part of the map.
+    """Find the connected part of the map that each keyframe belongs to. A part is denoted by its
+    first keyframe, so the result is the ``(K,)`` int64 id of this keyframe.
 
-    Keyframes that observe a common landmark are connected (union-find).
+    Two keyframes are connected if they observe a common landmark. The parts are found by
+    union-find.
     """
     part = np.arange(n_keyframes)
     for landmark in landmarks:
@@ -89,12 +93,13 @@ def connected_parts(a, landmarks, n_keyframes):
 
 
 def merge_solution(map_: Map, snapshot: GlobalSnapshot, solution: BundleSolution) -> None:
-    """Apply the solution of a snapshot to the map. The map may have changed since the snapshot.
+    """Apply the result of global bundle adjustment to the map. The map may have changed since the
+    snapshot.
 
-    Keyframes and landmarks of the snapshot that still exist take their new positions. Newer
+    Keyframes and landmarks of the snapshot that still exist are moved to their new positions. Newer
     keyframes keep their pose relative to their parent in the spanning tree (Mur-Artal and Tardós,
-    ORB-SLAM2, III-D). Newer landmarks move with their anchor keyframe. An observation that failed
-    the chi-square test is removed if its row still observes the same landmark.
+    ORB-SLAM2, section III-D). Newer landmarks move with their anchor keyframe. An observation that
+    failed the chi-square test is removed if its feature still observes the same landmark.
     """
     a = map_.arrays
     T_cw_old = a.T_cw[: map_.n_keyframes].copy()
@@ -116,7 +121,9 @@ def merge_solution(map_: Map, snapshot: GlobalSnapshot, solution: BundleSolution
 
 @kernel
 def remove_unchanged(a, rows, landmarks):
-    """Unlink each of ``(N,)`` rows that still observes its landmark."""
+    """Remove N observations that still exist unchanged. ``rows`` gives their ``(N,)`` rows in the
+    observation arrays of the map. An observation is removed only if it still belongs to the given
+    landmark."""
     for i in range(len(rows)):
         if a.landmark[rows[i]] == landmarks[i]:
             unlink(a, rows[i])

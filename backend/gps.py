@@ -1,23 +1,24 @@
 """Georeferences a finished map by adding GPS fixes to its pose graph.
 
 First, RANSAC with Umeyama's closed form (TPAMI 1991) aligns the map frame with the local
-east-north-up frame (ENU). Parts of the map that tracking did not connect are aligned separately.
-Then the keyframes are optimised. The graph has the edges of the essential graph and a GPS factor
-for each fix. No keyframe is held fixed.
+east-north-up frame (ENU). If tracking was lost, the map consists of parts that tracking did not
+connect. These parts are aligned separately. Then the poses of the keyframes are optimised in a pose
+graph. The graph has the edges of the essential graph and a GPS factor for each fix. No keyframe is
+held fixed.
 
-At first, fixes have a Cauchy loss with a large scale, which shrinks from one optimisation to the
-next. Even a map that has drifted far is then pulled to its fixes. Afterwards, fixes that fail a
-chi-square test are discarded, and the remaining fixes have a Gaussian loss.
+At first, fixes have a Cauchy loss with a large scale. The scale shrinks from one optimisation to
+the next. In this way, even a map that has drifted far is pulled to its fixes. Afterwards, fixes
+that fail a chi-square test are discarded, and the remaining fixes have a Gaussian loss.
 
-The error of GPS is mostly a bias that changes slowly (atmosphere, reflections). A hundred fixes in
-ten seconds therefore provide little more information than one. For this reason, all fixes within
-``CORRELATION_S`` together have the weight of a single fix.
+The error of GPS is mostly a bias that changes slowly, which is caused by the atmosphere and by
+reflections. A hundred fixes in ten seconds therefore provide little more information than a single
+fix. For this reason, all fixes within ``CORRELATION_S`` together have the weight of a single fix.
 
-The drift of a metric map depends on the camera, its calibration and the loops that were closed. One
-drift model of the pose graph must hold for all maps. With this model, a good map would be bent
-towards the bias of the fixes. Therefore, the standard deviations of the drift model are multiplied
-by the factor for which the fixes are most likely (empirical Bayes: MacKay, Bayesian Interpolation,
-1992).
+The drift of a metric map depends on the camera, its calibration and the loops that were closed.
+However, the pose graph has a single drift model for all maps. With this model, a map with little
+drift would be bent towards the bias of the fixes. Therefore, the standard deviations of the drift
+model are multiplied by a factor. The factor is chosen so that the fixes become most likely
+(empirical Bayes: MacKay, Bayesian Interpolation, 1992).
 """
 
 from __future__ import annotations
@@ -72,8 +73,8 @@ class Positions:
 
     Attributes:
         seconds: ``(M,)`` times of the measurements, seconds.
-        keyframe: ``(M,)`` int64 index of a keyframe. ``arm`` and ``lever`` are given in the frame
-            of this keyframe.
+        keyframe: ``(M,)`` int64 index of the keyframe in whose frame ``arm`` and ``lever`` are
+            given.
         arm: ``(M, 3)`` estimated position of the camera, in units of the map.
         lever: ``(M, 3)`` vector from the camera to the antenna, in metres.
         enu: ``(M, 3)`` measured position relative to a reference point: east, north, up, in metres.
@@ -88,13 +89,13 @@ class Positions:
     sigma: Array
 
     def select(self, chosen: NDArray[np.bool_]) -> Positions:
-        """The positions where the ``(M,)`` bool ``chosen`` is True."""
+        """Return the positions for which ``chosen``, an ``(M,)`` bool array, is True."""
         return Positions(*(values[chosen] for values in vars(self).values()))
 
     @property
     def crowding(self) -> Array:
-        """``(M,)`` number of positions in a time window of ``CORRELATION_S`` around each position,
-        including the position itself."""
+        """Count the positions in a time window of ``CORRELATION_S`` around each position. Returns
+        ``(M,)`` numbers. The position itself is counted, too."""
         times = np.sort(self.seconds)
         first = np.searchsorted(times, self.seconds - 0.5 * CORRELATION_S, "left")
         last = np.searchsorted(times, self.seconds + 0.5 * CORRELATION_S, "right")
@@ -111,8 +112,9 @@ class Anchored:
         used: ``(M,)`` bool, True for fixes that passed the chi-square test.
         residual_m: root mean square distance of the used fixes from the trajectory.
         S_enu_w: ``(4, 4)`` alignment of the whole map before the optimisation.
-        level: False if the fixes lie on a straight line. The rotation about the line is then
-            determined by the assumption that the camera is upright.
+        level: whether the fixes determine all rotations of the map. It is False if the fixes lie on
+            a straight line. The rotation about the line is then determined by the assumption that
+            the camera is upright.
     """
 
     T_enu_k: Array
@@ -134,9 +136,9 @@ def anchor(
     Args:
         graph: the essential graph of the map.
         seconds: ``(N,)`` times of the keyframes.
-        metric: whether the unit of the map is the metre, up to errors of the calibration. It is
-            False for a monocular map. In this case, the scale and its drift are estimated without a
-            prior.
+        metric: whether the unit of the map is the metre, apart from errors of the calibration. It
+            must be False for a monocular map. In this case, the scale and its drift are estimated
+            without a prior.
 
     Raises:
         InputError: the drive is too short to determine its direction.
@@ -198,12 +200,13 @@ class Alignment:
 
 
 def align(T_wk: Array, positions: Positions, *, metric: bool, seed: int = 0) -> Alignment:
-    """Align a map with its fixes by RANSAC.
+    """Align a map with its GPS fixes using RANSAC.
 
-    The scale of a metric map is estimated as well. If the calibrated baseline is 1 % too long, for
-    example, the map is 1 % too large. The estimate is a weighted mean of two scales: the scale that
-    the fixes suggest, and the scale of the calibration, which is 1. The weights are the inverse
-    variances. ``_METRIC`` is the standard deviation of the calibrated scale.
+    The scale of a metric map is estimated as well, because the calibration may be inaccurate. For
+    example, if the calibrated baseline is 1 % too long, the map is 1 % too large. The estimate is a
+    weighted mean of two scales: the scale that the fixes suggest, and the scale of the calibration,
+    which is 1. The weights are the inverse variances. ``_METRIC`` is the standard deviation of the
+    calibrated scale.
 
     Args:
         T_wk: ``(N, 4, 4)`` poses of the keyframes in the map (camera to world).
@@ -249,8 +252,9 @@ def align(T_wk: Array, positions: Positions, *, metric: bool, seed: int = 0) -> 
 
 
 def _umeyama(p: Array, q: Array, up: Array, fixed: float | None) -> Array:
-    """``(..., 4, 4)`` similarity transforms that map ``(..., M, 3)`` points p to q. Their scale is
-    ``fixed``. If ``fixed`` is None, the scale is estimated.
+    """Compute the ``(..., 4, 4)`` similarity transforms that map ``(..., M, 3)`` points p to points
+    q (Umeyama's closed form). Their scale is ``fixed``. If ``fixed`` is None, the scale is
+    estimated.
 
     Points on a line do not determine the rotation about this line. In this case, the upward axes
     ``up`` of the camera determine the rotation. In all other cases, these axes have too little
@@ -278,13 +282,14 @@ def _umeyama(p: Array, q: Array, up: Array, fixed: float | None) -> Array:
 
 
 def _mapped(S: Array, points: Array) -> Array:
-    """``(M, 3)`` points transformed by ``(..., 4, 4)`` similarities. The result is
+    """Transform ``(M, 3)`` points by ``(..., 4, 4)`` similarities. The result has the shape
     ``(..., M, 3)``."""
     return points @ np.swapaxes(S[..., :3, :3], -2, -1) + S[..., None, :3, 3]
 
 
 def _aligned(T_wk: Array, S_enu_w: Array) -> tuple[Array, Array]:
-    """Poses ``T_enu_k`` and scales of the keyframes after an alignment."""
+    """Apply the similarity transform ``S_enu_w`` to the poses of the keyframes. Returns the new
+    poses ``T_enu_k`` and the scales."""
     scale = float(scale_of(S_enu_w))
     T_enu_k = S_enu_w @ T_wk
     T_enu_k[:, :3, :3] /= scale
@@ -292,12 +297,13 @@ def _aligned(T_wk: Array, S_enu_w: Array) -> tuple[Array, Array]:
 
 
 def _points(T: Array, points: Array) -> Array:
-    """``(M, 3)`` points, each transformed by one of ``(M, 4, 4)`` poses."""
+    """Transform each of ``(M, 3)`` points by the corresponding pose of ``(M, 4, 4)`` poses."""
     return np.einsum("mij,mj->mi", T[:, :3, :3], points) + T[:, :3, 3]
 
 
 def _antenna(positions: Positions, scale: Array) -> Array:
-    """``(M, 3)`` positions of the antenna in the frames of the keyframes, in metres."""
+    """Compute the ``(M, 3)`` positions of the antenna, in metres. Each position is given in the
+    frame of its keyframe."""
     return positions.arm * scale[positions.keyframe, None] + positions.lever
 
 
@@ -310,11 +316,11 @@ def _chi2(positions: Positions, T_enu_k: Array, scale: Array) -> Array:
 
 
 def _local_scale(T_wk: Array, T_enu_k: Array, scale: Array, part: NDArray[np.int64]) -> Array:
-    """``(N,)`` metres per unit of the map at each keyframe.
+    """Estimate the scale of the map at each keyframe, as ``(N,)`` metres per unit of the map.
 
     The scale is the length of the path around the keyframe in ENU, divided by the length of the
-    same path in the map. The path stays within the keyframe's part of the map. Where its length is
-    0, the previous ``scale`` is returned.
+    same path in the map. The path stays within the keyframe's part of the map. Where the length of
+    the path is 0, the previous ``scale`` is returned.
     """
     scale = scale.copy()
     for label in np.unique(part):
@@ -331,8 +337,8 @@ def _local_scale(T_wk: Array, T_enu_k: Array, scale: Array, part: NDArray[np.int
 def _likeliest(
     factors: Callable[..., _Factors], part: NDArray[np.int64], config: PoseGraphConfig
 ) -> Array:
-    """``(N, 4, 4)`` optimised poses. The drift factor is the one of ``_DRIFTS`` for which the fixes
-    are most likely, given the edges.
+    """Optimise the poses with each drift factor of ``_DRIFTS``. Returns the ``(N, 4, 4)`` poses for
+    the factor with which the fixes are most likely, given the edges.
 
     The likelihood of the fixes is an integral over all poses of the keyframes. It is computed by
     Laplace's approximation. This approximation depends on the error at the optimum and on the
@@ -362,9 +368,9 @@ def _likeliest(
 
 
 def _log_determinant(factors: Any, values: Any) -> float:
-    """Logarithm of the determinant of the normal matrix. NaN if GTSAM cannot eliminate the matrix.
-    This happens if the edges are much stiffer than the priors, for example on a drive of less than
-    a metre."""
+    """Return the logarithm of the determinant of the normal matrix. The result is NaN if GTSAM
+    cannot factorise the matrix. This happens if the edges have much smaller standard deviations
+    than the priors, for example on a drive of less than a metre."""
     try:
         # GTSAM returns the log determinant of the triangular root.
         return 2.0 * float(factors.linearize(values).eliminateMultifrontal().logDeterminant())
@@ -373,7 +379,8 @@ def _log_determinant(factors: Any, values: Any) -> float:
 
 
 def _optimised(factors: _Factors, config: PoseGraphConfig) -> Array:
-    """``(N, 4, 4)`` poses that agree best with the edges and the fixes."""
+    """Find the ``(N, 4, 4)`` poses of the keyframes that agree best with the edges and the
+    fixes."""
     factors.vision.push_back(factors.fixes)
     return _poses(minimised(factors.vision, factors.start, config))
 
@@ -383,7 +390,7 @@ def _poses(values: Any) -> Array:
 
 
 class _Factors(NamedTuple):
-    """The factors of an optimisation, and where it starts.
+    """The factors of a pose-graph optimisation with GPS, and its initial values.
 
     Attributes:
         vision: ``gtsam.NonlinearFactorGraph`` of the edges.
@@ -408,7 +415,8 @@ def _factors(
     stretch: float = 0.0,
     drift: float = 1.0,
 ) -> _Factors:
-    """The factors of edges and fixes. The optimisation starts from ``T_enu_k``.
+    """Create the factors of a pose-graph optimisation with GPS: factors for the edges and factors
+    for the fixes. The optimisation starts from the poses ``T_enu_k``.
 
     Args:
         cauchy: scale of the Cauchy loss of the fixes, in standard deviations of the fixes; None

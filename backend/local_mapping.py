@@ -1,4 +1,4 @@
-"""Local mapping: updates the map after each new keyframe (ORB-SLAM, section VI)."""
+"""Local mapping: updates the map after each new keyframe (section VI of the ORB-SLAM paper)."""
 
 from __future__ import annotations
 
@@ -47,7 +47,8 @@ def refresh_keyframe(map_: Map, keyframe: int) -> None:
 
 
 def cull_recent_landmarks(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Erase recent landmarks that tracking rarely finds or that too few keyframes observe."""
+    """Erase recently created landmarks that tracking rarely finds, or that too few keyframes
+    observe."""
     a, n = map_.arrays, map_.n_landmarks
     first = int(np.searchsorted(a.first_keyframe[:n], keyframe - RECENT_KEYFRAMES))
     # A stereo observation counts twice. In a stereo map, one stereo and one monocular observation
@@ -68,12 +69,12 @@ def _cull_landmarks(a, first, last, keyframe, min_found_ratio, too_few):
 
 
 def adjust_locally(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Local bundle adjustment (ORB-SLAM, VI-D).
+    """Run local bundle adjustment around a keyframe (section VI-D of the ORB-SLAM paper).
 
-    The keyframe, its covisible keyframes and all landmarks that they observe are optimised. Other
-    keyframes that observe these landmarks are held fixed. The first keyframe of the map is also
-    held fixed, because it defines the world frame. Observations that fail the chi-square test
-    afterwards are removed.
+    The keyframe, its covisible keyframes and all landmarks that these keyframes observe are
+    optimised. Other keyframes that observe these landmarks are held fixed. The first keyframe of
+    the map is also held fixed, because it defines the world frame. After the optimisation,
+    observations that fail the chi-square test are removed.
     """
     free, fixed, landmarks = local_window(map_, keyframe, config)
     problem, rows = assemble(map_, free, fixed, landmarks, camera)
@@ -94,8 +95,9 @@ def adjust_locally(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
 def local_window(
     map_: Map, keyframe: int, config: Config
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
-    """Ids of the keyframes and landmarks of local bundle adjustment: free keyframes, fixed
-    keyframes, landmarks."""
+    """Select the keyframes and landmarks of local bundle adjustment. Returns the ids of the
+    keyframes that are optimised, the ids of the keyframes that are held fixed, and the ids of the
+    landmarks."""
     strong = strong_neighbours(map_, keyframe, config)
     window = np.concatenate([[keyframe], strong])[: config.mapping.max_ba_keyframes]
     landmarks, others = window_landmarks(
@@ -113,10 +115,11 @@ def local_window(
 
 
 def strong_neighbours(map_: Map, keyframe: int, config: Config) -> NDArray[np.int64]:
-    """Ids of the neighbours of a keyframe in the covisibility graph, most shared landmarks first.
+    """Return the ids of the neighbours of a keyframe in the covisibility graph. The neighbour that
+    shares the most landmarks comes first.
 
-    Neighbours that share few landmarks are left out. If all neighbours share few, the best one is
-    returned (ORB-SLAM, III-D).
+    Neighbours that share few landmarks are left out. If all neighbours share few landmarks, only
+    the best neighbour is returned (section III-D of the ORB-SLAM paper).
     """
     neighbours, shared = map_.covisible(keyframe)
     return neighbours[(shared >= config.mapping.min_shared) | (np.arange(len(shared)) == 0)]
@@ -124,8 +127,12 @@ def strong_neighbours(map_: Map, keyframe: int, config: Config) -> NDArray[np.in
 
 @kernel
 def window_landmarks(a, window, n_landmarks, n_keyframes):
-    """``(P,)`` int32 landmarks that the keyframes of a window observe, and a ``(K,)`` bool mask of
-    the keyframes outside the window that observe any of these landmarks."""
+    """Find the landmarks that the keyframes of a window observe, and the other keyframes that
+    observe these landmarks.
+
+    Returns the ``(P,)`` int32 ids of the landmarks, and a ``(K,)`` bool mask of the other
+    keyframes.
+    """
     seen = np.zeros(n_landmarks, np.bool_)
     others = np.zeros(n_keyframes, np.bool_)
     for keyframe in window:
@@ -150,14 +157,16 @@ def assemble(
     landmarks: NDArray[np.int32],
     camera: Camera,
 ) -> tuple[BundleProblem, NDArray[np.int64]]:
-    """The bundle problem of the given keyframes and landmarks.
+    """Assemble the bundle problem of the given keyframes and landmarks.
 
     Args:
-        free, fixed: ids of the keyframes that are optimised, and of those that are held fixed.
+        free, fixed: ids of the keyframes that are optimised, and ids of the keyframes that are held
+            fixed.
         landmarks: ``(P,)`` ids of the landmarks.
 
     Returns:
-        The problem, and the ``(O,)`` int64 row of each observation in the map's arrays.
+        The problem, and the ``(O,)`` int64 row of each observation in the observation arrays of the
+        map.
     """
     a = map_.arrays
     cameras = np.concatenate([free, fixed])
@@ -180,7 +189,8 @@ def assemble(
 
 @kernel
 def remove_observations(a, rows):
-    """Unlink each of ``(N,)`` rows, if it still observes a landmark."""
+    """Remove N observations. ``rows`` gives their ``(N,)`` rows in the observation arrays of the
+    map. Rows that no longer hold an observation are skipped."""
     for row in rows:
         if a.landmark[row] >= 0:
             unlink(a, row)
@@ -190,8 +200,8 @@ def cull_keyframes(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
     """Cull redundant keyframes among the covisible keyframes of a keyframe.
 
     A keyframe is redundant if most of its close landmarks are also observed by at least three other
-    keyframes, at a finer or about the same scale (ORB-SLAM, VI-E). For a monocular camera, all
-    landmarks count as close.
+    keyframes, at a finer or about the same scale (section VI-E of the ORB-SLAM paper). For a
+    monocular camera, all landmarks count as close.
     """
     neighbours, shared = map_.covisible(keyframe)
     close = config.stereo.close_depth_baselines * camera.baseline
@@ -206,7 +216,8 @@ def cull_keyframes(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
 
 @kernel
 def count_redundant(a, keyframe, bf, close_depth):
-    """Number of close landmarks of a keyframe, and number of those that are redundant.
+    """Count the close landmarks of a keyframe, and count how many of these landmarks are redundant.
+    Returns both numbers.
 
     A landmark is redundant if at least three other keyframes observe it at a finer or about the
     same scale. If ``bf`` is 0 (monocular camera), all landmarks count as close.

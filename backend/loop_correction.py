@@ -15,9 +15,9 @@ def move_keyframes(
 ) -> None:
     """Set the poses of keyframes, and move each landmark rigidly with its anchor keyframe.
 
-    The anchor of a landmark is the keyframe that first observed it (ORB-SLAM, VII-C). If that
-    keyframe was culled, the anchor is the oldest keyframe that observes the landmark. A landmark
-    whose anchor is not among ``keyframes`` does not move.
+    The anchor of a landmark is the keyframe that first observed the landmark (section VII-C of the
+    ORB-SLAM paper). If that keyframe was culled, the anchor is the oldest keyframe that observes
+    the landmark. A landmark whose anchor is not among ``keyframes`` does not move.
 
     The landmark keeps its position relative to the anchor. Its distance range therefore stays the
     same, and its normal is rotated with the anchor. The range and the normal are exact only if all
@@ -29,7 +29,7 @@ def move_keyframes(
         T_cw_new: ``(N, 4, 4)`` new poses of these keyframes (world to camera).
 
     Raises:
-        ValueError: a keyframe was culled and has no pose of its own.
+        ValueError: one of the keyframes was culled, so that its pose cannot be set.
     """
     a = map_.arrays
     if not a.keyframe_alive[keyframes].all():
@@ -40,7 +40,8 @@ def move_keyframes(
 
 
 def carry_landmarks(map_: Map, landmarks: NDArray[np.int64], T_cw_old: NDArray[np.float64]) -> None:
-    """Move landmarks rigidly with their anchors, from the old poses to the poses in the map.
+    """Move landmarks rigidly with their anchor keyframes. The keyframes have already moved from
+    ``T_cw_old`` to their current poses in the map.
 
     Args:
         landmarks: ``(N,)`` int64 ids; erased landmarks are skipped.
@@ -52,12 +53,13 @@ def carry_landmarks(map_: Map, landmarks: NDArray[np.int64], T_cw_old: NDArray[n
 
 
 def carry_landmarks_by(map_: Map, motion: NDArray[np.float64], moved: NDArray[np.bool_]) -> None:
-    """Move all landmarks by the given motions of their anchors.
+    """Move all landmarks by the given motions of their anchor keyframes.
 
     Args:
-        motion: ``(K, 4, 4)`` transform in the world frame, for the landmarks that are anchored in
-            each keyframe. If the transforms are similarities, the caller must refresh the normals
-            and distance ranges of the landmarks afterwards.
+        motion: ``(K, 4, 4)`` motion of each keyframe: a transform in the world frame, which is
+            applied to all landmarks that are anchored in the keyframe. If the transforms are
+            similarities, the caller must refresh the normals and distance ranges of the landmarks
+            afterwards.
         moved: ``(K,)`` bool, True for keyframes that move. For the other keyframes, ``motion`` is
             ignored.
     """
@@ -66,8 +68,8 @@ def carry_landmarks_by(map_: Map, motion: NDArray[np.float64], moved: NDArray[np
 
 @kernel
 def _motions(T_cw_old, T_cw_new, moved):
-    """``(K, 4, 4)`` motion of each keyframe in the world frame. A point p that is fixed to the
-    keyframe moves to ``motion p``."""
+    """Compute the ``(K, 4, 4)`` motion of each keyframe in the world frame. A point p that is fixed
+    to the keyframe moves to ``motion p``."""
     motion = np.zeros((len(moved), 4, 4))
     for k in range(len(moved)):
         if moved[k]:
@@ -97,8 +99,8 @@ def _carry(a, landmarks, motion, moved):
 
 @inner_kernel
 def anchor_of(a, landmark):
-    """Id of the keyframe that a landmark moves with, or -1 if no keyframe of the map observes
-    it."""
+    """Return the id of the anchor of a landmark, which is the keyframe that the landmark moves
+    with. Returns -1 if no keyframe of the map observes the landmark."""
     first = a.first_keyframe[landmark]
     if a.keyframe_alive[first]:
         return first

@@ -1,9 +1,9 @@
 """Pose-graph optimisation after a loop closure, and a test of whether its result is plausible.
 
-The graph is the essential graph of ORB-SLAM (Mur-Artal et al., T-RO 2015, III-D and VII-C). It
-consists of the spanning tree, strong covisibility edges and loop edges. Poses are ``T_cw`` on input
-and output. GTSAM optimises the graph with its built-in factors. It is imported inside the functions
-that need it, because the import is slow.
+The graph is the essential graph of ORB-SLAM (Mur-Artal et al., T-RO 2015, sections III-D and
+VII-C). It consists of the spanning tree, strong covisibility edges and loop edges. Poses are
+``T_cw`` on input and output. GTSAM optimises the graph with its built-in factors. GTSAM is imported
+inside the functions that need it, because the import is slow.
 """
 
 from __future__ import annotations
@@ -28,20 +28,21 @@ HOLD = 1e-6  # standard deviation of the prior that fixes a keyframe, m and rad
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """Keyframes and the measurements of their relative poses.
+    """A pose graph: keyframes, and measurements of their relative poses as edges.
 
     Attributes:
         keyframes: ``(N,)`` int64 ids, ascending.
         T_cw: ``(N, 4, 4)`` initial poses (world to camera).
-        edges: ``(E, 2)`` int64, indices i, j into ``keyframes``.
+        edges: ``(E, 2)`` int64 indices i, j into ``keyframes``.
         T_i_j: ``(E, 4, 4)`` measured pose of camera j in the frame of camera i.
         kind: ``(E,)`` uint8 kind of each edge: TREE, COVISIBLE, WEAK, LOOP or GAP.
         sigmas: ``(E, 2)`` standard deviations per axis of translation (m) and rotation (rad).
-        fixed: ``(N,)`` bool, True for keyframes that are held fixed. There is one in each connected
-            part.
-        scale: ``(E,)`` factor that converts lengths from the map's unit around j to its unit around
-            i. ``T_i_j`` is in the unit around i. The factor differs from 1 only for loops of
-            monocular maps (``similarity_graph``).
+        fixed: ``(N,)`` bool, True for keyframes that are held fixed. There is one such keyframe in
+            each connected part of the graph.
+        scale: ``(E,)`` factor that converts lengths from the unit of length around keyframe j to
+            the unit of length around keyframe i. ``T_i_j`` is in the unit around i. The factor
+            differs from 1 only for loops of monocular maps, whose scale drifts
+            (``similarity_graph``).
     """
 
     keyframes: NDArray[np.int64]
@@ -56,16 +57,17 @@ class PoseGraph:
 
 @dataclass(frozen=True)
 class GraphCheck:
-    """Whether the edges of an optimised graph agree with each other.
+    """The result of testing whether the edges of an optimised pose graph agree with each other.
 
     Attributes:
-        consistent: whether the correction is plausible.
+        consistent: whether the edges agree, so that the correction is plausible.
         reason: "consistent", or a short explanation of why the correction is not plausible.
         strain: total chi-square of the tree, covisibility and gap edges. It measures how much drift
-            the correction implies, relative to the drift model.
+            the correction assumes, relative to the drift model.
         closed: number of loop edges that were violated before the optimisation. The limit on the
             strain is proportional to this number.
-        loop_error: ``(E,)`` chi-square of each loop edge; NaN for other edges.
+        loop_error: ``(E,)`` chi-square of each loop edge after the optimisation; NaN for other
+            edges.
     """
 
     consistent: bool
@@ -82,26 +84,28 @@ def essential_graph(
     *,
     driven: bool = False,
 ) -> PoseGraph:
-    """The essential graph of a map. It must be built *before* the new loop changes the map.
+    """Build the essential graph of a map, including a new loop. The graph must be built *before*
+    the new loop changes the map.
 
-    The measurements of tree and covisibility edges are taken from the poses in the map. Suppose
-    that landmarks of the new loop were already fused. Then keyframes on both sides of the loop
-    would be covisible, and their edges would preserve the drift. Therefore, correct the map and
-    fuse landmarks only after the graph has been found to be consistent.
+    The measurements of tree and covisibility edges are taken from the poses in the map. If
+    landmarks of the new loop were already fused, keyframes on both sides of the loop would be
+    covisible. The edges between these keyframes would then preserve the drift. Therefore, correct
+    the map and fuse landmarks only after the graph has been found to be consistent.
 
     A loop edge replaces any other edge between its two keyframes. A culled keyframe of a loop is
     replaced by the keyframe that its pose is stored relative to. If several loops then connect the
     same two keyframes, only the last loop is used.
 
-    Suppose that the camera was lost between the two keyframes of a tree edge, and they share hardly
-    any landmarks. Their relative pose was then not measured, but at best predicted. Such an edge is
-    a GAP edge if the pose was predicted and ``driven`` is true. Otherwise it is a WEAK edge.
+    If the camera was lost between the two keyframes of a tree edge, these keyframes share hardly
+    any landmarks. The relative pose of such keyframes was not measured. At best, it was predicted.
+    The edge is a GAP edge if the pose was predicted and ``driven`` is true. Otherwise it is a WEAK
+    edge.
 
     Args:
         loops: all closed loops, with the new loop at the end. Each loop must have a pose.
-        driven: whether the camera is on a vehicle. If so, the motion between the two keyframes of a
-            GAP edge can be predicted, and the edge is trusted to this extent. A camera that is not
-            on a vehicle may have been carried anywhere, so its WEAK edges say almost nothing.
+        driven: whether the camera is on a vehicle. The motion of a vehicle during a gap can be
+            predicted roughly, so a GAP edge has some weight. A camera that is not on a vehicle may
+            have been carried anywhere, so a WEAK edge has almost no weight.
 
     Raises:
         ValueError: a loop has no pose.
@@ -157,10 +161,12 @@ def essential_graph(
 
 
 def connectivity(map_: Map) -> NDArray[np.int64]:
-    """``(n_keyframes,)`` int64: how well each keyframe is connected to the earlier part of the map.
+    """Measure how well each keyframe and all later keyframes are connected to the earlier
+    keyframes. Returns ``(n_keyframes,)`` int64.
 
-    The value for a keyframe is the largest number of landmarks that a keyframe before it shares
-    with the keyframe itself or a later one. The value is 0 for the first keyframe.
+    The value of a keyframe is the largest number of landmarks that two keyframes share, where one
+    of them is earlier than this keyframe, and the other is this keyframe or a later one. The value
+    is 0 for the first keyframe.
     """
     living = map_.living_keyframes()
     pairs, shared = covisible_pairs(map_.arrays, living, map_.n_keyframes, 1)
@@ -172,8 +178,8 @@ def connectivity(map_: Map) -> NDArray[np.int64]:
 
 
 def _spans(pair: tuple[int, int], keyframes: NDArray[np.int64]) -> bool:
-    """Whether any of the sorted ids ``keyframes`` is greater than the first id of the pair and not
-    greater than its second id."""
+    """Return whether any of the ids ``keyframes`` is greater than the first id of the pair and not
+    greater than the second id of the pair. ``keyframes`` must be sorted."""
     low, high = np.searchsorted(keyframes, pair, side="right")
     return bool(low < high)
 
@@ -186,17 +192,18 @@ def edge_sigmas(
     n: int,
     config: PoseGraphConfig,
 ) -> NDArray[np.float64]:
-    """``(E, 2)`` standard deviations of the edges: translation (m) and rotation (rad).
+    """Compute the ``(E, 2)`` standard deviations of the edges: translation (m) and rotation (rad).
 
     Drift is modelled as a random walk, so the variance of a tree or covisibility edge grows with
-    its length. All these edges are derived from one measurement: the estimated path. If the edges
-    were treated as independent, a path with more edges would be stiffer. Therefore, the variance of
-    an edge is multiplied by the number of edges that cover the path at the ends of the edge. All
-    edges together are then as stiff as the drift model, regardless of their number.
+    its length. All these edges are derived from the same measurement, the estimated path. If the
+    edges were treated as independent, a path with more edges would have a smaller total
+    uncertainty. Therefore, the variance of an edge is multiplied by the number of edges that cover
+    the path at the ends of the edge. All edges together then have the uncertainty of the drift
+    model, regardless of their number.
 
     The translation of a GAP edge may be wrong by a share of the predicted distance, or by the
-    distance that a slow car drives in the elapsed time. The larger of these two errors is used.
-    Almost nothing is known about a WEAK edge.
+    distance that a slow car drives in the elapsed time. The larger of these two errors is used. A
+    WEAK edge has very large standard deviations, because almost nothing is known about it.
 
     Args:
         seconds: ``(E, 2)`` timestamps of the ends of the edges.
@@ -222,8 +229,8 @@ def edge_sigmas(
 
 
 def parts_of(edges: NDArray[np.int64], n: int) -> NDArray[np.int64]:
-    """``(n,)`` int64: for each node, the first node of its connected part of the graph
-    (union-find)."""
+    """Find the connected part of the graph that each node belongs to, using union-find. A part is
+    denoted by its first node, so the result is the ``(n,)`` int64 index of this node."""
     part = list(range(n))
 
     def first_of(node: int) -> int:
@@ -239,16 +246,18 @@ def parts_of(edges: NDArray[np.int64], n: int) -> NDArray[np.int64]:
 
 
 def load_optimiser() -> None:
-    """Import GTSAM before the first loop. The import takes a tenth of a second. During a loop
-    closure this would be too long, because frames of a live camera would have to wait."""
+    """Import GTSAM, so that it need not be imported during the first loop closure. The import takes
+    a tenth of a second. During a loop closure, this would be too long, because frames of a live
+    camera would have to wait."""
     import gtsam  # noqa: F401
 
 
 def optimise(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
-    """``(N, 4, 4)`` poses ``T_cw`` that agree best with the edges, found by Levenberg-Marquardt.
+    """Find the ``(N, 4, 4)`` poses ``T_cw`` that agree best with the edges, using
+    Levenberg-Marquardt.
 
-    Loop edges have the Cauchy loss. A loop that contradicts the others then loses its influence and
-    is detected by ``check_pose_graph``. All other edges have a Gaussian loss.
+    Loop edges have the Cauchy loss. A loop that contradicts the other loops then loses its
+    influence, and ``check_pose_graph`` can detect it. All other edges have a Gaussian loss.
     """
     import gtsam
 
@@ -274,7 +283,7 @@ def optimised_values(
     factor_types: tuple[Any, Any],
     config: PoseGraphConfig,
 ) -> Any:
-    """The ``gtsam.Values`` of the keyframes that agree best with the edges.
+    """Find the ``gtsam.Values`` of the keyframes that agree best with the edges.
 
     Args:
         poses: initial values of the N keyframes, as GTSAM objects.
@@ -303,7 +312,8 @@ def optimised_values(
 
 
 def minimised(factors: Any, start: Any, config: PoseGraphConfig) -> Any:
-    """The ``gtsam.Values`` that minimise a ``gtsam.NonlinearFactorGraph`` (Levenberg-Marquardt)."""
+    """Find the ``gtsam.Values`` that minimise the error of a ``gtsam.NonlinearFactorGraph``, using
+    Levenberg-Marquardt."""
     import gtsam
 
     parameters = gtsam.LevenbergMarquardtParams()
@@ -318,13 +328,13 @@ def check_pose_graph(
     """Test whether an optimised graph is plausible. If it is not, the new loop is wrong and must be
     rejected.
 
-    There are two tests. The first test is the residual of each loop edge. A loop edge whose
-    residual is still large contradicts the other loops, or too much of the path.
+    There are two tests. The first test checks the residual of each loop edge. A loop edge whose
+    residual is still large contradicts the other loops, or a large part of the path.
 
-    The second test is the strain: the total chi-square of the tree, covisibility and gap edges. If
-    the drift follows the model, the strain has six degrees of freedom per closed loop. If the
-    strain is several times larger, no plausible drift explains the loop. A single loop across a
-    WEAK edge always passes the tests, because it causes no strain.
+    The second test checks the strain, which is the total chi-square of the tree, covisibility and
+    gap edges. If the drift follows the model, the strain has six degrees of freedom per closed
+    loop. If the strain is several times larger, no plausible drift explains the loop. A single loop
+    across a WEAK edge always passes the tests, because it causes no strain.
 
     Args:
         T_cw: ``(N, 4, 4)`` poses that ``optimise`` returned.
@@ -340,8 +350,8 @@ def check_edge_errors(
     after: NDArray[np.float64],
     config: PoseGraphConfig,
 ) -> GraphCheck:
-    """Like ``check_pose_graph``, but takes the ``(E,)`` chi-squares of the edges before and after
-    the optimisation."""
+    """Test whether an optimised graph is plausible, as ``check_pose_graph`` does, from the ``(E,)``
+    chi-squares of the edges before and after the optimisation."""
     loop = graph.kind == LOOP
     loop_error = np.where(loop, after, np.nan)
     strain = float(after[~loop & (graph.kind != WEAK)].sum())
@@ -361,8 +371,9 @@ def check_edge_errors(
 
 @kernel
 def edge_errors(T_cw, edges, T_i_j, sigmas):
-    """``(E,)`` chi-square of each edge. The residual motion is expressed as a twist, and the twist
-    is divided by the standard deviations. The squared norm of the result is returned."""
+    """Compute the ``(E,)`` chi-square of each edge. The residual motion of the edge is expressed as
+    a twist. The twist is divided by the standard deviations. The chi-square is the squared norm of
+    the result."""
     chi2 = np.empty(len(edges))
     for e in range(len(edges)):
         T = compose(T_cw[edges[e, 0]], inverse(T_cw[edges[e, 1]]))

@@ -1,11 +1,11 @@
-"""Pose-graph optimisation of a monocular map, whose scale drifts (ORB-SLAM, T-RO 2015, VII-C;
-Strasdat et al., "Scale drift-aware large scale monocular SLAM", RSS 2010).
+"""Pose-graph optimisation of a monocular map, whose scale drifts (Mur-Artal et al., ORB-SLAM, T-RO
+2015, section VII-C; Strasdat et al., "Scale drift-aware large scale monocular SLAM", RSS 2010).
 
-Each keyframe has a similarity transform ``S_wc`` from the camera frame to the world. It is a
-``(4, 4)`` matrix with the scale in its upper left 3x3 block, so that ``@`` composes similarities.
-Lengths in the camera frame are in the unit that the map had around the keyframe before the
-correction. Initially, all scales are 1. Only loop edges measure other scales. GTSAM optimises the
-graph with its built-in Similarity3 factors.
+Each keyframe has a similarity transform ``S_wc`` from the camera frame to the world. The transform
+is a ``(4, 4)`` matrix with the scale in its upper left 3x3 block, so that ``@`` composes
+similarities. Lengths in the camera frame are in the unit that the map had around the keyframe
+before the correction. Initially, all scales are 1. Only loop edges measure other scales. GTSAM
+optimises the graph with its built-in Similarity3 factors.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from vslam.map_kernels import refresh_landmarks
 
 
 def similarity(T_a_b: Matrix, scale: NDArray[np.float64] | float) -> Matrix:
-    """``(..., 4, 4)`` similarities, composed of ``(..., 4, 4)`` rigid motions and ``(...,)``
+    """Compose ``(..., 4, 4)`` similarities from ``(..., 4, 4)`` rigid motions and ``(...,)``
     scales."""
     S = T_a_b.copy()
     S[..., :3, :3] *= np.asarray(scale)[..., None, None]
@@ -41,21 +41,22 @@ def similarity(T_a_b: Matrix, scale: NDArray[np.float64] | float) -> Matrix:
 
 
 def scale_of(S: Matrix) -> NDArray[np.float64]:
-    """``(...,)`` scales of ``(..., 4, 4)`` similarities."""
+    """Return the ``(...,)`` scales of ``(..., 4, 4)`` similarities."""
     return np.cbrt(np.linalg.det(S[..., :3, :3]))
 
 
 def rigid(S: Matrix) -> Matrix:
-    """``(..., 4, 4)`` rigid motions: the given similarities with their scale set to 1."""
+    """Convert ``(..., 4, 4)`` similarities to ``(..., 4, 4)`` rigid motions by setting their scale
+    to 1."""
     return similarity(S, 1.0 / scale_of(S))
 
 
 def optimise_similarities(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfig) -> Matrix:
-    """``(N, 4, 4)`` similarities that agree best with the edges. The optimisation starts from
-    ``S_wc``.
+    """Find the ``(N, 4, 4)`` similarities that agree best with the edges. The optimisation starts
+    from ``S_wc``.
 
-    The loss functions and the optimiser are those of ``pose_graph.optimise``. Fixed keyframes keep
-    their pose and their scale.
+    The loss functions and the optimiser are the same as in ``pose_graph.optimise``. Fixed keyframes
+    keep their pose and their scale.
     """
     import gtsam
 
@@ -83,7 +84,8 @@ def optimise_similarities(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfi
 
 
 def sigmas(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
-    """``(E, 7)`` standard deviations of rotation, translation and the logarithm of the scale.
+    """Compute the ``(E, 7)`` standard deviations of the edges: rotation, translation, and the
+    logarithm of the scale.
 
     The drift of the scale is modelled as a random walk along the path, like the drift of the pose.
     """
@@ -97,13 +99,14 @@ def sigmas(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
 def check_similarity_graph(
     graph: PoseGraph, S_wc_before: Matrix, S_wc: Matrix, config: PoseGraphConfig
 ) -> GraphCheck:
-    """Like ``check_pose_graph``, for the similarities before and after the optimisation."""
+    """Test whether an optimised graph is plausible, as ``check_pose_graph`` does, from the
+    similarities before and after the optimisation."""
     before, after = (edge_errors(graph, S, config) for S in (S_wc_before, S_wc))
     return check_edge_errors(graph, before, after, config)
 
 
 def edge_errors(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfig) -> NDArray[np.float64]:
-    """``(E,)`` chi-square of each edge, from the rotation, translation and scale of its
+    """Compute the ``(E,)`` chi-square of each edge from the rotation, translation and scale of its
     residual."""
     i, j = graph.edges.T
     S_i_j = np.linalg.inv(S_wc[i]) @ S_wc[j]
@@ -116,8 +119,8 @@ def edge_errors(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfig) -> NDAr
 def move_keyframes_similarly(
     map_: Map, keyframes: NDArray[np.integer], S_wc: Matrix
 ) -> NDArray[np.float64]:
-    """Move keyframes by similarities. Each landmark is moved and scaled with its anchor (ORB-SLAM,
-    VII-C).
+    """Move keyframes by similarity transforms. Each landmark is moved and scaled with its anchor
+    keyframe (section VII-C of the ORB-SLAM paper).
 
     The poses of culled keyframes, which are stored relative to other keyframes, are scaled as well.
     ``map_.keyframes.unit_scale`` is multiplied by the scales.
@@ -147,8 +150,8 @@ def move_keyframes_similarly(
 
 
 def loop_in_new_units(edge: LoopEdge, growth: NDArray[np.float64]) -> LoopEdge:
-    """Convert a loop edge after a correction. ``growth`` is the factor by which the correction
-    multiplied lengths around each keyframe."""
+    """Convert a loop edge to the new units of length after a correction of a monocular map.
+    ``growth`` is the factor by which the correction multiplied lengths around each keyframe."""
     assert edge.T_query_match is not None
     T = edge.T_query_match.copy()
     T[:3, 3] *= growth[edge.match]

@@ -23,7 +23,7 @@ def map_stereo_points(
     """Create landmarks from the close stereo features of a keyframe that observe no landmark yet.
 
     If fewer than ``mapping.min_stereo_points`` features are close, the nearest
-    ``min_stereo_points`` stereo features are used instead (ORB-SLAM2, section III-E).
+    ``min_stereo_points`` stereo features are used instead (section III-E of the ORB-SLAM2 paper).
 
     Args:
         far: whether far features are used as well.
@@ -49,10 +49,11 @@ def map_stereo_points(
 def triangulate_with_neighbours(
     map_: Map, keyframe: int, camera: Camera, config: Config
 ) -> NDArray[np.int32]:
-    """Create landmarks by triangulation between a keyframe and its covisible keyframes.
+    """Create landmarks by triangulating features of a keyframe and its covisible keyframes.
 
     Features that observe no landmark yet are matched along epipolar lines, and the matches are
-    triangulated (ORB-SLAM, VI-C). Returns the ``(N,)`` ids of the new landmarks.
+    triangulated (section VI-C of the ORB-SLAM paper). Returns the ``(N,)`` ids of the new
+    landmarks.
     """
     neighbours, _ = map_.covisible(keyframe)
     created = [np.empty(0, np.int32)]
@@ -84,15 +85,16 @@ def triangulate_with_neighbours(
 
 
 def median_depth(map_: Map, keyframe: int) -> float:
-    """Median depth of the landmarks that a keyframe observes, which measures the scale of the
-    scene."""
+    """Return the median depth of the landmarks that a keyframe observes. It measures the scale of
+    the scene."""
     points, T_cw = map_.arrays.xyz[map_.landmarks_of(keyframe)], map_.arrays.T_cw[keyframe]
     return float(np.median(points @ T_cw[2, :3] + T_cw[2, 3]))
 
 
 @inner_kernel
 def unmapped_rows(a, keyframe):
-    """``(N,)`` int64 rows of a keyframe that do not observe a landmark."""
+    """Find the features of a keyframe that do not observe a landmark. Returns their ``(N,)`` int64
+    rows in the observation arrays of the map."""
     first, last = a.first_row[keyframe], a.first_row[keyframe + 1]
     return first + np.flatnonzero(a.landmark[first:last] < 0)
 
@@ -102,7 +104,7 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
     """Triangulate new landmarks from two keyframes.
 
     Args:
-        a: the map's arrays.
+        a: the arrays of the map.
         k1, k2: ids of the keyframes.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         scales: ``(levels,)`` pyramid scale factors.
@@ -111,8 +113,9 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
         max_cosine: largest cosine of the parallax angle of a match without stereo depth.
 
     Returns:
-        ``(N, 3)`` positions in the world frame; ``(N,)`` int64 rows of the observations in keyframe
-        ``k1``; ``(N,)`` int64 rows of the observations in keyframe ``k2``.
+        ``(N, 3)`` positions of the landmarks in the world frame; ``(N,)`` int64 rows of their
+        features in keyframe ``k1``; ``(N,)`` int64 rows of their features in keyframe ``k2``. The
+        rows are indices into the observation arrays of the map.
     """
     fx, fy, cx, cy, bf, _ = intrinsics
     T1, T2 = a.T_cw[k1], a.T_cw[k2]
@@ -215,7 +218,8 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
 
 @kernel
 def perpendicular(t):
-    """``(2, 3)`` unit vectors that are orthogonal to ``t`` ``(3,)`` and to each other."""
+    """Return ``(2, 3)``: two unit vectors that are orthogonal to the vector ``t`` and to each
+    other."""
     across = np.zeros((2, 3))
     least = 0
     for i in range(1, 3):
@@ -235,7 +239,7 @@ def perpendicular(t):
 
 @kernel
 def direction(u, v):
-    """Direction of the line through the origin and (u, v), as a number in [0, 2).
+    """Return the direction of the line through the origin and (u, v), as a number in [0, 2).
 
     The number grows with the angle of the line from 0 to 180 degrees. It is computed without
     trigonometric functions.
@@ -253,9 +257,9 @@ def sorted_about_epipole(x, y, gate, intrinsics, across):
 
     All epipolar planes contain the baseline. In a view along the baseline, each plane is therefore
     a line through the origin and has a direction. A feature matches planes that cross a square
-    around it. Half the side of this square is the square root of ``gate``. In the view along the
-    baseline, the square becomes a parallelogram, which covers an interval of directions. If the
-    epipole is inside the square, all directions are covered.
+    around the feature. Half the side of this square is the square root of ``gate``. In the view
+    along the baseline, the square becomes a parallelogram, which covers an interval of directions.
+    If the epipole is inside the square, all directions are covered.
 
     Args:
         x, y: ``(n,)`` float32, pixels.
@@ -264,8 +268,8 @@ def sorted_about_epipole(x, y, gate, intrinsics, across):
         across: ``(2, 3)``, the two axes of the view along the baseline, see ``perpendicular``.
 
     Returns:
-        ``start`` ``(SECTIONS + 1,)``, and ``items`` int32. The features near a plane whose
-        direction is in bin s are among ``items[start[s]:start[s + 1]]``, in ascending order.
+        ``start``, with shape ``(SECTIONS + 1,)``, and ``items``, int32. The features near a plane
+        whose direction is in bin s are among ``items[start[s]:start[s + 1]]``, in ascending order.
     """
     n = len(x)
     low, high = np.empty(n, np.int64), np.empty(n, np.int64)
@@ -303,7 +307,7 @@ def sorted_about_epipole(x, y, gate, intrinsics, across):
 
 @inner_kernel
 def seen_along(x, y, intrinsics, across):
-    """Components of the ray of a pixel along the two axes of ``across``."""
+    """Return the two components of the viewing ray of a pixel along the two axes in ``across``."""
     fx, fy, cx, cy, _, _ = intrinsics
     d_x, d_y = (x - cx) / fx, (y - cy) / fy
     u = d_x * across[0, 0] + d_y * across[0, 1] + across[0, 2]
@@ -318,8 +322,8 @@ def dot3(a, b):
 
 @inner_kernel
 def world_ray(T_cw, xy, intrinsics, ray):
-    """Write the viewing ray of a pixel into ``ray`` ``(3,)``. The ray is in the world frame and is
-    scaled to z = 1 in the camera frame."""
+    """Compute the viewing ray of a pixel, and write it into ``ray``, with shape ``(3,)``. The ray
+    is in the world frame. Its length is such that z = 1 in the camera frame."""
     x = (xy[0] - intrinsics[2]) / intrinsics[0]
     y = (xy[1] - intrinsics[3]) / intrinsics[1]
     for i in range(3):
@@ -328,10 +332,11 @@ def world_ray(T_cw, xy, intrinsics, ray):
 
 @inner_kernel
 def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_cosine, point):
-    """Triangulate a landmark and write its position in the world frame into ``point`` ``(3,)``.
+    """Triangulate a landmark from two views, and write its position in the world frame into
+    ``point``, with shape ``(3,)``.
 
-    Usually, the two rays are intersected. The stereo pair of one keyframe may see the landmark with
-    more parallax than the two rays have. In this case, the stereo point of that keyframe is used
+    Usually, the two viewing rays are intersected. If the stereo pair of one keyframe sees the
+    landmark with more parallax than the two rays have, the stereo point of that keyframe is used
     instead.
 
     Args:
@@ -377,8 +382,8 @@ def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_
 
 @inner_kernel
 def agrees(T, p, xy, u_right, scale, intrinsics):
-    """Whether a point lies in front of the camera and its reprojection error passes the chi-square
-    test."""
+    """Return whether a point agrees with an observation: it lies in front of the camera, and its
+    reprojection error passes the chi-square test."""
     z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
     if z <= 0.0:
         return False

@@ -22,7 +22,7 @@ ITERATIONS = 20
 def adjust_two_views(
     T_2_1: Matrix, points: Matrix, uv: Matrix, sigma: Matrix, camera: Camera, depth: float
 ) -> tuple[Matrix, Matrix, NDArray[np.bool_]]:
-    """Bundle adjustment of two views. The result is scaled to a given median depth.
+    """Run bundle adjustment of two views, and scale the result to a given median depth.
 
     Args:
         T_2_1: ``(4, 4)`` initial transform from camera 1 to camera 2.

@@ -1,4 +1,4 @@
-"""Sub-pixel alignment of matches: each landmark's patch is registered to the image.
+"""Sub-pixel alignment of matches: an image patch of each landmark is registered to the new image.
 
 FAST places a corner at a whole pixel of a pyramid level, so a corner is typically off by half a
 pixel. When the camera approaches the scene, this error is biased towards the focus of expansion
@@ -6,9 +6,9 @@ pixel. When the camera approaches the scene, this error is biased towards the fo
 
 To remove the error, the patch is taken from a keyframe that observed the landmark. The patch is
 warped into the view of the frame and shifted until it agrees with the image. This is the "feature
-alignment" of SVO (Forster et al., ICRA 2014, III-B), solved by inverse compositional Lucas-Kanade
-(Baker and Matthews, IJCV 2004, section 3.2). Changes of brightness and contrast are estimated
-together with the shift.
+alignment" of SVO (Forster et al., ICRA 2014, section III-B). The method is inverse compositional
+Lucas-Kanade (Baker and Matthews, IJCV 2004, section 3.2). Changes in brightness and contrast are
+estimated together with the shift.
 """
 
 from __future__ import annotations
@@ -37,17 +37,19 @@ def align_frame(
     intrinsics: NDArray[np.float64],
     config: AlignmentConfig,
 ) -> NDArray[np.float32] | None:
-    """Align the matches of a frame with the patches of their landmarks.
+    """Align the matches of a frame: find each matched landmark in the image with sub-pixel
+    accuracy, using an image patch from a keyframe.
 
     Args:
-        known: patches of the landmarks that can be aligned.
+        known: image patches of the landmarks. A match is aligned only if its landmark has a patch
+            here.
         scales: ``(levels,)`` full-resolution pixels per pixel of each octave.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
 
     Returns:
-        ``(N, 2)`` float32 for ``Frame.shift``: the offset from each feature to its aligned
-        position, in full-resolution pixels. NaN where a match was not aligned. None if the frame
-        has no pyramid or no landmark has a patch.
+        ``(N, 2)`` float32, the new value of ``Frame.shift``: the offset from each feature to its
+        aligned position, in full-resolution pixels. It is NaN where a match was not aligned. The
+        result is None if the frame has no pyramid or no landmark has a patch.
     """
     features = frame.features
     if frame.pyramid is None or not len(known.ids):
@@ -87,7 +89,7 @@ def find_patches(
     intrinsics: NDArray[np.float64],
     config: AlignmentConfig,
 ) -> NDArray[np.float32]:
-    """Find the patches of N landmarks near their expected positions in an image.
+    """Find the image patches of N landmarks near their expected positions in an image.
 
     Args:
         pyramid: the pyramid of the image.
@@ -95,7 +97,7 @@ def find_patches(
         octave: ``(N,)`` pyramid levels in which the patches are searched for.
         T_cw: ``(4, 4)`` pose of the camera that took the image (world to camera).
         xyz: ``(N, 3)`` positions of the landmarks, in the world frame.
-        known: patches of landmarks.
+        known: image patches of landmarks.
         at: ``(N,)`` index of each landmark's patch in ``known``.
         scales: ``(levels,)`` full-resolution pixels per pixel of each octave.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
@@ -121,10 +123,10 @@ def find_patches(
 
 @kernel
 def warps(T_cw, xyz, T_seen, view, size_seen, size, intrinsics):
-    """Affine warps from the patches of a frame to the patches of keyframes.
+    """Compute affine warps from image patches of a frame to image patches of keyframes.
 
     The surface around a landmark is approximated by a plane perpendicular to the viewing direction
-    of the keyframe (SVO, III-B).
+    of the keyframe (section III-B of the SVO paper).
 
     Args:
         T_cw: ``(4, 4)`` pose of the frame's camera (world to camera).
@@ -137,8 +139,8 @@ def warps(T_cw, xyz, T_seen, view, size_seen, size, intrinsics):
 
     Returns:
         ``(N, 2, 2)`` float32 matrices. Each maps an offset in the frame's patch to the offset in
-        the keyframe's patch, both in pixels of the patch. NaN where the landmark is behind one of
-        the cameras or the frame views the plane from behind.
+        the keyframe's patch, both in pixels of the patch. A matrix is NaN where the landmark is
+        behind one of the cameras, or where the frame views the plane from behind.
     """
     fx, fy = intrinsics[0], intrinsics[1]
     steps = np.full((len(xyz), 2, 2), np.nan, np.float32)
@@ -170,23 +172,24 @@ def warps(T_cw, xyz, T_seen, view, size_seen, size, intrinsics):
 
 @kernel
 def align(seen, reference, centre, which, warp, iterations, max_shift, min_correlation):
-    """Locate landmarks with sub-pixel accuracy by registering a reference patch to each of N
+    """Locate landmarks with sub-pixel accuracy: register a reference patch to each of N image
     patches.
 
     Args:
         seen: ``(N, PATCH_PIXELS)`` uint8 patches of the frame.
         reference: ``(P, PATCH_PIXELS)`` uint8 patches of keyframes.
-        centre: ``(P, 2)`` float32 position of the landmark in each reference patch, in pixels from
-            the middle of the patch.
-        which: ``(N,)`` index of the reference patch of each seen patch.
-        warp: ``(N, 2, 2)`` float32, see ``warps``.
+        centre: ``(P, 2)`` float32 position of the landmark in each reference patch, in pixels
+            relative to the middle of the patch.
+        which: ``(N,)`` index, into ``reference``, of the patch that is registered to each patch of
+            the frame.
+        warp: ``(N, 2, 2)`` float32 matrices, see ``warps``.
         iterations: maximum number of Gauss-Newton steps.
-        max_shift: largest accepted shift in x and in y, in pixels of the seen patch.
+        max_shift: largest accepted shift in x and in y, in pixels of the frame's patch.
         min_correlation: least normalised cross-correlation of an accepted alignment.
 
     Returns:
-        ``(N, 2)`` float32 position of each landmark, in pixels from the middle of its seen patch;
-        NaN if the alignment failed.
+        ``(N, 2)`` float32 position of each landmark, in pixels relative to the middle of the
+        frame's patch; NaN if the alignment failed.
     """
     n = len(seen)
     shift = np.full((n, 2), np.nan, np.float32)
@@ -221,12 +224,15 @@ def align(seen, reference, centre, which, warp, iterations, max_shift, min_corre
 
 @inner_kernel
 def draw(patch, centre, warp, out):
-    """Warp a patch around ``centre`` with bilinear interpolation. Returns True on success. If the
-    warped window is not inside the patch, returns False and leaves ``out`` unchanged.
+    """Warp a patch around ``centre`` with bilinear interpolation.
+
+    The function returns True on success. If the warped window is not inside the patch, it returns
+    False and leaves ``out`` unchanged.
 
     Args:
         patch: ``(PATCH_PIXELS,)`` uint8.
-        centre: ``(2,)`` float32, pixels from the middle of the patch.
+        centre: ``(2,)`` float32 position in the patch, in pixels relative to the middle of the
+            patch.
         warp: ``(2, 2)`` float32, see ``warps``.
         out: ``(WIDE * WIDE,)`` float32, receives the window.
     """
@@ -261,11 +267,12 @@ def draw(patch, centre, warp, out):
 def prepare(wide, template, slope_x, slope_y):
     """Compute the template and its gradients from a warped window.
 
-    The mean of the template is subtracted. The gradients are made orthogonal to changes of
+    The mean of the template is subtracted. The gradients are made orthogonal to changes in
     brightness and contrast, so that such changes do not affect the shift.
 
     Returns:
-        Sum of squares of the template, and the entries xx, xy, yy of the 2x2 normal matrix.
+        Four numbers: the sum of squares of the template, and the entries xx, xy and yy of the 2x2
+        normal matrix.
     """
     half, zero, count = np.float32(0.5), np.float32(0.0), np.float32(SIDE * SIDE)
     # Sums of products of 1, the template t and its gradients x, y. Grey values are relative to the
@@ -301,12 +308,12 @@ def prepare(wide, template, slope_x, slope_y):
 
 @inner_kernel
 def compare(image, x, y, template, slope_x, slope_y):
-    """Compare the template with a window of the image. The window is shifted by ``x, y`` pixels
+    """Compare a template with a window of an image. The middle of the window is ``x, y`` pixels
     from the middle of the image.
 
     Returns:
-        Sum of squares of the window minus its mean; inner product of the window with the template;
-        inner products of the window with both gradients.
+        The sum of squares of the window after its mean is subtracted; the inner product of the
+        window and the template; the inner products of the window and both gradients.
     """
     one, zero = np.float32(1.0), np.float32(0.0)
     left, top = int(np.floor(x)), int(np.floor(y))

@@ -15,15 +15,16 @@ from vslam.kernels import inline, inner_kernel, kernel, trailing_zeros
 
 @kernel
 def fast_scores(pixels, height, width):
-    """FAST-9 score of each pixel.
+    """Compute the FAST-9 corner score of each pixel of an image.
 
     A pixel with value c is a corner at threshold t if 9 contiguous pixels of its circle are all
     brighter than c + t, or all darker than c - t. The score is the largest such t plus 1, or 0 if
     there is none.
 
     For an arc of 9 bright pixels, this score is the smallest value in the arc minus c. The score of
-    the pixel is the maximum over all 16 arcs and both polarities. Arcs share the minima over runs
-    of 2, 4 and 8 pixels, which leaves 31 minima and maxima per polarity.
+    the pixel is the maximum over all 16 arcs and both polarities. The minima over runs of 2, 4 and
+    8 pixels are used for several arcs. Therefore, only 31 minima and maxima are computed for each
+    polarity.
 
     Indices are unsigned. The compiler then needs no test for negative indices and vectorises the
     loop over bytes.
@@ -88,16 +89,18 @@ def fast_scores(pixels, height, width):
 
 @kernel
 def local_maxima(scores, margin, threshold, threshold_min, cell):
-    """Non-maximum suppression: corners whose score no neighbour exceeds.
+    """Find the corners of an image by non-maximum suppression: no neighbour of a corner has a
+    higher score.
 
-    Weak corners are kept only in cells without a strong corner.
+    The image is divided into square cells. Weak corners are kept only in cells without a strong
+    corner.
 
     Args:
         scores: ``(height, width)`` uint8, see ``fast_scores``.
         margin: width of the border without corners, pixels.
-        threshold: corners with a higher score are strong, the others are weak.
-        threshold_min: pixels with this score or a lower one are not corners.
-        cell: side of the cells, pixels.
+        threshold: corners with a higher score are strong; all other corners are weak.
+        threshold_min: pixels whose score is at most this value are not corners.
+        cell: side of the square cells into which the image is divided, pixels.
 
     Returns:
         ``(n,)`` int32 x and y, in pixels, and ``(n,)`` uint8 scores, in row order.
@@ -146,9 +149,10 @@ def local_maxima(scores, margin, threshold, threshold_min, cell):
 
 @kernel
 def spread(x, y, score, width, height, quota):
-    """Choose up to ``quota`` evenly spread corners: the best corner of each cell of a grid.
+    """Choose up to ``quota`` evenly spread corners. They are the corners with the best score in
+    each cell of a grid.
 
-    The grid has the largest cells with which at least ``quota`` cells contain a corner.
+    The cells are as large as possible, but at least ``quota`` cells must contain a corner.
 
     The cell size is found by bisection, as in Bailo et al. ("Efficient adaptive non-maximal
     suppression", PRL 2018).
@@ -210,15 +214,15 @@ def spread(x, y, score, width, height, quota):
 
 @inline
 def cell_of(x, y, inverse, columns):
-    """Index of the cell of a pixel. ``inverse`` is the inverse of the cell size, because
-    multiplication is much faster than division."""
+    """Return the index of the grid cell that contains a pixel. ``inverse`` is 1 divided by the cell
+    size, because multiplication is much faster than division."""
     half = np.float32(0.5)
     return int((y + half) * inverse) * columns + int((x + half) * inverse)
 
 
 @inner_kernel
 def occupies(x, y, width, height, size, quota, is_occupied):
-    """Whether the corners occupy at least ``quota`` cells of ``size`` x ``size`` pixels."""
+    """Return whether at least ``quota`` cells of ``size`` x ``size`` pixels contain a corner."""
     columns = (width + size - 1) // size
     rows = (height + size - 1) // size
     is_occupied[: columns * rows] = 0
@@ -235,8 +239,8 @@ def occupies(x, y, width, height, size, quota, is_occupied):
 
 @inner_kernel
 def occupy(x, y, score, width, size, best_of_cell):
-    """Write the index of the best corner of each cell of ``size`` x ``size`` pixels into
-    ``best_of_cell``.
+    """Find the corner with the best score in each cell of ``size`` x ``size`` pixels, and write its
+    index into ``best_of_cell``.
 
     The index is -1 for an empty cell. If several corners have equal scores, the first one is used.
     """

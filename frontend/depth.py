@@ -1,4 +1,5 @@
-"""Converts depth images to the right view of a virtual stereo pair (ORB-SLAM2, section III-A)."""
+"""Converts the depths of keypoints to columns in the right image of a virtual stereo pair (section
+III-A of the ORB-SLAM2 paper)."""
 
 from __future__ import annotations
 
@@ -17,16 +18,17 @@ def columns_of_depth(
     camera: Camera,
     config: DepthConfig,
 ) -> NDArray[np.float32]:
-    """Column that each keypoint would have in the right image of a virtual stereo pair, in pixels.
+    """Convert depths to disparities: compute the column that each keypoint would have in the right
+    image of a virtual stereo pair, in pixels.
 
     A keypoint at column u whose nearest pixel has depth d gets the column ``u - fx b / d``. In this
     model, a constant error in pixels corresponds to a depth error that grows with the square of the
-    depth. This agrees with the errors of structured-light cameras.
+    depth. This relation agrees with the errors of structured-light cameras.
 
     The depth of a corner at a depth discontinuity is ambiguous. Where the contour of a near object
-    crosses the background, the corner is not a point of the scene. Instead, it slides along the
-    contour as the camera moves. Stereo matching rejects most of these corners. Here they get no
-    column.
+    crosses the background, the corner is not a point of the scene. Instead, the corner slides along
+    the contour as the camera moves. Stereo matching rejects most of these corners. With a depth
+    image, corners at a depth discontinuity get no column.
 
     Args:
         xy: ``(N, 2)`` keypoints of the left image, pixels.
@@ -48,7 +50,7 @@ def columns_of_depth(
 
 @kernel
 def depth_around(xy, radius, depth, max_ratio):
-    """Depth at the nearest pixel of each keypoint, in metres.
+    """Look up the depth of each keypoint, in metres, at the nearest pixel of the depth image.
 
     Args:
         radius: ``(N,)`` int64, half width of the neighbourhood that is checked, pixels.

@@ -1,4 +1,4 @@
-"""Extracts the features of a frame from its images: stereo, RGB-D or monocular, in any light."""
+"""Extracts the features of a stereo, RGB-D or monocular frame, also from dark or noisy images."""
 
 from __future__ import annotations
 
@@ -25,15 +25,17 @@ from vslam.workers import Job, Urgency, Workers
 
 
 class Corners(NamedTuple):
-    """The features of a frame that do not depend on tracking.
+    """The features that a corner detector found in the images of a frame, and their stereo matches.
+    Both are independent of tracking.
 
     Attributes:
-        found: the features of the image of ``side``.
+        found: the features of the left image, or of the right image if the left one is black.
         matches: the stereo matches of ``found``; None if there is no right image, or if the left
             one is black.
         depth: ``(H, W)`` float32 depth image of an RGB-D camera, metres; None for other cameras.
-        side: see ``Extracted``.
-        sides: the comparison of the left and the right image; None without a right image.
+        side: the image that ``found`` comes from: left or right (``Extracted.side``).
+        sides: result of comparing the exposure of the left and the right image; None without a
+            right image.
     """
 
     found: Extraction
@@ -44,16 +46,17 @@ class Corners(NamedTuple):
 
 
 class FrameImages:
-    """The images of a frame. The second image is read, and features are extracted, only when they
-    are first needed: a frame that is tracked by patches needs neither.
+    """The images of a frame, and their features. The second image (right image or depth image) is
+    read only when it is first needed. Features are also extracted only when they are first needed.
+    A frame that is tracked by patches needs neither.
 
     Attributes:
         left: ``(H, W)`` uint8.
         mask: the mask of the left image; None if all pixels are used.
         pyramid: the pyramid of the left image; None if frames are not tracked by patches.
         coarse: ``coarse_levels`` of ``pyramid``; None if ``pyramid`` is None.
-        sides: the comparison of the left and the right image; None if there is no right image, or
-            it has not been read.
+        sides: result of comparing the exposure of the left and the right image; None if there is no
+            right image, or if it has not been read.
         problem: why the second image could not be read, so that only the left one is used; None if
             there was no such problem.
     """
@@ -69,9 +72,10 @@ class FrameImages:
         """
         Args:
             left: ``(H, W)`` uint8.
-            read_second: returns the second image, or raises UnreadableImageError.
-            image_map: applies a function to both images, one after the other or in parallel; the
-                result is the same.
+            read_second: function that returns the right image or the depth image, or None if there
+                is no second image. It raises UnreadableImageError if the image cannot be read.
+            image_map: applies a function to both images, sequentially or in parallel. Both ways
+                give the same result.
             mask: the mask of the left image; None uses all pixels.
         """
         self.left = left
@@ -90,23 +94,25 @@ class FrameImages:
             self.coarse = coarse_levels(self.pyramid)
 
     def start_corners(self, workers: Workers) -> None:
-        """Start to compute ``corners`` in another thread, before they are needed."""
+        """Start computing ``corners`` in another thread, before the corners are needed."""
         if self._started is None:
             self._image_map = partial(workers.map, urgency=Urgency.CORNERS)
             self._started = workers.submit(self._find_corners, Urgency.CORNERS)
 
     @cached_property
     def corners(self) -> Corners:
-        """The features that do not depend on tracking. This reads the second image."""
+        """The features that a corner detector finds, and their stereo matches. The first access
+        reads the second image (right image or depth image)."""
         return self._find_corners() if self._started is None else self._started.result()
 
     @cached_property
     def extracted(self) -> Extracted:
-        """The features."""
+        """The features of the frame, with their columns in the right image."""
         return matched(self.corners, self._context)
 
     def extracted_with(self, keypoints: Keypoints) -> Extracted:
-        """The features, and additional features at given positions and levels of the left image."""
+        """Return the features of the frame, and additional features at the given positions and
+        pyramid levels of the left image."""
         return matched(self.corners, self._context, keypoints)
 
     @cached_property
@@ -138,8 +144,8 @@ def find_corners(
     mask: Mask | None = None,
     pyramid: Pyramid | None = None,
 ) -> Corners:
-    """The first step of extraction: the features of each image and their stereo matches. If the
-    left image is black, only the right image is used, and its features have no stereo match.
+    """Extract the features of each image and match them (the first step of extraction). If the left
+    image is black, only the right image is used, and its features have no stereo match.
 
     Args:
         left: ``(H, W)`` uint8.
@@ -171,11 +177,12 @@ def find_corners(
 def matched(
     corners: Corners, context: TrackingContext, keypoints: Keypoints | None = None
 ) -> Extracted:
-    """The second step of extraction: additional features, and the columns of all features in the
-    right image.
+    """Add features at given positions, and compute the columns of all features in the right image
+    (the second step of extraction).
 
     Args:
-        keypoints: positions in the left image for additional features (``extract_at``).
+        keypoints: positions in the left image at which features are added (``extract_at``); None
+            adds no features.
     """
     camera, config = context.camera, context.config
     found, matches, depth, side, _ = corners

@@ -1,4 +1,4 @@
-"""A frame: the features of an image, the pose of the camera, and the tracked landmarks."""
+"""A frame: the features of an image, the pose of the camera, and the landmarks that are tracked."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from vslam.geometry import Matrix, inverse
 
 
 class FeatureSource(Protocol):
-    """The images of a frame. Their features are extracted on first use.
+    """The images of a frame. Features are extracted from the images when the features are first
+    needed.
 
     Attributes:
-        extracted: the features.
-        image: the ``(H, W)`` uint8 image that they are extracted from.
-        sides: the comparison of the left and the right image; None if there is no right image or it
-            has not been read.
+        extracted: the features of the frame.
+        image: the ``(H, W)`` uint8 image that the features are extracted from.
+        sides: result of comparing the exposure of the left and the right image; None if there is no
+            right image, or if it has not been read.
         problem: why the right image could not be read; None if there was no such problem.
     """
 
@@ -33,7 +34,8 @@ class FeatureSource(Protocol):
     def extracted(self) -> Extracted: ...
 
     def extracted_with(self, keypoints: Keypoints) -> Extracted:
-        """The features, plus features at the given positions and levels of the left image."""
+        """Return the features of the frame, and additional features at the given positions and
+        pyramid levels of the left image."""
         ...
 
     @property
@@ -42,20 +44,21 @@ class FeatureSource(Protocol):
 
 @dataclass
 class Frame:
-    """A frame that is being tracked.
+    """One frame of the run: its features, its pose, and the landmarks that its features track.
 
-    "The camera" is the camera whose image the features come from. It is the left camera, or the
-    right camera if the left image is black. ``T_cw`` is the pose of the left camera in both cases.
+    In this class, "the camera" is the camera whose image the features come from. It is usually the
+    left camera. It is the right camera if the left image is black. ``T_cw`` is the pose of the left
+    camera in both cases.
 
     Attributes:
         index: number of the frame in the run, from 0.
         timestamp: seconds.
         image: ``(H, W)`` uint8 image of the camera, for loop detectors that need it. None before
             ``extract`` is called, or if the frame has no image.
-        features, grid: the N features of the image, and a grid to search them by position. Before
-            features are extracted, ``features`` has one entry for each landmark that was found by
-            its patch.
-        pyramid, row_offset, side: see ``Extracted``.
+        features, grid: the N features of the image, and a grid in which features can be searched by
+            position. Before features are extracted, ``features`` has one entry for each landmark
+            whose image patch was found.
+        pyramid, row_offset, side: see the class ``Extracted``.
         T_camera_left: ``(4, 4)`` transform from the left camera to the camera: the identity, or
             ``Camera.T_right_left``.
         T_cw: ``(4, 4)`` estimated pose of the left camera (world to camera).
@@ -63,13 +66,15 @@ class Frame:
             none.
         xyz: ``(N, 3)`` float64 position of the landmark that each feature tracks, in the world
             frame, in metres; NaN if the feature tracks none.
-        disparity_offset: pixels that have been added to every disparity (``RigCalibration``).
-        delay_removed: whether the columns in the right image have been corrected for its delay.
+        disparity_offset: offset that has been added to every disparity, in pixels
+            (``RigCalibration``).
+        delay_removed: whether the columns in the right image have been corrected for the delay of
+            that image.
         shift: ``(N, 2)`` float32 offset from each feature to its aligned position, in pixels; NaN
             where the match was not aligned. None if no match was aligned.
-        twist: ``(6,)`` velocity when the frame was tracked, per second; None if unknown.
-            ``exp(twist dt)`` maps points from the camera frame at one time to the camera frame dt
-            seconds later.
+        twist: ``(6,)`` velocity of the camera when the frame was tracked, as a twist per second;
+            None if unknown. ``exp(twist dt)`` maps points from the camera frame at one time to the
+            camera frame dt seconds later.
         source: the images from which ``extract`` takes the features; None after extraction.
         coarse: the ``coarse_levels`` of the image, to which the next frame is aligned; None if
             frames are not aligned.
@@ -105,7 +110,8 @@ class Frame:
         timestamp: float = 0.0,
         image: NDArray[np.uint8] | None = None,
     ) -> Frame:
-        """A new frame that is not tracked yet. Its pose is the identity, and it has no matches."""
+        """Create a frame that is not tracked yet. Its pose is the identity, and it has no
+        matches."""
         features, n = extracted.features, len(extracted.features)
         return cls(
             index=index,
@@ -131,8 +137,8 @@ class Frame:
     def extract(self, camera: Camera) -> None:
         """Extract the features of the images, unless this has already been done.
 
-        The pose is kept, but the new features do not track landmarks yet. Where a landmark was
-        found by its patch, a feature is extracted even if the detector finds no corner there.
+        The pose is kept, but the new features do not track landmarks yet. Where the image patch of
+        a landmark was found, a feature is extracted even if the detector finds no corner there.
         """
         if self.source is None:
             return
@@ -155,11 +161,11 @@ class Frame:
         self.landmark[features], self.xyz[features] = -1, np.nan
 
     def snapshot(self) -> Frame:
-        """A copy that later changes of the frame's pose and matches do not affect."""
+        """Copy the frame. Later changes to its pose and its matches do not affect the copy."""
         return replace(self, landmark=self.landmark.copy(), xyz=self.xyz.copy())
 
     def restore(self, snapshot: Frame) -> None:
-        """Restore the state of the frame at the time of the snapshot."""
+        """Restore the pose and the matches that the frame had when ``snapshot`` made this copy."""
         vars(self).update(vars(snapshot))
 
     def set_camera_pose(self, T_camera_w: Matrix) -> None:
@@ -168,18 +174,20 @@ class Frame:
 
     @property
     def can_become_keyframe(self) -> bool:
-        """Whether the frame can become a keyframe. All keyframes are left images."""
+        """Whether the frame can become a keyframe. It cannot if its features come from the right
+        image, which happens when the left image is black."""
         return self.side == Side.LEFT
 
     @property
     def aligned(self) -> NDArray[np.bool_]:
-        """``(N,)`` bool: whether the match of each feature was aligned."""
+        """``(N,)`` bool: True for features whose match was aligned with sub-pixel accuracy."""
         if self.shift is None:
             return np.zeros(len(self.features), np.bool_)
         return (self.landmark >= 0) & np.isfinite(self.shift[:, 0])
 
     def refined_features(self) -> Features:
-        """The features at their aligned positions; disparities are unchanged."""
+        """Return the features, moved to their aligned positions where their matches were aligned.
+        Disparities are unchanged."""
         aligned = self.aligned
         if self.shift is None or not aligned.any():
             return self.features
@@ -190,7 +198,8 @@ class Frame:
 
     @property
     def n_stereo(self) -> int:
-        """Number of features with a stereo match (or, in an RGB-D frame, with a depth)."""
+        """Number of features with a stereo match. In an RGB-D frame, it is the number of features
+        with a depth."""
         return int(np.count_nonzero(np.isfinite(self.features.u_right)))
 
 

@@ -1,13 +1,14 @@
-"""Initialises a monocular map from two views (ORB-SLAM, section IV).
+"""Initialises a monocular map from two views (section IV of the ORB-SLAM paper).
 
-The fundamental matrix is not determined if the scene is planar or the camera only rotates. In all
-other cases, a homography does not explain the matches. So both models are fitted to the same random
-samples, and the model is selected by their scores. A reconstruction is accepted only if one motion
-explains clearly more points than any other, because a map with a wrong start cannot be repaired
-later.
+If the scene is planar or the camera only rotates, the fundamental matrix is not determined. In all
+other cases, a homography does not explain the matches. Therefore, both models are fitted to the
+same random samples, and the model with the better score is used.
 
-All samples are fitted and scored in one batch. Here NumPy is as fast as a Numba kernel and needs no
-compilation.
+A reconstruction is accepted only if one motion explains clearly more points than any other motion.
+The reason is that a map with a wrong start cannot be repaired later.
+
+All samples are fitted and scored in one batch. For this batch, NumPy is as fast as a Numba kernel,
+and NumPy needs no compilation.
 """
 
 from __future__ import annotations
@@ -41,9 +42,9 @@ class TwoViewModel:
         kind: the model that was selected.
         matrix: ``(3, 3)``. A homography maps pixels of view 1 to pixels of view 2. A fundamental
             matrix maps pixels of view 1 to epipolar lines in view 2.
-        inlier: ``(N,)`` bool, matches that the model explains.
-        homography_share: ``S_H / (S_H + S_F)``, the ratio of the scores by which the model was
-            selected.
+        inlier: ``(N,)`` bool, True for matches that the model explains.
+        homography_share: ``S_H / (S_H + S_F)``, where S_H is the score of the homography and S_F is
+            the score of the fundamental matrix. The model was selected by this ratio.
     """
 
     kind: Literal["homography", "fundamental"]
@@ -59,7 +60,8 @@ class TwoViews:
     Attributes:
         T_2_1: ``(4, 4)`` transform from camera 1 to camera 2; its translation has length 1.
         match: ``(M,)`` int64, indices of the matches that were triangulated.
-        points: ``(M, 3)`` triangulated points, in the frame of camera 1; the unit is the baseline.
+        points: ``(M, 3)`` triangulated points, in the frame of camera 1. The unit of length is the
+            distance between the two cameras.
     """
 
     T_2_1: Matrix
@@ -70,7 +72,8 @@ class TwoViews:
 def match_views(
     one: Frame, two: Frame, context: TrackingContext
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Match two frames by descriptor, within a window around each feature's position in ``one``.
+    """Match the features of two frames by their descriptors. Each feature of frame ``one`` is
+    searched for in frame ``two``, in a window around its position in ``one``.
 
     Returns:
         ``(N,)`` indices of the matched features in ``one``, and ``(N,)`` indices in ``two``.
@@ -106,7 +109,8 @@ def reconstruct(
     *,
     seed: int,
 ) -> TwoViews | None:
-    """Relative pose and points of two views; None if the matches do not determine the motion.
+    """Reconstruct the relative pose of two views and the matched points. Returns None if the
+    matches do not determine the motion.
 
     Args:
         xy_1, xy_2: ``(N, 2)`` matched pixels.
@@ -145,8 +149,8 @@ def reconstruct(
 def select_model(
     xy_1: Matrix, xy_2: Matrix, sigma: Matrix, config: InitializationConfig, *, seed: int
 ) -> TwoViewModel:
-    """Fit a homography and a fundamental matrix, and select one by their scores (ORB-SLAM, IV,
-    steps 2 and 3).
+    """Fit a homography and a fundamental matrix to the matches, and select one of the models by
+    their scores (section IV of the ORB-SLAM paper, steps 2 and 3).
 
     Args:
         xy_1, xy_2: ``(N, 2)`` matched pixels, N at least 8.
@@ -203,8 +207,8 @@ def normalised(xy: Matrix) -> tuple[Matrix, Matrix]:
 
 
 def fit_homographies(x_1: Matrix, x_2: Matrix) -> Matrix:
-    """``(B, 3, 3)`` homographies of B samples of shape ``(B, M, 2)``, by DLT (Hartley and
-    Zisserman, 4.1)."""
+    """Fit a homography to each of B samples of M matches, using the DLT (Hartley and Zisserman,
+    section 4.1). The points have shape ``(B, M, 2)``. Returns ``(B, 3, 3)`` matrices."""
     x, y, u, v = x_1[..., 0], x_1[..., 1], x_2[..., 0], x_2[..., 1]
     zero, one = np.zeros_like(x), np.ones_like(x)
     above = np.stack([zero, zero, zero, -x, -y, -one, v * x, v * y, v], axis=-1)
@@ -213,8 +217,11 @@ def fit_homographies(x_1: Matrix, x_2: Matrix) -> Matrix:
 
 
 def fit_fundamentals(x_1: Matrix, x_2: Matrix) -> Matrix:
-    """``(B, 3, 3)`` fundamental matrices of B samples of shape ``(B, M, 2)``, by the eight-point
-    algorithm (Hartley and Zisserman, 11.2). They have rank 2 and satisfy ``x_2' F x_1 = 0``."""
+    """Fit a fundamental matrix to each of B samples of M matches, using the eight-point algorithm
+    (Hartley and Zisserman, section 11.2). The points have shape ``(B, M, 2)``.
+
+    Returns ``(B, 3, 3)`` matrices of rank 2. Each matrix F satisfies ``x_2' F x_1 = 0``.
+    """
     x, y, u, v = x_1[..., 0], x_1[..., 1], x_2[..., 0], x_2[..., 1]
     A = np.stack([u * x, u * y, u, v * x, v * y, v, x, y, np.ones_like(x)], axis=-1)
     U, d, Vt = np.linalg.svd(_null_vectors(A))
@@ -223,7 +230,8 @@ def fit_fundamentals(x_1: Matrix, x_2: Matrix) -> Matrix:
 
 
 def _null_vectors(A: Matrix) -> Matrix:
-    """The unit vectors h that minimise ``|A h|``, each reshaped to a 3x3 matrix: ``(B, 3, 3)``."""
+    """For each of B matrices A, find the unit vector h that minimises ``|A h|``. Each h is reshaped
+    to a 3x3 matrix, so the result has shape ``(B, 3, 3)``."""
     _, vectors = np.linalg.eigh(A.swapaxes(1, 2) @ A)
     return vectors[:, :, 0].reshape(-1, 3, 3)
 
@@ -231,7 +239,8 @@ def _null_vectors(A: Matrix) -> Matrix:
 def score_homographies(
     H: Matrix, xy_1: Matrix, xy_2: Matrix, sigma: Matrix
 ) -> tuple[Matrix, NDArray[np.bool_]]:
-    """``(B,)`` scores and ``(B, N)`` inliers by the symmetric transfer error (ORB-SLAM, IV)."""
+    """Score B homographies by the symmetric transfer error (section IV of the ORB-SLAM paper).
+    Returns ``(B,)`` scores and a ``(B, N)`` bool mask of the inliers."""
     with np.errstate(all="ignore"):  # collinear samples give NaN errors, which score 0
         error_2 = _squared(_transferred(H, xy_1) - xy_2) / sigma**2
         error_1 = _squared(_transferred(_adjugates(H), xy_2) - xy_1) / sigma**2
@@ -241,12 +250,12 @@ def score_homographies(
 def score_fundamentals(
     F: Matrix, xy_1: Matrix, xy_2: Matrix, sigma: Matrix
 ) -> tuple[Matrix, NDArray[np.bool_]]:
-    """``(B,)`` scores and ``(B, N)`` inliers by the distances from the epipolar lines in both
-    views.
+    """Score B fundamental matrices by the distances from the epipolar lines in both views. Returns
+    ``(B,)`` scores and a ``(B, N)`` bool mask of the inliers.
 
     The distance from a line has one degree of freedom, so the inlier threshold is ``CHI2_LINE``. A
-    perfect match scores as much as with a homography, so that the scores of both models can be
-    compared (ORB-SLAM, IV).
+    perfect match has the same score as with a homography, so that the scores of both models can be
+    compared (section IV of the ORB-SLAM paper).
     """
     one = np.ones((len(xy_1), 1))
     p_1, p_2 = np.hstack([xy_1, one]), np.hstack([xy_2, one])
@@ -260,7 +269,8 @@ def score_fundamentals(
 
 
 def _score(error_1: Matrix, error_2: Matrix, limit: float) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Scores and inliers of B models from the ``(B, N)`` chi-squares in both views."""
+    """Compute ``(B,)`` scores and a ``(B, N)`` bool mask of the inliers for B models. The arguments
+    are the ``(B, N)`` chi-square errors in view 1 and in view 2, and the inlier threshold."""
     score = np.zeros(len(error_1))
     for error in (error_2, error_1):
         score += np.where(error < limit, CHI2_MONO - error, 0.0).sum(axis=1)
@@ -273,8 +283,8 @@ def _transferred(H: Matrix, xy: Matrix) -> Matrix:
 
 
 def _adjugates(H: Matrix) -> Matrix:
-    """Adjugates of ``(B, 3, 3)`` matrices. They are the inverses up to scale, and exist even for
-    singular matrices."""
+    """Compute the adjugates of ``(B, 3, 3)`` matrices. An adjugate is the inverse up to scale. It
+    exists even for a singular matrix."""
     a, b, c = H[:, 0], H[:, 1], H[:, 2]
     return np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
 
@@ -284,8 +294,8 @@ def _squared(x: Matrix) -> Matrix:
 
 
 def motions_of_essential(E: Matrix) -> list[Matrix]:
-    """The four candidate motions ``T_2_1`` of an essential matrix (Hartley and Zisserman,
-    9.6.2)."""
+    """Return the four candidate motions ``T_2_1`` of an essential matrix (Hartley and Zisserman,
+    section 9.6.2)."""
     U, _, Vt = np.linalg.svd(E)
     W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     s = np.linalg.det(U) * np.linalg.det(Vt)
@@ -294,9 +304,9 @@ def motions_of_essential(E: Matrix) -> list[Matrix]:
 
 
 def motions_of_homography(A: Matrix) -> list[Matrix]:
-    """The eight candidate motions ``T_2_1`` of a calibrated homography (Faugeras and Lustman,
-    "Motion and structure from motion in a piecewise planar environment", 1988). Returns an empty
-    list for a pure rotation."""
+    """Return the eight candidate motions ``T_2_1`` of a calibrated homography (Faugeras and
+    Lustman, "Motion and structure from motion in a piecewise planar environment", 1988). The list
+    is empty for a pure rotation."""
     U, (d1, d2, d3), Vt = np.linalg.svd(A)
     if d1 / d2 < 1.00001 or d2 / d3 < 1.00001:
         return []
@@ -334,8 +344,9 @@ def _triangulate(
     """Triangulate N matches.
 
     Returns:
-        ``(N, 3)`` points in the frame of camera 1; ``(N,)`` bool, True for points in front of both
-        cameras with small reprojection errors; ``(N,)`` cosine of the parallax angle of each point.
+        ``(N, 3)`` points in the frame of camera 1; ``(N,)`` bool, True for points that lie in front
+        of both cameras and have small reprojection errors; ``(N,)`` cosine of the parallax angle of
+        each point.
     """
     R, t = T_2_1[:3, :3], T_2_1[:3, 3]
     ray_1 = camera.backproject(xy_1, np.ones(len(xy_1)))

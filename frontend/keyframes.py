@@ -1,4 +1,5 @@
-"""Decides when a frame becomes a keyframe (ORB-SLAM2, section III-E; monocular: ORB-SLAM, V-E)."""
+"""Decides when a frame becomes a keyframe. The rules follow section III-E of the ORB-SLAM2 paper.
+For monocular cameras, they follow section V-E of the ORB-SLAM paper."""
 
 from __future__ import annotations
 
@@ -28,9 +29,10 @@ class KeyframeEvidence:
         untracked_close: number of close stereo features that track no landmark. None for a frame
             that was tracked by patches and has no features; the number is then assumed to be large
             enough.
-        mapping_idle: whether local mapping of the last keyframe is finished and merged.
-        gained_close: running mean, over the last keyframes, of the number of close points that the
-            first frame after a keyframe tracks. Infinite if unknown.
+        mapping_idle: whether local mapping of the last keyframe is finished, and its result is
+            merged into the map that tracking reads.
+        gained_close: number of close points that the first frame after a keyframe tracks, as a
+            running mean over the last keyframes. It is infinite if unknown.
         first_close: number of close points that the first frame after the last keyframe tracks.
         close_ratio: factor, at most 1, by which the number of tracked close points has changed per
             frame since the first frame after the last keyframe.
@@ -47,8 +49,8 @@ class KeyframeEvidence:
     close_ratio: float = 1.0
 
     def ahead(self, frames: int) -> KeyframeEvidence:
-        """The evidence that is expected some frames later. It is assumed that the number of tracked
-        close points continues to change by the factor ``close_ratio`` per frame."""
+        """Predict the evidence some frames later. It is assumed that the number of tracked close
+        points continues to change by the factor ``close_ratio`` per frame."""
         close = round(self.tracked_close * self.close_ratio**frames)
         n_inliers = self.n_inliers + close - self.tracked_close
         return replace(self, tracked_close=close, n_inliers=n_inliers)
@@ -57,7 +59,7 @@ class KeyframeEvidence:
 def needs_keyframe(
     evidence: KeyframeEvidence, config: KeyframeConfig, *, depth: bool = False
 ) -> bool:
-    """Whether a stereo or RGB-D frame should become a keyframe.
+    """Return whether a stereo or RGB-D frame should become a keyframe.
 
     A keyframe is needed if the last one is old. A keyframe is also needed if the view has changed
     enough, or if too few close points are tracked. For these last two reasons, a keyframe is made
@@ -100,10 +102,11 @@ def needs_keyframe(
 
 
 def needs_monocular_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig) -> bool:
-    """Whether a monocular frame should become a keyframe (ORB-SLAM, V-E).
+    """Return whether a monocular frame should become a keyframe. The rule follows section V-E of
+    the ORB-SLAM paper.
 
-    Keyframes are made early, because a point is mapped only after two keyframes have seen it from
-    different positions. Redundant keyframes are culled later.
+    Keyframes are made early, because a point can be mapped only after two keyframes have seen it
+    from different positions. Redundant keyframes are culled later.
 
     The time since the last keyframe is not a reason by itself. While the camera stands still,
     nothing new can be triangulated.
@@ -120,12 +123,15 @@ def needs_monocular_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig)
 def count_close(
     state: PolicyState, tracked_close: int, frame: int, config: KeyframeConfig
 ) -> PolicyState:
-    """The state after the frame with index ``frame``, which tracks ``tracked_close`` close points.
-    The state changes only if this is the first frame after a keyframe.
+    """Update the running mean of the number of close points that the first frame after a keyframe
+    tracks. Returns the new state.
+
+    ``tracked_close`` is the number of close points that the frame with index ``frame`` tracks. The
+    state changes only if this frame is the first frame after a keyframe.
 
     A single frame may track few close points by chance. Close points are scarce only if several
-    frames in a row track few of them. So an exponential moving average is kept, which starts at a
-    high value.
+    frames in a row track few of them. Therefore, the running mean is an exponential moving average.
+    It starts at a high value.
     """
     if not state.gain_awaited:
         return state
@@ -134,9 +140,12 @@ def count_close(
 
 
 def close_ratio(state: PolicyState, tracked_close: int, frame: int) -> float:
-    """Factor by which the number of tracked close points has changed per frame, from the first
-    frame after the last keyframe to ``frame``, which tracks ``tracked_close``. Returns 1 if the
-    number has not fallen."""
+    """Compute the factor by which the number of tracked close points has changed per frame since
+    the first frame after the last keyframe.
+
+    ``tracked_close`` is the number of close points that the current frame, which has the index
+    ``frame``, tracks. The result is 1 if the number has not fallen.
+    """
     if not 0 < tracked_close < state.first_close:
         return 1.0
     share = tracked_close / state.first_close
@@ -154,7 +163,7 @@ class KeyframePolicy:
 
     @property
     def due(self) -> int:
-        """Index of the frame that is to become a keyframe; -1 if none is planned."""
+        """Index of the frame that is planned to become a keyframe; -1 if none is planned."""
         return self._state.due
 
     def observe(
@@ -185,31 +194,34 @@ class KeyframePolicy:
         )
 
     def wants_keyframe(self, evidence: KeyframeEvidence) -> bool:
-        """Whether the frame should become a keyframe. This does not test whether the place is
-        already mapped; ``is_known`` does."""
+        """Return whether the frame should become a keyframe. This method does not test whether the
+        place is already mapped. ``is_known`` tests this."""
         camera = self._context.camera
         if camera.monocular:
             return needs_monocular_keyframe(evidence, self._config)
         return needs_keyframe(evidence, self._config, depth=camera.depth)
 
     def is_known(self, *, n_inliers: int, n_shared: int, n_place: int) -> bool:
-        """Whether the place is already mapped, so that a keyframe here would repeat an old one.
+        """Return whether the place that the frame shows is already mapped, so that a new keyframe
+        would repeat an old one.
 
-        The frame must track as many landmarks as a frame next to the old keyframe should. It must
-        also share enough of them with the old keyframe.
+        Two conditions must hold. The frame must track as many landmarks as is expected of a frame
+        next to the old keyframe. It must also share enough of these landmarks with the old
+        keyframe.
 
         A lack of close points is not a reason to map a known place again, because the old keyframe
         did not provide more of them.
 
-        A minimum number of inliers is required, because of the end of a map. The last keyframe of a
-        map has few landmarks that at least three keyframes observe. If the camera drives beyond the
-        end, both ratios would therefore hold until tracking is lost.
+        In addition, a minimum number of inliers is required. Otherwise, no keyframe would be made
+        when the camera drives beyond the end of a map. The last keyframe of a map has few landmarks
+        that at least three keyframes observe, so both conditions would hold until tracking is lost.
 
         Args:
-            n_inliers: number of landmarks tracked in the frame.
+            n_inliers: number of landmarks that the frame tracks.
             n_shared: number of these landmarks that the old keyframe observes. The old keyframe is
                 the one that observes the most of them.
-            n_place: number of landmarks of that keyframe that at least three keyframes observe.
+            n_place: number of landmarks that the old keyframe and at least two other keyframes
+                observe.
         """
         return (
             n_inliers >= self._config.known_min_inliers
@@ -218,7 +230,8 @@ class KeyframePolicy:
         )
 
     def is_due(self, index: int, evidence: KeyframeEvidence) -> bool:
-        """Whether frame ``index``, which was tracked by patches, is to become a keyframe.
+        """Return whether the frame with this index, which was tracked by patches, is to become a
+        keyframe.
 
         A keyframe is planned a few frames before it is expected to be needed. Its features can then
         be extracted in the background.
@@ -233,13 +246,13 @@ class KeyframePolicy:
         return True
 
     def keyframe_made(self) -> None:
-        """Update the state after a keyframe was made."""
+        """Update the state after a frame became a keyframe."""
         self._state = replace(self._state, gain_awaited=True, due=-1)
 
     def state(self) -> PolicyState:
-        """The state, for a saved map or a checkpoint."""
+        """Return the state of the policy, to store it in a map file or a checkpoint."""
         return self._state
 
     def restore(self, state: PolicyState) -> None:
-        """Continue from a state that ``state`` returned."""
+        """Continue from a state that the method ``state`` returned."""
         self._state = state

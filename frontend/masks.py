@@ -26,8 +26,8 @@ class Mask:
     """The mask of one image.
 
     Attributes:
-        used: ``(H, W)`` bool, False where the image is not to be used.
-        levels: for each pixel of the pyramid, 1 if a feature may lie there, else 0.
+        used: ``(H, W)`` bool, False for pixels that are not to be used.
+        levels: pyramid of the mask. A pixel is 1 if a feature may lie there, else 0.
     """
 
     used: NDArray[np.bool_]
@@ -35,7 +35,8 @@ class Mask:
 
     @classmethod
     def of(cls, mask: NDArray[np.uint8] | NDArray[np.bool_], config: OrbConfig) -> Self:
-        """A mask from an ``(H, W)`` array. Pixels whose value is 0 are not to be used."""
+        """Create a mask from an ``(H, W)`` array. Pixels whose value is 0 in the array are not to
+        be used."""
         used = mask > 0
         levels = build_pyramid(used * np.uint8(255), config)
         for index in range(config.n_levels):
@@ -44,9 +45,12 @@ class Mask:
         return cls(used, levels)
 
     def shows(self, xy: NDArray[np.floating], octave: NDArray[np.integer]) -> NDArray[np.bool_]:
-        """``(N,)`` bool, True for features that the mask allows. Their positions are ``(N, 2)``
-        full-resolution pixels, and their octaves are ``(N,)``. Positions outside the image are
-        clamped to its border."""
+        """Return ``(N,)`` bool, True for features that the mask allows.
+
+        ``xy`` is the ``(N, 2)`` positions of the features, in full-resolution pixels. ``octave`` is
+        their ``(N,)`` pyramid levels. Positions outside the image are clamped to the border of the
+        image.
+        """
         shapes = self.levels.shapes[octave]
         ratio = self.levels.shapes[0, ::-1] / shapes[:, ::-1]
         pixel = np.rint((np.nan_to_num(xy) + 0.5) / ratio - 0.5)
@@ -55,7 +59,7 @@ class Mask:
         return self.levels.pixels[at] > 0
 
     def filled(self, image: Image) -> Image:
-        """A copy of an ``(H, W)`` uint8 image for networks that read the whole image. Masked pixels
-        have the mean grey value of the other pixels."""
+        """Copy an ``(H, W)`` uint8 image and give all masked pixels the mean grey value of the
+        other pixels. The copy is for networks that read the whole image."""
         mean = np.uint8(image[self.used].mean()) if self.used.any() else np.uint8(0)
         return np.where(self.used, image, mean)

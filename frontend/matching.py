@@ -1,7 +1,8 @@
-"""Matching of landmarks and descriptors to the features of a frame, without state.
+"""Matches landmarks and descriptors with the features of a frame.
 
-Search by projection follows ORB-SLAM (Mur-Artal et al., T-RO 2015, V-C and V-D). A landmark is
-searched for only near its projection and near the pyramid level at which it should appear.
+The search by projection follows ORB-SLAM (Mur-Artal et al., T-RO 2015, sections V-C and V-D). A
+landmark is searched for only near its projection, and only near the pyramid level at which it
+should appear.
 """
 
 from __future__ import annotations
@@ -20,17 +21,18 @@ ORIENTATION_BINS = 30
 
 @kernel
 def predict_view(T, xyz, normal, distance_range, intrinsics, width, height, scales, window):
-    """Predict where landmarks appear in an image (ORB-SLAM, V-D).
+    """Predict where landmarks appear in an image (section V-D of the ORB-SLAM paper).
 
     A landmark is visible if it meets three conditions. It projects into the image. Its distance
-    from the camera is in ``distance_range``, with a tolerance of 20 %. The camera views it from at
-    most 60 degrees off its mean viewing direction.
+    from the camera is in ``distance_range``, with a tolerance of 20 %. The angle between the
+    viewing ray and the mean viewing direction of the landmark is at most 60 degrees.
 
     Args:
         T: ``(4, 4)`` pose of the camera (world to camera).
         xyz, normal: ``(N, 3)`` positions and ``(N, 3)`` mean viewing directions (unit vectors) of
             the landmarks, in the world frame.
-        distance_range: ``(N, 2)`` least and greatest distance at which each landmark is detected.
+        distance_range: ``(N, 2)`` least and greatest distance at which each landmark can be
+            detected.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         scales: ``(levels,)`` pyramid scale factors.
         window: search radius at octave 0, pixels.
@@ -94,7 +96,7 @@ class Projections(NamedTuple):
 
 
 class Searchable(NamedTuple):
-    """N features of an image, with a grid to search them by position.
+    """N features of an image, and a grid in which the features can be searched by position.
 
     Attributes:
         xy: ``(N, 2)`` pixels.
@@ -112,7 +114,7 @@ class Searchable(NamedTuple):
 
     @classmethod
     def of_features(cls, features: Features, grid: FeatureGrid) -> Searchable:
-        """The features of a frame. The arrays are not copied."""
+        """Create a ``Searchable`` from the features of a frame. The arrays are not copied."""
         descriptor = features.descriptors.view(np.uint64)
         return cls(features.xy, features.octave, features.u_right, descriptor, grid)
 
@@ -122,16 +124,17 @@ def search_windows(projections, features, free, max_distance, ratio):
     """Find the best feature for each of M projected landmarks.
 
     Args:
-        projections: ``Projections`` of the landmarks.
-        features: ``Searchable`` of the image.
+        projections: the ``Projections`` of the M landmarks.
+        features: the ``Searchable`` of the image, with N features.
         free: ``(N,)`` bool, True for features that may be matched.
         max_distance: largest Hamming distance of a match, bits.
         ratio: largest ratio of the best to the second best distance. The ratio is tested only if
             both features have the same octave; 1 disables the test.
 
     Returns:
-        ``(M,)`` int32 index of the matched feature, or -1; and ``(M,)`` int32 distances. A feature
-        is matched at most once, to the landmark with the closest descriptor.
+        ``(M,)`` int32 index of the feature that each landmark is matched with, or -1 if it has no
+        match; ``(M,)`` int32 distances between the descriptors. A feature is matched at most once,
+        with the landmark that has the closest descriptor.
     """
     uvr, radius, octave_low, octave_high, descriptors = projections
     xy, octave, u_right, frame_descriptors, grid = features
@@ -196,7 +199,8 @@ def search_all(a, b, max_distance, ratio):
         ratio: largest ratio of the best to the second best distance, for each descriptor of a.
 
     Returns:
-        ``(M,)`` int32 index of the match in b, or -1.
+        ``(M,)`` int32: for each descriptor of a, the index of its match in b, or -1 if it has no
+        match.
     """
     m, n = len(a), len(b)
     best_of_a = np.full(m, -1, np.int32)
@@ -223,9 +227,11 @@ def search_all(a, b, max_distance, ratio):
 
 @kernel
 def consistent_orientation(angle_a, angle_b):
-    """Whether the rotation of each match agrees with most other matches (ORB-SLAM, V-C).
+    """Test whether the rotation of each match agrees with the rotations of most other matches
+    (section V-C of the ORB-SLAM paper).
 
-    The rotations are counted in a histogram of 30 bins, and matches in the three fullest bins are
+    The rotation of a match is the difference between the orientations of its two features. The
+    rotations are counted in a histogram of 30 bins. Matches in the three fullest bins are
     consistent. The second and the third bin count only if each holds at least a tenth as many
     matches as the first.
 
@@ -233,7 +239,7 @@ def consistent_orientation(angle_a, angle_b):
         angle_a, angle_b: ``(N,)`` float32 orientations of the matched features, radians.
 
     Returns:
-        ``(N,)`` bool.
+        ``(N,)`` bool, True for matches whose rotation is consistent.
     """
     n = len(angle_a)
     bins = np.empty(n, np.int64)
@@ -255,8 +261,8 @@ def consistent_orientation(angle_a, angle_b):
 
 
 def count_elsewhere(u: NDArray[np.floating], width: int) -> int:
-    """Number of inliers outside a vertical strip of the image. The strip is a third of the image
-    wide and is placed so that it contains as many inliers as possible.
+    """Count the inliers outside a vertical strip of the image. The width of the strip is a third of
+    the width of the image. The strip is placed where it contains as many inliers as possible.
 
     Two different places may contain a similar object, for example a facade or a parked car. Such an
     object can provide a hundred inliers and determine a pose to a centimetre. However, all these

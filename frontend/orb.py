@@ -34,8 +34,9 @@ PATTERN: NDArray[np.int8] = np.load(Path(__file__).with_name("orb_pattern.npy"))
 class Extraction:
     """Features of one image, sorted by octave. ``vslam.features.Features`` describes the fields.
 
-    At every level, coordinate 0 is the centre of the first pixel. If the image is ``w`` times wider
-    than a level, x in the level corresponds to ``(x + 0.5) w - 0.5`` in the image.
+    At every pyramid level, coordinate 0 is the centre of the first pixel. If the image is ``w``
+    times wider than a level, column x of the level corresponds to column ``(x + 0.5) w - 0.5`` of
+    the image.
     """
 
     xy: NDArray[np.float32]
@@ -45,12 +46,13 @@ class Extraction:
     pyramid: Pyramid
 
     def joined(self, other: Extraction) -> tuple[Extraction, NDArray[np.int64]]:
-        """Join these features with those of another extraction from the same image.
+        """Join these features with the features of another extraction from the same image. The
+        joined features are sorted by octave again.
 
         Returns:
-            The joined features, and the ``(N,)`` order in which they were sorted. Entry i of the
-            order is the index of the i-th joined feature in a list of these features followed by
-            the other ones.
+            The joined features, and the ``(N,)`` indices that sorted them. To sort another array in
+            the same way, concatenate its values for these features and for ``other``, in this
+            order, and index the result with the ``(N,)`` indices.
         """
         octave = np.concatenate([self.octave, other.octave])
         order = np.argsort(octave, kind="stable")
@@ -72,10 +74,11 @@ def extract(
 ) -> Extraction:
     """Extract up to ``config.n_features`` ORB features from an ``(H, W)`` uint8 image.
 
-    This is a pure function. It can be called from several threads at the same time.
+    The function has no side effects. It can be called from several threads at the same time.
 
     Args:
-        allowed: 1 for pixels where a corner may lie, 0 for the others; None allows all pixels.
+        allowed: pyramid that is 1 for pixels where a corner may lie, and 0 for other pixels; None
+            allows all pixels.
         pyramid: the pyramid of the image, if it has already been built.
     """
     pyramid = pyramid or build_pyramid(image, config)
@@ -95,8 +98,8 @@ def extract(
 
 
 def extract_at(found: Extraction, xy: NDArray[np.float32], octave: NDArray[np.uint8]) -> Extraction:
-    """Extract features at N given positions. Positions with another feature within
-    ``KEYPOINT_REACH`` are skipped.
+    """Extract features at N given positions. A position is skipped if another feature lies within
+    ``KEYPOINT_REACH`` of it.
 
     Args:
         found: the features that were already extracted from the image.
@@ -127,7 +130,8 @@ def extract_at(found: Extraction, xy: NDArray[np.float32], octave: NDArray[np.ui
 
 @kernel
 def _is_free(pixel, existing):
-    """``(N,)`` bool: whether each ``(N, 2)`` pixel is far from all ``(M, 2)`` existing features."""
+    """Return ``(N,)`` bool, True for pixels that are far from all existing features. ``pixel`` has
+    shape ``(N, 2)``, and ``existing`` has shape ``(M, 2)``."""
     free = np.ones(len(pixel), np.bool_)
     for i in range(len(pixel)):
         x, y = pixel[i, 0], pixel[i, 1]
@@ -140,14 +144,15 @@ def _is_free(pixel, existing):
 
 
 def scale_factors(config: OrbConfig) -> NDArray[np.float64]:
-    """``(L,)`` float64 scale of each level, in full-resolution pixels per pixel; 1 for level 0."""
+    """Return the ``(L,)`` float64 scale of each pyramid level, in full-resolution pixels per pixel
+    of the level. The scale of level 0 is 1."""
     return config.scale_factor ** np.arange(config.n_levels, dtype=np.float64)
 
 
 @cache
 def features_per_level(config: OrbConfig) -> NDArray[np.int64]:
-    """``(L,)`` int64 maximum number of features of each level. ``n_features`` is divided among the
-    levels in proportion to 1 / scale (ORB-SLAM, V-A)."""
+    """Return the ``(L,)`` int64 maximum number of features of each pyramid level. ``n_features`` is
+    divided among the levels in proportion to 1 / scale (section V-A of the ORB-SLAM paper)."""
     weights = 1.0 / scale_factors(config)
     share = config.n_features * weights / weights.sum()
     quota = np.floor(share).astype(np.int64)
@@ -161,7 +166,7 @@ def features_per_level(config: OrbConfig) -> NDArray[np.int64]:
 def _layout(
     height: int, width: int, config: OrbConfig
 ) -> tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Number of bytes of a pyramid, and the offsets, shapes and scales of its levels."""
+    """Return the number of bytes of a pyramid, and the offsets, shapes and scales of its levels."""
     scales = scale_factors(config)
     shapes = np.round(np.array([height, width]) / scales[:, None]).astype(np.int64).clip(min=1)
     sizes = shapes.prod(axis=1)
@@ -170,8 +175,8 @@ def _layout(
 
 
 def level_shapes(size: tuple[int, int], config: OrbConfig) -> NDArray[np.int64]:
-    """``(L, 2)`` heights and widths of the pyramid levels of an image. ``size`` is the height and
-    width of the image."""
+    """Return the ``(L, 2)`` heights and widths of the pyramid levels of an image. ``size`` is the
+    height and width of the image."""
     return _layout(*size, config)[2]
 
 
@@ -195,17 +200,18 @@ def build_pyramid(image: NDArray[np.uint8], config: OrbConfig) -> Pyramid:
 def extract_levels(
     pixels, offsets, shapes, allowed, quota, threshold, threshold_min, cell, inside, pattern
 ):
-    """Extract the features of all levels.
+    """Extract the ORB features of all pyramid levels of an image.
 
     All levels are processed in a single kernel, so that the global interpreter lock is acquired
     only once per image.
 
     Args:
-        pixels, offsets, shapes: fields of the ``Pyramid``.
-        allowed: 1 for pixels where a corner may lie, 0 for the others; empty allows all pixels.
+        pixels, offsets, shapes: fields of the ``Pyramid`` of the image.
+        allowed: pixels of a pyramid of the same shapes, 1 where a corner may lie and 0 elsewhere;
+            an empty array allows all pixels.
         quota: ``(L,)`` int64, greatest number of features per level.
         threshold, threshold_min, cell: see ``local_maxima``.
-        inside: ``DISC``, the disc for ``orientations``.
+        inside: ``DISC``, the disc that ``orientations`` uses.
         pattern: ``PATTERN``, ``(256, 4)`` int8 coordinates xa, ya, xb, yb of the two points of each
             test.
 
@@ -240,8 +246,9 @@ def extract_levels(
 
 @kernel
 def detect_corners(pixels, allowed, quota, threshold, threshold_min, cell):
-    """``(n, 2)`` float32 x, y of up to ``quota`` FAST-9 corners of one level, in pixels of the
-    level. The corners are evenly spread over the ``allowed`` pixels."""
+    """Detect up to ``quota`` FAST-9 corners in one pyramid level. The corners are evenly spread
+    over the ``allowed`` pixels. Returns their ``(n, 2)`` float32 x and y, in pixels of the
+    level."""
     height, width = pixels.shape
     if min(height, width) <= 2 * MARGIN or quota == 0:
         return np.empty((0, 2), np.float32)
@@ -259,8 +266,8 @@ def detect_corners(pixels, allowed, quota, threshold, threshold_min, cell):
 
 
 def disc(radius: int) -> NDArray[np.int16]:
-    """``(2 radius + 1, LANES)`` mask that is 1 inside a disc. The centre of the disc is in column
-    ``radius``."""
+    """Create a ``(2 radius + 1, LANES)`` mask that is 1 inside a disc. The centre of the disc is in
+    column ``radius``."""
     x = np.arange(LANES) - radius
     y = np.arange(-radius, radius + 1)[:, None]
     return (abs(x) <= np.floor(np.sqrt(radius**2 - y**2 + 0.5))).astype(np.int16)
@@ -271,8 +278,9 @@ DISC = disc(PATCH_RADIUS)
 
 @kernel
 def orientations(pixels, corners, inside):
-    """``(n,)`` float32 orientation of each corner, in radians: the direction of the intensity
-    centroid of the disc around the corner (Rublee et al., section 3.2)."""
+    """Compute the ``(n,)`` float32 orientation of each corner, in radians. It is the direction from
+    the corner to the intensity centroid of the disc around the corner (Rublee et al., section
+    3.2)."""
     n = len(corners)
     angles = np.empty(n, np.float32)
     height, width = pixels.shape
@@ -304,8 +312,8 @@ def orientations(pixels, corners, inside):
 
 @kernel
 def describe(smooth, corners, angles, pattern):
-    """``(n, 32)`` uint8 rotated BRIEF descriptor of each corner (Rublee et al., section 4). Bit 0
-    of byte 0 is the result of the first test."""
+    """Compute the ``(n, 32)`` uint8 rotated BRIEF descriptor of each corner (Rublee et al., section
+    4). Bit 0 of byte 0 is the result of the first test."""
     n = len(corners)
     height, width = smooth.shape
     flat = smooth.reshape(height * width)
@@ -337,7 +345,7 @@ def describe(smooth, corners, angles, pattern):
 
 @kernel
 def smoothed(pixels):
-    """Blur an image before BRIEF tests are evaluated.
+    """Blur an image. BRIEF descriptors are computed from the blurred image.
 
     The result is identical to that of ``cv2.GaussianBlur`` with a 7x7 kernel and a sigma of 2.
     Borders are mirrored.
@@ -391,10 +399,11 @@ def smoothed(pixels):
 
 @inner_kernel
 def weigh(a, b, c, d, e, f, g, out):
-    """Weighted sum of seven rows, or of seven shifted copies of one row.
+    """Write the weighted sum of seven image rows, or of seven shifted copies of one row, into
+    ``out``.
 
-    The weights are those of a Gaussian with a sigma of 2, in 256ths. They are rounded to a sum of
-    256, as in OpenCV.
+    The weights of the seven rows are samples of a Gaussian with a sigma of 2, in 256ths. They are
+    rounded to a sum of 256, as in OpenCV.
     """
     for x in range(np.uintp(len(out))):
         out[x] = 18 * (a[x] + g[x]) + 34 * (b[x] + f[x]) + 48 * (c[x] + e[x]) + 56 * d[x]

@@ -1,9 +1,9 @@
-"""Tracks a frame without features: searches the image for patches of the newest keyframes.
+"""Tracks a frame without extracting features: it searches the image for image patches of landmarks.
 
-The method follows SVO (Forster et al., ICRA 2014, III, and T-RO 2017). First, sparse image
-alignment to the last frame estimates the pose (``pose_alignment``). Then the patch of each landmark
-is aligned with the image separately. Finally, the pose is optimised from the positions that were
-found.
+The patches come from the newest keyframes. The method follows SVO (Forster et al., ICRA 2014,
+section III, and T-RO 2017). First, sparse image alignment to the last frame estimates the pose
+(``pose_alignment``). Then the patch of each landmark is aligned with the image separately. Finally,
+the pose is optimised using the image positions of the patches.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ _MARGIN = PATCH_RADIUS + 2  # least distance of a patch centre from the border o
 
 
 class PatchTrack(NamedTuple):
-    """The pose of a frame that was tracked by patches, and the N landmarks that are inliers.
+    """The result of tracking a frame by image patches: its pose, and the N landmarks that are
+    inliers of the pose optimisation.
 
     Attributes:
         T_cw: ``(4, 4)`` pose (world to camera).
@@ -56,7 +57,8 @@ def track_patches(
     context: TrackingContext,
     mask: Mask | None = None,
 ) -> PatchTrack:
-    """Search the image for the patches of the landmarks of the local map, and optimise the pose.
+    """Search an image for the image patches of the landmarks in the local map, and optimise the
+    pose.
 
     Args:
         pyramid: the pyramid of the image.

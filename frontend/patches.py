@@ -1,4 +1,5 @@
-"""Image patches around keypoints, to which matches are aligned, and a store of recent patches.
+"""Cuts out image patches around keypoints, and stores the patches of the newest keyframes. Matches
+are aligned to these patches with sub-pixel accuracy.
 
 The patches of the newest keyframes are kept, and older patches are discarded. The newest keyframes
 observe nearly all landmarks that are being tracked, and a patch takes more memory than the rest of
@@ -57,7 +58,7 @@ def _cut(pixels, offsets, shapes, xy, octave):
 
 
 class RecentPatches:
-    """Stores the patches of the newest keyframes.
+    """Stores the image patches around the features of the newest keyframes.
 
     Frames without an image pyramid, for example frames of an RGB-D camera, have no patches.
     """
@@ -88,8 +89,8 @@ class RecentPatches:
         self.add(KeyframePatches(keyframe, pixels, shift))
 
     def add(self, patches: KeyframePatches) -> None:
-        """Store the patches of another keyframe. If all slots are full, the patches of the oldest
-        keyframe are replaced."""
+        """Store the patches of one more keyframe. If ``capacity`` keyframes are stored, the patches
+        of the oldest one are replaced."""
         slot, n = self._next, len(patches.pixels)
         if n > self._shift.shape[1]:
             self._pixels = _widened(self._pixels, n)
@@ -99,7 +100,8 @@ class RecentPatches:
         self._next = (slot + 1) % len(self._keyframes)
 
     def all(self) -> tuple[KeyframePatches, ...]:
-        """The stored patches of all keyframes, oldest keyframe first, for a checkpoint."""
+        """Return the stored patches of all keyframes, oldest keyframe first, to save them in a
+        checkpoint."""
         slots = np.roll(np.arange(len(self._keyframes)), -self._next)
         return tuple(
             KeyframePatches(
@@ -112,10 +114,11 @@ class RecentPatches:
         )
 
     def of(self, map_: Map, ids: NDArray[np.int32]) -> LandmarkPatches:
-        """The patches of landmarks in the map.
+        """Look up the image patches of landmarks in the map.
 
-        Each patch comes from the newest stored keyframe that observes the landmark. Landmarks that
-        no stored keyframe observes are omitted. The result is valid until ``add`` is called.
+        Each patch comes from the newest keyframe that observes the landmark and whose patches are
+        stored. If there is no such keyframe, the landmark is omitted. The result is valid until
+        ``add`` is called.
 
         Args:
             ids: ``(L,)`` ids of the landmarks, sorted.
@@ -144,10 +147,11 @@ def _widened(array: NDArray, n: int) -> NDArray:
 
 
 def certainty_of(frame: Frame, config: AlignmentConfig) -> NDArray[np.uint8] | int:
-    """``(N,)`` uint8 certainty of each feature's position (``Arrays.certainty``).
+    """Compute the ``(N,)`` uint8 certainty of the position of each feature (``Arrays.certainty``).
 
-    The certainty is the variance of a keypoint's position, divided by the variance of this
-    position. It is 1 for all features of a frame without a pyramid.
+    The certainty is a ratio of two variances: the usual variance of a keypoint's position, divided
+    by the variance of the position of this feature. It is 1 for all features of a frame without a
+    pyramid.
 
     The position of an aligned match is accurate. A feature without a match is also considered
     accurate, because a landmark that is created from it is defined by its position. A match that
@@ -167,8 +171,9 @@ def newest_rows(a, keyframes, ids):
     search therefore ends at the first observation that is older than all ``keyframes``.
 
     Returns:
-        ``(L,)`` int64 row of the observation in the map's arrays, and ``(L,)`` int64 index of its
-        keyframe in ``keyframes``. Both are -1 where none of ``keyframes`` observes the landmark.
+        ``(L,)`` int64 row of each observation in the observation arrays of the map, and ``(L,)``
+        int64 index into ``keyframes`` of the keyframe that made the observation. Both are -1 where
+        none of ``keyframes`` observes the landmark.
     """
     found, view = np.full(len(ids), -1, np.int64), np.full(len(ids), -1, np.int64)
     newest = keyframes.max()

@@ -1,5 +1,5 @@
-"""Optimises a camera pose from matched landmarks (motion-only bundle adjustment, ORB-SLAM2,
-III-C)."""
+"""Optimises a camera pose from matched landmarks (motion-only bundle adjustment, section III-C of
+the ORB-SLAM2 paper)."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def optimise_pose(
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Find the camera pose that minimises the robust reprojection error of fixed landmarks.
 
-    Runs four rounds of Gauss-Newton. After each round, all observations are classified again by the
-    chi-square test, and the next round uses only inliers. The first two rounds use the Huber loss.
+    Gauss-Newton is run four times. After each run, all observations are classified again by the
+    chi-square test, and the next run uses only the inliers. The first two runs use the Huber loss.
 
     Args:
         T_cw: ``(4, 4)`` initial pose (world to camera).
@@ -42,8 +42,8 @@ def optimise_pose(
             standard deviation of the disparity; None uses the ratio in ``intrinsics``.
 
     Returns:
-        ``T_cw`` ``(4, 4)`` and ``(N,)`` bool inliers. There are no inliers if fewer than three
-        observations are left.
+        The pose ``T_cw``, ``(4, 4)``, and an ``(N,)`` bool mask of the inliers. There are no
+        inliers if fewer than three observations are left.
     """
     if disparity_weight is None:
         disparity_weight = np.full(len(points), intrinsics[5])
@@ -58,7 +58,7 @@ def pose_covariance(
     intrinsics: NDArray[np.float64],
     disparity_weight: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """Covariance of an optimised pose relative to the landmarks.
+    """Estimate the covariance of an optimised pose relative to the landmarks.
 
     If the errors of all observations were independent and as large as their weights say, the
     covariance would be the inverse of the normal matrix times a variance factor. In practice,
@@ -115,11 +115,11 @@ def offset_effect(
     inverse_sigma2: NDArray[np.float64],
     intrinsics: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Linear effect of an error in the disparity offset on the estimated motion of a stereo camera.
+    """Compute how an error in the disparity offset of a stereo camera affects its estimated motion.
+    The effect is linearised.
 
-    Suppose that all disparities are too large by one pixel. A point at depth z then seems too near
-    by a fraction of ``z / bf``. The point suggests a translation that is too short by the same
-    fraction.
+    If all disparities are too large by one pixel, a point at depth z seems too near by a fraction
+    of ``z / bf``. The translation that this point suggests is then too short by the same fraction.
 
     Args:
         T_cw: ``(4, 4)`` optimised pose.
@@ -145,7 +145,8 @@ def offset_effect(
 
 @kernel
 def _gradients(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics, first):
-    """Normal equations of all observations, with gradients summed per cell.
+    """Compute the normal matrix of all observations, and the sum of the gradients in each cell of a
+    grid.
 
     Args:
         first: ``(C + 1,)`` index of the first observation of each cell. The last entry is the
@@ -206,8 +207,8 @@ def _optimise(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics):
 
 @inner_kernel
 def normal_equations(T, points, uvr, inverse_sigma2, disparity_weight, intrinsics, inlier, robust):
-    """Linearise the reprojection errors of all inliers at pose ``T``. Uses the Huber loss if
-    ``robust``.
+    """Linearise the reprojection errors of all inliers at pose ``T``. If ``robust`` is True, the
+    Huber loss is used.
 
     Returns:
         Lower triangle of the normal matrix, right-hand side, sum of the chi-squares of the
@@ -258,7 +259,8 @@ def normal_equations(T, points, uvr, inverse_sigma2, disparity_weight, intrinsic
 
 @inner_kernel
 def classify(T, points, uvr, inverse_sigma2, disparity_weight, intrinsics, inlier):
-    """Write into ``inlier`` whether each observation passes the chi-square test at pose ``T``."""
+    """Test each observation with the chi-square test at pose ``T``. The results are written into
+    ``inlier``: True for observations that pass the test."""
     fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
     for i in range(len(points)):
         p = points[i]

@@ -2,12 +2,13 @@
 landmarks.
 
 The motion of the camera is optimised until small windows around all landmarks of the last frame
-agree with the new image (SVO: Forster et al., ICRA 2014, III-A, and T-RO 2017, IV-A). The images
-are reduced in size, and the coarsest one is aligned first. Therefore, the prediction may be off by
-about twenty pixels, for example at the beginning of a turn.
+agree with the new image (SVO: Forster et al., ICRA 2014, section III-A, and T-RO 2017, section
+IV-A). The images are reduced in size, and the smallest image is aligned first. Therefore, the
+predicted pose may be wrong by about twenty pixels in the image, for example at the beginning of a
+turn.
 
-The light may change between two frames. So the mean of each window is subtracted, and one contrast
-factor for all windows is estimated.
+The lighting may change between two frames. Therefore, the mean of each window is subtracted, and a
+common contrast factor of all windows is estimated.
 """
 
 from __future__ import annotations
@@ -40,10 +41,11 @@ ROBUST = 1.5  # Huber threshold of a window's error, in multiples of the median 
 
 
 def coarse_levels(pyramid: Pyramid) -> Pyramid:
-    """The three small images of a frame that are used for its alignment, coarsest first.
+    """Return the three small images of a frame that are used for its sparse image alignment,
+    coarsest first.
 
-    They are the smallest level of the pyramid reduced to half size, the smallest level itself, and
-    the middle level.
+    The first image is the smallest level of the pyramid, reduced to half size. The second image is
+    the smallest level itself. The third image is the middle level.
     """
     height, width = pyramid.shapes[0]
     last, middle = len(pyramid.shapes) - 1, len(pyramid.shapes) // 2
@@ -56,7 +58,7 @@ def coarse_levels(pyramid: Pyramid) -> Pyramid:
 
 
 def coarse_shapes(shapes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """``(3, 2)`` heights and widths of ``coarse_levels``.
+    """Return the ``(3, 2)`` heights and widths of the three images that ``coarse_levels`` returns.
 
     Args:
         shapes: ``(L, 2)`` heights and widths of the levels of the whole pyramid.
@@ -68,7 +70,7 @@ def coarse_shapes(shapes: NDArray[np.int64]) -> NDArray[np.int64]:
 def coarse_pyramid(
     pixels: NDArray[np.uint8], shapes: NDArray[np.int64], size: tuple[int, int]
 ) -> Pyramid:
-    """Rebuild the result of ``coarse_levels`` from the pixels and shapes of its levels.
+    """Rebuild the result of ``coarse_levels`` from the stored pixels and shapes of its levels.
 
     Args:
         size: height and width of the whole image, pixels.
@@ -95,7 +97,7 @@ def align_pose(
     """Estimate the pose of a frame by sparse image alignment to another frame.
 
     Args:
-        now, before: ``coarse_levels`` of the frame and of the other frame.
+        now, before: the results of ``coarse_levels`` for the frame and for the other frame.
         xyz: ``(N, 3)`` landmarks that the other frame tracks, in the world frame.
         T_before: ``(4, 4)`` pose of the other frame (world to camera).
         T_cw: ``(4, 4)`` predicted pose of the frame (world to camera).
@@ -123,7 +125,7 @@ def align_pose(
 
 @kernel
 def _align(image, before, points, T_start, intrinsics, ratio_x, ratio_y):
-    """Align one level by inverse compositional Gauss-Newton.
+    """Align one pyramid level of two frames by inverse compositional Gauss-Newton.
 
     Gradients and Jacobians are computed only once, in the image ``before``.
 
@@ -135,8 +137,8 @@ def _align(image, before, points, T_start, intrinsics, ratio_x, ratio_y):
         ratio_x, ratio_y: full-resolution pixels per pixel of the level.
 
     Returns:
-        The ``(4, 4)`` motion, and the correlation between all windows and the image. If the
-        alignment fails, ``T_start`` and 0 are returned.
+        The ``(4, 4)`` motion, and the correlation between the windows of ``before`` and ``image``.
+        If the alignment fails, ``T_start`` and 0 are returned.
     """
     n = len(points)
     template = np.empty((n, PIXELS), np.float32)
@@ -181,7 +183,8 @@ def _align(image, before, points, T_start, intrinsics, ratio_x, ratio_y):
 
 @inner_kernel
 def _corner(point, intrinsics, ratio_x, ratio_y):
-    """Column and row, in the level, of the first pixel of the window around a projected point."""
+    """Project a point into a pyramid level, and return the column and the row of the first pixel of
+    the window around it."""
     u = intrinsics[0] * point[0] / point[2] + intrinsics[2]
     v = intrinsics[1] * point[1] / point[2] + intrinsics[3]
     middle = 0.5 + 0.5 * (WINDOW - 1)
@@ -190,11 +193,11 @@ def _corner(point, intrinsics, ratio_x, ratio_y):
 
 @inner_kernel
 def _draw_template(before, point, intrinsics, ratio_x, ratio_y, template, jacobian):
-    """Compute the template of the window around a point. Returns False if the window is not inside
-    the image.
+    """Compute the template of the window around a projected point. Returns False if the window is
+    not inside the image.
 
-    Grey values are written into ``template``, and their derivatives with respect to the motion into
-    ``jacobian``. The mean over the window is subtracted from both.
+    The grey values are written into ``template``. Their derivatives with respect to the motion are
+    written into ``jacobian``. The mean over the window is subtracted from both.
     """
     height, width = before.shape
     x, y, z = point[0], point[1], point[2]
@@ -240,8 +243,9 @@ def _draw_template(before, point, intrinsics, ratio_x, ratio_y, template, jacobi
 
 @inner_kernel
 def _read_window(image, T, p, intrinsics, ratio_x, ratio_y, seen):
-    """Write the grey values of the window around a point that was moved by ``T`` into ``seen``,
-    minus their mean. Returns False if the window is not inside the image."""
+    """Move a point by ``T``, project it, and read the grey values of the window around it. The grey
+    values minus their mean are written into ``seen``. Returns False if the window is not inside the
+    image."""
     height, width = image.shape
     x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
     y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
@@ -270,7 +274,7 @@ def _read_window(image, T, p, intrinsics, ratio_x, ratio_y, seen):
 
 @inner_kernel
 def _square(jacobian, hessian):
-    """Write the lower triangle of the normal matrix of one window into ``hessian``."""
+    """Compute the normal matrix of one window, and write its lower triangle into ``hessian``."""
     for j in range(6):
         for t in range(j + 1):
             total = np.float32(0.0)
@@ -281,10 +285,11 @@ def _square(jacobian, hessian):
 
 @inner_kernel
 def _step(seen, template, jacobian, hessian, error, m, contrast):
-    """``(6,)`` Gauss-Newton step that reduces the differences between ``seen`` and the templates.
+    """Compute the ``(6,)`` Gauss-Newton step that reduces the differences between the windows in
+    ``seen`` and the templates.
 
-    On entry, ``error`` must be negative for windows outside the image. For the other windows, it
-    receives the norm of the differences.
+    On entry, ``error`` must be negative for windows outside the image. For the other windows, the
+    norm of the differences is written into ``error``.
     """
     inside = 0
     scale = np.float32(1.0 / contrast)

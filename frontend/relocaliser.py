@@ -1,5 +1,5 @@
-"""Relocalisation: finds the pose of a lost or doubtful frame anywhere in the map (ORB-SLAM, T-RO
-2015, V-C).
+"""Relocalisation: finds the pose of a lost or doubtful frame anywhere in the map (Mur-Artal et al.,
+ORB-SLAM, T-RO 2015, section V-C).
 
 A frame is doubtful if it has so few inliers that its matches may be wrong.
 """
@@ -35,11 +35,12 @@ Recognise = Callable[[Map, Image | None, Features, list[LoopCandidate]], Localis
 
 
 class MapAccess(Protocol):
-    """Access to the map while local mapping does not write to it."""
+    """Gives access to the map at times when local mapping does not write to it."""
 
     @property
     def is_merged(self) -> bool:
-        """Whether no keyframe is being mapped, so that tracking sees the whole map."""
+        """Whether local mapping has finished with all keyframes, so that tracking sees the whole
+        map."""
         ...
 
     def merge(self) -> Map:
@@ -49,13 +50,14 @@ class MapAccess(Protocol):
 
 
 class Relocaliser:
-    """Relocalises frames at keyframes that look similar."""
+    """Relocalises lost and doubtful frames at keyframes that look similar. A frame is doubtful if
+    it has so few inliers that its matches may be wrong."""
 
     def __init__(self, context: TrackingContext, locate: Locate, recognise: Recognise) -> None:
         """
         Args:
             locate: returns the keyframes that look similar to a frame, best first.
-            recognise: called if a frame cannot be located at any of these keyframes by ORB
+            recognise: called if a frame cannot be located at any of these keyframes using ORB
                 descriptors.
         """
         self._context = context
@@ -63,18 +65,19 @@ class Relocaliser:
         self._recognise = recognise
 
     def relocalise_if_needed(self, frame: Frame, found: Found, owner: MapAccess) -> Found:
-        """Relocalise a frame that is lost or doubtful.
+        """Relocalise a frame if it is lost or doubtful. A frame is doubtful if it has so few
+        inliers that its matches may be wrong.
 
-        A lost frame is relocalised only if no keyframe is being mapped at the moment. For a
-        doubtful frame, the function waits until the keyframe is mapped. The doubtful frame keeps
-        its tracked pose unless relocalisation finds more than ``relocalization.better`` times as
-        many inliers.
+        A lost frame is relocalised only if no keyframe is being mapped at the moment. If the frame
+        is doubtful, the method first waits until no keyframe is being mapped. A doubtful frame
+        usually keeps its tracked pose. It takes the pose of the relocalisation only if this pose
+        has more than ``relocalization.better`` times as many inliers.
 
         Args:
             found: the result of tracking the frame.
 
         Returns:
-            The new result, or ``found`` if the frame keeps its tracked pose.
+            The result of the relocalisation, or ``found`` if the frame was not relocalised.
         """
         if found.is_lost:
             return self._find(frame, owner.merge()) if owner.is_merged else found
@@ -89,7 +92,8 @@ class Relocaliser:
         return found
 
     def _find(self, frame: Frame, map_: Map) -> Found:
-        """Relocalise a frame at the candidates: first by ORB descriptors, then by ``recognise``."""
+        """Relocalise a frame at keyframes that look similar. ORB descriptors are tried first. If
+        the frame cannot be located using ORB descriptors, ``recognise`` is called."""
         config = self._context.config.relocalization
         candidates = self._locate(frame.image, frame.features, map_)
         for candidate in candidates[: config.max_candidates]:
@@ -120,8 +124,8 @@ def relocalise(
 
     The descriptors of the frame are matched with the landmarks of the place. A pose is estimated
     from the matches by P3P inside RANSAC, which needs no stereo. Then all landmarks of the
-    surroundings are searched for near their projections, first in wide windows, then in windows of
-    the usual size.
+    surroundings are searched for near their projections. The search first uses wide windows and
+    then windows of the usual size.
 
     Args:
         frame: receives the pose and the matches. On failure, both are reset.
@@ -131,7 +135,7 @@ def relocalise(
 
     Returns:
         Number of inliers, or 0 if the pose was not found. A pose is accepted if it has at least
-        ``relocalization.min_inliers`` inliers and they do not all lie on one object
+        ``relocalization.min_inliers`` inliers and the inliers do not all lie on a single object
         (``count_elsewhere``).
     """
     inliers = _locate(frame, place, surroundings, context, seed)

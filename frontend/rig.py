@@ -1,9 +1,9 @@
 """Corrects the measurements of a stereo rig for errors that remain after rectification.
 
-Two errors are corrected. The first is a common offset of all disparities, which is estimated while
-the map grows (``backend/disparity_offset.py``). The second is the delay of the right image, which
-is given in the calibration file (``Camera.right_delay``). The delay is also measured, but the
-measurement is only reported.
+Two errors are corrected. The first error is a common offset of all disparities. It is estimated
+while the map grows (``backend/disparity_offset.py``). The second error is the delay of the right
+image. The calibration file gives this delay (``Camera.right_delay``). The delay is also measured,
+but the measured value is only reported.
 """
 
 from __future__ import annotations
@@ -25,17 +25,20 @@ from vslam.states import RigState
 
 
 class RigCalibration:
-    """The corrections of a stereo pair.
+    """Corrects the measurements of a stereo rig for an offset of all disparities and for the delay
+    of the right image.
 
-    After stereo matching, only this class changes the ``u_right`` of a frame.
+    After stereo matching, only this class changes the columns of the features in the right image
+    (``u_right``).
 
     Attributes:
-        disparity_offset: pixels that are added to every measured disparity. At each merge, the
-            owner of the map sets it to the map's disparity offset.
-        offset_sigma: standard deviation of the disparity offset, in pixels. The owner of the map
-            sets it at each merge.
+        disparity_offset: offset that is added to every measured disparity, in pixels. The owner of
+            the map sets it to the disparity offset of the map each time that a mapped keyframe is
+            merged.
+        offset_sigma: standard deviation of ``disparity_offset``, in pixels. The owner of the map
+            sets both at the same time.
         delay: the measured delay of the right image.
-        sides: a summary of the comparisons of left and right images.
+        sides: a summary of how the exposures of the left and the right images differed.
         problems: one message for each frame whose right image could not be read.
     """
 
@@ -52,8 +55,8 @@ class RigCalibration:
         self._scales = scales
 
     def extract(self, frame: Frame, twist: Matrix | None) -> None:
-        """Extract the features of a frame unless this has already been done. Also records the
-        comparison of its two images, and calls ``prepare``."""
+        """Extract the features of a frame, unless this has already been done, and correct them
+        using ``prepare``. The difference in exposure between its two images is recorded."""
         source = frame.source
         frame.extract(self._camera)
         if source is not None and source.sides is not None:
@@ -65,13 +68,14 @@ class RigCalibration:
         self.prepare(frame, twist)
 
     def prepare(self, frame: Frame, twist: Matrix | None) -> None:
-        """Correct ``u_right`` of a frame for the disparity offset and the delay of the right image.
+        """Correct the columns of a frame's features in the right image (``u_right``) for the
+        disparity offset and for the delay of the right image.
 
         The delay is corrected only if the motion is known. A second call does not apply a
         correction again.
 
         Args:
-            twist: ``(6,)`` velocity, see ``Frame.twist``; None if unknown.
+            twist: ``(6,)`` velocity of the camera, see ``Frame.twist``; None if unknown.
         """
         self.correct_offset(frame)
         delay = self._camera.right_delay
@@ -83,8 +87,8 @@ class RigCalibration:
         frame.delay_removed = True
 
     def correct_offset(self, frame: Frame) -> None:
-        """Apply the current disparity offset to a frame, in place of the offset that was applied
-        before."""
+        """Apply the current disparity offset to a frame. It replaces the offset that was applied to
+        the frame earlier."""
         change = self.disparity_offset - frame.disparity_offset
         if change == 0.0:
             return
@@ -93,12 +97,12 @@ class RigCalibration:
         frame.disparity_offset = self.disparity_offset
 
     def mark_corrected(self, frame: Frame) -> None:
-        """Mark a frame that was restored from a checkpoint as corrected. It was corrected before it
-        was saved."""
+        """Mark a frame that was restored from a checkpoint as corrected. Its columns in the right
+        image were corrected before the frame was saved."""
         frame.disparity_offset, frame.delay_removed = self.disparity_offset, True
 
     def observe(self, frame: Frame, twist: Matrix | None) -> None:
-        """Measure the delay in a tracked frame.
+        """Update the measured delay of the right image using a tracked frame.
 
         Args:
             twist: ``(6,)`` mean velocity since the previous frame, see ``Frame.twist``; None if
@@ -107,12 +111,12 @@ class RigCalibration:
         self.delay.add(frame.features, frame.row_offset, twist, self._scales)
 
     def state(self) -> RigState:
-        """The measurements so far, for a saved map or a checkpoint. The disparity offset is not
-        included, because it is part of the map."""
+        """Return the measurements obtained so far, to store them in a map file or a checkpoint. The
+        disparity offset is not included, because it is part of the map."""
         return RigState(self.delay.state().numbers(), self.sides.numbers())
 
     def restore(self, state: RigState) -> None:
-        """Continue from a state that ``state`` returned.
+        """Continue from a state that the method ``state`` returned.
 
         Raises:
             ValueError: the stored state is damaged.

@@ -10,11 +10,12 @@ adjustment cannot absorb it. Therefore, the delay is measured from the row shift
 needed.
 
 A wrong calibration also shifts the rows, but by the same amount at every speed. A polynomial of the
-image position models this part.
+image position models this part of the row shift.
 
-The delay is measured and reported, but not corrected during the run. The reason is that it is known
-only after some seconds, when the map is already distorted. To correct the delay in every frame
-whose motion is known, set ``Camera.right_delay`` in the calibration.
+The measured delay is reported, but it is not corrected during the run. The reason is that the delay
+is known only after some seconds, when the map is already distorted. To correct the delay, set
+``Camera.right_delay`` in the calibration. The delay is then corrected in every frame whose motion
+is known.
 """
 
 from __future__ import annotations
@@ -48,9 +49,9 @@ _SOLUTION, _TWIST, _WAITING, _GROUP = (1 + _P,), (6,), (7 + _P, 7 + _P), (2 + _P
 def row_offsets(
     left: Extraction, right: Extraction, u_right: NDArray[np.float32], config: StereoConfig
 ) -> NDArray[np.float32]:
-    """``(N,)`` float32 row offset of each feature: its row in the right image minus its row in the
-    left image, in full-resolution pixels. Only a subset of the features is measured. The others are
-    NaN.
+    """Measure the ``(N,)`` float32 row offset of each feature, in full-resolution pixels. It is the
+    row in the right image minus the row in the left image. Only a subset of the features is
+    measured. The row offset of all other features is NaN.
 
     Args:
         u_right: ``(N,)`` columns of the left features in the right image, NaN without a match.
@@ -87,12 +88,14 @@ def _row_offsets(xy, octave, u_right, pixels_l, pixels_r, offsets, shapes, half)
 
 @inner_kernel
 def _row_shift(image_l, image_r, x, y, dx, half):
-    """Vertical shift of the patch around ``(x, y)`` from the left to the right image, in pixels of
-    the level. NaN if the patch has too little texture or is not found. The search starts at the
-    horizontal shift ``dx``.
+    """Measure the vertical shift of the patch around ``(x, y)`` from the left to the right image,
+    in pixels of the pyramid level.
 
-    Uses inverse compositional Lucas-Kanade (Baker and Matthews, IJCV 2004), so that gradients are
-    computed only in the left patch.
+    The search starts at the horizontal shift ``dx``. The result is NaN if the patch has too little
+    texture or is not found.
+
+    The method is inverse compositional Lucas-Kanade (Baker and Matthews, IJCV 2004). It computes
+    gradients only in the left patch.
     """
     height, width = image_l.shape
     edge = half + 1
@@ -137,7 +140,7 @@ def _row_shift(image_l, image_r, x, y, dx, half):
 
 @inner_kernel
 def _interpolated(image, x, y, a, b):
-    """Grey value at ``(x + a, y + b)``, interpolated bilinearly."""
+    """Return the grey value at ``(x + a, y + b)``, interpolated bilinearly."""
     upper = (1.0 - a) * float(image[y, x]) + a * float(image[y, x + 1])
     lower = (1.0 - a) * float(image[y + 1, x]) + a * float(image[y + 1, x + 1])
     return (1.0 - b) * upper + b * lower
@@ -145,15 +148,16 @@ def _interpolated(image, x, y, a, b):
 
 @dataclass(eq=False)
 class DelayState:
-    """The state of ``SideDelay``. "Moments" are weighted second moments; see
-    ``SideDelay._moments``.
+    """The state of ``SideDelay``, which estimates the delay of the right image. "Moments" are
+    weighted second moments of the variables of a regression; see ``SideDelay._moments``.
 
     Attributes:
         n_group: number of frames in the group that is being filled.
         length: number of frames in a full group.
         solution: ``(1 + P,)`` the delay in seconds, followed by the P coefficients of the
-            polynomial. It was estimated when the last group became full.
-        twist: ``(6,)`` velocity before the last frame, see ``Frame.twist``.
+            polynomial that models a wrong calibration. The delay and the coefficients were
+            estimated when the last group became full.
+        twist: ``(6,)`` velocity of the camera before the last frame, see ``Frame.twist``.
         waiting: ``(7 + P, 7 + P)`` moments of the last frame, which has not been added to a group
             yet.
         group: ``(2 + P, 2 + P)`` moments of the group that is being filled.
@@ -170,7 +174,7 @@ class DelayState:
 
     @classmethod
     def nothing(cls) -> DelayState:
-        """The state before the first frame."""
+        """Return the state before the first frame."""
         return cls(
             n_group=0,
             length=FRAMES_OF_A_GROUP,
@@ -182,15 +186,15 @@ class DelayState:
         )
 
     def numbers(self) -> tuple[float, ...]:
-        """The state as numbers for a map file. ``of_numbers`` is the inverse."""
+        """Convert the state to numbers for a map file. ``of_numbers`` is the inverse."""
         arrays = (self.solution, self.twist, self.waiting, self.group, self.groups)
         flat = np.concatenate([array.ravel() for array in arrays])
         return (float(self.n_group), float(self.length), *flat.tolist())
 
     @classmethod
     def of_numbers(cls, numbers: tuple[float, ...]) -> DelayState:
-        """The state from the result of ``numbers``. An empty tuple gives the state before the first
-        frame.
+        """Create a state from the numbers that the method ``numbers`` returned. An empty tuple
+        gives the state before the first frame.
 
         Raises:
             ValueError: ``numbers`` does not have the length of a state.
@@ -214,14 +218,16 @@ class DelayState:
 
 
 class SideDelay:
-    """Least-squares estimate of the delay of the right image from all frames so far.
+    """Estimates the delay of the right image by least squares from all frames processed so far.
 
     The velocity at a frame is the mean of the velocities before and after the frame. A frame is
-    therefore added only when the next frame is tracked. Until then, its moments are kept. The
-    velocity can be applied to the moments later, because image velocities are linear in the twist.
+    therefore added only when the next frame is tracked. Until then, the second moments of its
+    measurements are kept. The velocity can be applied to these moments later, because image
+    velocities are linear in the twist of the camera.
 
     Attributes:
-        seconds: the delay: the time by which the right image is taken later than the left image.
+        seconds: the delay in seconds. It is positive if the right image is taken later than the
+            left image.
         sigma: standard deviation of ``seconds``. It is estimated from the disagreement between
             groups of frames (cluster-robust: Liang and Zeger, Biometrika 1986). Infinite until
             there are enough groups.
@@ -233,7 +239,7 @@ class SideDelay:
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the measured delay differs significantly from the calibrated one
+        """Whether the measured delay differs significantly from the delay in the calibration
         (``Camera.right_delay``)."""
         least = max(self._config.least_delay, self._config.delay_sigmas * self.sigma)
         return abs(self.seconds - self._camera.right_delay) > least
@@ -263,11 +269,11 @@ class SideDelay:
         state.waiting = self._moments(features, row_offset, twist, scales)
 
     def state(self) -> DelayState:
-        """The state, for a saved map or a checkpoint."""
+        """Return the state, to store it in a map file or a checkpoint."""
         return deepcopy(self._state)
 
     def restore(self, state: DelayState) -> None:
-        """Continue from a state that ``state`` returned."""
+        """Continue from a state that the method ``state`` returned."""
         self.seconds, self.sigma = 0.0, np.inf
         self._state = deepcopy(state)
         self._solve()
@@ -279,7 +285,8 @@ class SideDelay:
         twist: Matrix,
         scales: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """``(7 + P, 7 + P)`` weighted second moments of the variables of the regression in a frame.
+        """Compute the ``(7 + P, 7 + P)`` weighted second moments of the regression variables in one
+        frame.
 
         The variables are the six derivatives of the row velocity with respect to the twist, the P
         terms of the polynomial, and the row offset. Outliers are down-weighted (Huber).
@@ -300,7 +307,8 @@ class SideDelay:
         return moments
 
     def _add_waiting(self, twist: Matrix) -> None:
-        """Add the moments of the waiting frame, whose velocity is ``twist``, to the group."""
+        """Add the moments of the last frame to the current group of frames. ``twist`` is the
+        velocity of the camera at that frame."""
         state = self._state
         if not state.waiting.any():
             return

@@ -34,12 +34,12 @@ _MIN_VISIBLE_RANGE = 16.0  # least range of the grey values of an image that is 
 
 @dataclass(frozen=True)
 class Sides:
-    """The difference in exposure between the left and the right image of a pair.
+    """The difference in exposure between the left and the right image of a stereo pair.
 
     Attributes:
         darker_stops: difference in exposure, in stops. It is positive if the right image is darker
-            than the left one. It is 0 if the difference is below the threshold, or if it is not a
-            gain.
+            than the left one. It is 0 if the difference is below the threshold, or if a common gain
+            does not explain it.
         black: the side whose image is black while the other image is not. Empty if there is no such
             side.
     """
@@ -50,7 +50,7 @@ class Sides:
 
 @dataclass
 class ComparedSides:
-    """A summary of the comparisons of all image pairs of a drive.
+    """A summary of the differences in exposure of all stereo pairs of a drive.
 
     Attributes:
         n: number of comparisons.
@@ -65,7 +65,7 @@ class ComparedSides:
     darker_stops: list[float] = field(default_factory=list)
 
     def add(self, sides: Sides) -> None:
-        """Add a comparison."""
+        """Add the comparison of one stereo pair to the summary."""
         self.n += 1
         self.n_black_left += sides.black == "left"
         self.n_black_right += sides.black == "right"
@@ -73,12 +73,12 @@ class ComparedSides:
             self.darker_stops.append(sides.darker_stops)
 
     def numbers(self) -> tuple[float, ...]:
-        """The summary as numbers for a map file. ``of_numbers`` is the inverse."""
+        """Convert the summary to numbers for a map file. ``of_numbers`` is the inverse."""
         return (self.n, self.n_black_left, self.n_black_right, *self.darker_stops)
 
     @classmethod
     def of_numbers(cls, numbers: tuple[float, ...]) -> ComparedSides:
-        """The state that ``numbers`` returned.
+        """Create a summary from the numbers that the method ``numbers`` returned.
 
         Raises:
             ValueError: ``numbers`` is too short.
@@ -98,8 +98,8 @@ def compare_sides(left: Grey, right: Grey, config: StereoConfig) -> Sides:
 
 
 def balanced(left: Grey, right: Grey, sides: Sides) -> tuple[Grey, Grey]:
-    """The left and the right image. The darker one is brightened by the gain that ``compare_sides``
-    found."""
+    """Brighten the darker image of a stereo pair by the gain that ``compare_sides`` found. Returns
+    the left and the right image."""
     stops = sides.darker_stops
     if stops > 0:
         return left, _brightened(right, left, stops)
@@ -109,8 +109,8 @@ def balanced(left: Grey, right: Grey, sides: Sides) -> tuple[Grey, Grey]:
 
 
 def _shares(image: Grey) -> NDArray[np.float64]:
-    """``(256,)`` cumulative histogram: for each grey value, the share of pixels that are at most as
-    bright."""
+    """Compute the ``(256,)`` cumulative histogram of an image. For each grey value, it is the share
+    of the pixels whose grey value is at most as high."""
     counts = np.bincount(image[::_STRIDE, ::_STRIDE].ravel(), minlength=256)
     return np.cumsum(counts) / counts.sum()
 
@@ -131,8 +131,8 @@ def _is_black(side: NDArray[np.float64], other: NDArray[np.float64], config: Ste
 
 
 def _stops(left: NDArray[np.float64], right: NDArray[np.float64], config: StereoConfig) -> float:
-    """Gain from the right to the left image, in stops. The arguments are the ``_shares`` of both
-    images.
+    """Estimate the gain from the right to the left image, in stops. The arguments are the
+    cumulative histograms of both images (``_shares``).
 
     The result is 0 if the gain is below the threshold, or if dark and bright pixels have different
     gains. Quantiles that are overexposed in either image are not compared.
@@ -164,9 +164,9 @@ def _stops(left: NDArray[np.float64], right: NDArray[np.float64], config: Stereo
 
 
 def _proportional(left: NDArray[np.float64], right: NDArray[np.float64], top: float) -> bool:
-    """Whether the quantiles of both images up to ``top`` are proportional. They are if the images
-    differ only by a gain. They are not if, for example, only one image shows the sky beside a
-    bridge."""
+    """Return whether the quantiles of both images up to ``top`` are proportional. The quantiles are
+    proportional if the images differ only by a gain. They are not proportional if, for example,
+    only one of the images shows the sky beside a bridge."""
     at = np.linspace(_LOW, top, _N_QUANTILES)
     a, b = (np.array(_quantiles(shares, *at)) for shares in (left, right))
     a, b = a - a[0], b - b[0]
@@ -174,8 +174,8 @@ def _proportional(left: NDArray[np.float64], right: NDArray[np.float64], top: fl
 
 
 def _brightened(dark: Grey, bright: Grey, stops: float) -> Grey:
-    """The dark image with its grey values multiplied by ``2 ** stops``. They are also shifted so
-    that both images have the same lower quantile."""
+    """Brighten the darker image: multiply its grey values by ``2 ** stops``, and shift them so that
+    both images have the same lower quantile."""
     (low,), (target,) = _quantiles(_shares(dark), _LOW), _quantiles(_shares(bright), _LOW)
     table = (np.arange(256) + 0.5 - low) * 2.0**stops + target - 0.5
     return np.clip(np.rint(table), 0, 255).astype(np.uint8)[dark]

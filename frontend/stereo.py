@@ -1,4 +1,4 @@
-"""Stereo matching of ORB features in a rectified pair (ORB-SLAM2, section III-A)."""
+"""Stereo matching of ORB features in a rectified pair (section III-A of the ORB-SLAM2 paper)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ class StereoMatches(NamedTuple):
         right: the features of the right image.
         u_right: ``(N,)`` float32 column in the right image, pixels; NaN for features without a
             match.
-        sad: ``(N,)`` float32 sum of absolute differences (SAD), -1 for features without a match.
+        sad: ``(N,)`` float32 sum of absolute differences (SAD) of each match, -1 for features
+            without a match.
     """
 
     right: Extraction
@@ -35,8 +36,8 @@ class StereoMatches(NamedTuple):
     sad: NDArray[np.float32]
 
     def joined(self, other: StereoMatches, order: NDArray[np.int64]) -> StereoMatches:
-        """These matches followed by other matches, reordered. ``order`` is the index of each match
-        in the joined list."""
+        """Concatenate these matches and the other matches, and sort the result. Entry i of
+        ``order`` is the index, before sorting, of the match that becomes match i."""
         u_right = np.concatenate([self.u_right, other.u_right])[order]
         return StereoMatches(self.right, u_right, np.concatenate([self.sad, other.sad])[order])
 
@@ -46,12 +47,14 @@ def match_stereo(
 ) -> StereoMatches:
     """Match each left feature with a right feature, independently of the other left features.
 
-    A candidate must meet three conditions. It lies in the same row, within 2 px at the scale of the
-    right feature. Its octave differs by at most one. Its disparity is between 0 and the disparity
-    of a point at a distance of one baseline.
+    A right feature is a candidate if it meets three conditions. It lies in the same row as the left
+    feature, within 2 px at the scale of the right feature. The octaves of the two features differ
+    by at most one. The disparity is between 0 and the disparity of a point at a distance of one
+    baseline.
 
-    The candidate with the closest descriptor is chosen. Then a SAD window at the level of the left
-    feature is shifted along the row, to locate the match with sub-pixel accuracy.
+    The candidate with the closest descriptor is chosen. Then a window around the right feature is
+    shifted along the row, at the pyramid level of the left feature. The shift with the least sum of
+    absolute differences (SAD) gives the match with sub-pixel accuracy.
     """
     u_right, sad = _match(
         _Side.of_extraction(left),
@@ -68,11 +71,12 @@ def match_stereo(
 
 
 class _Side(NamedTuple):
-    """One image of the pair.
+    """One image of a stereo pair, as an argument of kernels.
 
     Attributes:
-        xy, octave, descriptor: ``(N, 2)``, ``(N,)`` and ``(N, 4)``, its features.
-        pixels: the pixels of its pyramid.
+        xy, octave, descriptor: ``(N, 2)`` positions, ``(N,)`` pyramid levels and ``(N, 4)``
+            descriptors of the features of the image.
+        pixels: the pixels of the pyramid of the image.
     """
 
     xy: NDArray[np.float32]
@@ -88,7 +92,7 @@ class _Side(NamedTuple):
 
 @kernel
 def rows_to_features(xy, octave, scales, height):
-    """Index the features by the rows in which they may match.
+    """Index the features of the right image by the image rows in which they may match.
 
     Returns:
         ``start``, ``(height + 1,)`` int64, and ``items``, int32. The features of row r are
@@ -117,8 +121,9 @@ def rows_to_features(xy, octave, scales, height):
 
 @kernel
 def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, half, reach):
-    """``(N,)`` float32 ``u_right`` and ``(N,)`` float32 SAD of each match. They are NaN and -1 for
-    features without a match."""
+    """Match each left feature with a right feature. Returns the ``(N,)`` float32 column of each
+    match in the right image, and the ``(N,)`` float32 sum of absolute differences (SAD) of each
+    match. For features without a match, the column is NaN and the SAD is -1."""
     xy_l, octave_l, descriptors_l, pixels_l = left
     xy_r, octave_r, descriptors_r, pixels_r = right
     n = len(xy_l)
@@ -168,8 +173,9 @@ def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, ha
 
 
 def inliers_only(matches: StereoMatches, octave: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """The ``u_right`` of the matches, with NaN for outliers. An outlier is a match whose SAD
-    exceeds ``MEDIAN_FACTOR`` times the median of its octave.
+    """Return the columns of the matches in the right image, with NaN for outliers. A match is an
+    outlier if its sum of absolute differences (SAD) exceeds ``MEDIAN_FACTOR`` times the median SAD
+    of all matches in its octave.
 
     Args:
         octave: ``(N,)`` uint8 octave of each feature, sorted.
@@ -200,11 +206,12 @@ def _inliers_only(matched, sad, octave):
 
 @kernel
 def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
-    """Shift of the right patch at which both patches agree best, in pixels of the level, and the
-    SAD at this shift.
+    """Slide a patch of the right image along its row, and find the shift at which it agrees best
+    with a patch of the left image. Returns the shift, in pixels of the pyramid level, and the sum
+    of absolute differences (SAD) at this shift.
 
-    The shift is relative to ``x_r``. It is NaN if a patch would leave the image, or if the minimum
-    is at an end of the search range.
+    The shift is relative to ``x_r``. The shift is NaN if a patch would leave the image, or if the
+    least SAD is at an end of the search range.
     """
     height, width = image_l.shape
     if (
@@ -232,7 +239,8 @@ def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
 
 @inner_kernel
 def add_differences(image_l, image_r, x_l, y_l, x_r, half, reach, costs):
-    """Add the sum of absolute differences at each shift to ``costs``.
+    """Compute the sum of absolute differences between two patches at each shift, and add it to
+    ``costs``.
 
     A vector register holds ``LANES`` shifts. Four columns of the patch are summed before the
     register is stored. Lanes beyond the last shift may read from the next row. The caller ignores
@@ -274,19 +282,19 @@ def add_differences(image_l, image_r, x_l, y_l, x_r, half, reach, costs):
 
 @inline
 def difference(a, b):
-    """Absolute difference of two bytes. It is computed in bytes, so that a register holds many of
-    them."""
+    """Return the absolute difference of two bytes. The difference is computed in bytes, so that a
+    vector register holds many differences."""
     return np.uint16(np.uint8(max(a, b) - min(a, b)))
 
 
 @inner_kernel
 def refine_shift(image_l, image_r, x_l, y_l, x_r, shift, half):
-    """Shift in pixels that minimises the sum of squared differences. ``shift`` is a first estimate
-    in (-1, 1).
+    """Find the shift, in pixels, that minimises the sum of squared differences between two patches.
+    ``shift`` is a first estimate in (-1, 1).
 
-    A parabola through three sums of absolute differences has a minimum that is biased towards whole
+    The minimum of a parabola through three sums of absolute differences is biased towards whole
     pixels. Two Gauss-Newton steps on the interpolated patch remove this bias (Lucas and Kanade,
-    IJCAI 1981). If they fail, ``shift`` is returned.
+    IJCAI 1981). If these steps fail, ``shift`` is returned.
     """
     start = shift
     width = image_r.shape[1]

@@ -1,4 +1,4 @@
-"""Tracks the camera from frame to frame against a view of the map."""
+"""Tracks the camera from frame to frame against a ``MapView``, a copy of the map for tracking."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Found:
         visible: ``(N,)`` int32 ids of the landmarks that the frame should see.
         keyframe: id of the keyframe at which the frame was relocalised; -1 if it was not
             relocalised.
-        is_doubtful: whether the frame has so few inliers that its matches may be wrong.
+        is_doubtful: True if the frame has so few inliers that its matches may be wrong.
     """
 
     state: TrackingState
@@ -63,7 +63,7 @@ class Found:
 
     @classmethod
     def at_start(cls, frame: Frame, *, begun: bool) -> Found:
-        """The result for a frame before tracking starts.
+        """Create the result for a frame before tracking starts.
 
         If the frame has started a map (``begun``), the state is OK, and all landmarks that the
         frame created are inliers. Otherwise the state is LOST.
@@ -79,12 +79,13 @@ class Found:
 
     @property
     def relocalised(self) -> bool:
-        """Whether the frame was found by a search of the whole map."""
+        """Whether the pose of the frame was found by relocalisation, which is a search of the whole
+        map."""
         return self.keyframe >= 0
 
 
 def judge(n_matches: int, n_inliers: int, context: TrackingContext) -> TrackingState:
-    """The tracking state of a frame with the given number of matches, of which some are inliers."""
+    """Return the tracking state of a frame with the given numbers of matches and inliers."""
     config = context.config.tracking
     # The search windows of an RGB-D camera are wide, so that even a wrong pose has some inliers.
     share = config.depth_min_inlier_ratio if context.camera.depth else 0.0
@@ -94,12 +95,13 @@ def judge(n_matches: int, n_inliers: int, context: TrackingContext) -> TrackingS
 
 
 class Tracker:
-    """Tracks one frame after another. It reads only a view of the map, not the map itself.
+    """Tracks one frame after another. It reads only a ``MapView``, a copy of the map, not the map
+    itself.
 
     Attributes:
         status: what is known about the position of the camera.
         last: the last frame that was tracked; None before a frame was tracked.
-        lost_frames: number of frames lost since ``last``.
+        lost_frames: number of frames that were lost since the frame ``last``.
     """
 
     def __init__(self, context: TrackingContext) -> None:
@@ -129,7 +131,7 @@ class Tracker:
             frames: poses of all earlier frames, including lost frames.
 
         Returns:
-        ``(4, 4)`` pose ``T_cw`` (world to camera).
+            ``(4, 4)`` pose ``T_cw`` (world to camera).
         """
         if not len(frames):
             return view.T_reference
@@ -140,8 +142,8 @@ class Tracker:
         return orthonormalised(se3_exp(self.twist * elapsed) @ T_last)
 
     def track_patches(self, frame: Frame, T_cw: Matrix, view: MapView) -> Found:
-        """Track a frame by the image patches of landmarks, without extracting features. ``T_cw`` is
-        the predicted ``(4, 4)`` pose.
+        """Track a frame using the image patches of landmarks, without extracting features. ``T_cw``
+        is the predicted ``(4, 4)`` pose (world to camera).
 
         The result is LOST if too few patches are found. It is also LOST if the frame cannot be
         tracked in this way, for example because the previous frame was not tracked.
@@ -185,10 +187,10 @@ class Tracker:
         return judge(n_matches, n_inliers, self._context) != TrackingState.LOST
 
     def track(self, frame: Frame, T_cw: Matrix, view: MapView, frames: FramePoses) -> Found:
-        """Track a frame by its features.
+        """Track a frame using its features.
 
-        The frame is tracked first against the last frame or the reference keyframe, then against
-        all landmarks of the local map.
+        First, the frame is tracked against the last frame or the reference keyframe. Then it is
+        tracked against all landmarks of the local map.
 
         Args:
             T_cw: ``(4, 4)`` predicted pose (world to camera).
@@ -205,7 +207,8 @@ class Tracker:
         return Found(state, n_matches, n_inliers, visible, is_doubtful=doubtful)
 
     def accept(self, frame: Frame, found: Found, frames: FramePoses) -> None:
-        """Continue from a frame that was tracked or relocalised.
+        """Accept the pose of a frame that was tracked or relocalised. The next frame is tracked
+        from this frame.
 
         The twist of the frame is computed from the motion since the last tracked frame. A
         relocalised frame gets no twist, because the jump to its pose is not a motion of the camera.
@@ -221,7 +224,7 @@ class Tracker:
         self.start_from(frame)
 
     def start_from(self, frame: Frame) -> None:
-        """Continue from a frame that started a map or a sub-map."""
+        """Track the next frames from a frame that started a map or a sub-map."""
         self.last, self.lost_frames, self.status = frame, 0, TrackerStatus.TRACKING
 
     def lose(self) -> None:
@@ -238,8 +241,8 @@ class Tracker:
         self.status, self._resumed_twist = TrackerStatus.RESUMED, twist
 
     def state(self) -> TrackerState | None:
-        """The state between two frames, for a checkpoint. None before the first frame is
-        tracked."""
+        """Return the state between two frames, to save it in a checkpoint. Returns None before the
+        first frame is tracked."""
         last = self.last
         if last is None:
             return None
@@ -256,7 +259,7 @@ class Tracker:
         )
 
     def restore(self, state: TrackerState, xyz: Matrix) -> Frame:
-        """Continue from a state that ``state`` returned. Returns the last tracked frame.
+        """Continue from a state that the method ``state`` returned. Returns the last tracked frame.
 
         Args:
             xyz: ``(N, 3)`` positions of the landmarks that the last frame tracks, in the world
@@ -280,9 +283,10 @@ class Tracker:
     def _track_previous_frame(self, frame: Frame, T_cw: Matrix, view: MapView) -> int:
         """Find a first pose and first matches of a frame. Returns the number of inliers.
 
-        The frame is tracked against the last frame, using the predicted pose. If the motion is
-        unknown or this fails, the frame is tracked against the reference keyframe. If this fails
-        too and the motion is known, ``_track_predicted`` is called.
+        If the motion is known, the frame is tracked against the last frame, using the predicted
+        pose. If the motion is unknown or tracking against the last frame fails, the frame is
+        tracked against the reference keyframe. If that fails too and the motion is known,
+        ``_track_predicted`` is called.
         """
         if self.last is None and self.status is not TrackerStatus.RESUMED:
             return 0
@@ -296,11 +300,11 @@ class Tracker:
         return self._track_predicted(frame, T_cw, view)
 
     def _track_predicted(self, frame: Frame, T_cw: Matrix, view: MapView) -> int:
-        """Match all landmarks of the local map near their predicted positions. Returns the number
-        of inliers, or 0 if the prediction was wrong.
+        """Match all landmarks of the local map near their predicted image positions. Returns the
+        number of inliers, or 0 if the prediction was wrong.
 
-        This helps after a sudden change of brightness. Landmarks that older frames observed may
-        still match when those of the previous frame do not.
+        This helps after a sudden change in brightness. Landmarks that older frames observed may
+        still match when the landmarks of the previous frame do not.
         """
         frame.T_cw = T_cw
         frame.drop_matches()
@@ -318,8 +322,8 @@ class Tracker:
         return n_inliers >= max(config.min_inliers_motion, config.min_inlier_ratio * n_matches)
 
     def _is_doubtful(self, frame: Frame, n_inliers: int, view: MapView, frames: FramePoses) -> bool:
-        """Whether a frame has so few inliers that its matches may be wrong, and there is another
-        reason for doubt.
+        """Return whether a frame is doubtful. A frame is doubtful if it has so few inliers that its
+        matches may be wrong and there is another reason for doubt.
 
         There are three such reasons. The first is a gap in time. The second is an unknown motion,
         because the pose was then not predicted. The third is a sudden drop in the number of
@@ -344,8 +348,8 @@ def result_of(
     stage_ms: dict[str, float],
     odometry: Odometry,
 ) -> TrackResult:
-    """The ``TrackResult`` of a frame, which the library returns to its caller. ``stage_ms`` is the
-    time that each stage took, in milliseconds."""
+    """Create the ``TrackResult`` of a frame, which the library returns to its caller. ``stage_ms``
+    is the time that each stage took, in milliseconds."""
     return TrackResult(
         index=frame.index,
         timestamp=frame.timestamp,

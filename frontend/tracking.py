@@ -1,4 +1,4 @@
-"""Tracking of one frame against the map (ORB-SLAM2, section III; ORB-SLAM, section V).
+"""Tracks one frame against the map (ORB-SLAM2 paper, section III; ORB-SLAM paper, section V).
 
 All functions depend only on the frame, the previous frame and a ``LocalMap``. The map itself is
 never accessed, so local mapping can write to it at the same time.
@@ -51,8 +51,9 @@ class TrackingContext:
 
     @property
     def tracks_patches(self) -> bool:
-        """Whether frames are tracked by patches when possible. For RGB-D cameras, tracking by
-        patches is less accurate and not faster (docs/research/performance.md)."""
+        """Whether frames are tracked using image patches when possible. RGB-D cameras are excluded:
+        for them, patch-based tracking is less accurate and not faster
+        (docs/research/performance.md)."""
         method, camera = self.config.tracking.method, self.camera
         if method == "auto":
             return camera.sensor == "stereo"
@@ -60,7 +61,8 @@ class TrackingContext:
 
     @property
     def close_depth(self) -> float:
-        """Depth below which a stereo point is close, metres (ORB-SLAM2, III-A)."""
+        """Depth below which a stereo point is close, metres (section III-A of the ORB-SLAM2
+        paper)."""
         return self.config.stereo.close_depth_baselines * self.camera.baseline
 
     @property
@@ -77,7 +79,8 @@ class TrackingContext:
 
 
 def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:
-    """``(N,)`` float64 depth from stereo, metres; NaN for features without a stereo match."""
+    """Compute the ``(N,)`` float64 stereo depth of each feature, in metres. It is NaN for features
+    without a stereo match."""
     return camera.bf / (features.xy[:, 0].astype(np.float64) - features.u_right)
 
 
@@ -89,9 +92,9 @@ def track_motion(
     The points are projected with the predicted pose and matched near their projections. Then the
     pose is optimised.
 
-    The points are the landmarks of the previous frame and its close stereo points that are not in
-    the map (the visual-odometry points of ORB-SLAM2). The stereo points stabilise the pose and are
-    then discarded.
+    The points are the landmarks of the previous frame and its other close stereo points, which are
+    not in the map (the visual-odometry points of ORB-SLAM2). The stereo points stabilise the pose
+    and are then discarded.
 
     Args:
         frame: receives the pose and the matches.
@@ -142,7 +145,7 @@ def track_motion(
 def trackable_points(
     previous: Frame, context: TrackingContext
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points that a frame observed: its landmarks and its other close stereo points.
+    """Return the points that a frame observed: its landmarks and its other close stereo points.
 
     Returns:
         ``(M, 3)`` points in the world frame, and ``(M,)`` indices of their features in the frame.
@@ -160,7 +163,7 @@ def trackable_points(
 def match_descriptors(
     frame: Frame, local: LocalMap, max_distance: int, ratio: float
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Match the features of a frame with landmarks by their descriptors alone (``search_all``).
+    """Match the features of a frame with landmarks, using only their descriptors (``search_all``).
 
     Returns:
         ``(M,)`` indices of the matched features, and ``(M,)`` indices of their landmarks in
@@ -178,7 +181,8 @@ def track_descriptors(
     T_cw: NDArray[np.float64],
     context: TrackingContext,
 ) -> int:
-    """Match landmarks by their descriptors alone, without a prediction, and optimise the pose.
+    """Match landmarks using only their descriptors, without a predicted pose, and then optimise the
+    pose.
 
     Args:
         frame: receives the pose and the matches.
@@ -288,7 +292,8 @@ def refine(
     context: TrackingContext,
     shift: NDArray[np.float32] | None = None,
 ) -> int:
-    """Optimise the pose from all matches, drop the outliers, and return the number of inliers.
+    """Optimise the pose of a frame using all its matches, drop the outliers, and return the number
+    of inliers.
 
     Args:
         T_cw: ``(4, 4)`` initial pose of the left camera (world to camera).
@@ -307,15 +312,16 @@ def refine(
 def uncertainty_of(
     frame: Frame, offset_sigma: float, context: TrackingContext
 ) -> tuple[Matrix, Matrix | None]:
-    """The uncertainty of the pose and the motion of a tracked frame.
+    """Estimate the uncertainty of the pose and of the motion of a tracked frame.
 
     Args:
         offset_sigma: standard deviation of the disparity offset, pixels; 0 for cameras without one.
 
     Returns:
-        ``(6, 6)`` covariance of the pose ``T_cw`` relative to the points that the frame tracks
-        (``pose_covariance``). ``(6, 3)`` effect on the motion if the disparity offset is wrong by
-        ``offset_sigma`` (``offset_effect``); None if ``offset_sigma`` is 0.
+        Two matrices. The first is the ``(6, 6)`` covariance of the pose ``T_cw`` relative to the
+        points that the frame tracks (``pose_covariance``). The second is the ``(6, 3)`` effect on
+        the motion if the disparity offset is wrong by ``offset_sigma`` (``offset_effect``). It is
+        None if ``offset_sigma`` is 0.
     """
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
     observed = _observed_points(frame, matched, context)
@@ -332,8 +338,9 @@ def uncertainty_of(
 def _observed_points(
     frame: Frame, matched: NDArray[np.integer], context: TrackingContext
 ) -> tuple[NDArray[np.float64], ...]:
-    """The arguments of ``optimise_pose`` that follow the pose, for the points that the ``matched``
-    features track. Aligned matches have their aligned positions."""
+    """Return the arguments of ``optimise_pose`` that follow the pose. They describe the points that
+    the features ``matched`` track. For matches that were aligned, the aligned positions are
+    used."""
     uvr, weight = observations(frame, matched, context)
     certainty = np.ones(len(matched))
     if frame.shift is not None:
@@ -349,8 +356,8 @@ def _observed_points(
 def observations(
     frame: Frame, feature: NDArray[np.integer], context: TrackingContext
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """``(N, 3)`` float64 u, v, u_right of ``(N,)`` features of a frame, in pixels, and ``(N,)``
-    float64 inverse variances of u and v."""
+    """Return two arrays for ``(N,)`` features of a frame: their ``(N, 3)`` float64 u, v and
+    u_right, in pixels, and the ``(N,)`` float64 inverse variances of u and v."""
     features = frame.features
     uvr = stack_uvr(features.xy[feature], features.u_right[feature])
     return uvr, context.scales[features.octave[feature]] ** -2.0

@@ -1,4 +1,4 @@
-"""Extracts features from images that are noisy or have low contrast.
+"""Extracts features from all images, including images that are noisy or have low contrast.
 
 The thresholds of FAST are grey levels that suit images of normal contrast. At night, in fog or with
 a wrong exposure, a corner differs from its surroundings by only one or two grey levels. In heavy
@@ -44,14 +44,15 @@ def extract_in_any_light(
 ) -> list[Extraction]:
     """Extract the ORB features of ``(H, W)`` uint8 images that were taken at the same time.
 
-    Noisy images are filtered first. The contrast of faint images, which have low contrast and few
-    corners, is raised. If one image needs this, all images are processed in the same way, because
+    Noisy images are filtered first. Then the contrast is raised in images that have low contrast
+    and few corners. If one image needs this, all images are processed in the same way, because
     stereo matching compares their patches.
 
     Args:
-        image_map: applies a function to all images, either sequentially or in parallel. The result
-            is the same.
-        allowed: where the first image may have corners, see ``extract``.
+        image_map: applies a function to all images, sequentially or in parallel. Both ways give the
+            same result.
+        allowed: pyramid that is 1 where the first image may have corners, see ``extract``; None
+            allows all pixels.
         pyramid: the pyramid of the first image, if it has already been built.
     """
     weak, first = config.weak_images, images[0]
@@ -90,12 +91,12 @@ def grain(image, stride, least):
     """Estimate the noise and the spikes of an ``(H, W)`` uint8 image from every ``stride``-th row.
 
     Noise is estimated from the median of absolute second differences along a row. The median is
-    robust to edges. The mean (Immerkaer, CVIU 1996) is not.
+    robust to edges. The mean, which Immerkaer (CVIU 1996) uses, is not robust to edges.
 
     Returns:
         Standard deviation of the noise, in grey levels; share of the pixels that are spikes. A
-        spike is brighter than both neighbours, or darker than both. The difference must exceed
-        ``least`` grey levels and four standard deviations.
+        spike is brighter than both of its neighbours, or darker than both of them. The difference
+        must exceed ``least`` grey levels and four standard deviations.
     """
     height, width = image.shape
     counts = np.zeros(1021, np.int64)
@@ -125,10 +126,11 @@ def grain(image, stride, least):
 
 
 def is_faint(images: Sequence[Grey], counts: Sequence[int], config: Config) -> bool:
-    """Whether any of the images has few corners because of low contrast.
+    """Return whether any of the images has few corners because of low contrast.
 
-    An image that is out of focus also has few corners. It is not counted as faint, because raising
-    its contrast would only amplify rounding errors. An image that shows nothing at all is ignored.
+    An image that is out of focus also has few corners. Such an image is not counted, because
+    raising its contrast would only amplify rounding errors. An image that shows nothing at all is
+    ignored.
 
     Args:
         counts: number of features of each image.
@@ -146,12 +148,14 @@ def _is_faint(image: Grey, config: WeakImageConfig) -> bool:
 
 
 def detail(image: Grey) -> float:
-    """Mean absolute second difference of the grey values along the rows, grey levels."""
+    """Compute the mean absolute second difference of the grey values along the rows, in grey
+    levels. It measures how much fine detail an image has."""
     return float(np.abs(np.diff(image[::2].astype(np.int16), 2, axis=1)).mean())
 
 
 def contrast(image: Grey) -> float:
-    """Median, over blocks of the image, of the standard deviation of the grey values in a block."""
+    """Measure the contrast of an image, in grey levels. The standard deviation of the grey values
+    is computed in each block of the image. The result is the median over all blocks."""
     rows, columns = (side // _BLOCK * _BLOCK for side in image.shape)
     if not rows or not columns:
         return 0.0
@@ -162,9 +166,9 @@ def contrast(image: Grey) -> float:
 def with_contrast(image: Grey, config: WeakImageConfig) -> Grey:
     """Normalise the local contrast of an ``(H, W)`` uint8 image.
 
-    After a blur of one pixel, grey values are scaled. Their standard deviation is then the same in
-    a window (``contrast_window``) around every pixel. Flat regions, which contain only noise, are
-    amplified less.
+    The image is first blurred by one pixel. Then the grey values are scaled so that the window
+    around every pixel (``contrast_window``) has the same standard deviation. Flat regions, which
+    contain only noise, are amplified less.
     """
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.0)
     window = (config.contrast_window, config.contrast_window)

@@ -1,9 +1,10 @@
-"""Loop detection by bag of words.
+"""Detects loops by comparing bags of visual words.
 
 Candidates are chosen as in ORB-SLAM (Mur-Artal et al., T-RO 2015, sections III-E and VII-A). A
-candidate shares many words with the query. It belongs to one of the groups of covisible keyframes
-with the highest total scores. Its score is at least the lowest score among the keyframes that are
-covisible with the query. One pass over the inverted index gives the scores of all keyframes.
+candidate meets three conditions. It shares many visual words with the query. It belongs to one of
+the groups of covisible keyframes with the highest total scores. Its score is at least the lowest
+score among the keyframes that are covisible with the query. A single pass over the inverted index
+gives the scores of all keyframes.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from vslam.map_kernels import count_shared
 
 
 class BowDetector:
-    """A ``LoopDetector`` that uses visual words. Keyframes must be added in ascending order."""
+    """A ``LoopDetector`` that compares images using bags of visual words. Keyframes must be added
+    in ascending order of their ids."""
 
     name = "bow"
 
@@ -41,7 +43,7 @@ class BowDetector:
         self._n_keyframes = 0  # newest id + 1
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
-        """Store the words of a keyframe. The image is ignored.
+        """Store the visual words of a keyframe. The image is ignored.
 
         Raises:
             ValueError: the id is not greater than the ids of all earlier keyframes.
@@ -57,9 +59,10 @@ class BowDetector:
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
         """Find candidates for a keyframe that has been added.
 
-        Candidates are keyframes in the map that are neither recent nor covisible with the query.
-        Their scores are at least the lowest score among the keyframes that are covisible with the
-        query. If no keyframe is covisible with the query, there is no lower limit.
+        Candidates are keyframes in the map that are neither recent nor covisible with the query,
+        which is the given keyframe. The scores of candidates are at least the lowest score among
+        the keyframes that are covisible with the query. If no keyframe is covisible with the query,
+        there is no lower limit.
         """
         config = self.config
         entries = self._entries(keyframe)
@@ -77,14 +80,16 @@ class BowDetector:
     def locate(
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
-        """Keyframes in the map that look similar to a frame outside the map, most similar first."""
+        """Return the keyframes in the map that look similar to a frame outside the map, most
+        similar first."""
         words = self.vocabulary.words(features.descriptors)
         likeness = self._index.compare(bow_vector(self.vocabulary, words))
         eligible = map_.arrays.keyframe_alive[: len(likeness.score)].copy()
         return self._candidates(-1, likeness, eligible, 0.0, map_)
 
     def memory(self) -> DetectorMemory:
-        """See :class:`LoopDetector`. The memory consists of the words of all keyframes."""
+        """Return the visual words of all keyframes, to be saved in a map file (see
+        :class:`LoopDetector`)."""
         first = self._start[: self._n_keyframes + 1]
         words = PerKeyframe(first, self._word[: first[-1]])
         return DetectorMemory(self.name, self._fingerprint, {"words": words})
@@ -150,11 +155,13 @@ class BowDetector:
 
 @inner_kernel
 def most_covisible(counts, minimum, keyframes, strength):
-    """Select the keyframes with the highest counts. Counts below ``minimum`` are ignored.
+    """Select the keyframes that share the most landmarks with a keyframe. ``counts`` gives the
+    number of landmarks that each other keyframe shares with this keyframe. Counts below ``minimum``
+    are ignored.
 
     Up to G keyframes are selected. Their ids are written into ``keyframes`` and their counts into
-    ``strength``, both ``(G,)`` int64. They are sorted by descending count and then by ascending id.
-    Returns the number of selected keyframes.
+    ``strength``, both ``(G,)`` int64. The selected keyframes are sorted by descending count and
+    then by ascending id. Returns the number of selected keyframes.
     """
     n = 0
     for k in range(len(counts)):
@@ -184,7 +191,7 @@ def choose_candidates(
     group_score_ratio,
     max_groups,
 ):
-    """Choose candidates by shared words, scores, and groups of covisible keyframes.
+    """Choose loop candidates using shared words, scores, and groups of covisible keyframes.
 
     1. A keyframe passes if it shares enough words with the query: at least ``common_words_ratio``
        times as many as the keyframe that shares the most. Of the keyframes that pass and score at
@@ -197,7 +204,8 @@ def choose_candidates(
 
     Args:
         a, n_keyframes: arrays of the map, and number of keyframes in the map.
-        shared: ``(K,)`` number of shared words; K is at most ``n_keyframes``.
+        shared: ``(K,)`` number of words that each keyframe shares with the query; K is at most
+            ``n_keyframes``.
         score: ``(K,)`` score of each keyframe.
         eligible: ``(K,)`` bool, True for keyframes that may be candidates.
 

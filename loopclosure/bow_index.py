@@ -1,9 +1,10 @@
-"""Inverted index from visual words to keyframes (Galvez-Lopez and Tardos, T-RO 2012, IV).
+"""Inverted index from visual words to keyframes (Galvez-Lopez and Tardos, T-RO 2012, section IV).
 
-The L1 score of two bags of words is the sum, over their shared words, of the smaller of the two
-weights (vocabulary.py). Each posting therefore stores the weight of its word in the keyframe. One
-pass over the postings of a query's words then gives the number of shared words and the score of
-every keyframe.
+The L1 score of two bags of words is a sum over their shared words. Each shared word contributes the
+smaller of its two weights (vocabulary.py). A posting is an entry of the index for a word and a
+keyframe that contains the word. It stores the weight of the word in the keyframe. A single pass
+over the postings of a query's words then gives the number of shared words and the score of every
+keyframe.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ SHARED = 1 << 40  # added for each shared word; larger than any sum of weights
 
 
 def grown(array: NDArray, needed: int) -> NDArray:
-    """An array with room for at least ``needed`` items. This is the array itself if it is long
-    enough, or else a copy of at least 1.5 times its length."""
+    """Return an array with room for at least ``needed`` items. The given array is returned if it is
+    long enough. Otherwise, a copy with at least 1.5 times the length is returned."""
     if needed <= len(array):
         return array
     bigger = np.empty((max(needed, len(array) * 3 // 2), *array.shape[1:]), array.dtype)
@@ -35,7 +36,7 @@ class Likeness(NamedTuple):
     """Comparison of an image with each of K keyframes.
 
     Attributes:
-        shared: ``(K,)`` number of shared words.
+        shared: ``(K,)`` number of words that the image shares with each keyframe.
         score: ``(K,)`` L1 score in [0, 1].
     """
 
@@ -44,7 +45,8 @@ class Likeness(NamedTuple):
 
 
 class Postings(NamedTuple):
-    """Inverted index of W words. The postings of a word are contiguous, in one block.
+    """Inverted index of W words. A posting records that a keyframe contains a word. The postings of
+    a word are contiguous in memory, in one block.
 
     The size of a block is 8, 16, 32 or another power of two. When the block of a word is full, its
     postings are moved to a block of twice the size. The old block can then be reused for other
@@ -65,7 +67,8 @@ class Postings(NamedTuple):
 
 
 class InvertedIndex:
-    """The keyframes that contain each word, and the weight of the word in each keyframe."""
+    """An inverted index: it stores the keyframes that contain each visual word, and the weight of
+    the word in each of these keyframes."""
 
     def __init__(self, n_words: int) -> None:
         self.n_keyframes = 0  # newest id + 1
@@ -87,19 +90,22 @@ class InvertedIndex:
         self.n_keyframes = max(self.n_keyframes, keyframe + 1)
 
     def compare(self, bag: BowVector) -> Likeness:
-        """Compare the bag of words of an image with all keyframes, from id 0 to the newest id."""
+        """Compare the bag of words of an image with the bags of all keyframes, from id 0 to the
+        newest id."""
         sums = compare_with_all(self._postings, self.n_keyframes, bag.words, fixed(bag.weights))
         return Likeness((sums // SHARED).astype(np.int32), sums % SHARED / UNIT)
 
 
 def fixed(weights: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Weights in [0, 1], as integer multiples of 1 / ``UNIT``."""
+    """Convert weights in [0, 1] to integer multiples of 1 / ``UNIT``."""
     return np.rint(weights.astype(np.float64) * UNIT).astype(np.int64)
 
 
 def is_full(size):
-    """Whether the block of a word with ``size`` postings is full. ``size`` may be an array. The
-    condition must be the same as in ``post``."""
+    """Return whether the block of a word with ``size`` postings is full. ``size`` may be an array.
+
+    The condition must be the same as in ``post``.
+    """
     return (size & (size - 1) == 0) & ((size == 0) | (size >= FIRST_BLOCK))
 
 
@@ -143,8 +149,9 @@ def post(postings, used, keyframe, words, weights):
 
 @kernel
 def compare_with_all(postings, n_keyframes, words, weights):
-    """``(K,)`` int64: for each keyframe, ``SHARED`` times the number of shared words plus the sum
-    of the smaller weights.
+    """Compare the bag of words of an image with the bags of all keyframes. Returns ``(K,)`` int64:
+    for each keyframe, the number of shared words times ``SHARED``, plus the score. The score is the
+    sum of the smaller weight of each shared word.
 
     Both quantities are stored in one integer, so that each posting needs only one addition.
     """

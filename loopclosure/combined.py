@@ -15,12 +15,14 @@ from vslam.map import Map
 
 
 class CombinedDetector:
-    """Implements :class:`vslam.loopclosure.detector.LoopDetector`.
+    """A :class:`vslam.loopclosure.detector.LoopDetector` that merges the candidates of several
+    detectors.
 
     The scores of different detectors are not comparable, so the candidates of all detectors are
     interleaved. The best candidate of each detector comes first, then the second best of each, and
-    so on. Candidates for the same keyframe are joined. Different keyframes of one place all remain
-    candidates, because after a change of the light, only one of them may be recognisable.
+    so on. Candidates for the same keyframe are joined. Several keyframes of the same place may all
+    remain candidates. The reason is that after a change in lighting, only one of them may be
+    recognisable.
     """
 
     def __init__(self, name: str, detectors: list[LoopDetector]) -> None:
@@ -40,7 +42,9 @@ class CombinedDetector:
         return _interleaved([one.locate(image, features, map_) for one in self._detectors])
 
     def memory(self) -> DetectorMemory:
-        """See :class:`LoopDetector`. It contains the memory of each detector under its name."""
+        """Return the data that all detectors have stored, to be saved in a map file (see
+        :class:`LoopDetector`). The data of each detector is stored under the name of the
+        detector."""
         memories = [one.memory() for one in self._detectors]
         tables = {
             f"{memory.name}/{name}": table

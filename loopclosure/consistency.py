@@ -1,9 +1,9 @@
-"""Temporal consistency of loops.
+"""Tests the temporal consistency of loops.
 
-Several keyframes must propose the same place, and their verified loops must agree.
+A loop is accepted only if several keyframes propose the same place and their verified loops agree.
 
-ORB-SLAM (T-RO 2015, VII-A) requires that the candidates of consecutive keyframes belong to
-overlapping places. This is evidence from appearance. Geometry gives stronger evidence: each
+ORB-SLAM (T-RO 2015, section VII-A) requires that the candidates of consecutive keyframes belong to
+overlapping places. This evidence comes from appearance only. Geometry gives stronger evidence. Each
 verified loop implies how much the map has drifted, and the loops of neighbouring keyframes must
 imply the same drift. ORB-SLAM3 (T-RO 2021, section VI) also verifies a loop first and then confirms
 it with other keyframes.
@@ -27,10 +27,11 @@ from vslam.states import ConsistencyState
 
 
 class LoopConsistency:
-    """Stores which places recent keyframes resembled, and which loops were verified for them.
+    """Tests the temporal consistency of loops. It stores which places recent keyframes resembled,
+    and which loops were verified for these keyframes.
 
     Call ``update`` once for every keyframe, with or without candidates. Call ``confirm`` for every
-    verified edge. Call ``reset`` after a loop has been closed.
+    loop edge that was verified. Call ``reset`` after a loop has been closed.
     """
 
     def __init__(self, config: ConsistencyConfig) -> None:
@@ -50,7 +51,7 @@ class LoopConsistency:
         than candidates.
 
         Returns:
-            The candidates whose place was resembled by enough consecutive keyframes, and a rejected
+            The candidates whose place enough consecutive keyframes resembled, and a rejected loop
             edge for each other candidate.
         """
         self._turn += 1
@@ -81,15 +82,17 @@ class LoopConsistency:
         return consistent, rejected
 
     def confirm(self, edge: LoopEdge, map_: Map) -> LoopEdge:
-        """Accept a verified edge only if the loops of enough recent keyframes imply the same drift.
+        """Accept a verified loop edge only if the loops of enough recent keyframes imply the same
+        drift.
 
-        The drift that an edge implies is a motion of the world: it would move the query to where
-        the edge places it. Odometry between neighbouring keyframes is accurate compared with the
-        tolerances. True loops therefore imply the same drift, and false loops do not.
+        The drift that an edge implies is a motion of the world. This motion would move the query
+        keyframe to where the edge places it. Odometry between neighbouring keyframes is accurate
+        compared with the tolerances. True loops therefore imply the same drift, and false loops do
+        not.
 
         Returns:
-            The edge. It is marked as not accepted if too few keyframes agree so far. A keyframe
-            counts once, even if several of its edges agree.
+            The edge. It is marked as not accepted if too few keyframes have agreed so far. A
+            keyframe counts only once, even if several of its edges agree.
         """
         if not edge.accepted:
             return edge
@@ -110,12 +113,13 @@ class LoopConsistency:
     def confirmed_by_earlier(
         self, map_: Map, camera: Camera, config: VerificationConfig
     ) -> Iterator[LoopEdge]:
-        """Yield verified loops that still lack agreement, but that an earlier keyframe confirms.
-        The newest loop comes first.
+        """Yield verified loops that an earlier keyframe confirms, although too few keyframes have
+        agreed with them so far. The newest loop comes first.
 
-        An earlier keyframe confirms a loop if it is covisible with the query, is verified at the
-        same place, and implies the same drift. ORB-SLAM3 (section VI) also tries covisible
-        keyframes before it waits for later keyframes.
+        An earlier keyframe confirms a loop if it meets three conditions. It is covisible with the
+        query of the loop. It can be verified at the same place as the query. The two loops imply
+        the same drift. ORB-SLAM3 (section VI) also tries covisible keyframes before it waits for
+        later keyframes.
         """
         oldest = self._turn + 1 - self.config.verified_memory
         for waiting in [edge for turn, edge in reversed(self._verified) if turn >= oldest]:
@@ -128,8 +132,9 @@ class LoopConsistency:
     def _is_confirmed(
         self, edge: LoopEdge, map_: Map, camera: Camera, config: VerificationConfig
     ) -> bool:
-        """Whether another keyframe is verified at the same place with the same drift. The keyframe
-        must be covisible with the query of the edge and at least ``min_moved`` away from it."""
+        """Return whether another keyframe can be verified at the place of a loop edge, with the
+        same drift. This keyframe must be covisible with the query of the edge, and at least
+        ``min_moved`` away from the query."""
         assert edge.T_query_match is not None
         T_w_query = inverse(map_.keyframe_pose(edge.query))
         for keyframe in map_.covisible(edge.query)[0].tolist():
@@ -146,7 +151,7 @@ class LoopConsistency:
         return False
 
     def agree(self, edge: LoopEdge, other: LoopEdge, map_: Map) -> bool:
-        """Whether two edges imply the same drift at the query of the first edge."""
+        """Return whether two loop edges imply the same drift at the query of the first edge."""
         position = inverse(map_.keyframe_pose(edge.query))[:3, 3]
         a, b = implied_drift(edge, map_), implied_drift(other, map_)
         twist = se3_log(inverse(_rigid(a)) @ _rigid(b))
@@ -157,23 +162,25 @@ class LoopConsistency:
         )
 
     def state(self) -> ConsistencyState:
-        """The state, for a saved map or a checkpoint."""
+        """Return the state, to store it in a map file or a checkpoint."""
         return ConsistencyState(tuple(self._series), tuple(self._verified), self._turn)
 
     def restore(self, state: ConsistencyState) -> None:
-        """Continue from a state that ``state`` returned."""
+        """Continue from a state that the method ``state`` returned."""
         self._series, self._verified = list(state.places), list(state.verified)
         self._turn = state.turn
 
     def reset(self) -> None:
-        """Discard all series and verified loops, because the map moved when a loop was closed."""
+        """Discard the places and verified loops of all recent keyframes. This is necessary after a
+        loop has been closed, because the map has moved."""
         self._series.clear()
         self._verified.clear()
 
 
 def implied_drift(edge: LoopEdge, map_: Map) -> NDArray[np.float64]:
-    """``(4, 4)`` motion of the world that moves the query to where an edge places it. If the edge
-    has a scale, the motion is a similarity with the scale in its upper left 3x3 block.
+    """Compute the drift that a loop edge implies: the ``(4, 4)`` motion of the world that moves the
+    query to where the edge places it. If the edge has a scale, the motion is a similarity with the
+    scale in its upper left 3x3 block.
 
     Raises:
         ValueError: the edge has no pose.
@@ -186,7 +193,7 @@ def implied_drift(edge: LoopEdge, map_: Map) -> NDArray[np.float64]:
 
 
 def _rigid(S: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A similarity with its scale set to 1. A rigid motion is returned unchanged."""
+    """Set the scale of a similarity to 1. A rigid motion is returned unchanged."""
     T, scale_cubed = S.copy(), np.linalg.det(S[:3, :3])
     if abs(scale_cubed - 1.0) > 1e-9:
         T[:3, :3] /= np.cbrt(scale_cubed)

@@ -1,4 +1,4 @@
-"""The interface of loop detectors: bag of words, learned networks, and plug-ins."""
+"""The interface that all loop detectors implement: bag of words, learned networks, and plug-ins."""
 
 from __future__ import annotations
 
@@ -13,30 +13,31 @@ from vslam.map import Map
 
 
 class LoopDetector(Protocol):
-    """Stores the appearance of keyframes and finds keyframes that look similar.
+    """Interface of a loop detector. A detector stores the appearance of keyframes, and finds
+    keyframes that look similar to an image.
 
     The methods are called in the order of the keyframes, by one thread at a time.
 
     All detectors share the later stages: rating and verification of candidates, consistency, and
-    correction. However, detectors differ in the descriptors that verify their candidates. The
-    setting ``verification.descriptors`` selects these descriptors, and its default depends on the
-    detector.
+    correction. However, the descriptors that are used to verify candidates depend on the detector.
+    The setting ``verification.descriptors`` selects these descriptors. Its default is different for
+    different detectors.
 
-    For ``bow``, ``capsule-paper`` and plug-ins, candidates are verified only by ORB descriptors.
-    For ``both`` and the other networks, candidates that ORB rejects are verified again by learned
-    local descriptors. These detectors also use the local descriptors to rank the 20 most similar
-    keyframes. The local descriptors always come from the feature extractor of the capsule network,
-    regardless of the network that proposed the candidates.
+    For ``bow``, ``capsule-paper`` and plug-ins, candidates are verified using only ORB descriptors.
+    For ``both`` and the other networks, candidates that fail this verification are verified again
+    using learned local descriptors. These detectors also use the local descriptors to rank the 20
+    most similar keyframes. The local descriptors always come from the feature extractor of the
+    capsule network, regardless of the network that proposed the candidates.
 
-    To compare detectors in isolation, set ``verification.descriptors`` to ``orb`` or ``both`` for
-    all of them.
+    To compare detectors in isolation, set ``verification.descriptors`` to the same value for all
+    detectors, either ``orb`` or ``both``.
     """
 
     name: str
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
-        """Store the appearance of a keyframe. ``image`` is its ``(H, W)`` uint8 left image, or None
-        if it was not stored."""
+        """Store the appearance of a keyframe. ``image`` is the ``(H, W)`` uint8 left image of the
+        keyframe, or None if the image was not stored."""
         ...
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
@@ -47,35 +48,35 @@ class LoopDetector(Protocol):
     def locate(
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
-        """Keyframes in the map that look similar to a frame outside the map, most similar first.
-        ``LoopCandidate.query`` is -1, because the frame is not a keyframe."""
+        """Return the keyframes in the map that look similar to a frame outside the map, most
+        similar first. ``LoopCandidate.query`` is -1, because the frame is not a keyframe."""
         ...
 
     def memory(self) -> DetectorMemory:
-        """The data that the detector has stored for all keyframes, to be saved in a map file. Do
-        not write to its arrays, because the detector still uses them."""
+        """Return the data that the detector has stored for all keyframes, to be saved in a map
+        file. Do not write to the returned arrays, because the detector still uses them."""
         ...
 
     def restore(self, memory: DetectorMemory) -> None:
-        """Load the memory of an identical detector. This replaces calling ``add`` for each
-        keyframe.
+        """Load the data that the method ``memory`` of an identical detector returned. This replaces
+        calling ``add`` for each keyframe.
 
         Raises:
-            ValueError: the memory is damaged or comes from another detector.
+            ValueError: the data is damaged or comes from a different detector.
         """
         ...
 
 
 def require_same(detector: DetectorMemory, memory: DetectorMemory) -> None:
-    """Check that a memory was made by the same detector.
+    """Check that stored data comes from the same detector, with the same vocabulary or weights.
 
     Args:
-        detector: the detector's own memory.
-        memory: the memory to be restored.
+        detector: what the method ``memory`` of the detector returns.
+        memory: the stored data.
 
     Raises:
-        ValueError: the memory comes from another detector, or from the same detector with another
-            vocabulary or other weights.
+        ValueError: the data comes from a different detector, or from the same detector with a
+            different vocabulary or different weights.
     """
     if memory.name != detector.name:
         raise ValueError(f"made with the detector {memory.name}, not {detector.name}")
@@ -84,7 +85,7 @@ def require_same(detector: DetectorMemory, memory: DetectorMemory) -> None:
 
 
 class NoDetector:
-    """A detector that never finds a loop. It is used for pure odometry."""
+    """A loop detector that never finds a loop. It is used for pure odometry."""
 
     name = "none"
 

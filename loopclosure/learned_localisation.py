@@ -1,8 +1,8 @@
-"""Estimates the pose of an image at a place in the map by learned local descriptors.
+"""Estimates the pose of an image at a place in the map, using learned local descriptors.
 
-Landmarks of the place are searched for anywhere in the image, not only at its keypoints. The reason
-is that the corner detector responds at other points at night or in the other lane. If one keyframe
-of the place does not give enough matches, the matches of further keyframes are added.
+Landmarks of the place are searched for everywhere in the image, not only at its keypoints. The
+reason is that at night or in a different lane, the corner detector finds different points. If one
+keyframe of the place does not give enough matches, the matches of further keyframes are added.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from vslam.reprojection import stack_uvr
 
 
 class View(NamedTuple):
-    """The local descriptors and the landmarks of one keyframe of the place.
+    """The local descriptors and the landmarks of one keyframe of a place.
 
     Attributes:
         maps: local descriptors of the keyframe's image.
@@ -44,14 +44,16 @@ class View(NamedTuple):
 
 
 class PoseEstimate(NamedTuple):
-    """A camera pose, and the landmarks of a place that should be visible from it.
+    """A camera pose that was estimated at a place, and the landmarks of the place that should be
+    visible from this pose.
 
     Attributes:
         landmarks: ``(M,)`` int32 ids of the landmarks that should be visible.
         uv: ``(M, 2)`` float64 predicted positions of these landmarks in the image, pixels.
         seen: ``(M,)`` bool, True for inliers: landmarks that were found at their predicted
             positions.
-        n_matches: number of matches near the predictions, including outliers.
+        n_matches: number of landmarks that were matched near their predicted positions, including
+            outliers.
         T_cw: ``(4, 4)`` pose of the camera (world to camera), in the world frame of the landmarks.
     """
 
@@ -71,7 +73,7 @@ def localise(
     config: LearnedMatchingConfig,
     seed: int,
 ) -> PoseEstimate | str:
-    """Estimate the pose of an image at a place.
+    """Estimate the pose of an image at a place of the map, using learned local descriptors.
 
     Args:
         query: local descriptors of the image.
@@ -115,7 +117,7 @@ def localise(
 
 
 def view_of(map_: Map, keyframe: int, images: KeyframeImages) -> View:
-    """The ``View`` of a keyframe that has an image."""
+    """Create the ``View`` of a keyframe that has an image."""
     a, rows = map_.arrays, map_.rows(keyframe)
     landmark = a.landmark[rows]
     observing = np.flatnonzero(landmark >= 0)
@@ -130,8 +132,8 @@ def guided_search(
     camera: Camera,
     config: LearnedMatchingConfig,
 ) -> PoseEstimate:
-    """Refine a pose. All landmarks of the views are searched for near their projections, and the
-    pose is optimised with all matches. Both steps are done twice."""
+    """Refine the pose of an image. All landmarks of the views are searched for near their
+    projections, and the pose is optimised with all matches. Both steps are done twice."""
     _, first = np.unique(np.concatenate([view.landmarks for view in views]), return_index=True)
     landmarks = np.concatenate([view.landmarks for view in views])[first]
     xyz = map_.arrays.xyz[landmarks]
@@ -157,7 +159,8 @@ def guided_search(
 
 
 def project(xyz: Matrix, T_cw: Matrix, camera: Camera) -> Matrix:
-    """``(N, 2)`` pixels of ``(N, 3)`` world points; NaN for points outside the image."""
+    """Project ``(N, 3)`` points in the world frame to ``(N, 2)`` pixels. Points outside the image
+    become NaN."""
     p = transform(T_cw, xyz)
     uv = np.full((len(p), 2), np.nan)
     ahead = p[:, 2] > 0.1
@@ -170,7 +173,7 @@ def project(xyz: Matrix, T_cw: Matrix, camera: Camera) -> Matrix:
 def _observed(
     uv: Matrix, query: DescriptorMaps, config: LearnedMatchingConfig
 ) -> tuple[Matrix, Matrix]:
-    """Monocular observations at ``(N, 2)`` pixels: ``(N, 3)`` u, v, u_right (NaN), and ``(N,)``
-    inverse variances of u and v."""
+    """Convert ``(N, 2)`` pixels to monocular observations: ``(N, 3)`` u, v, u_right, where u_right
+    is NaN, and ``(N,)`` inverse variances of u and v."""
     sigma = config.sigma / query.scale
     return stack_uvr(uv, np.full(len(uv), np.nan)), np.full(len(uv), sigma**-2.0)

@@ -1,10 +1,10 @@
-"""Verifies loop candidates and relocalises by learned local descriptors.
+"""Verifies loop candidates and relocalises frames using learned local descriptors.
 
 Learned descriptors still match when the appearance has changed too much for ORB descriptors.
 
-The steps are those of :mod:`vslam.loopclosure.verification`. First, an initial pose is estimated.
-Then, guided matching uses all landmarks of the place, and the pose is refined. Finally, the same
-tests reject places that only look similar.
+The steps are the same as in :mod:`vslam.loopclosure.verification`. First, an initial pose is
+estimated. Then, guided matching uses all landmarks of the place, and the pose is refined. Finally,
+the same tests as with ORB descriptors reject places that only look similar.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ _DEPTHS_AGREE = 0.15  # largest relative difference in depth between two landmar
 
 
 class LearnedTrials:
-    """Chooses the candidates for learned verification.
+    """Chooses the loop candidates that are verified using learned local descriptors.
 
-    Learned verification takes forty times as long as verification by ORB descriptors, so only a few
-    candidates are tried.
+    Verification with learned descriptors takes forty times as long as verification with ORB
+    descriptors, so only a few candidates are tried.
 
-    The candidates whose images are most similar by local descriptors are chosen, if they are
-    similar enough. After a failed attempt, the limit is higher for the next
-    ``learned.retry_interval`` keyframes. Only candidates that are clearly more similar than the
-    failed one are then chosen.
+    The local descriptors give a similarity of each candidate to the query. The candidates with the
+    highest similarities are chosen if their similarities exceed a limit. After a failed attempt,
+    the limit is higher for the next ``learned.retry_interval`` keyframes. During this time, only
+    candidates that are clearly more similar than the failed candidate are chosen.
 
     Attributes:
-        state: the outcome of the last attempt.
+        state: the result of the last attempt.
     """
 
     def __init__(self, config: LearnedMatchingConfig) -> None:
@@ -56,8 +56,8 @@ class LearnedTrials:
         self.state = VerifierState()
 
     def choose(self, keyframe: int, candidates: Collection[LoopCandidate]) -> set[int]:
-        """The ids ``match`` of the candidates that should be tried. Candidates without a similarity
-        are never chosen."""
+        """Choose the candidates that should be tried, and return the ids of their keyframes
+        (``match``). Candidates without a similarity are never chosen."""
         config = self._config
         min_similarity = config.min_similarity
         if keyframe < self.state.resting_until:
@@ -67,7 +67,7 @@ class LearnedTrials:
         return {match for similarity, match in best if similarity >= min_similarity}
 
     def record(self, candidate: LoopCandidate, *, located: bool) -> None:
-        """Record the result of an attempt.
+        """Record the result of verifying a candidate with learned descriptors.
 
         Args:
             located: whether the attempt found a pose, even if the loop was rejected afterwards.
@@ -86,15 +86,16 @@ def with_similarities(
     config: LearnedMatchingConfig,
     beyond: NDArray[np.float64] | None = None,
 ) -> list[LoopCandidate]:
-    """Set the ``similarity`` of candidates that the detector has not compared by local descriptors.
+    """Compute the ``similarity`` of candidates using local descriptors, unless the detector has
+    already done this.
 
     Args:
         candidates: the candidates, best first. At most ``config.max_compared`` of them are
             compared.
-        glance: returns the coarse descriptors of the query image. It is called only if there is a
-            candidate to compare.
-        beyond: result of :func:`vslam.loopclosure.reach.beyond_reach`. Keyframes out of reach are
-            not compared. None if the camera may be anywhere.
+        glance: function that returns the coarse descriptors of the query image. It is called only
+            if there is a candidate to compare.
+        beyond: result of :func:`vslam.loopclosure.reach.beyond_reach`. Keyframes that the camera
+            cannot be revisiting are not compared. None excludes no keyframe.
 
     Returns:
         The candidates in the same order.
@@ -117,12 +118,13 @@ def with_similarities(
 def is_image_redundant(
     map_: Map, keyframe: int, images: KeyframeImages, config: LearnedMatchingConfig
 ) -> bool:
-    """Whether the image of a keyframe need not be stored, because another image shows nearly the
-    same view.
+    """Return whether the image of a keyframe need not be stored, because another stored image shows
+    nearly the same view.
 
-    There are two such cases. First, the previous keyframe has an image; every second image is
-    enough even if keyframes are far apart. Second, any keyframe with an image shares most landmarks
-    with this keyframe. This happens in slow motion, in turns, and on revisits of mapped places.
+    There are two such cases. In the first case, the image of the previous keyframe is stored. Every
+    second image is enough, even if keyframes are far apart. In the second case, any keyframe whose
+    image is stored shares most landmarks with this keyframe. This happens when the camera moves
+    slowly, turns, or revisits a mapped place.
     """
     if keyframe - 1 in images:
         return True
@@ -139,11 +141,12 @@ def verify_learned(
     config: LearnedMatchingConfig,
     gates: VerificationConfig,
 ) -> LoopEdge:
-    """Verify a candidate by learned local descriptors, as :func:`verification.verify` does by ORB.
+    """Verify a candidate using learned local descriptors. :func:`verification.verify` does the same
+    using ORB descriptors.
 
     Returns:
-        The edge. It is either accepted, or it has the reason for its rejection. Its features and
-        landmarks are the inliers that coincide with a keypoint of the query.
+        The loop edge. It is either accepted, or it contains the reason why it was rejected. Its
+        features and landmarks are the inliers that coincide with a keypoint of the query.
     """
     query, match = candidate.query, candidate.match
     edge = LoopEdge.of(candidate, matched_by="learned")
@@ -192,7 +195,8 @@ def recognise(
     camera: Camera,
     config: Config,
 ) -> Localisation | None:
-    """Estimate the pose of a frame outside the map at the place of a keyframe.
+    """Estimate the pose of a frame outside the map at the place of a keyframe, using learned local
+    descriptors.
 
     Args:
         query: local descriptors of the frame's image.
@@ -200,8 +204,8 @@ def recognise(
         match: id of the keyframe.
 
     Returns:
-        The pose and the observed landmarks. None if the frame fails the tests of a loop, or if too
-        few of its keypoints coincide with landmarks to continue tracking.
+        The pose and the observed landmarks. None if the frame fails the tests that a loop must
+        pass. Also None if too few of its keypoints coincide with landmarks to continue tracking.
     """
     gates = config.verification
     around = [match, *map_.covisible(match)[0].tolist()]
@@ -221,10 +225,11 @@ def recognise(
 def observed_features(
     map_: Map, query: int, estimate: PoseEstimate, camera: Camera, config: LearnedMatchingConfig
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Pair features of the query with landmarks of the place that are at the same image position.
+    """Pair features of the query with landmarks of a place that are predicted at the same image
+    position.
 
     If a feature already observes a landmark, the depths of both landmarks must agree. Otherwise, a
-    corner of a car could be paired with a corner of the facade behind it.
+    corner of a car could be paired with a corner of the facade behind the car.
 
     Returns:
         ``(N,)`` indices of features and ``(N,)`` ids of landmarks, without duplicates.
@@ -259,16 +264,16 @@ def nearest_features(
     scales: NDArray[np.float64],
     config: LearnedMatchingConfig,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Match pixels to the nearest features. The distance is at most ``config.fuse_pixels``,
-    measured in pixels of the feature's octave.
+    """Match image positions with the nearest features. The distance of a match is at most
+    ``config.fuse_pixels``, measured in pixels of the feature's octave.
 
     Args:
         uv: ``(N, 2)`` positions in the image, pixels.
         xy, octave: positions and octaves of the features of the image.
 
     Returns:
-        ``(K,)`` indices of features, without duplicates, and ``(K,)`` indices of their pixels. The
-        nearest pairs come first.
+        ``(K,)`` indices of features, without duplicates, and ``(K,)`` indices of the matched
+        positions. The pair with the smallest distance comes first.
     """
     if not len(uv) or not len(xy):
         return np.empty(0, np.int64), np.empty(0, np.int64)
@@ -293,7 +298,8 @@ def _rejection_reason(
     config: LearnedMatchingConfig,
     gates: VerificationConfig,
 ) -> str:
-    """The reason to reject a refined loop, or "" if the loop passes all tests.
+    """Test a loop after its pose was refined. Returns the reason to reject the loop, or "" if the
+    loop passes all tests.
 
     Args:
         query_seen: the result of ``_seen_of_query``.
@@ -313,8 +319,8 @@ def _rejection_reason(
 def _visibility_reason(
     estimate: PoseEstimate, camera: Camera, config: LearnedMatchingConfig, gates: VerificationConfig
 ) -> str:
-    """The reason to reject a pose because too little of the place is seen, or "" if enough is
-    seen."""
+    """Test whether enough landmarks of the place were found in the image. Returns the reason to
+    reject the pose, or "" if enough landmarks were found."""
     seen, total = int(np.count_nonzero(estimate.seen)), len(estimate.seen)
     if seen < config.min_inliers:
         return f"only {seen} learned matches fit"
@@ -335,7 +341,8 @@ def _seen_of_query(
     camera: Camera,
     config: LearnedMatchingConfig,
 ) -> tuple[int, int]:
-    """Count the landmarks of the query that are visible in the image of a keyframe of the place.
+    """Count the landmarks of the query keyframe that are visible in the image of a keyframe of the
+    place.
 
     Returns:
         Number of landmarks of the query that are found at their projections in this image, and
@@ -361,7 +368,8 @@ def _seen_of_query(
 
 
 class LearnedRelocalisation:
-    """Implements ``Recognise`` with the images of keyframes. Without images, it finds nothing."""
+    """Relocalises frames using learned local descriptors of the stored keyframe images (implements
+    ``Recognise``). Without stored images, it finds nothing."""
 
     def __init__(self, images: KeyframeImages | None, camera: Camera, config: Config) -> None:
         self._images = images
@@ -371,8 +379,8 @@ class LearnedRelocalisation:
     def __call__(
         self, map_: Map, image: Image | None, features: Features, candidates: list[LoopCandidate]
     ) -> Localisation | None:
-        """Search for a frame at the candidates whose images are most similar to it. Returns None if
-        no candidate succeeds."""
+        """Estimate the pose of a frame at the candidate keyframes whose images are most similar to
+        the image of the frame. Returns None if this fails at all candidates."""
         images, config = self._images, self._config
         if images is None or image is None:
             return None

@@ -1,9 +1,11 @@
-"""Coarse-to-fine matching of learned local descriptors (after LoFTR, Sun et al., CVPR 2021).
+"""Coarse-to-fine matching of learned local descriptors, as in LoFTR (Sun et al., CVPR 2021).
 
-Coarse matches are pairs of cells in two images that are mutual nearest neighbours. Fine matching
-searches the other image for each keypoint of one image. It searches in windows around the positions
-that nearby coarse matches predict. The other image needs no keypoints. The position is refined to a
-fraction of a cell. It is accepted only if the reverse search returns to the keypoint.
+Each image is divided into cells, and each cell has a descriptor. A coarse match is a pair of cells
+in two images whose descriptors are mutual nearest neighbours. Fine matching searches the second
+image for each keypoint of the first image. The search windows lie around the positions that nearby
+coarse matches predict. The second image needs no keypoints. The position that is found is refined
+to a fraction of a cell. A position is accepted only if the reverse search, from the second to the
+first image, returns to the keypoint.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ _HOMOGRAPHY_DRAWS = 300  # maximum number of RANSAC samples
 
 
 class DescriptorMaps(NamedTuple):
-    """Local descriptors of an image, normalised to length 1.
+    """Local descriptors of an image on a coarse and a fine grid of cells, normalised to length 1.
 
     Attributes:
         coarse: ``(h, w, C)`` float32, or float16 from ``coarse_alone``. Cell (i, j) lies at pixel
@@ -35,14 +37,14 @@ class DescriptorMaps(NamedTuple):
     scale: float
 
     def coarse_alone(self) -> DescriptorMaps:
-        """Only the coarse descriptors, in half precision. Half precision saves memory, because
-        these descriptors stay in memory for all keyframes."""
+        """Return a copy that contains only the coarse descriptors, in half precision. These
+        descriptors stay in memory for all keyframes, and half precision saves memory."""
         none = np.empty((0, *self.fine.shape[1:]), np.float32)
         return self._replace(coarse=self.coarse.astype(np.float16), fine=none)
 
 
 class CoarseMatches(NamedTuple):
-    """Cells of two images that are mutual nearest neighbours.
+    """Pairs of coarse cells in two images whose descriptors are mutual nearest neighbours.
 
     Attributes:
         a, b: ``(N,)`` int64 indices of the cells in each image, row-major.
@@ -70,8 +72,8 @@ class Located(NamedTuple):
 
 
 def match_coarse(a: DescriptorMaps, b: DescriptorMaps, least: float) -> CoarseMatches:
-    """Mutual nearest neighbours of the coarse descriptors whose cosine similarity is at least
-    ``least``."""
+    """Find pairs of coarse cells whose descriptors are mutual nearest neighbours. Their cosine
+    similarity must be at least ``least``."""
     cells = [one.coarse.reshape(-1, one.coarse.shape[2]).astype(np.float32) for one in (a, b)]
     best_a, best_b, similarity = _nearest(cells[0], np.ascontiguousarray(cells[1].T))
     mutual = (best_b[best_a] == np.arange(len(best_a))) & (similarity >= least)
@@ -80,7 +82,8 @@ def match_coarse(a: DescriptorMaps, b: DescriptorMaps, least: float) -> CoarseMa
 
 
 def positions(cells: NDArray[np.int64], maps: DescriptorMaps) -> NDArray[np.float64]:
-    """``(N, 2)`` positions of ``(N,)`` coarse cells, in pixels of the camera image."""
+    """Convert the indices of ``(N,)`` coarse cells to ``(N, 2)`` positions, in pixels of the camera
+    image."""
     columns = maps.coarse.shape[1]
     return COARSE_STRIDE * np.stack([cells % columns, cells // columns], 1) / maps.scale
 
@@ -93,7 +96,7 @@ def locate(
     reach: int,
     least: float,
 ) -> Located:
-    """Search image b for keypoints of image a. The search windows lie around the positions that
+    """Search image b for the keypoints of image a. The search windows lie around the positions that
     nearby coarse matches predict.
 
     Args:
@@ -120,7 +123,7 @@ def locate_near(
     reach: int,
     least: float,
 ) -> Located:
-    """Search image b for keypoints of image a, in windows around predicted positions.
+    """Search image b for the keypoints of image a, in windows around the given predicted positions.
 
     Args:
         xy: ``(N, 2)`` keypoints, in pixels of camera image a.
@@ -137,7 +140,8 @@ def locate_near(
 
 
 def likeness(a: DescriptorMaps, b: DescriptorMaps, least: float) -> float:
-    """Similarity of two images by their coarse descriptors; 1 for identical images.
+    """Compute the similarity of two images from their coarse descriptors. It is 1 for identical
+    images.
 
     The similarity is the sum of the cosine similarities of the coarse matches, divided by the
     number of cells of the smaller image.
@@ -149,16 +153,17 @@ def likeness(a: DescriptorMaps, b: DescriptorMaps, least: float) -> float:
 
 
 def homography_share(coarse: CoarseMatches, a: DescriptorMaps, b: DescriptorMaps) -> float:
-    """``homography_inliers``, divided by the number of cells of the smaller image."""
+    """Compute the number of coarse matches that fit a single homography, divided by the number of
+    cells of the smaller image."""
     return homography_inliers(coarse, a, b) / _fewest_cells(a, b)
 
 
 def homography_inliers(coarse: CoarseMatches, a: DescriptorMaps, b: DescriptorMaps) -> int:
-    """Number of coarse matches that fit a single homography.
+    """Count the coarse matches that fit a single homography.
 
     A homography is not an exact model of a street. However, distant points fit it, and near points
-    deviate from it by only a cell or two. In images of different places, far fewer matches fit any
-    homography.
+    deviate from it by only a cell or two. In images of different places, far fewer matches fit a
+    common homography.
     """
     import cv2
 
@@ -172,17 +177,18 @@ def homography_inliers(coarse: CoarseMatches, a: DescriptorMaps, b: DescriptorMa
 
 
 def _fewest_cells(a: DescriptorMaps, b: DescriptorMaps) -> int:
-    """Number of coarse cells of the smaller image."""
+    """Return the number of coarse cells of the smaller image."""
     return min(one.coarse.shape[0] * one.coarse.shape[1] for one in (a, b))
 
 
 @kernel
 def _nearest(a, b):
-    """Nearest neighbours by cosine similarity, of descriptors a ``(N, C)`` and b ``(C, M)``.
+    """Find the nearest neighbours of two sets of descriptors by cosine similarity: a, with shape
+    ``(N, C)``, and b, with shape ``(C, M)``.
 
     Returns:
-        ``(N,)`` int64 nearest b of each a; ``(M,)`` int64 nearest a of each b; ``(N,)`` float32
-        cosine similarity of each a and its nearest b.
+        ``(N,)`` int64 index of the nearest b for each a; ``(M,)`` int64 index of the nearest a for
+        each b; ``(N,)`` float32 cosine similarity of each a and its nearest b.
     """
     n, channels = a.shape
     m = b.shape[1]
@@ -205,9 +211,11 @@ def _nearest(a, b):
 
 @inner_kernel
 def _interpolate(fine, x, y, out):
-    """Write the interpolated descriptor at (x, y) into ``out``. Returns False outside the image.
+    """Interpolate the descriptor at (x, y), and write it into ``out``. Returns False if the
+    position is outside the image.
 
-    The position is in cells. The descriptor is interpolated bilinearly and normalised to length 1.
+    The position is given in cells. The descriptor is interpolated bilinearly and normalised to
+    length 1.
     """
     rows, columns, channels = fine.shape
     if not (x >= 0.0 and y >= 0.0 and x <= columns - 1 and y <= rows - 1):
@@ -243,8 +251,9 @@ def _cosine(fine, i, j, descriptor):
 
 @inner_kernel
 def _search(fine, descriptor, x, y, reach):
-    """Find the most similar cell within ``reach`` of (x, y). Returns its column, row and cosine
-    similarity. The similarity is -2 if the window is outside the image."""
+    """Find the cell within ``reach`` of (x, y) whose descriptor is most similar to the given
+    descriptor. Returns its column, row and cosine similarity. The similarity is -2 if the window is
+    outside the image."""
     rows, columns, _ = fine.shape
     best_i, best_j, best = -1, -1, np.float32(-2.0)
     middle_j, middle_i = int(np.rint(x)), int(np.rint(y))
@@ -258,8 +267,9 @@ def _search(fine, descriptor, x, y, reach):
 
 @inner_kernel
 def _peak(fine, descriptor, j, i, best):
-    """Position of the best match at sub-cell precision. In x and in y, it is the maximum of the
-    parabola through the cosine similarities of the best cell and its two neighbours."""
+    """Refine the position of the best match to a fraction of a cell. In x and in y, the refined
+    position is the maximum of a parabola. The parabola passes through the cosine similarities of
+    the best cell and its two neighbours."""
     rows, columns, _ = fine.shape
     x, y = float(j), float(i)
     if 0 < j < columns - 1:
@@ -277,9 +287,9 @@ def _peak(fine, descriptor, j, i, best):
 
 @inner_kernel
 def _accept_if_mutual(fine_a, fine_b, descriptor, x, y, j, i, best, reach, other, found):
-    """Set ``found`` to the peak around the best cell of b, if the reverse search confirms it. The
-    reverse search from the peak must end within 1.5 cells of the keypoint (x, y) in a. ``other`` is
-    a workspace."""
+    """Refine the position of the best cell in b, and write it into ``found`` if the reverse search
+    confirms it. The reverse search from this position must end within 1.5 cells of the keypoint at
+    ``(x, y)`` in a. ``other`` is a workspace."""
     peak_x, peak_y = _peak(fine_b, descriptor, j, i, best)
     if _interpolate(fine_b, peak_x, peak_y, other):
         back_j, back_i, _ = _search(fine_a, other, x, y, reach)
@@ -289,8 +299,8 @@ def _accept_if_mutual(fine_a, fine_b, descriptor, x, y, j, i, best, reach, other
 
 @kernel
 def _locate(xy, fine_a, fine_b, cell_in_b, columns_b, reach, least):
-    """Like ``locate``, in units of fine cells. ``cell_in_b`` is the coarse match of each cell of a,
-    or -1."""
+    """Do the work of ``locate`` in units of fine cells. ``cell_in_b`` is the coarse match of each
+    cell of a, or -1 if the cell has no match."""
     n, channels = len(xy), fine_a.shape[2]
     rows_a, columns_a = cell_in_b.shape
     found = np.full((n, 2), np.nan)
@@ -330,7 +340,7 @@ def _locate(xy, fine_a, fine_b, cell_in_b, columns_b, reach, least):
 
 @kernel
 def _locate_near(xy, expected, fine_a, fine_b, reach, least):
-    """Like ``locate_near``, in units of fine cells."""
+    """Do the work of ``locate_near`` in units of fine cells."""
     n, channels = len(xy), fine_a.shape[2]
     found = np.full((n, 2), np.nan)
     descriptor, other = np.empty(channels, np.float32), np.empty(channels, np.float32)

@@ -25,11 +25,11 @@ _METHODS = ("add", "query", "locate")
 class PlugInDetector:
     """A ``LoopDetector`` that forwards all calls to the detector of another package.
 
-    After its first failure, the detector of the package is not called again.
+    After that detector has failed once, it is not called again.
 
     Attributes:
         problem: one sentence about the failure; None if there was no failure. A run ends after a
-            failure and keeps the results that it has so far.
+            failure and keeps the results obtained so far.
     """
 
     def __init__(self, plugin: PlugIn, detector: LoopDetector) -> None:
@@ -50,8 +50,9 @@ class PlugInDetector:
         return self._candidates(-1, map_, self._detector.locate, _read_only(image), features, map_)
 
     def memory(self) -> DetectorMemory:
-        """The memory of the package's detector. If that detector has no method ``memory``, it is
-        only its name."""
+        """Return the data that the other package's detector has stored for all keyframes, to be
+        saved in a map file. If that detector has no method ``memory``, the result contains only the
+        name of the detector."""
         empty = DetectorMemory(self.name)
         if not callable(getattr(self._detector, "memory", None)):
             return empty
@@ -67,11 +68,11 @@ class PlugInDetector:
         return replace(memory, name=self.name)
 
     def restore(self, memory: DetectorMemory) -> None:
-        """See ``LoopDetector``.
+        """Load the data that the method ``memory`` returned (see ``LoopDetector``).
 
         Raises:
-            ValueError: the memory comes from another detector, or the package's detector has no
-                method ``restore``, or this method fails.
+            ValueError: the data comes from a different detector, or the other package's detector
+                has no method ``restore``, or this method fails.
         """
         if memory.name != self.name:
             raise ValueError(f"made with the detector {memory.name}, not {self.name}")
@@ -84,8 +85,8 @@ class PlugInDetector:
             raise ValueError(self.problem)
 
     def _call(self, method: Callable[..., Any], *arguments: object) -> Any:
-        """Call a method and return its result. Returns None if the detector fails or has failed
-        before."""
+        """Call a method of the other package's detector and return its result. Returns None if the
+        detector fails, or if it has failed in an earlier call."""
         if self.problem is not None:
             return None
         try:
@@ -123,7 +124,8 @@ def open_plugin(plugin: PlugIn, config: Config, weights: Path | None) -> PlugInD
 
 
 def _fault(candidates: object, query: int, map_: Map) -> str:
-    """Describe what is wrong with the candidates for a query. Returns "" if they are valid.
+    """Describe what is wrong with the candidates that the other package's detector returned for a
+    query. Returns "" if the candidates are valid.
 
     The check is needed because compiled kernels use the ids as indices without bounds checks.
     """

@@ -1,7 +1,7 @@
-"""Precision, recall and derived measures for the scores of a loop detector.
+"""Computes precision, recall and derived measures from the scores of a loop detector.
 
-The definitions are those of published benchmarks. An example is recall at 100 % precision (Cummins
-and Newman, IJRR 2008). Tests check that the curves are identical to those of scikit-learn.
+The measures are defined as in published benchmarks. An example is recall at 100 % precision
+(Cummins and Newman, IJRR 2008). Tests check that the curves are identical to those of scikit-learn.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from vslam.errors import InputError
 class PrecisionRecall:
     """A precision-recall curve of K + 1 points.
 
-    There is one point for each of K thresholds. The last point has precision 1 and recall 0.
+    There is one point for each of K thresholds on the score. An additional last point has precision
+    1 and recall 0.
 
     Attributes:
         precision, recall: ``(K + 1,)`` float64.
@@ -32,7 +33,8 @@ class PrecisionRecall:
 
 
 def precision_recall(same: NDArray, score: NDArray) -> PrecisionRecall:
-    """Compute precision and recall at each distinct score.
+    """Compute the precision-recall curve of a loop detector, with one threshold at each distinct
+    score.
 
     Args:
         same: ``(N,)`` bool, True for pairs of images that show the same place.
@@ -55,7 +57,7 @@ def precision_recall(same: NDArray, score: NDArray) -> PrecisionRecall:
 
 
 def curve_of(right: NDArray[np.bool_], score: NDArray[np.float64], total: int) -> PrecisionRecall:
-    """The precision-recall curve of N scored items.
+    """Compute the precision-recall curve of N scored items.
 
     Args:
         right: ``(N,)`` bool, True for items that should be accepted.
@@ -74,30 +76,32 @@ def curve_of(right: NDArray[np.bool_], score: NDArray[np.float64], total: int) -
 
 
 def average_precision(curve: PrecisionRecall) -> float:
-    """Average precision: the sum of precisions weighted by the steps in recall, without
-    interpolation."""
+    """Compute the average precision. It is the sum of the precisions, weighted by the steps in
+    recall, without interpolation."""
     return float(-np.sum(np.diff(curve.recall) * curve.precision[:-1]))
 
 
 def recall_at_full_precision(curve: PrecisionRecall) -> float:
-    """The highest recall at which all accepted pairs are correct."""
+    """Return the highest recall at which all accepted pairs are correct."""
     return float(curve.recall[curve.precision == 1.0].max())
 
 
 def precision_at_recall(curve: PrecisionRecall, recall: float) -> float:
-    """The highest precision among all thresholds with at least the given recall."""
+    """Return the highest precision that any threshold gives at the given recall or a higher
+    recall."""
     return float(curve.precision[curve.recall >= recall].max())
 
 
 def accepted_at(curve: PrecisionRecall, threshold: float) -> tuple[float, float]:
-    """Precision and recall at a threshold. They are 1 and 0 if no pair is accepted."""
+    """Return the precision and the recall at a threshold on the score. If no pair is accepted, the
+    precision is 1 and the recall is 0."""
     k = int(np.searchsorted(curve.thresholds, threshold))
     return float(curve.precision[k]), float(curve.recall[k])
 
 
 def max_f1(curve: PrecisionRecall) -> tuple[float, float]:
-    """The highest F1 score (harmonic mean of precision and recall), and the threshold that gives
-    it."""
+    """Return the highest F1 score (harmonic mean of precision and recall), and the threshold that
+    gives it."""
     p, r = curve.precision[:-1], curve.recall[:-1]
     f1 = np.divide(2 * p * r, p + r, out=np.zeros_like(p), where=p + r > 0)
     best = int(np.argmax(f1))
@@ -105,9 +109,10 @@ def max_f1(curve: PrecisionRecall) -> tuple[float, float]:
 
 
 def balanced_accuracy(same: NDArray, score: NDArray, threshold: float) -> float:
-    """Mean of the true positive rate and the true negative rate at a threshold.
+    """Compute the balanced accuracy at a threshold on the score. It is the mean of the true
+    positive rate and the true negative rate.
 
-    This equals the accuracy on a set with as many positive as negative pairs.
+    It equals the accuracy on a set with as many positive as negative pairs.
 
     Args:
         same: ``(N,)`` bool, True for pairs of images that show the same place.
@@ -126,8 +131,8 @@ def balanced_accuracy(same: NDArray, score: NDArray, threshold: float) -> float:
 
 
 def summary(same: NDArray, score: NDArray) -> dict[str, float]:
-    """All measures that a report shows for a detector, computed from its scores on a set of
-    pairs."""
+    """Compute all measures that a report shows for a loop detector, from its scores on a set of
+    image pairs."""
     curve = precision_recall(same, score)
     f1, threshold = max_f1(curve)
     return {

@@ -10,19 +10,21 @@ from vslam.map import Map
 
 
 def beyond_reach(map_: Map, keyframe: int, config: SiameseConfig) -> NDArray[np.float64]:
-    """Test which keyframes the camera may be revisiting, given the possible error of odometry.
+    """Compute how far each keyframe is beyond the reach of the camera. A keyframe within reach may
+    be the place that the camera is revisiting.
 
     The result is the distance between the camera and each keyframe, minus a bound on the position
     error of odometry. The bound is a constant plus a fraction of the distance driven since the
-    keyframe. A monocular map has no metric scale, and its scale drifts. There, the bound is a
-    larger fraction of the distance driven, with no constant term.
+    keyframe. A monocular map has no metric scale, and its scale drifts. In a monocular map, the
+    bound is therefore a larger fraction of the distance driven, with no constant term.
 
     Keyframes of other sub-maps are always within reach. The camera was lost between the sub-maps,
     so their relative pose is unknown. In a monocular map, their relative scale is unknown as well.
 
     Within a sub-map, a keyframe whose viewing direction differs too much from that of the camera is
     out of reach at any distance. There are two reasons. The heading from odometry is accurate to a
-    few degrees. In addition, the detectors do not recognise a place from behind or from the side.
+    few degrees. In addition, the detectors do not recognise a place that is seen from behind or
+    from the side.
 
     Args:
         keyframe: id of the current keyframe.

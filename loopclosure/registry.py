@@ -1,4 +1,5 @@
-"""Creates loop detectors by name: those of vslam and of other packages (docs/howto/plugins.md)."""
+"""Creates loop detectors by name: the detectors of vslam, and those of other packages
+(docs/howto/plugins.md)."""
 
 from __future__ import annotations
 
@@ -26,19 +27,19 @@ _ABOUT = {
     "capsule-pruned": "the Siamese capsule network, pruned",
     "capsule-paper": "the Siamese capsule network as the paper describes it",
 }
-# Detectors whose candidates are also verified by learned descriptors. The configuration can
+# Detectors whose candidates are also verified using learned descriptors. The configuration can
 # override this.
 LEARNED_VERIFICATION = ("both", *(name for name in NETWORKS if name != TO_THE_LETTER))
 
 
 def about(name: str) -> str:
-    """A short description of a detector."""
+    """Return a short description of a loop detector."""
     return _ABOUT.get(name, "a plug-in")
 
 
 def require_detector(name: str, weights: Path | None = None, option: str = "--detector") -> None:
-    """Check that a detector can be created. This is done before anything expensive is imported or
-    compiled.
+    """Check that a loop detector can be created. This check is done before anything expensive is
+    imported or compiled.
 
     Args:
         name: name of the detector.
@@ -69,7 +70,8 @@ def require_detector(name: str, weights: Path | None = None, option: str = "--de
 
 
 def problem_of(detector: LoopDetector) -> str | None:
-    """One sentence about the failure of a plug-in detector; None if there was no failure."""
+    """Return one sentence about the failure of a plug-in detector, or None if there was no
+    failure."""
     return detector.problem if isinstance(detector, PlugInDetector) else None
 
 
@@ -81,16 +83,16 @@ def detector_with_images(
     local_weights: Path | None = None,
     late: bool = True,
 ) -> tuple[LoopDetector, KeyframeImages | None]:
-    """Create a detector, and the store of keyframe images for learned verification. Neither
-    contains any keyframes yet. :class:`vslam.slam.Slam` takes both.
+    """Create a loop detector, and the store of keyframe images for verification with learned
+    descriptors. Both are empty, and :class:`vslam.slam.Slam` takes both.
 
     Args:
         weights, late: see :func:`create_detector`.
         local_weights: weights of the local descriptors; None uses the weights that vslam ships.
 
     Returns:
-        The detector, and the store of images. The store is None if candidates are verified only by
-        ORB descriptors.
+        The detector, and the store of images. The store is None if candidates are verified using
+        only ORB descriptors.
 
     Raises:
         InputError, ValueError: see :func:`create_detector`.
@@ -107,8 +109,8 @@ def create_detector(
     *,
     late: bool = False,
 ) -> LoopDetector:
-    """Create a detector without any keyframes. The dependencies of the detector are imported only
-    here.
+    """Create a loop detector without any keyframes. The dependencies of the detector are imported
+    only when this function is called.
 
     Args:
         weights: weights of a learned detector, or the vocabulary of ``bow``; None uses the file
@@ -151,8 +153,8 @@ def create_detector(
 
 
 def create_images(name: str, config: Config, weights: Path | None = None) -> KeyframeImages | None:
-    """Create the store of keyframe images, which learned rating and verification of candidates
-    need. Returns None if ``verification.descriptors`` selects only ORB descriptors.
+    """Create the store of keyframe images. The images are needed to rate and verify candidates with
+    learned descriptors. Returns None if ``verification.descriptors`` selects only ORB descriptors.
 
     Raises:
         InputError: the network of the local descriptors cannot be read.
@@ -172,7 +174,8 @@ def create_images(name: str, config: Config, weights: Path | None = None) -> Key
 
 
 def _network_of(name: str) -> str:
-    """Name of the network that a learned detector uses. The detector ``both`` uses ``capsule``."""
+    """Return the name of the network that a learned detector uses. The detector ``both`` uses the
+    network ``capsule``."""
     return "capsule" if name == "both" else name
 
 
@@ -180,7 +183,7 @@ def parse_weights(given: Collection[str], detectors: Collection[str]) -> dict[st
     """Parse items of the form ``NAME=FILE``. Returns the file of weights for each detector name.
 
     Raises:
-        InputError: an item has another form or names an unknown detector.
+        InputError: an item has a different form or names an unknown detector.
     """
     files = {}
     for item in given:

@@ -1,8 +1,9 @@
-"""Estimates the motion between two cameras from matched 3D landmarks, by RANSAC.
+"""Estimates the motion between two cameras from matched 3D landmarks using RANSAC.
 
-Both sides of a loop have triangulated the same points. Three matches therefore determine the motion
-in closed form (Horn, JOSA A 1987; the scale is computed as in Umeyama, PAMI 1991). As in ORB-SLAM
-(T-RO 2015, VII-B), RANSAC scores a motion by the reprojection errors in *both* keyframes.
+On both sides of a loop, the map contains landmarks of the same points. Three matches of such
+landmarks determine the motion in closed form (Horn, JOSA A 1987; the scale is computed as in
+Umeyama, PAMI 1991). As in ORB-SLAM (T-RO 2015, section VII-B), RANSAC scores a motion by the
+reprojection errors in *both* keyframes.
 """
 
 from __future__ import annotations
@@ -64,8 +65,8 @@ def align(
     confidence: float,
     fix_scale: bool = True,
 ) -> Alignment | None:
-    """Find the rigid motion or similarity with the highest MSAC score. Returns None if it has fewer
-    than ``min_inliers`` inliers.
+    """Find the rigid motion or similarity between two cameras that has the highest MSAC score.
+    Returns None if the best motion has fewer than ``min_inliers`` inliers.
 
     Args:
         a, b: the same N matches, as observed by each camera.
@@ -73,8 +74,8 @@ def align(
         seed: seed of the random samples; the same seed gives the same result.
         min_inliers: least number of inliers.
         max_draws: maximum number of samples.
-        confidence: a probability. Sampling ends once a better motion would have been found with
-            this probability.
+        confidence: a probability. Sampling ends when a better motion, if there were one, would have
+            been found with this probability.
         fix_scale: whether the scale is fixed to 1. True for metric maps (stereo, RGB-D), False for
             monocular maps.
     """
@@ -95,7 +96,8 @@ def align(
 
 @kernel
 def fit_motion(p_a, p_b, weights, fix_scale):
-    """Weighted least-squares motion ``p_a = scale * R p_b + t`` between two point sets (Horn 1987).
+    """Fit the motion ``p_a = scale * R p_b + t`` to two point sets by weighted least squares (Horn
+    1987).
 
     Args:
         p_a, p_b: ``(N, 3)`` float64 points. There must be at least three points that are not
@@ -172,8 +174,8 @@ def fit_motion(p_a, p_b, weights, fix_scale):
 
 @kernel
 def is_degenerate(p):
-    """Whether three points are nearly collinear or coincide. The points are the rows of ``p``,
-    ``(3, 3)``."""
+    """Return whether three points are nearly collinear or coincide. The points are the rows of the
+    ``(3, 3)`` array ``p``."""
     longest = 0.0
     for i in range(3):
         side = 0.0
@@ -191,12 +193,12 @@ def is_degenerate(p):
 
 @inner_kernel
 def _same_sides(p_a, p_b, bf):
-    """Whether the side lengths of two triangles agree within the stereo error.
+    """Return whether the side lengths of two triangles agree within the error of stereo depths.
 
     This fast test rejects most samples that contain a wrong match.
 
     A disparity error of one pixel moves a point by z^2 / bf. Both ends of a side may have this
-    error, in both cameras.
+    error in both cameras.
     """
     for i in range(3):
         j = (i + 1) % 3
@@ -212,7 +214,7 @@ def _same_sides(p_a, p_b, bf):
 
 @inner_kernel
 def _add_residual(p, motion, uvr, inverse_sigma2, intrinsics, H, b):
-    """Add one observation to the normal equations, with the Huber loss.
+    """Add the reprojection error of one observation to the normal equations, with the Huber loss.
 
     Args:
         p: ``(3,)`` point in the camera frame.
@@ -297,8 +299,9 @@ def refine_motion(T, scale, a, b, chosen, intrinsics, iterations, fix_scale):
 
 @inner_kernel
 def _derivative(p, fix_scale, out):
-    """Write the derivative ``[I, -[p]x, p]`` of a moved point into ``out``, ``(3, 7)``. The
-    derivative is with respect to translation, rotation and the logarithm of the scale."""
+    """Compute the derivative of a moved point, ``[I, -[p]x, p]``, and write it into the ``(3, 7)``
+    array ``out``. The derivative is with respect to translation, rotation and the logarithm of the
+    scale."""
     for row in range(3):
         for column in range(3):
             out[row, column] = 1.0 if row == column else 0.0
@@ -311,7 +314,8 @@ def _derivative(p, fix_scale, out):
 
 @inner_kernel
 def _error(x, y, z, uvr, inverse_sigma2, intrinsics):
-    """``chi_square_ratio`` of an observation, or 2 if the point is not in front of the camera."""
+    """Return the ``chi_square_ratio`` of an observation, or 2 if the point is not in front of the
+    camera."""
     if z <= 0.1:
         return 2.0
     pinhole = unpacked(intrinsics)
@@ -320,10 +324,10 @@ def _error(x, y, z, uvr, inverse_sigma2, intrinsics):
 
 @inner_kernel
 def _score_motion(T, scale, a, b, intrinsics, to_beat, inlier):
-    """MSAC score of a motion and its number of inliers (Torr and Zisserman, CVIU 2000).
+    """Compute the MSAC score of a motion (Torr and Zisserman, CVIU 2000) and its number of inliers.
 
-    The inliers are written into ``inlier``. Returns (-1, 0) as soon as the score can no longer
-    exceed ``to_beat``.
+    The inliers are written into ``inlier``. As soon as the score can no longer exceed ``to_beat``,
+    the function stops and returns (-1, 0).
     """
     points_a, uvr_a, weight_a = a
     points_b, uvr_b, weight_b = b
@@ -355,8 +359,8 @@ def _score_motion(T, scale, a, b, intrinsics, to_beat, inlier):
 
 @kernel
 def _ransac(a, b, intrinsics, seed, min_inliers, max_draws, confidence, fix_scale):
-    """RANSAC on samples of three matches. Each motion with a new best score is refitted to its
-    inliers. Returns T, the scale, the inliers, and the number of inliers."""
+    """Run RANSAC on samples of three matches. Each motion with a new best score is refitted to its
+    inliers. Returns the rigid motion T, the scale, the inliers, and the number of inliers."""
     points_a, points_b = a.points, b.points
     n = len(points_a)
     state = np.empty(1, np.uint64)

@@ -1,15 +1,16 @@
-"""Geometric verification of loop candidates.
+"""Verifies loop candidates geometrically, using ORB descriptors.
 
 Verification tests whether two keyframes show the same place, and estimates their relative pose.
 
-The first steps are those of ORB-SLAM (T-RO 2015, VII-B; for stereo T-RO 2017, III-D). The
-descriptors of two keyframes are matched, and a motion is estimated by RANSAC. Then all landmarks of
-the place are matched near their projections, and the pose is refined.
+The first steps follow ORB-SLAM (T-RO 2015, section VII-B) and, for stereo, ORB-SLAM2 (T-RO 2017,
+section III-D). The descriptors of two keyframes are matched, and a motion is estimated by RANSAC.
+Then all landmarks of the place are matched near their projections, and the pose is refined.
 
-ORB-SLAM then only counts inliers. However, a facade or a car that looks like another one has many
-inliers, too. The tests here therefore also look for evidence against the loop. The inliers must be
-spread over the image. In addition, each keyframe must show most of the other side's landmarks that
-should be visible in it.
+ORB-SLAM then only counts inliers. However, if two different facades or cars look alike, there are
+many inliers, too. The tests in this module therefore also look for evidence against the loop. There
+are two such tests. First, the inliers must be spread over the image. Second, the landmarks on each
+side of the loop are projected into the keyframe on the other side. Most of the landmarks that
+should be visible in that keyframe must be found.
 """
 
 from __future__ import annotations
@@ -49,10 +50,11 @@ class GuidedMatches(NamedTuple):
 
     Attributes:
         landmarks: ``(M,)`` int32 ids of the landmarks that should be visible.
-        feature: ``(M,)`` int32 inlier feature of each landmark, as its index within the keyframe;
-            -1 if there is none.
+        feature: ``(M,)`` int32 index, within the keyframe, of the feature that matches each
+            landmark and is an inlier; -1 if there is no such feature.
         uv: ``(M, 2)`` float64 predicted positions of the landmarks in the image, pixels.
-        n_matches: number of matches near the predictions, including outliers.
+        n_matches: number of landmarks that were matched near their predicted positions, including
+            outliers.
         T_cw: ``(4, 4)`` pose of the camera (world to camera), in the world frame of the landmarks.
     """
 
@@ -74,13 +76,13 @@ def verify(
     camera: Camera,
     config: VerificationConfig,
 ) -> LoopEdge:
-    """Decide whether the query keyframe shows the place of the match keyframe. The map is not
-    changed.
+    """Decide whether the query keyframe of a loop candidate shows the place of the match keyframe.
+    The map is not changed.
 
     Returns:
-        An edge. It is accepted with the reason "verified", or rejected with another reason. The
-        pose and the numbers of matches come from the last step that was completed. The inliers are
-        features of the query and landmarks of the place, without duplicates.
+        A loop edge. It is accepted with the reason "verified", or rejected with a different reason.
+        The pose and the numbers of matches come from the last step that was completed. The inliers
+        are pairs of a feature of the query and a landmark of the place, without duplicates.
     """
     query, match = candidate.query, candidate.match
     edge = LoopEdge.of(candidate)
@@ -99,8 +101,8 @@ def verify(
 
 
 def verify_near(map_: Map, edge: LoopEdge, camera: Camera, config: VerificationConfig) -> LoopEdge:
-    """Verify an edge that already has a pose. This does the same as ``verify``, but starts from the
-    pose of the edge instead of matching descriptors.
+    """Verify a loop edge that already has a pose. The function does the same as ``verify``, but it
+    starts from the pose of the edge instead of matching descriptors.
 
     Raises:
         ValueError: the edge has no pose.
@@ -133,7 +135,8 @@ def match_keyframes(
     """Match the descriptors of two keyframes. Only features that observe landmarks are used.
 
     Returns:
-        ``(N,)`` rows of the matched features of each keyframe in the map's arrays.
+        Two arrays: the ``(N,)`` rows of the matched features of each keyframe in the observation
+        arrays of the map.
     """
     a = map_.arrays
     rows_q, rows_m = (
@@ -157,8 +160,8 @@ def _consensus(
     camera: Camera,
     config: VerificationConfig,
 ) -> tuple[Matrix | None, float, int]:
-    """``T_query_match`` and the scale from RANSAC, with the number of inliers. The pose is None if
-    no motion has enough inliers."""
+    """Estimate the motion between two keyframes using RANSAC. Returns ``T_query_match``, the scale
+    and the number of inliers. ``T_query_match`` is None if no motion has enough inliers."""
     found = align(
         _observed_points(map_, query, rows_q),
         _observed_points(map_, match, rows_m),
@@ -177,8 +180,8 @@ def _consensus(
 
 
 def relative_scale(map_: Map, edge: LoopEdge, T_cw: Matrix, *, default: float) -> float:
-    """Scale of a monocular loop. It is the factor that converts lengths around the match to lengths
-    around the query.
+    """Estimate the scale of a monocular loop. It is the factor that converts lengths around the
+    match to lengths around the query.
 
     An inlier feature of the query may also observe a landmark of its own. The depth of this
     landmark, divided by the depth of the matched landmark of the place, is one estimate of the
@@ -186,7 +189,7 @@ def relative_scale(map_: Map, edge: LoopEdge, T_cw: Matrix, *, default: float) -
 
     Args:
         T_cw: ``(4, 4)`` pose of the query (world to camera), in the world frame of the place.
-        default: the result if there are too few such features.
+        default: the result if there are too few features that observe landmarks on both sides.
     """
     a = map_.arrays
     assert edge.features is not None
@@ -207,16 +210,16 @@ def _observed_points(map_: Map, keyframe: int, rows: NDArray[np.int64]) -> Obser
 
 
 def _observations(map_: Map, rows: NDArray[np.int64]) -> tuple[Matrix, Matrix]:
-    """``(N, 3)`` u, v, u_right of ``(N,)`` rows of the map's arrays, and their ``(N,)`` inverse
-    variances."""
+    """Read the ``(N, 3)`` u, v, u_right and the ``(N,)`` inverse variances of N features. ``rows``
+    is the ``(N,)`` rows of the features in the observation arrays of the map."""
     a = map_.arrays
     uvr = stack_uvr(a.xy[rows], a.u_right[rows])
     return uvr, map_.scales[a.octave[rows]] ** -2.0
 
 
 def place_of(map_: Map, match: int, query: int, config: VerificationConfig) -> NDArray[np.int64]:
-    """Ids of the match and its most covisible keyframes. Keyframes that are covisible with the
-    query are excluded."""
+    """Return the ids of the keyframes that form the place of a candidate: the match and its most
+    covisible keyframes. Keyframes that are covisible with the query are excluded."""
     near_query = {query, *map_.covisible(query)[0].tolist()}
     around = [k for k in map_.covisible(match)[0].tolist() if k not in near_query]
     return np.array([match, *around[: config.place_keyframes]], np.int64)
@@ -230,14 +233,16 @@ def guided_match(
     camera: Camera,
     config: VerificationConfig,
 ) -> GuidedMatches:
-    """Match ``(N,)`` landmarks to the features of a keyframe and refine its pose.
+    """Match ``(N,)`` landmarks with the features of a keyframe, and refine the pose of the
+    keyframe.
 
     The landmarks are searched for near their projections, and the pose is refined with all matches.
     Both steps are then repeated with narrower windows.
 
     Args:
         T_cw: ``(4, 4)`` estimated pose of the keyframe (world to camera), in the world frame of the
-            landmarks. If the map has drifted, it differs from the pose of the keyframe in the map.
+            landmarks. If the map has drifted, this pose differs from the pose of the keyframe in
+            the map.
     """
     a, rows = map_.arrays, map_.rows(keyframe)
     grid = FeatureGrid.of_positions(a.xy[rows], camera.width, camera.height)
@@ -283,7 +288,8 @@ def _rejection_reason(
     camera: Camera,
     config: VerificationConfig,
 ) -> str:
-    """The reason to reject a refined loop, or "" if the loop passes all tests."""
+    """Test a loop after its pose was refined. Returns the reason to reject the loop, or "" if the
+    loop passes all tests."""
     if edge.n_inliers < config.min_inliers:
         return f"only {edge.n_inliers} landmarks of the place fit"
     if edge.n_inliers < config.min_inlier_ratio * edge.n_matches:
@@ -311,13 +317,15 @@ def spread_reason(
     config: VerificationConfig,
     min_elsewhere: int,
 ) -> str:
-    """The reason to reject inliers that are not spread over the image, or "" if they are spread.
+    """Test whether the inliers are spread over the image. Returns the reason to reject them, or ""
+    if they are spread.
 
     Args:
         uv: ``(M, 2)`` predicted positions, in pixels, of the landmarks that should be visible.
         seen: ``(M,)`` bool, True for inliers.
-        min_elsewhere: least number of inliers outside a vertical strip of the image. The strip is a
-            third of the image wide, and is placed so that it contains as many inliers as possible.
+        min_elsewhere: least number of inliers outside a vertical strip of the image. The width of
+            the strip is a third of the width of the image. The strip is placed where it contains as
+            many inliers as possible.
     """
     expected, occupied = occupied_cells(uv, camera), occupied_cells(uv[seen], camera)
     if occupied < max(config.min_cells, config.min_cell_ratio * expected):
@@ -335,7 +343,7 @@ def reverse_match(
     camera: Camera,
     config: VerificationConfig,
 ) -> GuidedMatches:
-    """Search for the landmarks of the query in the image of the match."""
+    """Search for the landmarks of the query keyframe in the image of the match keyframe."""
     T_match_query = inverse(T_query_match)
     T_match_query[:3, 3] *= edge.scale  # lengths in the unit around the query, like the landmarks
     T_mw = T_match_query @ map_.keyframe_pose(edge.query)
@@ -343,14 +351,14 @@ def reverse_match(
 
 
 def seen_of(map_: Map, keyframe: int, guided: GuidedMatches) -> tuple[int, int]:
-    """Number of landmarks of a keyframe that guided matching found, and number of landmarks of the
-    keyframe that should be visible."""
+    """Count the landmarks of a keyframe that guided matching found, and the landmarks of the
+    keyframe that should be visible. Returns both numbers."""
     own = np.isin(guided.landmarks, map_.landmarks_of(keyframe))
     return int(np.count_nonzero(guided.seen & own)), int(np.count_nonzero(own))
 
 
 def occupied_cells(uv: Matrix, camera: Camera) -> int:
-    """Number of cells of a grid over the image that contain at least one of ``(N, 2)`` pixels."""
+    """Count the cells of a grid over the image that contain at least one of ``(N, 2)`` pixels."""
     column = (uv[:, 0] * GRID_COLUMNS / camera.width).astype(np.int64)
     row = (uv[:, 1] * GRID_ROWS / camera.height).astype(np.int64)
     return len(np.unique(row * GRID_COLUMNS + column))

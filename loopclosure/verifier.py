@@ -1,10 +1,10 @@
-"""Verifiers of loop candidates.
+"""Verifiers: they decide geometrically whether a loop candidate is a loop.
 
-There are three: a verifier that uses ORB descriptors, one that uses learned descriptors, and one
-that uses ORB first and learned descriptors if ORB fails.
+There are three verifiers. The first uses ORB descriptors. The second uses learned descriptors. The
+third uses ORB descriptors first, and learned descriptors if ORB descriptors fail.
 
-Loop closing uses only the interface of :class:`Verifier`. It is therefore the same for all
-verifiers.
+Loop closing uses only the interface of :class:`Verifier`. Therefore, loop closing is the same for
+all verifiers.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from vslam.states import VerifierState
 
 
 class Verifier:
-    """Decides by geometry whether a keyframe shows the place that a detector proposes. This class
-    uses only ORB descriptors.
+    """Decides geometrically whether a keyframe shows the place that a loop detector proposes. This
+    class uses only ORB descriptors.
 
     The methods are called in the order of the keyframes, by one thread at a time.
 
     Attributes:
-        images: the keyframe images that verification needs; None if it needs no images.
+        images: the store of keyframe images that verification needs; None if it needs no images.
         verified_memory: number of keyframes for which a verified loop is kept while it waits for
             other loops that agree with it.
     """
@@ -50,8 +50,8 @@ class Verifier:
         self._camera = camera
 
     def is_image_redundant(self, map_: Map, keyframe: int) -> bool:
-        """Whether the image of a keyframe is not needed, because other images show nearly the same
-        view."""
+        """Return whether the image of a keyframe is not needed, because other stored images show
+        nearly the same view."""
         return False
 
     def add(self, map_: Map, keyframe: int, image: NDArray[np.uint8] | None) -> None:
@@ -64,8 +64,9 @@ class Verifier:
     def rate(
         self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
     ) -> list[LoopCandidate]:
-        """Set ``similarity`` and ``promising`` of a keyframe's candidates, if this verifier uses
-        them (see ``LoopCandidate``). The order of the candidates is not changed."""
+        """Set the fields ``similarity`` and ``promising`` of a keyframe's candidates (see
+        ``LoopCandidate``), if this verifier uses these fields. The order of the candidates is not
+        changed."""
         return candidates
 
     def verify(
@@ -74,22 +75,24 @@ class Verifier:
         """Decide whether a candidate is a loop. The map is not changed.
 
         Args:
-            refusal: the rejected edge if the candidate has failed an earlier test, or else None.
-                Verification by ORB skips candidates that have failed an earlier test.
+            refusal: the rejected loop edge if the candidate has failed an earlier test, or else
+                None. Verification with ORB descriptors skips candidates that have failed an earlier
+                test.
 
         Returns:
-            An accepted edge with a pose, or a rejected edge with the reason.
+            An accepted loop edge with a pose, or a rejected loop edge with the reason.
         """
         if refusal is not None:
             return refusal
         return verification.verify(map_, candidate, self._camera, self._config.verification)
 
     def state(self) -> VerifierState:
-        """The state of the verifier, without the images, for a saved map or a checkpoint."""
+        """Return the state of the verifier, to store it in a map file or a checkpoint. The state
+        does not include the images."""
         return VerifierState()
 
     def restore(self, state: VerifierState) -> None:
-        """Continue from a state that ``state`` returned."""
+        """Continue from a state that the method ``state`` returned."""
 
 
 def verifier_for(config: Config, camera: Camera, images: KeyframeImages | None = None) -> Verifier:
@@ -97,8 +100,8 @@ def verifier_for(config: Config, camera: Camera, images: KeyframeImages | None =
 
     Args:
         images: the store of keyframe images for learned verification, from
-            ``vslam.loopclosure.registry.create_images``. None selects verification only by ORB,
-            regardless of the configuration.
+            ``vslam.loopclosure.registry.create_images``. None selects verification with only ORB
+            descriptors, regardless of the configuration.
     """
     if images is None:
         return Verifier(config, camera)
@@ -110,10 +113,10 @@ def verifier_for(config: Config, camera: Camera, images: KeyframeImages | None =
 class LearnedVerifier(Verifier):
     """A verifier that uses only learned local descriptors.
 
-    It takes forty times as long as verification by ORB, so :class:`LearnedTrials` selects the
-    promising candidates. A promising candidate is tried even if only one keyframe resembled the
-    place. The reason is that a camera that crosses a place at night may get only one good view of
-    it.
+    Verification with learned descriptors takes forty times as long as with ORB descriptors, so
+    :class:`LearnedTrials` selects the promising candidates. A promising candidate is tried even if
+    only one keyframe resembled the place. The reason is that a camera that crosses a place at night
+    may get only one good view of the place.
     """
 
     images: KeyframeImages
@@ -128,7 +131,8 @@ class LearnedVerifier(Verifier):
         return is_image_redundant(map_, keyframe, self.images, self._config.learned)
 
     def add(self, map_: Map, keyframe: int, image: NDArray[np.uint8] | None) -> None:
-        """Store the image of a keyframe, and remove the images of keyframes that were culled."""
+        """Store the image of a new keyframe, and remove the images of keyframes that were
+        culled."""
         if image is not None:
             self.images.add(keyframe, image)
             self.images.keep(map_.arrays.keyframe_alive)
@@ -136,8 +140,9 @@ class LearnedVerifier(Verifier):
     def rate(
         self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
     ) -> list[LoopCandidate]:
-        """See :class:`Verifier`. Candidates whose images the detector has not compared are compared
-        here. Promising candidates are then marked."""
+        """Set the fields ``similarity`` and ``promising`` of a keyframe's candidates (see
+        ``LoopCandidate``). A similarity is computed only if the detector has not already done
+        this."""
         images, config = self.images, self._config
         if keyframe in images and any(one.similarity is None for one in candidates):
             beyond = beyond_reach(map_, keyframe, config.siamese)
@@ -151,8 +156,8 @@ class LearnedVerifier(Verifier):
     def verify(
         self, map_: Map, candidate: LoopCandidate, refusal: LoopEdge | None = None
     ) -> LoopEdge:
-        """See :class:`Verifier`. Promising candidates are tried even if they have failed an earlier
-        test. Other candidates are never tried."""
+        """Decide whether a candidate is a loop (see :class:`Verifier`). Promising candidates are
+        tried even if they have failed an earlier test. Other candidates are never tried."""
         if not candidate.promising:
             reason = "images not similar enough for learned verification"
             return refusal or LoopEdge.of(candidate, reason, matched_by="learned")
@@ -179,7 +184,7 @@ class OrbThenLearnedVerifier(LearnedVerifier):
     def verify(
         self, map_: Map, candidate: LoopCandidate, refusal: LoopEdge | None = None
     ) -> LoopEdge:
-        """See :class:`Verifier`. A promising candidate that ORB rejects is verified again by
-        learned descriptors."""
+        """Decide whether a candidate is a loop (see :class:`Verifier`). A promising candidate that
+        is rejected with ORB descriptors is verified again using learned descriptors."""
         edge = Verifier.verify(self, map_, candidate, refusal)
         return edge if edge.accepted else super().verify(map_, candidate, edge)

@@ -1,6 +1,6 @@
-"""Visual words: a vocabulary tree of binary descriptors, and the bag of words of an image.
+"""Visual words: a vocabulary tree of binary descriptors, and bags of words of images.
 
-The tree is the hierarchical vocabulary of Nister and Stewenius (CVPR 2006), in the form for binary
+The tree is the hierarchical vocabulary of Nister and Stewenius (CVPR 2006), adapted to binary
 descriptors (Galvez-Lopez and Tardos, T-RO 2012, section III). Each node splits its descriptors into
 k clusters by Hamming distance. The centre of a cluster is the bitwise majority of its descriptors.
 The leaves of the tree are the words.
@@ -30,7 +30,8 @@ MAX_BRANCHING, MAX_LEVELS = 20, 10  # the limits of DBoW2's text format
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """A tree of N nodes whose W leaves are the words. Node 0 is the root and has no descriptor.
+    """A vocabulary of visual words: a tree of N nodes whose W leaves are the words. Node 0 is the
+    root and has no descriptor.
 
     Attributes:
         branching: maximum number of children of a node (k in the literature).
@@ -43,8 +44,8 @@ class Vocabulary:
         level: ``(N,)`` uint8 depth of each node; 0 for the root.
         word: ``(N,)`` int32 word of each leaf, numbered in the order of the nodes; -1 for inner
             nodes.
-        weight: ``(W,)`` float32 inverse document frequency of each word: ln(images / images with
-            the word).
+        weight: ``(W,)`` float32 inverse document frequency of each word: the logarithm of the
+            number of images divided by the number of images with the word.
     """
 
     branching: int
@@ -62,7 +63,7 @@ class Vocabulary:
         return len(self.weight)
 
     def words(self, descriptors: NDArray[np.uint8]) -> NDArray[np.int32]:
-        """``(M,)`` int32 word of each of ``(M, 32)`` uint8 descriptors."""
+        """Find the ``(M,)`` int32 visual word of each of ``(M, 32)`` uint8 descriptors."""
         return descend(
             np.ascontiguousarray(descriptors).view(np.uint64),
             self.descriptors,
@@ -72,8 +73,8 @@ class Vocabulary:
         )
 
     def ancestors(self, level: int) -> NDArray[np.int32]:
-        """``(W,)`` int32 node that is the ancestor of each word at a level. The root is at level 0.
-        A word above the level is its own ancestor."""
+        """Find the ancestor of each word at a level of the tree. Returns ``(W,)`` int32 nodes. The
+        root is at level 0. A word above the level is its own ancestor."""
         nodes = np.flatnonzero(self.word >= 0).astype(np.int32)
         while (deep := self.level[nodes] > level).any():
             nodes[deep] = self.parent[nodes[deep]]
@@ -81,7 +82,7 @@ class Vocabulary:
 
 
 class BowVector(NamedTuple):
-    """Bag of words of an image.
+    """The bag of words of an image: its visual words and their weights.
 
     Attributes:
         words: ``(N,)`` int32 words, in ascending order.
@@ -93,11 +94,11 @@ class BowVector(NamedTuple):
 
 
 def bow_vector(vocabulary: Vocabulary, words: NDArray[np.int32]) -> BowVector:
-    """Bag of words of an image, from the ``(M,)`` words of its features. The tf-idf weights are
-    normalised to an L1 norm of 1 (Nister and Stewenius, section 4).
+    """Compute the bag of words of an image from the ``(M,)`` visual words of its features. The
+    tf-idf weights are normalised to an L1 norm of 1 (Nister and Stewenius, section 4).
 
-    Words that occur in every training image have weight 0. They carry no information and are left
-    out.
+    Words that occur in every training image have weight 0. These words carry no information and are
+    left out.
     """
     unique, count = np.unique(words, return_counts=True)
     weights = count * vocabulary.weight[unique].astype(np.float64)
@@ -107,11 +108,12 @@ def bow_vector(vocabulary: Vocabulary, words: NDArray[np.int32]) -> BowVector:
 
 
 def score(a: BowVector, b: BowVector) -> float:
-    """L1 score of two images in [0, 1]: 1 - |a - b| / 2 (T-RO 2012, equation 2).
+    """Compute the L1 score of two images from their bags of words: 1 - |a - b| / 2, in [0, 1]
+    (Galvez-Lopez and Tardos, T-RO 2012, equation 2).
 
-    The weights are positive and sum to 1. The score therefore equals the sum, over the shared
-    words, of the smaller of the two weights (Nister and Stewenius, section 4, equation 5,
-    rearranged).
+    The weights are positive and sum to 1. The score therefore equals a sum over the shared words,
+    in which each word contributes the smaller of its two weights (Nister and Stewenius, section 4,
+    equation 5, rearranged).
     """
     _, in_a, in_b = np.intersect1d(a.words, b.words, assume_unique=True, return_indices=True)
     return float(np.minimum(a.weights[in_a], b.weights[in_b]).sum(dtype=np.float64))
@@ -119,9 +121,11 @@ def score(a: BowVector, b: BowVector) -> float:
 
 @kernel
 def descend(queries, descriptors, first_child, n_children, word):
-    """Find the word of each query by descending the tree from the root to a leaf.
+    """Find the visual word of each query descriptor by descending the vocabulary tree from the root
+    to a leaf.
 
-    Each step goes to the nearest child. Of equally near children, the first one is chosen.
+    Each step goes to the nearest child. If several children are equally near, the first one is
+    chosen.
 
     Args:
         queries: ``(M, 4)`` uint64 descriptors. The other arrays are attributes of ``Vocabulary``.
@@ -227,7 +231,7 @@ def load(path: Path = SHIPPED) -> Vocabulary:
 
     Raises:
         InputError: the file is missing, damaged or not a vocabulary, or it was written by a version
-            of vslam with another schema.
+            of vslam with a different schema.
     """
     fix = "write it again with 'vslam vocabulary train' or 'convert'"
     parts = read_npz(path, "a vocabulary", fix)

@@ -1,9 +1,9 @@
 """Reads and writes vocabularies in DBoW2's text format, for example ORB-SLAM's ``ORBvoc.txt``.
 
-The first line is ``k L scoring weighting``. Each further line describes a node by numbers. They are
-the number of its parent, whether it is a leaf (0 or 1), the 32 bytes of its descriptor, and its
-weight. The weight of a leaf is the inverse document frequency. Nodes are numbered from 1, in the
-order of their lines. Node 0 is the root and has no line.
+The first line is ``k L scoring weighting``. Each further line describes a node by numbers. These
+numbers are the number of its parent, a flag that is 1 for a leaf and 0 otherwise, the 32 bytes of
+its descriptor, and its weight. The weight of a leaf is the inverse document frequency. Nodes are
+numbered from 1, in the order of their lines. Node 0 is the root and has no line.
 
 The reader accepts any order in which parents precede their children. The writer uses breadth-first
 order.
@@ -31,32 +31,33 @@ L1_NORM, TF_IDF = 0, 0  # DBoW2's codes for the scoring and the weighting of vsl
 
 
 def read_vocabulary(path: Path) -> Vocabulary:
-    """Read a vocabulary from a file. A name that ends in .txt selects DBoW2's text format, .npz the
-    format of vslam.
+    """Read a vocabulary from a file. A file name that ends in .txt selects DBoW2's text format. A
+    file name that ends in .npz selects the format of vslam.
 
     Raises:
-        InputError: the name has another ending, or the file cannot be read (see ``load`` and
-            ``read_text``).
+        InputError: the file name has any other extension, or the file cannot be read (see ``load``
+            and ``read_text``).
     """
     return read_text(path) if is_text(path) else load(path)
 
 
 def write_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
-    """Write a vocabulary to a file. A name that ends in .txt selects DBoW2's text format, .npz the
-    format of vslam.
+    """Write a vocabulary to a file. A file name that ends in .txt selects DBoW2's text format. A
+    file name that ends in .npz selects the format of vslam.
 
     Raises:
-        InputError: the name has another ending.
+        InputError: the file name has any other extension.
         ResultsError: the file cannot be written.
     """
     (write_text if is_text(path) else save)(vocabulary, path)
 
 
 def is_text(path: Path) -> bool:
-    """Whether a file name selects DBoW2's text format (.txt). Otherwise it selects npz.
+    """Return True if a file name ends in .txt, which selects DBoW2's text format. Return False if
+    the name ends in .npz, which selects the format of vslam.
 
     Raises:
-        InputError: the name has neither ending.
+        InputError: the name has neither extension.
     """
     if path.suffix not in (".txt", ".npz"):
         raise InputError(
@@ -69,7 +70,7 @@ def read_text(path: Path) -> Vocabulary:
     """Read a vocabulary in DBoW2's text format.
 
     Raises:
-        InputError: the file is missing or damaged. The message gives the line and the error.
+        InputError: the file is missing or damaged. The message states the line and the error.
     """
     try:
         text = path.read_bytes().rstrip()
@@ -150,8 +151,8 @@ def _read_header(path: Path, header: bytes) -> tuple[int, int]:
 
 
 def _read_nodes(path: Path, lines: list[bytes]) -> NDArray[np.float64]:
-    """Parse the lines of nodes 1 to n as ``(n, 35)`` numbers, and check the ranges of the
-    numbers."""
+    """Parse the lines of nodes 1 to n as ``(n, 35)`` numbers, and check that the numbers are in
+    their valid ranges."""
 
     def refused(node: int, fault: str) -> InputError:
         return InputError(f"{path}: line {node + 1} {fault}; fetch or export it again.")
@@ -185,7 +186,8 @@ def _read_nodes(path: Path, lines: list[bytes]) -> NDArray[np.float64]:
 def _check_children(
     path: Path, parent: NDArray[np.int64], leaf: NDArray[np.bool_], branching: int
 ) -> None:
-    """Check that leaves have no children and that other nodes have 1 to ``branching`` children."""
+    """Check the tree of a vocabulary: leaves must have no children, and other nodes must have 1 to
+    ``branching`` children."""
     n_children = np.bincount(parent[1:], minlength=len(parent))
     for wrong, fault in (
         (leaf & (n_children > 0), "is a leaf but has children"),
@@ -199,8 +201,8 @@ def _check_children(
 
 
 def _breadth_first(parent: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Nodes in breadth-first order, and the level of each node. Siblings are in the order of their
-    lines."""
+    """Sort the nodes of a tree in breadth-first order. Returns the sorted nodes, and the level of
+    each node. Siblings keep the order of their lines."""
     by_parent = np.argsort(parent, kind="stable")
     n_children = np.bincount(parent[1:], minlength=len(parent))
     first = 1 + np.cumsum(n_children) - n_children  # position of each first child in by_parent

@@ -1,12 +1,12 @@
 """Trains a vocabulary tree by k-majority clustering, level by level.
 
-This is the method of Galvez-Lopez and Tardos (T-RO 2012, section III) for binary descriptors, after
-Nister and Stewenius (CVPR 2006). In each node, every descriptor is assigned to the nearest of k
-centres. Each centre then becomes the bitwise majority of its descriptors. Both steps are repeated
-until nothing changes.
+The method is that of Galvez-Lopez and Tardos (T-RO 2012, section III) for binary descriptors, which
+is based on Nister and Stewenius (CVPR 2006). In each node, every descriptor is assigned to the
+nearest of k centres. Each centre then becomes the bitwise majority of its descriptors. Both steps
+are repeated until nothing changes.
 
-All arithmetic is on integers, and the random numbers are generated here. A seed therefore gives the
-same tree on every machine.
+All arithmetic is on integers, and this module generates the random numbers itself. A seed therefore
+gives the same tree on every machine.
 """
 
 from __future__ import annotations
@@ -30,13 +30,14 @@ def train(
     seed: int = 0,
     on_level: Callable[[int, int], None] | None = None,
 ) -> Vocabulary:
-    """Train a vocabulary. The same input and seed give the same tree.
+    """Train a vocabulary of visual words. The same input and seed give the same tree.
 
     Args:
         descriptors_of_images: ``(n, 32)`` uint8 descriptors of each image.
         branching: maximum number of children of a node.
         levels: maximum depth of a leaf.
-        on_level: called after each level, with the number of levels and the number of nodes so far.
+        on_level: called after each level of the tree, with the number of levels and the number of
+            nodes that exist so far.
 
     Raises:
         ValueError: branching or levels is out of range, or there are fewer than two different
@@ -78,8 +79,8 @@ def train(
 
 @inner_kernel
 def uniform(state):
-    """The next random number in [0, 1), and the next state of splitmix64 (Steele et al., OOPSLA
-    2014)."""
+    """Generate a random number in [0, 1) using splitmix64 (Steele et al., OOPSLA 2014). Returns the
+    number and the next state of the generator."""
     state = state + np.uint64(0x9E3779B97F4A7C15)
     z = state
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -90,20 +91,23 @@ def uniform(state):
 
 @inner_kernel
 def seed_centres(data, members, branching, state, nearest, centres):
-    """Choose initial centres: up to ``branching`` different members that are far from each other.
+    """Choose the initial cluster centres: up to ``branching`` different members of a node that are
+    far from each other.
 
-    k-means++ (Arthur and Vassilvitskii, SODA 2007) draws a member with a probability proportional
-    to its squared distance from the nearest centre so far. For bit vectors, this squared distance
-    is the Hamming distance. The greedy variant (their section 7) draws ``TRIALS`` members. It
-    chooses the one that minimises the sum of these distances over all members.
+    The method is the greedy variant of k-means++ (Arthur and Vassilvitskii, SODA 2007, section 7).
+    k-means++ draws a member with a probability proportional to its squared distance from the
+    nearest centre that was already chosen. For bit vectors, this squared distance is the Hamming
+    distance. The greedy variant draws ``TRIALS`` members, and chooses the member that minimises the
+    sum of these distances over all members.
 
     Args:
-        members: ``(n,)`` indices into data.
+        members: ``(n,)`` indices of the members of the node in ``data``.
         nearest: ``(n,)`` int64 workspace.
         centres: ``(branching, 4)`` uint64, receives the centres.
 
     Returns:
-        Number of centres. It is below ``branching`` only if there are fewer different descriptors.
+        Number of centres that were chosen. It is below ``branching`` only if there are fewer
+        different descriptors.
     """
     n = len(members)
     draw, state = uniform(state)
@@ -139,8 +143,8 @@ def seed_centres(data, members, branching, state, nearest, centres):
 
 @inner_kernel
 def assign(data, members, centres, n_centres, label):
-    """Assign each member to the nearest centre. Of equally near centres, the first one is chosen.
-    Returns the number of labels that changed."""
+    """Assign each member of a node to the nearest cluster centre. If several centres are equally
+    near, the first one is chosen. Returns the number of members whose centre has changed."""
     changed = 0
     for i in range(len(members)):
         nearest, least = 0, 257
@@ -156,8 +160,8 @@ def assign(data, members, centres, n_centres, label):
 
 @inner_kernel
 def vote(data, members, label, n_centres, ones, size, centres):
-    """Set each centre to the bitwise majority of its members. A centre without members is not
-    changed.
+    """Set each cluster centre to the bitwise majority of its members. A centre without members is
+    not changed.
 
     Args:
         ones: ``(branching, 256)`` int64 workspace.
@@ -187,11 +191,11 @@ def vote(data, members, label, n_centres, ones, size, centres):
 
 @kernel
 def split_level(data, order, starts, branching, stream, iterations):
-    """Split each node of a level into clusters, and sort ``order`` by cluster.
+    """Split each node of a level of the tree into clusters, and sort ``order`` by cluster.
 
     Args:
         data: ``(M, 4)`` uint64 descriptors.
-        order: ``(M,)`` int64 indices into ``data``, grouped by node. They are overwritten.
+        order: ``(M,)`` int64 indices into ``data``, grouped by node. The array is overwritten.
         starts: ``(n + 1,)`` int64 start of the group of each node in ``order``. Descriptors in
             leaves of upper levels do not belong to these groups.
         stream: uint64 seed of the random numbers of this level.

@@ -1,4 +1,4 @@
-"""Inference, without torch, of Siamese networks that decide whether two images show the same place.
+"""Runs Siamese networks, without torch, to decide whether two images show the same place.
 
 Training code is in :mod:`vslam.loopclosure.training`.
 """

@@ -1,4 +1,4 @@
-"""The loop detector that compares the image descriptors of a Siamese network."""
+"""A loop detector that compares images using the descriptors of a Siamese network."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from vslam.map import Map
 
 
 class SiameseDetector:
-    """A :class:`vslam.loopclosure.detector.LoopDetector` that uses the image descriptors of a
-    network.
+    """A :class:`vslam.loopclosure.detector.LoopDetector` that compares images using the descriptors
+    of a Siamese network.
 
     If the images of keyframes are stored (``images``), descriptors are computed on demand. The
     network computes the descriptor of a keyframe only when the camera comes within reach of the
-    keyframe (:func:`beyond_reach`) or is lost. On a drive that never returns to a place, the
-    network does not run at all.
+    keyframe (:func:`beyond_reach`), or when tracking is lost. On a drive that never returns to a
+    place, the network does not run at all.
 
-    Descriptors are the rows of a matrix that grows by half when it is full. The matrix has no
+    The descriptors are the rows of a matrix, which grows by half when it is full. The matrix has no
     columns until the network has computed the first descriptor.
     """
 
@@ -46,10 +46,10 @@ class SiameseDetector:
         Args:
             learned: thresholds for local descriptors; None uses the defaults.
             images: the store of keyframe images. With a store, candidates must reach the similarity
-                ``config.offered``. The most similar keyframes are then ranked again by local
-                descriptors, because at night the correct place is often among them but not the
-                first. Without a store (None), candidates must reach ``config.threshold`` and are
-                ranked by similarity.
+                ``config.offered``. The most similar keyframes are then ranked again using local
+                descriptors. The reason is that at night, the correct place is often among these
+                keyframes, but it is often not ranked first. Without a store (None), candidates must
+                reach ``config.threshold`` and are ranked by similarity.
         """
         self.name = network.name
         self._network = network
@@ -61,7 +61,8 @@ class SiameseDetector:
         self._row = np.full(64, -1, np.int64)  # row of each keyframe; -1 if it has no descriptor
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
-        """Add a keyframe. A keyframe without an image can never be a query or a match."""
+        """Add a keyframe to the detector. A keyframe without an image can never be a query or a
+        match."""
         if keyframe >= len(self._row):
             more = max(keyframe + 1 - len(self._row), len(self._row) // 2)
             self._row = np.pad(self._row, (0, more), constant_values=-1)
@@ -69,8 +70,9 @@ class SiameseDetector:
             self._store_descriptor(keyframe, image)
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
-        """See :class:`LoopDetector`. The similarity of a candidate is at least the threshold, which
-        depends on ``images`` (see ``__init__``)."""
+        """Find candidates for a keyframe that has been added, best first (see
+        :class:`LoopDetector`). The similarity of a candidate is at least a threshold. The threshold
+        depends on whether the images of keyframes are stored (see ``__init__``)."""
         if keyframe >= len(self._row) or not (self._described[keyframe] or self._stored(keyframe)):
             return []
         eligible = self._searchable(map_)
@@ -97,9 +99,10 @@ class SiameseDetector:
     def locate(
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
-        """The keyframes in the map that are most similar to a frame outside the map, best first.
+        """Return the keyframes in the map that are most similar to a frame outside the map, best
+        first.
 
-        No threshold is applied, because relocalisation verifies all candidates by geometry.
+        No threshold is applied, because relocalisation verifies all candidates geometrically.
         """
         if image is None:
             return []
@@ -113,8 +116,8 @@ class SiameseDetector:
         return self._best(-1, p, rating, map_)
 
     def memory(self) -> DetectorMemory:
-        """See :class:`LoopDetector`. The memory contains the descriptors that have been computed so
-        far."""
+        """Return the descriptors that have been computed so far, to be saved in a map file (see
+        :class:`LoopDetector`)."""
         first = np.concatenate([[0], np.cumsum(self._described)]).astype(np.int64)
         table = PerKeyframe(first, self._descriptors[self._row[self._described]])
         return DetectorMemory(self.name, self._network.fingerprint, {"descriptors": table})
@@ -133,23 +136,24 @@ class SiameseDetector:
 
     @property
     def _described(self) -> NDArray[np.bool_]:
-        """``(K,)`` bool, True for keyframes with a descriptor."""
+        """Return ``(K,)`` bool, True for keyframes whose descriptor has been computed."""
         return self._row >= 0
 
     def _searchable(self, map_: Map) -> NDArray[np.bool_]:
-        """``(n,)`` bool, True for keyframes in the map that have a descriptor, or an image from
-        which it can be computed."""
+        """Return ``(n,)`` bool, True for keyframes in the map that can be compared. Their
+        descriptor has been computed, or their image is stored, so that the descriptor can be
+        computed."""
         n = min(map_.n_keyframes, len(self._row))
         able = self._described[:n].copy()
         able[[k for k in np.flatnonzero(~able).tolist() if self._stored(k)]] = True
         return able & map_.arrays.keyframe_alive[:n]
 
     def _stored(self, keyframe: int) -> bool:
-        """Whether the image of a keyframe is stored."""
+        """Return whether the image of a keyframe is stored."""
         return self._images is not None and keyframe in self._images
 
     def _without_descriptor(self, keyframes: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Ids of the keyframes in an ``(n,)`` bool mask that have no descriptor yet."""
+        """Return the ids of the keyframes in an ``(n,)`` bool mask that have no descriptor yet."""
         return np.flatnonzero(keyframes & ~self._described[: len(keyframes)])
 
     def _describe(self, keyframes: Iterable[int]) -> None:
@@ -174,7 +178,8 @@ class SiameseDetector:
     def _similarities(
         self, descriptor: NDArray[np.float32], eligible: NDArray[np.bool_]
     ) -> NDArray[np.float32]:
-        """``(N,)`` similarity of each keyframe; -1 for keyframes that are not eligible."""
+        """Compare a descriptor with the descriptors of the keyframes. Returns the ``(N,)``
+        similarity of each keyframe; it is -1 for keyframes that are not eligible."""
         p = np.full(len(eligible), -1.0, np.float32)
         rows = self._row[: len(eligible)][eligible]
         if len(rows):
@@ -187,8 +192,9 @@ class SiameseDetector:
         return p
 
     def _local_ratings(self, p: NDArray[np.float32], query: DescriptorMaps) -> NDArray[np.float32]:
-        """``(N,)`` similarity by local descriptors, for the keyframes that are most similar
-        according to ``p``. It is -1 for the other keyframes."""
+        """Compare the query with the most similar keyframes again, using local descriptors. ``p``
+        is the ``(N,)`` similarity of the image descriptors. Returns the ``(N,)`` similarity of the
+        local descriptors; it is -1 for keyframes that were not compared."""
         assert self._images is not None
         rating = np.full(len(p), -1.0, np.float32)
         for keyframe in np.argsort(-p, kind="stable")[: self._config.reranked].tolist():
@@ -204,11 +210,11 @@ class SiameseDetector:
         rating: NDArray[np.float32],
         map_: Map,
     ) -> list[LoopCandidate]:
-        """The candidates with the highest ratings. ``rating`` is ``(N,)``, and -1 for keyframes
-        that cannot be candidates.
+        """Choose the keyframes with the highest ratings as candidates. ``rating`` has shape
+        ``(N,)``, and is -1 for keyframes that cannot be candidates.
 
-        Of several covisible keyframes, only the best one becomes a candidate. Further keyframes of
-        the same place would displace candidates at other places.
+        Among several covisible keyframes, only the best one becomes a candidate. Otherwise,
+        keyframes of the same place would displace candidates at other places.
         """
         rating = rating.copy()
         found: list[LoopCandidate] = []
@@ -236,7 +242,7 @@ def open_detector(
     *,
     late: bool = False,
 ) -> SiameseDetector:
-    """Create a detector and load its network.
+    """Create a loop detector and load its Siamese network.
 
     Args:
         name: one of ``NETWORKS``.
@@ -245,7 +251,8 @@ def open_detector(
         late: whether loading of the shipped weights is postponed until the first image.
 
     Raises:
-        InputError: the name is unknown, or the weights are missing or belong to another network.
+        InputError: the name is unknown, or the weights are missing or belong to a different
+            network.
     """
     late = late and weights is None
     network = LateNetwork(name) if late else open_network(name, weights)

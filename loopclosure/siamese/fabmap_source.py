@@ -25,14 +25,15 @@ def read_fabmap(folder: Path, truth: str = "", side: str = "left") -> list[Image
     """Read a FAB-MAP collection, which is a folder of images and a ground-truth matrix.
 
     The matrix has one row for each image, or one row for each pair of images. In a pair, the left
-    image has an odd number and the right image has an even number. Of such pairs, the images of
-    only one camera are used. If the folder has a file ``calibration.txt`` (fx fy cx cy k1 k2 p1 p2
-    [k3] on one line), the images are undistorted.
+    image has an odd number and the right image has an even number. If there is one row for each
+    pair, the images of only one camera are used. If the folder has a file ``calibration.txt`` (fx
+    fy cx cy k1 k2 p1 p2 [k3] on one line), the images are undistorted.
 
     Args:
         folder: folder of the images.
         truth: ``.mat`` file of the matrix. The default is the first ``.mat`` file in the folder.
-        side: "left" or "right": the camera that is used if the matrix has one row for each pair.
+        side: "left" or "right": the camera whose images are used if the matrix has one row for each
+            pair.
 
     Raises:
         InputError: there are no images or no matrix, or the number of rows does not match the

@@ -1,4 +1,5 @@
-"""The type of image source that all readers return, and functions that the readers share."""
+"""Defines ``ImageSource``, the type that all readers of image collections return, and functions
+that these readers share."""
 
 from __future__ import annotations
 
@@ -29,11 +30,11 @@ class ImageSource:
         family: name of a group of sources; sources of the same family may show the same places.
         names: names of the N images, as ``folder/file``.
         images: the N image files, or their encoded bytes as ``(B,)`` uint8.
-        relation: ``(N, N)`` int8, symmetric. 1: both images show the same place; -1: they show
-            different places; 0: unknown. The diagonal is 1, because an image shows the same place
-            as its augmented copies.
+        relation: ``(N, N)`` int8, symmetric. The value is 1 if both images show the same place, -1
+            if they show different places, and 0 if this is unknown. The diagonal is 1, because an
+            image shows the same place as its augmented copies.
         unit: ``(N,)`` int32 label of the folder or stretch of road that an image belongs to. Images
-            of the same unit are not split between training and validation.
+            of the same unit are never split between training and validation.
         calibration: ``(8,)`` or ``(9,)`` camera model fx fy cx cy k1 k2 p1 p2 [k3]. None if the
             images are rectified.
         is_query: ``(N,)`` bool, True for images that a benchmark compares with all other images.
@@ -72,8 +73,8 @@ class ImageSource:
         return image if self.calibration is None else undistorted(image, self.calibration)
 
     def select(self, chosen: NDArray[np.int64]) -> ImageSource:
-        """A source that contains only the images with the ``(M,)`` indices ``chosen``, in this
-        order."""
+        """Create a source that contains only the images with the ``(M,)`` indices ``chosen``, in
+        this order."""
         return replace(
             self,
             names=tuple(self.names[i] for i in chosen),
@@ -86,8 +87,8 @@ class ImageSource:
 
 
 def undistorted(image: NDArray[np.uint8], calibration: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Remove radial and tangential distortion (Brown's model). The image size and the camera matrix
-    stay the same."""
+    """Remove the radial and tangential distortion of an image (Brown's model). The image size and
+    the camera matrix stay the same."""
     import cv2
 
     fx, fy, cx, cy = calibration[:4]
@@ -96,22 +97,23 @@ def undistorted(image: NDArray[np.uint8], calibration: NDArray[np.float64]) -> N
 
 
 def images_in(folder: Path) -> list[Path]:
-    """The image files of a folder, sorted by name. The list is empty if there is no such folder."""
+    """List the image files of a folder, sorted by name. The list is empty if there is no such
+    folder."""
     if not folder.is_dir():
         return []
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
 
 
 def names_of(files: Iterable[Path]) -> tuple[str, ...]:
-    """The names of images in a source: ``folder/file``."""
+    """Return the names that images have in a source: ``folder/file``."""
     return tuple(f"{file.parent.name}/{file.name}" for file in files)
 
 
 def read_loop_matrix(path: Path) -> NDArray[np.bool_]:
-    """Read a loop matrix as ``(N, N)`` bool. It is True where two images close a loop.
+    """Read a loop matrix as ``(N, N)`` bool. An element is True if its two images close a loop.
 
     The loop matrix is the largest square matrix of a ``.mat`` file. It may be dense or sparse, and
-    may have any name. In the files of Oxford and Lip6, its name is ``truth``. In the files for
+    it may have any name. In the files of Oxford and Lip6, its name is ``truth``. In the files for
     KITTI, it is the name of the sequence. Most matrices mark each pair once, in the row of the
     later image.
 

@@ -1,4 +1,4 @@
-"""Runs trained networks in ONNX Runtime on a single thread, without torch."""
+"""Runs trained Siamese networks in ONNX Runtime on a single thread, without torch."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _FIX = "write one with 'vslam export onnx', or name another file"
 
 
 class OnnxNetwork:
-    """A network from a file that ``vslam export onnx`` wrote.
+    """A Siamese network, loaded from a file that ``vslam export onnx`` wrote.
 
-    The file contains two graphs: one computes descriptors from images, and the other compares
-    descriptors.
+    The file contains two graphs. The first graph computes descriptors from images. The second graph
+    compares descriptors.
 
     Attributes:
         name: one of ``NETWORKS``.
@@ -41,11 +41,11 @@ class OnnxNetwork:
     """
 
     def __init__(self, path: Path) -> None:
-        """Load the network.
+        """Load the network from an ONNX file.
 
         Raises:
-            InputError: the file is missing, damaged or not a network of vslam, or ONNX Runtime is
-                not installed.
+            InputError: the file is missing, damaged or not a network of vslam. The error is also
+                raised if ONNX Runtime is not installed.
         """
         self._embedding = open_session(path, path, "image")
         metadata = self._embedding.get_modelmeta().custom_metadata_map
@@ -94,8 +94,8 @@ class OnnxNetwork:
 
 
 class LateNetwork:
-    """A shipped network that is loaded only when the first image arrives. Many drives never need
-    it.
+    """A network that vslam ships, which is loaded only when the first image arrives. Many drives
+    never need the network.
 
     Attributes:
         name, fingerprint: see :class:`OnnxNetwork`.
@@ -137,19 +137,20 @@ class LateNetwork:
 
 
 def fingerprint_of(path: Path) -> str:
-    """Hash of the contents of a file: the first 16 hexadecimal digits of its SHA-256."""
+    """Return a hash of the contents of a file: the first 16 hexadecimal digits of its SHA-256."""
     return sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def open_network(name: str, weights: Path | None = None) -> OnnxNetwork:
-    """Load a network.
+    """Load a Siamese network by its name.
 
     Args:
         name: one of ``NETWORKS``.
         weights: ONNX file; None uses the file that vslam ships.
 
     Raises:
-        InputError: the name is unknown, or the weights are missing or belong to another network.
+        InputError: the name is unknown, or the weights are missing or belong to a different
+            network.
     """
     path = find_weights(name, weights)
     network = OnnxNetwork(path)
@@ -160,16 +161,17 @@ def open_network(name: str, weights: Path | None = None) -> OnnxNetwork:
 
 def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
     """Open an ``onnxruntime.InferenceSession`` that uses one thread. With one thread, the results
-    are bit-identical on any number of cores.
+    do not depend on the number of cores.
 
     Args:
         path: path of the file, for error messages.
         model: the file, or its bytes.
-        first_input: expected name of the first input. Graphs with another name are refused.
+        first_input: expected name of the first input. Graphs whose first input has a different name
+            are refused.
 
     Raises:
-        InputError: the file cannot be read, is not such a graph, or needs too much time or memory.
-            The error is also raised if ONNX Runtime is not installed.
+        InputError: the file cannot be read, does not contain such a graph, or needs too much time
+            or memory. The error is also raised if ONNX Runtime is not installed.
     """
     try:
         import onnxruntime
@@ -198,8 +200,8 @@ def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
 
 
 def _check_limits(path: Path, file: bytes) -> None:
-    """Refuse a file that exceeds the limits of ``onnx_limits``. This is called for files that vslam
-    does not ship."""
+    """Refuse a file whose graph needs too much time or memory (``onnx_limits``). This function is
+    called for files that vslam does not ship."""
     try:
         from vslam.loopclosure.siamese.onnx_limits import check_graph
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""Reads the images of a KITTI sequence.
+"""Reads the images of a KITTI sequence as an image source.
 
 The poses of the sequence, or a loop matrix, determine which images show the same place.
 """
@@ -49,11 +49,11 @@ def read_kitti(
             that show the same place. The images of an unmarked pair show different places if they
             are more than 25 m apart. Otherwise, their relation is unknown.
         near: distance in metres, below 25, within which two images show the same place. Published
-            loop matrices also mark images that are 20 m or more apart.
+            loop matrices also mark pairs of images that are 20 m or more apart.
 
     Raises:
-        InputError: the range contains no images, images have no poses, the matrix or the times do
-            not belong to the sequence, or ``near`` is out of range.
+        InputError: the range contains no images, images have no poses, or ``near`` is out of range.
+            The error is also raised if the matrix or the times do not belong to the sequence.
     """
     base = root if (root / "sequences").is_dir() else root / "dataset"
     folder = base / "sequences" / seq / "image_0"
@@ -96,8 +96,8 @@ def read_kitti(
 
 
 def _times(path: Path, number: NDArray[np.int64]) -> NDArray[np.float64] | None:
-    """Capture times of the images with the given numbers, in seconds; None if there is no such
-    file."""
+    """Read the capture times of the images with the given numbers, in seconds. Returns None if
+    there is no file of times."""
     if not path.exists():
         return None
     times = read_table(path, (1,), "a time")[:, 0]
@@ -110,11 +110,12 @@ def _times(path: Path, number: NDArray[np.int64]) -> NDArray[np.float64] | None:
 
 
 def relation_of_poses(T_wc: NDArray[np.float64], near: float = 5.0) -> NDArray[np.int8]:
-    """``(N, N)`` int8 relation of images, from their ``(N, 4, 4)`` poses.
+    """Determine which images show the same place from their ``(N, 4, 4)`` poses. Returns the
+    ``(N, N)`` int8 relation (see ``ImageSource``).
 
     Two images show the same place if they are less than ``near`` metres apart and their viewing
-    directions differ by less than 30 degrees. They show different places if they are more than 25 m
-    apart. Otherwise, the relation is unknown.
+    directions differ by less than 30 degrees. Two images show different places if they are more
+    than 25 m apart. Otherwise, the relation is unknown.
     """
     centre, forward = T_wc[:, :3, 3], T_wc[:, :3, 2]
     distance = np.linalg.norm(centre[:, None] - centre[None], axis=2)

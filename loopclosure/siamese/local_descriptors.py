@@ -26,7 +26,8 @@ _CACHED = 4  # number of descriptor maps in the least-recently-used cache
 
 
 class LocalDescriptors:
-    """The network that computes local descriptors. It is loaded when the first image arrives."""
+    """Computes local descriptors of images using a network. The network is loaded when the first
+    image arrives."""
 
     def __init__(self, path: Path = SHIPPED_LOCAL) -> None:
         """
@@ -56,8 +57,8 @@ class LocalDescriptors:
         """Resize an ``(H, W)`` uint8 image to ``width`` pixels and compute its local descriptors.
 
         Raises:
-            InputError: the file is damaged or not a network of local descriptors, or ONNX Runtime
-                is not installed.
+            InputError: the file is damaged, or it is not a network that computes local descriptors,
+                or ONNX Runtime is not installed.
         """
         scale = width / image.shape[1]
         coarse, fine = self._session.run(None, {"image": resized(image, width)})
@@ -76,10 +77,10 @@ def resized(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
 
 
 class KeyframeImages:
-    """Stores the images of keyframes as JPEG files in memory, about 40 kB each.
+    """Stores the images of keyframes as JPEG files in memory. An image takes about 40 kB.
 
-    Local descriptors would take thirty times as much memory. They are computed on demand, because
-    most of them are never needed.
+    The local descriptors of an image would take thirty times as much memory. They are computed on
+    demand, because most of them are never needed.
     """
 
     def __init__(self, network: LocalDescriptors) -> None:
@@ -95,14 +96,15 @@ class KeyframeImages:
         self._files[keyframe] = file.tobytes(), WIDTH / image.shape[1]
 
     def files(self, n_keyframes: int) -> PerKeyframe:
-        """The JPEG files of the first ``n_keyframes`` keyframes, as uint8, to be saved in a map
-        file."""
+        """Return the JPEG files of the first ``n_keyframes`` keyframes, as uint8, to be saved in a
+        map file."""
         files = [self._files[k][0] if k in self._files else b"" for k in range(n_keyframes)]
         first = np.cumsum([0, *map(len, files)]).astype(np.int64)
         return PerKeyframe(first, np.frombuffer(b"".join(files), np.uint8))
 
     def restore(self, files: PerKeyframe, width: int) -> None:
-        """Store the JPEG files of a loaded map. ``files`` is the result of the method ``files``.
+        """Store the JPEG files of a map that was loaded from a file. ``files`` is the result of the
+        method ``files``.
 
         Args:
             width: width of the camera images, pixels.
@@ -132,7 +134,7 @@ class KeyframeImages:
         return keyframe in self._files
 
     def maps(self, keyframe: int) -> DescriptorMaps:
-        """Local descriptors of the image of a stored keyframe."""
+        """Compute the local descriptors of the stored image of a keyframe."""
         if keyframe not in self._maps:
             self._maps[keyframe] = self._described(keyframe, WIDTH)
             while len(self._maps) > _CACHED:
@@ -141,9 +143,9 @@ class KeyframeImages:
         return self._maps[keyframe]
 
     def glance(self, keyframe: int) -> DescriptorMaps:
-        """Coarse descriptors of the image of a stored keyframe, computed at half the width.
+        """Compute the coarse descriptors of the stored image of a keyframe, at half the width.
 
-        They take a quarter of the time, and stay in memory.
+        This takes a quarter of the time that ``maps`` takes. The descriptors stay in memory.
         """
         if keyframe not in self._glances:
             maps = self._described(keyframe, GLANCE_WIDTH)
@@ -151,12 +153,12 @@ class KeyframeImages:
         return self._glances[keyframe]
 
     def glance_at(self, image: NDArray[np.uint8]) -> DescriptorMaps:
-        """Descriptors of an image that is not stored, computed at the same width as in
+        """Compute the descriptors of an image that is not stored, at the same width as in
         ``glance``."""
         return self.network.describe(image, GLANCE_WIDTH)
 
     def image(self, keyframe: int) -> NDArray[np.uint8]:
-        """The image of a stored keyframe, as uint8, with a width of ``WIDTH`` pixels.
+        """Decode the stored image of a keyframe, as uint8, with a width of ``WIDTH`` pixels.
 
         Raises:
             InputError: the file comes from a loaded map and is damaged.

@@ -88,8 +88,8 @@ def _check_nodes(model: ModelProto) -> None:
 
 
 def _shapes(model: ModelProto) -> dict[str, tuple[int, ...]]:
-    """Infer the shapes of all tensors from the shapes of the inputs. Shapes that the file states
-    for other tensors are ignored.
+    """Infer the shapes of all tensors of a graph from the shapes of its inputs. Shapes that the
+    file states for other tensors are ignored.
 
     Raises:
         Exception: a shape does not follow from the shapes of the inputs, or a tensor has a type
@@ -119,8 +119,8 @@ def _shapes(model: ModelProto) -> dict[str, tuple[int, ...]]:
 
 
 def _compute_shapes(graph: GraphProto) -> None:
-    """Replace the nodes that compute shapes by their results. This is needed because the shape
-    inference of onnx does not evaluate divisions."""
+    """Replace the nodes of a graph that compute shapes with their results. This is needed because
+    the shape inference of onnx does not evaluate divisions."""
     known = {
         tensor.name: numpy_helper.to_array(tensor)
         for tensor in graph.initializer
@@ -145,10 +145,10 @@ def _compute_shapes(graph: GraphProto) -> None:
 
 
 def _products(node: NodeProto, shapes: dict[str, Any]) -> int:
-    """Number of multiplications of a convolution or a matrix product.
+    """Count the multiplications of a convolution or a matrix product.
 
-    For other nodes the result is 0. They need only a few operations for each element of their
-    output.
+    For other nodes, the result is 0, because they need only a few operations for each element of
+    their output.
     """
     if node.op_type == "Conv":
         return math.prod(shapes[node.output[0]]) * math.prod(shapes[node.input[1]][1:])

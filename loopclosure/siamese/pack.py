@@ -1,5 +1,5 @@
-"""Writes and reads image sources as one small file. Such a file is meant for machines without space
-for the original images."""
+"""Writes image sources to one small file, and reads such a file. The file is meant for machines
+without space for the original images."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from vslam.untrusted import read_npz
 
 
 def write_pack(sources: list[ImageSource], path: Path, size: Size, fit: Fit) -> None:
-    """Write sources as one npz file (docs/howto/training.md).
+    """Write image sources as one npz file (docs/howto/training.md).
 
-    The file contains their relations and their images. The images are stored as JPEG files at the
-    input size of a network.
+    The file contains the images of the sources and the relations between the images. The images are
+    stored as JPEG files at the input size of a network.
 
     Raises:
         UnreadableImageError: an image is missing or damaged.
@@ -43,7 +43,7 @@ def write_pack(sources: list[ImageSource], path: Path, size: Size, fit: Fit) -> 
 
 
 def read_pack(path: Path) -> list[ImageSource]:
-    """Read the sources that ``write_pack`` wrote.
+    """Read the image sources from a file that ``write_pack`` wrote.
 
     Raises:
         InputError: the file is missing or damaged.

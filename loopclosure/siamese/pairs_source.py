@@ -24,9 +24,9 @@ def read_pairs(folder: Path) -> list[ImageSource]:
     """Read rendered pairs of images from a folder that contains a file ``pairs.csv``.
 
     The file must have the columns a and b (image files) and same (1 or 0). It may have further
-    columns. If it has the columns x_a, z_a, yaw_a, x_b, z_b, yaw_b (metres, degrees), images of
-    different pairs are related by ``relation_of_views``. Without these columns, the relations
-    between different pairs are unknown.
+    columns. If it has the columns x_a, z_a, yaw_a, x_b, z_b, yaw_b (metres, degrees),
+    ``relation_of_views`` determines whether images of different pairs show the same place. Without
+    these columns, it is unknown whether images of different pairs show the same place.
 
     Raises:
         InputError: the file is missing, malformed or empty.
@@ -73,15 +73,16 @@ def read_pairs(folder: Path) -> list[ImageSource]:
 
 
 def relation_of_views(views: NDArray[np.float64]) -> NDArray[np.int8]:
-    """``(N, N)`` int8 relation of images, from their poses.
+    """Determine which images show the same place from their camera poses. Returns the ``(N, N)``
+    int8 relation (see ``ImageSource``).
 
-    Two images show the same place if they are less than 5 m apart and their directions differ by
-    less than 35 degrees. They show different places if they are more than 40 m apart and do not
-    look along the same street. Otherwise, the relation is unknown.
+    Two images show the same place if they are less than 5 m apart and their viewing directions
+    differ by less than 35 degrees. Two images show different places if they are more than 40 m
+    apart and do not look along the same street. Otherwise, the relation is unknown.
 
-    Two images look along the same street if three conditions are met. Their directions are similar
-    or opposite. They are less than 160 m apart. One camera is less than 25 m to the side of the
-    line of sight of the other.
+    Two images look along the same street if three conditions are met. Their viewing directions are
+    similar or opposite. The images are less than 160 m apart. One camera is less than 25 m to the
+    side of the line of sight of the other camera.
 
     Args:
         views: ``(N, 3)`` x and z in metres, and yaw in degrees from z towards x.

@@ -1,5 +1,5 @@
-"""Reads sets of photographs. Their folders and a file NOTES.txt determine which show the same
-place."""
+"""Reads sets of photographs. The folders and a file NOTES.txt determine which photographs show the
+same place."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ _UNLIMITED = 1_000_000
 
 @dataclass(frozen=True)
 class _SpecialSet:
-    """Properties of a set of photographs that do not follow from the kind of the set. They were
-    copied from its notes.
+    """Properties of a set of photographs that do not follow from the kind of the set. The
+    properties were copied from the notes of the set.
 
     Attributes:
         reach: photographs of a folder show the same place if their positions in the sorted folder
             differ by at most this number. None if all photographs of a folder show the same place.
         region: maps the name of a folder to a region. Relations between folders of the same region
             are unknown.
-        family: family of the set, see ``ImageSource``.
+        family: family that the set belongs to, see ``ImageSource``.
         singles: folders whose photographs are unrelated to each other.
     """
 
@@ -71,11 +71,13 @@ _SPECIAL_SETS = {
 
 
 def read_photos(folder: Path) -> list[ImageSource]:
-    """Read sets of photographs: ``folder/SET/SUBFOLDER/*`` with the notes ``folder/SET/NOTES.txt``.
+    """Read sets of photographs. The photographs of a set are the files ``folder/SET/SUBFOLDER/*``,
+    and the notes of the set are in ``folder/SET/NOTES.txt``.
 
     The first line of the notes states the kind of the set. In a set of kind (a), each subfolder
-    shows one place. In kind (b), each subfolder is a video, in which consecutive frames overlap. In
-    kind (c), the photographs are unrelated. ``_SPECIAL_SETS`` has further properties of some sets.
+    shows one place. In a set of kind (b), each subfolder is a video whose consecutive frames
+    overlap. In a set of kind (c), the photographs are unrelated. ``_SPECIAL_SETS`` has further
+    properties of some sets.
 
     Raises:
         InputError: there is no set of photographs, or the notes do not state the kind.

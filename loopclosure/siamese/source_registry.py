@@ -1,8 +1,9 @@
-"""Opens sources of images by name. They are used to train networks and to compare detectors.
+"""Opens sources of images by name. The sources are used to train networks and to compare loop
+detectors.
 
-A source is a set of images with a matrix. For each pair of images, the matrix states whether they
-show the same place (1) or different places (-1), or whether this is unknown (0). Unknown pairs are
-never used.
+A source is a set of images with a matrix. For each pair of images, the matrix states what the
+images show: the same place (1), different places (-1), or unknown (0). Unknown pairs are never
+used.
 
 Images of different sources show different places, unless the sources belong to the same family.
 Between sources of the same family, the relation is unknown. An example of a family is two sets of
@@ -53,8 +54,8 @@ _READERS: dict[str, tuple[Callable[..., list[ImageSource]], tuple[str, ...]]] = 
 
 
 def split_spec(spec: str) -> tuple[str, str, dict[str, str]]:
-    """Split a specification ``kind:path[key=value,...]`` into kind, path and options. The path is
-    empty if the text does not have this form."""
+    """Split the specification of an image source, ``kind:path[key=value,...]``, into kind, path and
+    options. The path is empty if the text does not have this form."""
     kind, _, rest = spec.partition(":")
     found = re.fullmatch(r"(.+?)(?:\[(.*)\])?", rest)
     if found is None:
@@ -64,7 +65,8 @@ def split_spec(spec: str) -> tuple[str, str, dict[str, str]]:
 
 
 def open_source(spec: str) -> list[ImageSource]:
-    """Open the source ``kind:path[options]``. The docstring of this module lists the kinds.
+    """Open the image source that ``kind:path[options]`` specifies. The docstring of this module
+    lists the kinds.
 
     Raises:
         InputError: the kind or an option is unknown, or data is missing or malformed.

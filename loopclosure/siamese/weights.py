@@ -19,11 +19,11 @@ SHIPPED = Path(__file__).parent / "weights"
 
 
 def find_weights(name: str, weights: Path | None = None) -> Path:
-    """Path of the ONNX file of a network.
+    """Return the path of the ONNX file of a network.
 
     Args:
         name: one of ``NETWORKS``.
-        weights: the file that the user gave; None uses the file that vslam ships.
+        weights: path that the user gave; None uses the file that vslam ships.
 
     Raises:
         InputError: the name is unknown, or there is no such file.

@@ -1,5 +1,5 @@
-"""Random changes of an image that still shows the same place: viewpoint, light, occlusion,
-sensor."""
+"""Augments images by random changes in viewpoint, lighting, occlusion and sensor. A changed image
+still shows the same place."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ _TURNED, _ZOOMED = 0.5, 0.5  # shares of images that are rotated and zoomed, if 
 
 
 class Augmentation(BaseModel):
-    """Strengths of the random changes. A strength of 0 disables a change.
+    """Strengths of the random changes that are applied to training images. A strength of 0 disables
+    a change.
 
-    The paper changes perspective and luminance, and masks parts of the image.
+    Zhou and Sun (Sci Rep 15, 7644, 2025), whose network is trained here, change perspective and
+    luminance, and mask parts of the image.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -48,8 +50,8 @@ class Augmentation(BaseModel):
     mirror: bool = Field(True, description="Mirror both images of every second pair.")
 
 
-# Only changes of light and occlusion are stronger. Rendered pairs already differ in viewpoint. The
-# noise and blur of a camera average out at the resolution of the network.
+# Only changes in lighting and occlusion are stronger. Rendered pairs already differ in viewpoint.
+# The noise and blur of a camera average out at the resolution of the network.
 STRONG = Augmentation(
     homography=0.08, shift=0.12, log_gain=0.5, bias=30.0, log_gamma=0.5, masks=3, mask_area=0.15,
 )  # fmt: skip
@@ -58,10 +60,10 @@ STRONG = Augmentation(
 def augment(
     image: NDArray[np.uint8], strength: Augmentation, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Apply random changes to an ``(H, W)`` image.
+    """Apply random changes to an ``(H, W)`` uint8 image.
 
-    The changes are applied in the order in which an image is formed: viewpoint, occlusion, light,
-    lens, sensor, quantisation to 8 bits.
+    The changes are applied in the order in which an image is formed: viewpoint, occlusion,
+    lighting, lens, sensor, quantisation to 8 bits.
     """
     import cv2
 

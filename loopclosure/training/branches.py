@@ -1,4 +1,5 @@
-"""Defines how a network reads an image, and the branch that computes the image's descriptor."""
+"""Defines how a network reads an image, and the branch of the network that computes the descriptor
+of the image."""
 
 from __future__ import annotations
 
@@ -35,15 +36,15 @@ _LEAST_SHARE = 0.02  # least weight of a view, so that an image without texture 
 
 
 class Layout(NamedTuple):
-    """How a network reads an image.
+    """The size of a network's input image, and how the image is divided into views.
 
     Attributes:
-        size: height and width of the image.
+        size: height and width of the input image.
         views: number of views. A view is a part of the image with its own descriptor. Views are
             evenly spaced from left to right.
         view_width: number of columns of a view. None if the whole image is the only view.
-        half_angle, middle: see :class:`preprocessing.Unrolling`. If half_angle is 0, the image is
-            not unrolled.
+        half_angle, middle: see :class:`preprocessing.Unrolling`. If ``half_angle`` is 0, the image
+            is not projected onto a cylinder.
     """
 
     size: Size
@@ -54,7 +55,8 @@ class Layout(NamedTuple):
 
 
 class CapsuleShape(BaseModel):
-    """The structure of a capsule branch. It is stored together with the weights."""
+    """The structure of a capsule branch, which is the part of a network that computes descriptors.
+    It is stored together with the weights."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -118,34 +120,34 @@ class CapsuleShape(BaseModel):
 
     @property
     def layout(self) -> Layout:
-        """How the branch reads an image."""
+        """The size of the input image, and how it is divided into views."""
         return Layout(self.input, self.views, self.view_width, self.half_angle, self.middle)
 
     @property
     def view(self) -> Size:
-        """Height and width of a view. An image is cut into a number of ``views``."""
+        """Height and width of a view. A view is a part of the image with its own descriptor."""
         return self.pixels, self.view_width or self.input[1]
 
     @property
     def cut_stride(self) -> int:
-        """Stride, in pixels, of the array from which the views are cut.
+        """Stride of the array from which the views are cut, in pixels of the input image.
 
-        For lite0, views are cut from the early features, which are computed once for all views. For
-        other extractors, views are cut from the pixels.
+        For the extractor lite0, views are cut from the early features, which are computed once for
+        all views. For other extractors, views are cut from the pixels.
         """
         return EARLY_STRIDE if self.extractor == "lite0" else 1
 
     @property
     def cuts(self) -> list[slice]:
-        """Columns of each view in the array with the stride :attr:`cut_stride`."""
+        """Columns of each view in the array from which the views are cut."""
         width, view = self.input[1], self.view[1]
         step = (width - view) // self.cut_stride // max(1, self.views - 1)
         columns = (view - 1) // self.cut_stride + 1
         return [slice(k * step, k * step + columns) for k in range(self.views)]
 
     def for_images_of(self, size: Size) -> CapsuleShape:
-        """The shape for images with another height and width. Each view keeps approximately its
-        share of the width.
+        """Adapt the shape to images with a different height and width. Each view keeps
+        approximately its share of the width.
 
         Raises:
             InputError: the views become too narrow.
@@ -159,7 +161,8 @@ class CapsuleShape(BaseModel):
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Rows and columns of the feature grid of a view. A cell of the grid is called a place."""
+        """Number of rows and number of columns of the feature grid of a view. A cell of the grid is
+        called a place."""
         height, width = self.view
         if self.extractor == "lite0":
             return lite_grid_side(height), lite_grid_side(width)
@@ -172,7 +175,7 @@ class CapsuleShape(BaseModel):
         return rows * columns
 
     def with_layout(self, layout: Layout) -> CapsuleShape:
-        """The same shape with another layout.
+        """Return the same shape with a different layout of the input image.
 
         Raises:
             InputError: the views do not fit the image.
@@ -193,16 +196,17 @@ class CapsuleShape(BaseModel):
 
 
 class CapsuleBranch(nn.Module):
-    """The part of a network that computes descriptors: extractor, primary capsules and routing.
+    """The part of a Siamese network that computes descriptors: feature extractor, primary capsules
+    and routing.
 
     The descriptor consists of the flattened output capsules. With several views, it is the
     concatenation of the descriptors of the views, from left to right. The descriptor of each view
-    is scaled by the share of the view that shows texture. The reason is that fog or a covered lens
-    does not distinguish places.
+    is scaled by the share of the view that shows texture. The reason is that an area without
+    texture, for example fog or a covered lens, does not distinguish places.
 
-    For lite0, the views are cut from the early features of the whole image. These features are
-    computed only once. At the border of a view, they depend on the neighbouring pixels of the image
-    instead of padding.
+    With the extractor lite0, the views are cut from the early features of the whole image. These
+    features are computed only once. At the border of a view, the features depend on the
+    neighbouring pixels of the image instead of padding.
     """
 
     def __init__(self, shape: CapsuleShape) -> None:
@@ -233,19 +237,20 @@ class CapsuleBranch(nn.Module):
         return (views * self._textured_share(texture)[:, :, None]).flatten(1)
 
     def routed(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute output capsules ``(V N, J, D)`` and couplings ``(V N, J, I)``. The leftmost views
-        of all images come first."""
+        """Compute the output capsules, ``(V N, J, D)``, and the coupling coefficients,
+        ``(V N, J, I)``, of V views of N images. The leftmost views of all images come first."""
         grey = self._unrolled(images)
         return self.capsules.routed(self._primary_capsules(grey, textured(grey)))
 
     def _unrolled(self, images: Tensor) -> Tensor:
-        """Convert ``(N, 3, H, W)`` images to unrolled grey images, ``(N, 1, H, W)``."""
+        """Convert ``(N, 3, H, W)`` images to ``(N, 1, H, W)`` grey images that are projected onto a
+        cylinder."""
         grey: Tensor = self.unrolling(images.mean(1, keepdim=True))
         return grey
 
     def _primary_capsules(self, grey: Tensor, texture: Tensor) -> Tensor:
-        """Primary capsules ``(V N, T, P, A)`` of ``(N, 1, H, W)`` images. ``texture`` contains
-        their masks from :func:`textured`."""
+        """Compute the primary capsules, ``(V N, T, P, A)``, of ``(N, 1, H, W)`` images. ``texture``
+        contains the texture masks of the images from :func:`textured`."""
         if isinstance(self.extractor, LiteExtractor):
             x = standardised(grey, texture).contiguous(memory_format=torch.channels_last)
             x = self.extractor.late(self._views(self.extractor.early(x)))
@@ -255,20 +260,21 @@ class CapsuleBranch(nn.Module):
         return capsules
 
     def _textured_share(self, texture: Tensor) -> Tensor:
-        """``(N, V)`` share of each view that shows texture."""
+        """Compute the ``(N, V)`` share of each view that shows texture."""
         starts = [cut.start * self.shape.cut_stride for cut in self.shape.cuts]
         width = self.shape.view[1]
         shares = [texture[..., k : k + width].mean((1, 2, 3)) for k in starts]
         return torch.stack(shares, 1).clamp_min(_LEAST_SHARE)
 
     def _views(self, x: Tensor) -> Tensor:
-        """Cut ``(N, C, h, w)`` arrays into views, ``(V N, C, h, v)``."""
+        """Cut ``(N, C, h, w)`` arrays into V views each. The result has the shape
+        ``(V N, C, h, v)``."""
         if self.views > 1:
             x = torch.cat([x[..., columns] for columns in self.shape.cuts])
         return x.contiguous(memory_format=torch.channels_last)
 
 
 def _first_fault(error: ValidationError) -> str:
-    """The first error of a validation, as a clause."""
+    """Describe the first error of a validation in a clause."""
     first = error.errors()[0]
     return ": ".join([*map(str, first["loc"]), plain_reason(first["msg"])])

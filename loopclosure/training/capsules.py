@@ -1,13 +1,14 @@
-"""Capsules and dynamic routing.
+"""Implements capsules and dynamic routing between them.
 
-The equations are 4 to 9 of Zhou and Sun, Sci Rep 15, 7644 (2025), after Sabour et al., NIPS 2017.
-There are N images, I primary capsules of dimension A, and J output capsules of dimension D. Primary
-capsules have T types at P places. A type is a group of channels of the extractor, and a place is a
-cell of the feature grid. The index of a primary capsule is i = t P + p.
+The module implements equations 4 to 9 of Zhou and Sun, Sci Rep 15, 7644 (2025), which are based on
+Sabour et al., NIPS 2017. There are N images, I primary capsules of dimension A, and J output
+capsules of dimension D. Primary capsules have T types at P places. A type is a group of channels of
+the extractor, and a place is a cell of the feature grid. The index of a primary capsule is
+``i = t P + p``.
 
-All places of a type share their matrices. ``route`` therefore sums over the places first, and never
-computes the prediction vectors. ``tests/reference_routing.py`` implements the equations of the
-paper literally.
+All places of a type share the same matrices. ``route`` therefore sums over the places first, and
+never computes the prediction vectors. ``tests/reference_routing.py`` implements the equations of
+the paper literally.
 """
 
 from __future__ import annotations
@@ -23,25 +24,27 @@ TINY = 1e-12  # added so that the square root is differentiable at 0
 
 
 def squash(s: Tensor) -> Tensor:
-    """Eq. 8: ``|s|² / (1 + |s|²) · s / |s|`` along the last axis. The length of the result is below
-    1."""
+    """Compute ``|s|² / (1 + |s|²) · s / |s|`` along the last axis (equation 8 of Zhou and Sun). The
+    length of the result is below 1."""
     squared = (s * s).sum(-1, keepdim=True)
     return s * (torch.sqrt(squared + TINY) / (1.0 + squared))
 
 
 def length(v: Tensor) -> Tensor:
-    """Eq. 9: L2 norm along the last axis, with a finite gradient at 0."""
+    """Compute the L2 norm along the last axis (equation 9 of Zhou and Sun). Its gradient at 0 is
+    finite."""
     return torch.sqrt((v * v).sum(-1) + TINY)
 
 
 def route(
     u: Tensor, W: Tensor, iterations: int = 3, over: Over = "primary", alive: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Dynamic routing. Gradients flow only through the last iteration.
+    """Compute output capsules from primary capsules by dynamic routing. Gradients flow only through
+    the last iteration.
 
     The sums are rearranged as ``s_j = Σ_t W_tj (Σ_p c_tpj u_tp)`` and
     ``û_j|i · v_j = u_tp · (W_tjᵀ v_j)``. In this form, sums over the places replace the prediction
-    vectors. The sums are vectors of size A, whereas the prediction vectors have ``I J D`` numbers,
+    vectors. The sums are vectors of size A. The prediction vectors would have ``I J D`` numbers,
     which would have to be written once and read five times.
 
     Args:
@@ -49,15 +52,16 @@ def route(
         W: ``(J, T, A, D)`` matrices, shared by the places of a type.
         iterations: number of iterations, at least 1.
         over: axis of the softmax. With ``primary``, the coupling coefficients sum to 1 over i, as
-            in the paper. With ``output``, they sum to 1 over j, as in Sabour et al.
-        alive: ``(I,)`` bool. Capsules where it is False are ignored, as if they were removed. None
-            uses all capsules.
+            in Zhou and Sun. With ``output``, the coefficients sum to 1 over j, as in Sabour et al.
+        alive: ``(I,)`` bool, False for primary capsules that are ignored, as if they were removed.
+            None uses all capsules.
 
     Returns:
-        Output capsules ``v`` ``(N, J, D)``, and the coupling coefficients as numerators ``e``
-        ``(N, T, J, P)`` and denominators ``total`` ``(N, 1, J, 1)`` or ``(1,)``. :func:`couplings`
-        divides the numerators by the denominators. They are returned undivided, because ``route``
-        itself divides only the sums over P, which takes a sixth of the divisions.
+        Three arrays: the output capsules ``v``, ``(N, J, D)``; the numerators of the coupling
+        coefficients ``e``, ``(N, T, J, P)``; the denominators of the coupling coefficients
+        ``total``, ``(N, 1, J, 1)`` or ``(1,)``. :func:`couplings` divides the numerators by the
+        denominators. The coefficients are returned undivided, because ``route`` itself divides only
+        the sums over P, which needs a sixth of the divisions.
     """
     n, types, places, size = u.shape
     outputs, _, _, depth = W.shape
@@ -66,21 +70,22 @@ def route(
     present = None if alive is None else alive.view(types, 1, places)
 
     def weighted_sums(e: Tensor, total: Tensor) -> Tensor:
-        """The sums ``s`` ``(N, J, D)`` for the coupling coefficients ``e / total``."""
+        """Compute the sums ``s``, ``(N, J, D)``, for the coupling coefficients ``e / total``."""
         pooled = torch.bmm(e.view(n * types, outputs, places), rows)
         pooled = pooled.view(n, types, outputs, size) / total
         pooled = pooled.permute(2, 0, 1, 3).reshape(outputs, n, types * size)
         return torch.bmm(pooled, W_j).transpose(0, 1)
 
     def agreements(v: Tensor) -> Tensor:
-        """Agreements ``(N, T, J, P)`` of the prediction vectors with the outputs ``(N, J, D)``."""
+        """Compute the ``(N, T, J, P)`` agreements of the prediction vectors with the output
+        capsules ``(N, J, D)``."""
         back = torch.bmm(v.transpose(0, 1), W_j.transpose(1, 2)).view(outputs, n, types, size)
         back = back.permute(1, 2, 0, 3).reshape(n * types, outputs, size)
         return torch.bmm(back, rows.transpose(1, 2)).view(n, types, outputs, places)
 
     def softmax_parts(b: Tensor) -> tuple[Tensor, Tensor]:
-        """Numerators and denominator of Eq. 6 for logits ``(N, T, J, P)``. The logits are
-        overwritten."""
+        """Compute the numerators and the denominator of the softmax (equation 6 of Zhou and Sun) of
+        ``(N, T, J, P)`` logits. The logits are overwritten."""
         if over == "output":
             c = torch.softmax(b, dim=2)
             return c if present is None else c * present, b.new_ones(1)
@@ -114,17 +119,22 @@ def route(
 
 
 def couplings(e: Tensor, total: Tensor) -> Tensor:
-    """Coupling coefficients ``(N, J, I)`` of :func:`route`."""
+    """Compute the ``(N, J, I)`` coupling coefficients from the numerators and denominators that
+    :func:`route` returned."""
     return (e / total).transpose(1, 2).flatten(2)
 
 
 class CapsuleLayer(nn.Module):
     """The layer that computes output capsules from primary capsules.
 
-    The transforms are ``W_ij = W_t(i)j diag(g_i)``. There is a matrix for each type and output, and
-    a gain vector of size A for each primary capsule. The gain vectors distinguish the places. (A
-    matrix for each i and j would need tens of millions of parameters.) A pruned capsule has no
-    entry in ``gains`` and ``place``, and takes no part in any product or softmax.
+    Each primary capsule i has a type t(i), and is located at a place, which is a cell of the
+    feature grid. Its transform to output capsule j is ``W_ij = W_t(i)j diag(g_i)``. There is a
+    matrix for each pair of type and output capsule, and a gain vector of size A for each primary
+    capsule. The gain vectors distinguish the places. A separate matrix for each i and j would need
+    tens of millions of parameters.
+
+    A pruned capsule has no entry in ``gains`` and ``place``, and takes no part in any product or
+    softmax.
 
     Attributes:
         W: ``(J, T, A, D)`` matrices.
@@ -167,7 +177,8 @@ class CapsuleLayer(nn.Module):
         return self._route(u)[0]
 
     def routed(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Output capsules, and the couplings ``(N, J, T K)`` that led to them."""
+        """Compute the output capsules, and the ``(N, J, T K)`` coupling coefficients that led to
+        them."""
         v, e, total = self._route(u)
         return v, couplings(e, total)
 

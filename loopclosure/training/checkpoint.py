@@ -1,4 +1,4 @@
-"""Checkpoints of a training run."""
+"""Writes and reads the checkpoints of a training run."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ CHECKPOINT = "checkpoint.pt"
 
 @dataclass
 class TrainingProgress:
-    """The progress of a training run. A checkpoint contains the progress, the weights and Adam's
-    moments."""
+    """The progress of a training run. A checkpoint contains the progress, the weights and the
+    moments of Adam."""
 
     epoch: int = 0
     step: int = 0
@@ -43,10 +43,10 @@ def save_checkpoint(
     """Write everything that is needed to resume an interrupted training run.
 
     Args:
-        pairs: the pairs of the current epoch; None between epochs.
+        pairs: the image pairs of the current epoch; None between epochs.
 
     Raises:
-        ResultsError: the file cannot be written. In this case, an older file is not changed.
+        ResultsError: the file cannot be written. In this case, an existing file is not changed.
     """
     content = {
         "settings": settings.model_dump_json(),
@@ -69,11 +69,12 @@ def load_checkpoint(
     """Load a checkpoint into the network and the optimiser.
 
     Returns:
-        The progress, and the pairs of the current epoch. The pairs are None between epochs.
+        The progress, and the image pairs of the current epoch. The pairs are None if the checkpoint
+        was written between two epochs.
 
     Raises:
-        InputError: the file is damaged, or comes from another version of vslam, or was written with
-            other settings.
+        InputError: the file is damaged, or comes from a different version of vslam, or was written
+            with different settings.
     """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)

@@ -17,7 +17,7 @@ from vslam.errors import InputError, write_file
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN, ImageSource
 from vslam.loopclosure.siamese.images import Fit, Size
 
-# First and last frame of each sequence that training may use. Detectors are tested on the others.
+# First and last frame of each sequence that training may use. All other frames are test data.
 TRAINING_FRAMES = {"kitti00": (250, 1499)}
 # Groups of collections. Training may use only one collection of a group, because tests need the
 # other.
@@ -31,10 +31,10 @@ class Collection:
     Attributes:
         names: names of the N images, as ``source/folder/file``.
         images: ``(N, H, W)`` uint8 grey images.
-        relation: ``(N, N)`` int8 relation of each pair. 1: same place; -1: different places; 0:
-            unknown.
-        unit: ``(N,)`` int64 label. Images with the same label are not split between training and
-            validation.
+        relation: ``(N, N)`` int8 relation of each pair. The value is 1 for the same place, -1 for
+            different places, and 0 if this is unknown.
+        unit: ``(N,)`` int64 label of the group that an image belongs to. Images with the same label
+            are never split between training and validation.
         sources: name of each source, and its number of images.
     """
 
@@ -125,10 +125,11 @@ def load(sources: list[ImageSource], size: Size, fit: Fit, threads: int = 2) -> 
 def divide(
     collection: Collection, seed: int, share: float = 0.15
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Split the images into training and validation images. Units are not split.
+    """Split the images into training and validation images. Images of the same unit, for example of
+    the same stretch of road, are not split.
 
-    Other images may show the same place as a validation image, for example at the ends of a stretch
-    of road. These images are used neither for training nor for validation.
+    Images of other units may show the same place as a validation image, for example at the ends of
+    a stretch of road. Such images are used neither for training nor for validation.
 
     Raises:
         InputError: there are too few images.
@@ -156,7 +157,7 @@ def validation_images(validation: NDArray[np.int64], most: int, seed: int) -> ND
 
 
 def check_emphasis(collection: Collection, emphasis: Mapping[str, float]) -> None:
-    """Check that the collection contains the sources that ``emphasis`` names.
+    """Check that the collection contains all sources for which ``emphasis`` gives a frequency.
 
     Raises:
         InputError: a source does not exist.
@@ -185,14 +186,15 @@ def draw_pairs(
     Args:
         chosen: ``(M,)`` indices of the images from which pairs are drawn.
         count: number of pairs.
-        hard: ``(M, K)`` similar images of other places, padded with -1; see :func:`mine`.
-        hard_share: share of the pairs of different places for which the second image is drawn from
+        hard: ``(M, K)`` indices of similar images of other places for each chosen image, padded
+            with -1; see :func:`mine`.
+        hard_share: share of the pairs of different places whose second image is drawn from
             ``hard``.
         same_share: share of the pairs that show the same place. These pairs are spread evenly over
             the list.
         together: number of consecutive pairs whose first images come from the same source.
-        emphasis: relative frequency, for each source, with which an image is drawn as the first of
-            a pair. The default is 1.
+        emphasis: relative frequency of each source. Images of a source are drawn as first images of
+            pairs with this frequency. The default is 1.
     """
     relation = collection.relation[np.ix_(chosen, chosen)]
     sizes = [size for _, size in collection.sources]
@@ -243,8 +245,8 @@ def mine(
 
 
 def write_pairs(path: Path, collection: Collection, pairs: Pairs, seed: int) -> None:
-    """Write a list of pairs as a CSV file with the columns a, b, same. The first line states the
-    seed.
+    """Write a list of image pairs as a CSV file with the columns a, b, same. The first line states
+    the seed.
 
     Raises:
         ResultsError: the file cannot be written.

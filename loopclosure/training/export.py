@@ -33,7 +33,7 @@ _SMALL = 64  # half precision saves nothing for tensors with fewer numbers
 
 
 class _Embedding(nn.Module):
-    """Computes the descriptor ``(D,)`` of a grey ``(H, W)`` uint8 image."""
+    """A module that computes the ``(D,)`` descriptor of a grey ``(H, W)`` uint8 image."""
 
     def __init__(self, network: SiameseNetwork) -> None:
         super().__init__()
@@ -45,10 +45,11 @@ class _Embedding(nn.Module):
 
 
 class _Comparison(nn.Module):
-    """Computes the similarities ``(N,)`` of a query to a gallery.
+    """A module that computes the ``(N,)`` similarities of a query image to N gallery images.
 
-    The inputs are the descriptors of their views, ``(V, d)`` and ``(N, V, d)``, and the lengths
-    ``(N, V)`` of the descriptors of the gallery.
+    The inputs are the ``(V, d)`` descriptors of the V views of the query, the ``(N, V, d)``
+    descriptors of the views of the gallery images, and the ``(N, V)`` lengths of the descriptors of
+    the gallery.
     """
 
     def __init__(self, network: SiameseNetwork) -> None:
@@ -60,25 +61,25 @@ class _Comparison(nn.Module):
 
 
 def export_onnx(network: SiameseNetwork, path: Path, about: dict[str, Any] | None = None) -> float:
-    """Write a network in the format that :class:`inference.OnnxNetwork` reads.
+    """Write a network as one ONNX file, in the format that :class:`inference.OnnxNetwork` reads.
 
     The main graph maps ``image`` to ``descriptor``. The input is a grey ``(H, W)`` uint8 image of
-    the size that the network needs. The output is ``(D,)`` float32 of norm 1.
+    the size that the network needs. The output is a ``(D,)`` float32 descriptor of norm 1.
 
-    The metadata contains a second graph in base64. It computes ``similarity`` ``(N,)`` from
-    ``query`` ``(V, d)``, ``gallery`` ``(N, V, d)`` and ``lengths`` ``(N, V)``. ``query`` and
-    ``gallery`` are the descriptors of V views, with ``V d = D``. ``lengths`` are the lengths of the
-    descriptors of the gallery's views.
+    The metadata of the file contains a second graph in base64, which compares a query image with N
+    gallery images. It computes ``similarity``, ``(N,)``, from three inputs. ``query``, ``(V, d)``,
+    and ``gallery``, ``(N, V, d)``, are the descriptors of the V views of each image, with
+    ``V d = D``. ``lengths``, ``(N, V)``, are the lengths of the descriptors in ``gallery``.
 
     Args:
         about: description of the origin of the weights.
 
     Returns:
-        The largest difference between the descriptors of torch and ONNX Runtime for random images,
-        over all elements.
+        The largest difference between an element of a descriptor from torch and the same element
+        from ONNX Runtime, for random images.
 
     Raises:
-        ResultsError: the file cannot be written, or its results differ from those of torch.
+        ResultsError: the file cannot be written, or ONNX Runtime and torch give different results.
     """
     parameters = network.n_parameters()
     network = for_inference(copy.deepcopy(network).cpu())
@@ -119,8 +120,8 @@ def to_onnx(
     module: nn.Module, inputs: tuple[Tensor, ...], names: list[str], outputs: list[str],
     dynamic_shapes: Any = None,
 ) -> onnx.ModelProto:  # fmt: skip
-    """Convert a module to an ONNX graph. Tensors are stored in half precision if half precision
-    represents them exactly."""
+    """Convert a torch module to an ONNX graph. A tensor is stored in half precision if half
+    precision represents it exactly."""
     log = logging.getLogger("torch.onnx")
     level = log.level
     log.setLevel(logging.ERROR)  # hides warnings about missing torchvision and renamed inputs
@@ -143,7 +144,7 @@ def to_onnx(
 
 
 def write_onnx(model: onnx.ModelProto, path: Path, metadata: dict[str, str]) -> None:
-    """Write a graph with its metadata.
+    """Write an ONNX graph with its metadata.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -153,7 +154,8 @@ def write_onnx(model: onnx.ModelProto, path: Path, metadata: dict[str, str]) -> 
 
 
 def _halve(graph: onnx.GraphProto) -> None:
-    """Store tensors in half precision where this is exact. Nodes of the graph convert them back."""
+    """Store the tensors of a graph in half precision where this is exact. Nodes of the graph
+    convert them back to single precision."""
     casts = []
     for tensor in graph.initializer:
         if tensor.data_type != TensorProto.FLOAT:

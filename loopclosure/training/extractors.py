@@ -1,4 +1,5 @@
-"""The light feature extractor of the paper, and the layer of primary capsules."""
+"""The light feature extractor of Zhou and Sun (Sci Rep 15, 7644, 2025), and the layer of primary
+capsules."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ LIGHT_BLOCKS: tuple[Block, ...] = (
 
 
 class Separable(nn.Module):
-    """Depthwise and pointwise convolution, followed by batch normalisation (Eq. 1) and ReLU."""
+    """Depthwise and pointwise convolution, followed by batch normalisation (equation 1 of Zhou and
+    Sun) and ReLU."""
 
     def __init__(
         self,
@@ -50,15 +52,16 @@ class Separable(nn.Module):
         return torch.relu(x) if self.active else x
 
     def fold(self) -> None:
-        """Fold the batch normalisation into the preceding convolution, which saves time."""
+        """Fold the batch normalisation into the preceding convolution, which makes inference
+        faster."""
         if isinstance(self.norm, nn.BatchNorm2d):
             self.pointwise = fuse_conv_bn_eval(self.pointwise, self.norm)
             self.norm = nn.Identity()
 
 
 class Stem(nn.Module):
-    """An ordinary 7x7 convolution. A separable one would save nothing, because there is only one
-    grey channel."""
+    """The first layer of the extractor, an ordinary 7x7 convolution. A separable convolution would
+    save nothing, because the image has only one grey channel."""
 
     def __init__(self, outputs: int, stride: int) -> None:
         super().__init__()
@@ -75,8 +78,8 @@ class Stem(nn.Module):
 
 
 class PrimaryCapsules(nn.Module):
-    """A separable 7x7 convolution with stride 1, whose channels are grouped into squashed
-    capsules."""
+    """The layer of primary capsules: a separable 7x7 convolution with stride 1. Its output channels
+    are grouped into capsules, and each capsule is squashed."""
 
     def __init__(self, inputs: int, types: int, size: int) -> None:
         super().__init__()
@@ -91,11 +94,11 @@ class PrimaryCapsules(nn.Module):
 
 
 class LightExtractor(nn.Sequential):
-    """Strided separable convolutions with dilations 1, 2, 3. An image of 227 pixels becomes a grid
-    of 15x15 cells.
+    """The light feature extractor of Zhou and Sun: strided separable convolutions with dilations 1,
+    2 and 3. An image of 227x227 pixels becomes a grid of 15x15 cells.
 
     Attributes:
-        out_channels: channels of the grid.
+        out_channels: number of channels of the feature grid.
     """
 
     def __init__(self, blocks: Collection[Block] = LIGHT_BLOCKS) -> None:
@@ -110,14 +113,16 @@ class LightExtractor(nn.Sequential):
 
 
 def grid_side(pixels: int, blocks: Collection[Block] = LIGHT_BLOCKS) -> int:
-    """Number of cells along one side of the feature grid, for an image side of ``pixels``."""
+    """Compute the number of cells along one side of the feature grid, for an image with a side of
+    ``pixels``."""
     for _, stride, _ in blocks:
         pixels = (pixels - 1) // stride + 1
     return pixels
 
 
 def fold_batch_norms(network: nn.Module) -> None:
-    """Fold all batch normalisations of a network in place. The network must be in eval mode."""
+    """Fold all batch normalisations of a network into its convolutions, in place. The network must
+    be in eval mode."""
     for module in network.modules():
         if isinstance(module, Separable | Stem):
             cast(Separable, module).fold()

@@ -1,5 +1,5 @@
-"""Initial weights of a training run: random, from another training run, from ImageNet, or
-pruned."""
+"""Creates the network that a training run starts from. Its weights are random, from another
+training run, from ImageNet, or pruned."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ def starting_network(
     Args:
         weights: a safetensors file of vslam, or ImageNet weights of the extractor lite0. None for
             random weights.
-        resuming: whether a checkpoint will replace the weights.
+        resuming: whether a checkpoint will replace the weights of the returned network.
 
     Returns:
         The network, the settings that fit it, and entries for the model card. The network is None
         for random weights.
 
     Raises:
-        InputError: the weights are missing, damaged or belong to another network.
+        InputError: the weights are missing, are damaged, or belong to a different network.
     """
     if settings.network in PRUNED:
         if weights is None:
@@ -94,13 +94,13 @@ def starting_network(
 
 
 def resized(network: SiameseNetwork, layout: Layout) -> SiameseNetwork:
-    """Adapt a network to another image size, other views or another unrolling, for further
-    training.
+    """Adapt a network to a different layout, for further training. The layout consists of the image
+    size, the views, and the cylindrical projection.
 
     Convolutions and transforms stay the same. The gains of the places (cells of the feature grid)
     are interpolated over the new grid. In this way, most of the training can use small images,
-    which take a third of the time (Howard's progressive resizing, as in the DAWNBench entry of
-    fast.ai, 2018).
+    which needs a third of the time (progressive resizing by Howard, DAWNBench entry of fast.ai,
+    2018).
 
     Raises:
         InputError: the network is pruned, or the views do not fit the image.
@@ -124,7 +124,8 @@ def resized(network: SiameseNetwork, layout: Layout) -> SiameseNetwork:
 
 
 def _fitted(network: SiameseNetwork, settings: TrainSettings) -> SiameseNetwork:
-    """The network itself if its layout is that of the settings, or else a resized network."""
+    """Return the network itself if it already has the layout of the settings, or else a resized
+    copy."""
     layout = settings.shape.layout
     return network if network.branch.layout == layout else resized(network, layout)
 
@@ -163,10 +164,11 @@ def _prune(
 
 @torch.no_grad()
 def milliseconds_per_image(*networks: SiameseNetwork, repeats: int = 50) -> list[float]:
-    """The shortest time that each network takes to embed one image on one core, in milliseconds.
+    """Measure the time that each network takes to embed one image on one core, in milliseconds.
 
-    The networks take turns, so that other load on the machine affects all of them equally. The
-    shortest time is used, because other processes can only make a measurement longer.
+    The networks take turns, so that other load on the machine affects all of them equally. Each
+    measurement is repeated, and the shortest time is returned, because other processes can only
+    make a measurement longer.
     """
     best = [float("inf")] * len(networks)
     threads = torch.get_num_threads()

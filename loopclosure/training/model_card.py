@@ -1,4 +1,5 @@
-"""The model card, which describes the origin of weights. It is written beside the weights."""
+"""Writes the model card, a file next to the weights of a network that describes how the weights
+were trained."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ def describe(
     data: list[str],
     device: str,
 ) -> dict[str, Any]:
-    """Collect the information that a reader needs to judge or reproduce the weights."""
+    """Collect the contents of the model card: the information that is needed to judge or reproduce
+    the weights of a network."""
     return {
         "network": network.name,
         "parameters": network.n_parameters(),
@@ -60,7 +62,8 @@ def describe(
 
 
 def write_card(card: dict[str, Any], weights: Path) -> tuple[Path, Path]:
-    """Write ``NAME.json`` and ``NAME.md`` beside the weights. Returns both paths.
+    """Write a model card as ``NAME.json`` and ``NAME.md`` next to the weights. Returns the paths of
+    both files.
 
     Raises:
         ResultsError: a file cannot be written.

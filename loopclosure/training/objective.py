@@ -1,4 +1,4 @@
-"""The losses of training, and the validation and calibration of a network."""
+"""The training losses, and the validation and calibration of a network."""
 
 from __future__ import annotations
 
@@ -20,23 +20,24 @@ _MOST_SAME = 5  # a validation query is compared with at most this many images o
 
 
 def cross_entropy(logits: Tensor, same: Tensor) -> Tensor:
-    """Eq. 3, from the logits of p: the mean over all pairs of
-    ``-(y log p + (1 - y) log(1 - p))``."""
+    """Compute the binary cross-entropy from the logits of p (equation 3 of Zhou and Sun, 2025). It
+    is the mean over all pairs of ``-(y log p + (1 - y) log(1 - p))``."""
     return functional.binary_cross_entropy_with_logits(logits, same.to(logits.dtype))
 
 
 def contrast(alike: Tensor, same: Tensor, relation: Tensor, temperature: float) -> Tensor:
-    """InfoNCE loss. It compares each pair of the same place with all images of other places in the
-    batch.
+    """Compute the InfoNCE loss. This loss compares each pair of images of the same place with all
+    images of other places in the batch.
 
-    The loss is that of van den Oord et al. (2018), in the symmetric form of CLIP. The paper does
-    not use this loss.
+    The loss is that of van den Oord et al. (2018), in the symmetric form of CLIP. Zhou and Sun
+    (2025) do not use this loss.
 
     Args:
         alike: ``(2 N, 2 N)`` cosine similarities of the images of N pairs. The first images of all
             pairs come first, followed by the second images.
         same: ``(N,)`` bool, True for pairs of the same place.
-        relation: ``(2 N, 2 N)`` int8 relation of these images.
+        relation: ``(2 N, 2 N)`` int8 relation of these images: 1 for the same place, -1 for
+            different places, 0 if unknown.
     """
     if not bool(same.any()):
         return alike.sum() * 0.0
@@ -53,7 +54,8 @@ def contrast(alike: Tensor, same: Tensor, relation: Tensor, temperature: float) 
 def embed_all(
     network: SiameseNetwork, images: NDArray[np.uint8], device: torch.device, batch: int = 64
 ) -> NDArray[np.float32]:
-    """Descriptors ``(N, D)`` of ``(N, H, W)`` images. The network is set to eval mode."""
+    """Compute the ``(N, D)`` descriptors of ``(N, H, W)`` images. The network is set to eval
+    mode."""
     network.eval()
     parts = [
         network.embed(to_tensor(images[k : k + batch]).to(device)).cpu()
@@ -69,8 +71,8 @@ def score_matrix(
     gallery: NDArray[np.float32],
     device: torch.device,
 ) -> NDArray[np.float32]:
-    """Similarities ``(Q, M)`` of query descriptors ``(Q, D)`` and gallery descriptors
-    ``(M, D)``."""
+    """Compute the ``(Q, M)`` similarities of ``(Q, D)`` query descriptors and ``(M, D)`` gallery
+    descriptors."""
     network.eval()
     all_images = torch.from_numpy(gallery).to(device)
     rows = [network.compare(q, all_images).cpu() for q in torch.from_numpy(queries).to(device)]
@@ -84,16 +86,16 @@ def validate(
     strength: Augmentation,
     device: torch.device,
 ) -> tuple[dict[str, float], NDArray[np.float32], NDArray[np.bool_]]:
-    """Measure retrieval among the validation images. The queries are augmented copies of the
-    images.
+    """Measure how well a network retrieves images of the same place among the validation images.
+    The queries are augmented copies of these images.
 
-    All pairs with a known relation count, with one exception: a query counts with at most five
-    images of its place. Most pairs therefore show different places, as in a SLAM run. Every call
-    uses the same augmentations and pairs.
+    All pairs are used for which it is known whether both images show the same place. There is one
+    exception: a query is paired with at most five images of its place. Most pairs therefore show
+    different places, as in a SLAM run. Every call uses the same augmentations and pairs.
 
     Returns:
-        The figures of :func:`vslam.loopclosure.precision_recall.summary`, and the scores and labels
-        of the pairs that the figures are computed from.
+        The measures of :func:`vslam.loopclosure.precision_recall.summary`, and the scores and
+        labels of the pairs from which these measures are computed.
     """
     images = collection.images[chosen]
     augmented = np.stack(
@@ -121,8 +123,8 @@ def blend(network: SiameseNetwork, before: dict[str, Tensor], share: float) -> N
     """Interpolate the weights of a network in place. Share 0 gives the weights ``before``, and
     share 1 gives the current weights.
 
-    Interpolated weights keep most of what fine-tuning has learned. They also forget less of what
-    the original network had learned (WiSE-FT, Wortsman et al., CVPR 2022).
+    Interpolated weights keep most of what fine-tuning has learned. They also keep more of what the
+    original network had learned (WiSE-FT, Wortsman et al., CVPR 2022).
     """
     after = network.state_dict()
     mixed = {
@@ -134,7 +136,8 @@ def blend(network: SiameseNetwork, before: dict[str, Tensor], share: float) -> N
 
 
 def calibrate(network: SiameseNetwork, score: NDArray, same: NDArray) -> None:
-    """Fit a and b of ``p = sigmoid(a - b d)`` in place, so that p is a calibrated probability.
+    """Fit the parameters a and b of the network's head, ``p = sigmoid(a - b d)``, in place, so that
+    p is a calibrated probability.
 
     The pairs of the same place and the pairs of different places get equal total weights. The order
     of the scores does not change, so average precision does not change either.

@@ -1,4 +1,4 @@
-"""Preprocessing of grey images before features are extracted."""
+"""Preprocesses grey images before a network extracts features from them."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ def to_tensor(images: NDArray[np.uint8]) -> Tensor:
 
 
 class Unrolling(nn.Module):
-    """Cylindrical projection of images. In a projected image, a rotation of the camera appears as a
-    shift.
+    """Projects images onto a cylinder. In a projected image, a rotation of the camera appears as a
+    horizontal shift.
 
     The method is that of Szeliski, Image Alignment and Stitching: A Tutorial, 2006, section 2.3. In
-    a flat image, objects become wider and taller towards the sides. A rotation by 30 degrees
-    therefore does not merely shift the image, and no single alignment of views fits all of it. The
-    paper does not use this projection.
+    a flat image, objects become wider and taller towards the sides. Therefore, a rotation of the
+    camera by 30 degrees does not merely shift the image, and no single shift aligns the whole
+    image. Zhou and Sun (2025) do not use this projection.
 
-    Column ``x`` in [-1, 1] shows the direction ``x half_angle``. In this column, row ``y`` shows
-    the row ``middle y / cos(x half_angle)`` of the flat image. The sides of the flat image are at
-    ``tan(half_angle)``. Pixels outside the flat image are black.
+    Column ``x`` of the projected image, in [-1, 1], shows the direction ``x half_angle``. In this
+    column, row ``y`` shows the row ``middle y / cos(x half_angle)`` of the flat image. The sides of
+    the flat image are at ``tan(half_angle)``. Pixels outside the flat image are black.
 
     Args:
         size: height and width of the images.
-        half_angle: angle from the middle to either side, in degrees; 0 leaves images flat. All
-            cameras use the same value, because some cameras are not calibrated. If the value is the
-            half angle of the camera itself, a rotation becomes exactly a shift. Otherwise, it
-            becomes approximately a shift.
+        half_angle: angle from the middle of the image to either side, in degrees; 0 leaves images
+            flat. All cameras use the same value, because some cameras are not calibrated. If the
+            value is the half angle of the camera itself, a rotation becomes exactly a shift.
+            Otherwise, it becomes approximately a shift.
         middle: share of the height that the middle column keeps. If it is the cosine of
             ``half_angle``, the sides keep their whole height, and no pixel is black. If it is 1,
             the middle keeps its whole height.
@@ -61,7 +61,7 @@ class Unrolling(nn.Module):
         self.register_buffer("grid", grid, persistent=False)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Unroll ``(N, 1, H, W)`` images. The result has the same shape."""
+        """Project ``(N, 1, H, W)`` images onto the cylinder. The result has the same shape."""
         if self.grid is None:
             return images
         grid = self.grid.expand(len(images), -1, -1, -1)
@@ -69,7 +69,7 @@ class Unrolling(nn.Module):
 
 
 def textured(images: Tensor) -> Tensor:
-    """Texture mask of ``(N, 1, H, W)`` images in [0, 1].
+    """Compute the texture masks of ``(N, 1, H, W)`` images in [0, 1].
 
     The mask is 1.0 where a pixel differs by more than one grey level from its right or lower
     neighbour. Elsewhere, for example in black, white or covered areas, the mask is 0.0.
@@ -82,8 +82,8 @@ def textured(images: Tensor) -> Tensor:
 def standardised(images: Tensor, texture: Tensor | None = None) -> Tensor:
     """Scale each image to mean 0 and standard deviation 1 over its textured pixels.
 
-    This removes the gain and the bias of the camera. Overexposed or covered areas do not affect the
-    other pixels.
+    The scaling removes the gain and the bias of the camera. Overexposed or covered areas do not
+    affect the other pixels.
 
     Args:
         images: ``(N, 1, H, W)`` images in [0, 1].

@@ -1,7 +1,8 @@
 """Pruning: removes the primary capsules with the lowest coupling coefficients.
 
-The paper ranks primary capsules by their coupling coefficients. It sets the W_ij of the lowest 20 %
-to 0. Multiplying by zeros saves no time, so these capsules are removed here.
+Zhou and Sun (Sci Rep 15, 7644, 2025) rank primary capsules by their coupling coefficients. They set
+the matrices W_ij of the lowest 20 % to 0. Multiplying by zeros saves no time, so this module
+removes these capsules.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from vslam.loopclosure.training.siamese import SiameseNetwork
 
 @torch.no_grad()
 def mean_couplings(network: SiameseNetwork, batches: Iterable[Tensor]) -> Tensor:
-    """Activity ``(T, K)`` of each primary capsule: the mean of c_ij over all images and outputs j.
+    """Compute the ``(T, K)`` activity of each primary capsule i. It is the mean of the coupling
+    coefficients c_ij over all images and all output capsules j.
 
     Args:
         network: the network, which must be in eval mode.
@@ -43,11 +45,12 @@ def mean_couplings(network: SiameseNetwork, batches: Iterable[Tensor]) -> Tensor
 
 
 def lowest(activity: Tensor, fraction: float = 0.2) -> Tensor:
-    """``(T, K)`` bool mask of the least active ``fraction`` of the capsules of each type.
+    """Select the least active ``fraction`` of the primary capsules of each type. Returns a
+    ``(T, K)`` bool mask.
 
-    The paper does not say how many capsules are removed from each type. Here, the number is the
-    same for all types. One dense product can then still compute all types together. Of capsules
-    with equal activity, those with the lower index are chosen first.
+    Zhou and Sun (2025) do not say how many capsules they remove from each type. This function
+    selects the same number for all types. A single dense product can then still compute all types
+    together. If capsules have equal activity, the capsule with the lower index is selected first.
     """
     dropped = round(fraction * activity.shape[1])
     order = torch.argsort(activity, dim=1, stable=True)
@@ -56,8 +59,8 @@ def lowest(activity: Tensor, fraction: float = 0.2) -> Tensor:
 
 
 def masked(network: SiameseNetwork, drop: Tensor) -> SiameseNetwork:
-    """A copy in which the capsules ``drop`` are masked, but still computed. ``drop`` is ``(T, K)``
-    bool."""
+    """Copy a network and mask the primary capsules ``drop`` in the copy. Masked capsules are
+    ignored, but still computed. ``drop`` is ``(T, K)`` bool."""
     copied = copy.deepcopy(network)
     layer = copied.branch.capsules
     layer.alive.copy_(~drop.flatten())
@@ -66,8 +69,8 @@ def masked(network: SiameseNetwork, drop: Tensor) -> SiameseNetwork:
 
 
 def pruned(network: SiameseNetwork, drop: Tensor, name: str = "capsule-pruned") -> SiameseNetwork:
-    """A copy without the capsules ``drop``. ``drop`` is ``(T, K)`` bool, with the same number of
-    capsules for each type.
+    """Copy a network without the primary capsules ``drop``. ``drop`` is ``(T, K)`` bool, with the
+    same number of capsules for each type.
 
     Args:
         name: name of the copy, one of ``PRUNED``.
@@ -88,7 +91,8 @@ def pruned(network: SiameseNetwork, drop: Tensor, name: str = "capsule-pruned") 
 
 
 def with_iterations(network: SiameseNetwork, iterations: int) -> SiameseNetwork:
-    """A copy with another number of routing iterations. The paper does not do this."""
+    """Copy a network and give the copy a different number of routing iterations. Zhou and Sun
+    (2025) do not do this."""
     copied = copy.deepcopy(network)
     branch = copied.branch
     branch.shape = branch.shape.model_copy(update={"iterations": iterations})

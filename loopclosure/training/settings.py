@@ -1,4 +1,4 @@
-"""The settings of a training run, and presets."""
+"""The settings of a training run, and the presets of these settings."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from vslam.loopclosure.training.branches import CapsuleShape
 
 
 class TrainSettings(BaseModel):
-    """The settings of a training run. ``settings.json`` stores them, and ``--settings`` reads
-    them."""
+    """The settings of a training run. The file ``settings.json`` stores the settings, and the
+    option ``--settings`` reads such a file."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -95,8 +95,8 @@ _BEST = TrainSettings(
     validation_images=400,
 )
 PRESETS = {
-    # The settings of the paper. The paper does not state the strengths of the augmentation or how
-    # pairs are mined.
+    # The settings of Zhou and Sun (2025). Their paper does not state the strengths of the
+    # augmentation or how pairs are mined.
     "paper": TrainSettings(),
     # The contrastive loss compares every image of a batch with every other image. The augmentation
     # is stronger. Most pairs show the same place, because this loss takes images of different
@@ -121,7 +121,8 @@ PRESETS = {
 
 
 def load_settings(path: Path) -> TrainSettings:
-    """Read settings from a JSON file. Keys that are missing keep their defaults.
+    """Read the settings of a training run from a JSON file. Settings that are missing in the file
+    keep their defaults.
 
     Raises:
         InputError: the file is missing or not JSON, a key is unknown, or a value is out of range.

@@ -23,21 +23,23 @@ _SOFTNESS = 0.04  # temperature of the soft maximum over alignments, in units of
 
 
 def aligned(alike: Tensor, most: Tensor) -> Tensor:
-    """Cosine similarity of two images under the best horizontal alignment of their views.
+    """Compute the cosine similarity of two images after the best horizontal alignment of their
+    views.
 
-    The descriptor of an image consists of the descriptors of its views, which are parts of the
-    image from left to right. After a rotation of the camera, an object appears in a different view.
-    Therefore, the views of one image are shifted to the left or right, by up to half the number of
-    views. For each shift, a cosine similarity is computed from the views that overlap.
+    An image is divided into views from left to right, and the descriptor of the image consists of
+    the descriptors of its views. After a rotation of the camera, an object appears in a different
+    view. Therefore, the views of one image are shifted to the left or right, by up to half the
+    number of views. For each shift, a cosine similarity is computed from the views that overlap.
 
     The result is the soft maximum of these similarities. A soft maximum is used because two shifts
     may fit about equally well. This happens if the camera has rotated by half the spacing of the
-    views, or has driven forwards. The result can slightly exceed 1. The paper compares only whole
-    images.
+    views, or has moved forwards. The result can slightly exceed 1. Zhou and Sun (2025) compare only
+    whole images.
 
     Args:
-        alike: ``(..., V, V)`` scalar products of the descriptors of the views.
-        most: ``(..., V, V)`` products of the lengths of these descriptors.
+        alike: ``(..., V, V)`` scalar products of the descriptors of each view of one image and each
+            view of the other image.
+        most: ``(..., V, V)`` products of the lengths of the same descriptors.
     """
     views = alike.shape[-1]
     v = torch.arange(views, device=alike.device)
@@ -48,8 +50,8 @@ def aligned(alike: Tensor, most: Tensor) -> Tensor:
 
 
 def cosines(a: Tensor, b: Tensor, views: int = 1) -> Tensor:
-    """Cosine similarities ``(N, M)`` of descriptors ``(N, D)`` and ``(M, D)``. If the descriptors
-    have several views, these are :func:`aligned`."""
+    """Compute the ``(N, M)`` cosine similarities of ``(N, D)`` descriptors and ``(M, D)``
+    descriptors. If the images have several views, the views are first aligned (:func:`aligned`)."""
     if views == 1:
         return a @ b.T
     a, b = _by_view(a, views), _by_view(b, views)
@@ -60,20 +62,22 @@ def cosines(a: Tensor, b: Tensor, views: int = 1) -> Tensor:
 
 
 def _by_view(descriptors: Tensor, views: int) -> Tensor:
-    """Split descriptors ``(N, V D)`` into the descriptors of their views, ``(N, V, D)``."""
+    """Split ``(N, V D)`` descriptors of images into the ``(N, V, D)`` descriptors of their V
+    views."""
     return descriptors.view(len(descriptors), views, descriptors.shape[1] // views)
 
 
 def _lengths(views: Tensor) -> Tensor:
-    """Lengths ``(N, V)`` of the descriptors ``(N, V, D)`` of views."""
+    """Compute the ``(N, V)`` lengths of the ``(N, V, D)`` descriptors of views."""
     return torch.linalg.vector_norm(views, dim=2)
 
 
 class DistanceHead(nn.Module):
-    """Computes ``p = sigmoid(a - b d)`` (Eq. 2) from the distance d of two descriptors (Eq. 10),
-    with a, b > 0.
+    """Computes the probability p that two images show the same place from the distance d of their
+    descriptors: ``p = sigmoid(a - b d)`` with a, b > 0 (equations 2 and 10 of Zhou and Sun, 2025).
 
-    With several views, d is computed from their :func:`aligned` cosine similarity.
+    If the images have several views, d is computed from the cosine similarity after the views are
+    aligned (:func:`aligned`).
     """
 
     def __init__(self, views: int = 1) -> None:
@@ -85,24 +89,25 @@ class DistanceHead(nn.Module):
         self.log_b = nn.Parameter(torch.tensor(1.4))
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
-        """Logits ``(N,)`` of N pairs of descriptors of norm 1. Both arguments are ``(N, D)``."""
+        """Compute the ``(N,)`` logits of N pairs of descriptors of norm 1. Both arguments are
+        ``(N, D)``."""
         a, b = _by_view(a, self.views), _by_view(b, self.views)
         most = _lengths(a)[:, :, None] * _lengths(b)[:, None]
         return self.of_cosine(aligned(a @ b.transpose(1, 2), most))
 
     def of_cosine(self, cosine: Tensor) -> Tensor:
-        """Logits from the cosine similarities of descriptors of norm 1. Their distance is
-        ``sqrt(2 - 2 cos)``."""
+        """Compute logits from the cosine similarities of descriptors of norm 1. The distance of two
+        such descriptors is ``sqrt(2 - 2 cos)``."""
         d = torch.sqrt((2.0 - 2.0 * cosine).clamp_min(0.0) + TINY)
         return self.log_a.exp() - self.log_b.exp() * d
 
     def compare(self, query: Tensor, gallery: Tensor, lengths: Tensor) -> Tensor:
-        """Compare an image with a gallery of images by one matrix product.
+        """Compare an image with a gallery of M images, using a single matrix product.
 
         Args:
             query: ``(V, d)`` descriptors of the views of the image.
             gallery: ``(M, V, d)`` descriptors of the views of M images.
-            lengths: ``(M, V)`` lengths of the descriptors of the gallery.
+            lengths: ``(M, V)`` lengths of the descriptors in ``gallery``.
 
         Returns:
             ``(M,)`` logits of the similarities.
@@ -132,31 +137,33 @@ class SiameseNetwork(nn.Module):
         return functional.normalize(self.branch(images).float(), dim=1)
 
     def cosines(self, a: Tensor, b: Tensor) -> Tensor:
-        """``(N, M)`` aligned cosine similarities of descriptors ``(N, D)`` and ``(M, D)``."""
+        """Compute the ``(N, M)`` cosine similarities of ``(N, D)`` descriptors and ``(M, D)``
+        descriptors, after the views of the images are aligned (:func:`aligned`)."""
         return cosines(a, b, self.branch.views)
 
     def logits(self, a: Tensor, b: Tensor) -> Tensor:
-        """Logits ``(N,)`` of the probabilities that ``similarity`` returns. The loss needs the
-        logits."""
+        """Compute the ``(N,)`` logits of the probabilities that ``similarity`` returns. The loss
+        needs the logits."""
         return self.head(a, b)
 
     def similarity(self, a: Tensor, b: Tensor) -> Tensor:
-        """Probabilities ``(N,)`` in (0, 1) that two images show the same place, for N pairs of
-        descriptors. Both arguments are ``(N, D)``."""
+        """Compute the ``(N,)`` probabilities, in (0, 1), that two images show the same place, for N
+        pairs of descriptors. Both arguments are ``(N, D)``."""
         return torch.sigmoid(self.head(a, b))
 
     def compare(self, query: Tensor, gallery: Tensor) -> Tensor:
-        """Similarities ``(M,)`` of a descriptor ``(D,)`` and each of the descriptors ``(M, D)``."""
+        """Compute the ``(M,)`` similarities of a ``(D,)`` descriptor and each of ``(M, D)``
+        descriptors."""
         by_view = _by_view(gallery, self.branch.views)
         query = _by_view(query[None], self.branch.views)[0]
         return torch.sigmoid(self.head.compare(query, by_view, _lengths(by_view)))
 
     def forward(self, images: Tensor) -> Tensor:
-        """Same as :meth:`embed`."""
+        """Compute the descriptors of images, as :meth:`embed` does."""
         return self.embed(images)
 
     def n_parameters(self) -> int:
-        """Number of learned parameters."""
+        """Return the number of learned parameters."""
         return sum(p.numel() for p in self.parameters())
 
 
@@ -165,7 +172,7 @@ def build_network(name: str, shape: CapsuleShape | None = None) -> SiameseNetwor
 
     Args:
         name: one of ``NETWORKS``.
-        shape: shape of the capsule branch; None uses the shape of the paper.
+        shape: shape of the capsule branch; None uses the shape of Zhou and Sun (2025).
 
     Raises:
         InputError: the name is unknown.
@@ -203,7 +210,8 @@ def save_network(
 
 
 def load_network(path: Path) -> tuple[SiameseNetwork, dict[str, Any]]:
-    """Read a file that :func:`save_network` wrote. Returns the network in eval mode, and ``about``.
+    """Read a network from a file that :func:`save_network` wrote. Returns the network in eval mode,
+    and the argument ``about`` of :func:`save_network`.
 
     Raises:
         InputError: the file is missing, damaged or not from this version of vslam.
@@ -226,8 +234,8 @@ def load_network(path: Path) -> tuple[SiameseNetwork, dict[str, Any]]:
 
 
 def for_inference(network: SiameseNetwork) -> SiameseNetwork:
-    """Prepare a network for inference, in place. It is set to eval mode, its weights need no
-    gradients, and its batch normalisations are folded into the convolutions."""
+    """Prepare a network for inference, in place. The network is set to eval mode, its weights need
+    no gradients, and its batch normalisations are folded into the convolutions."""
     network.eval().requires_grad_(False)
     fold_batch_norms(network)
     return network

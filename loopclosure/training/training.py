@@ -1,9 +1,9 @@
-"""Trains a network in epochs of pairs. An interrupted training run can be resumed from a
-checkpoint.
+"""Trains a network on pairs of images, epoch by epoch. An interrupted training run can be resumed
+from a checkpoint.
 
 All random numbers depend only on the seed, the epoch and the number of the pair. A checkpoint
-therefore needs no generator states. A resumed training run is bit-identical to an uninterrupted
-one, if both run on the same machine with the same number of threads.
+therefore needs no states of random generators. A resumed training run gives bit-identical results
+to an uninterrupted training run, if both run on the same machine with the same number of threads.
 """
 
 from __future__ import annotations
@@ -68,12 +68,14 @@ _HEAD_RATE = 30.0  # factor for the scalars log a and log b: Adam's steps are to
 
 @dataclass(frozen=True)
 class TrainingOutcome:
-    """The outcome of a training run.
+    """The result of a training run.
 
     Attributes:
-        finished: False if the training run was stopped early. A call with ``resume`` continues it.
-        figures: validation figures of the best network after calibration.
-        progress: the progress of the training run, with the figures of every epoch.
+        finished: False if the training run was stopped early. In this case, a call of ``train``
+            with ``resume`` continues the training run.
+        figures: validation measures of the best network after calibration.
+        progress: the progress of the training run, with the loss and the validation measures of
+            every epoch.
         weights: file of the best network.
         train, validation: indices of the training and validation images.
     """
@@ -98,8 +100,8 @@ def train(
     on_step: OnStep | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> TrainingOutcome:
-    """Train a network. Its weights, a log, the lists of pairs and checkpoints are written to a
-    folder.
+    """Train a Siamese network. The weights, a log, the lists of image pairs, and checkpoints are
+    written to a folder.
 
     Args:
         collection: the images and their relations.
@@ -109,14 +111,14 @@ def train(
         threads: number of threads that augment images.
         resume: whether training continues from the checkpoint in the folder, if there is one.
         start: network to start from instead of random weights (fine-tuning).
-        on_step: called after each step.
-        should_stop: called after each step. If it returns True, a checkpoint is written and
-            training stops.
+        on_step: called after each training step.
+        should_stop: called after each training step. If it returns True, a checkpoint is written
+            and training stops.
 
     Raises:
         InputError: there is too little data, the device or a source is unknown, the device does not
-            support the required bfloat16, or the checkpoint has other settings. The error is also
-            raised if ``learned_share`` is set, but there is no network to start from.
+            support the required bfloat16, or the checkpoint has different settings. The error is
+            also raised if ``learned_share`` is set, but there is no network to start from.
         ResultsError: the loss is not finite, or the results cannot be written. If the loss is not
             finite, the last good checkpoint is kept.
     """
@@ -193,7 +195,7 @@ def calibrated(
     weights: Path,
     device: torch.device,
 ) -> dict[str, float]:
-    """Calibrate a network and write its weights. Returns its validation figures.
+    """Calibrate a network and write its weights. Returns the validation measures of the network.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -207,8 +209,8 @@ def calibrated(
 
 @dataclass(frozen=True)
 class _Training:
-    """The data that training steps read, and the state that they change. The state consists of
-    network, optimiser and progress."""
+    """The data that training steps read, and the state that training steps change. The state
+    consists of the network, the optimiser and the progress."""
 
     collection: Collection
     settings: TrainSettings
@@ -256,8 +258,8 @@ class _Training:
         return value
 
     def _augmented(self, a: NDArray[np.int64], b: NDArray[np.int64], first: int) -> torch.Tensor:
-        """Augmented images of N successive pairs of the epoch, ``(2 N, 3, H, W)``. ``first`` is the
-        index of the first of these pairs in the epoch."""
+        """Augment the images of N successive pairs of the epoch. Returns ``(2 N, 3, H, W)`` images.
+        ``first`` is the index of the first of these pairs in the epoch."""
         settings, epoch = self.settings, self.progress.epoch
 
         def augmented(job: tuple[int, int, int]) -> NDArray[np.uint8]:
@@ -276,7 +278,7 @@ class _Training:
         return to_tensor(np.stack(list(self.pool.map(augmented, jobs))))
 
     def pairs_of_epoch(self) -> Pairs:
-        """Draw the pairs of the current epoch."""
+        """Draw the image pairs of the current epoch."""
         settings, network, images, hard = self.settings, self.network, self.images, None
         rng = np.random.default_rng([settings.seed, 4, self.progress.epoch])
         # There are no hard pairs in the first epoch, because random weights would not find any.
@@ -296,7 +298,8 @@ class _Training:
         )  # fmt: skip
 
     def end_epoch(self, validation: NDArray[np.int64], weights: Path) -> None:
-        """Validate the network. Its weights are written if they are the best so far."""
+        """Validate the network after an epoch. Its weights are written if they are the best so
+        far."""
         network, progress = self.network, self.progress
         augmentation = self.settings.augmentation
         figures = validate(network, self.collection, validation, augmentation, self.device)[0]
@@ -318,8 +321,8 @@ class _Training:
 
 
 def _optimiser(network: SiameseNetwork, settings: TrainSettings) -> torch.optim.Optimizer:
-    """Adam with separate learning rates for the extractor and the head. Frozen blocks are
-    excluded."""
+    """Create an Adam optimiser with separate learning rates for the extractor and the head. Frozen
+    blocks are excluded."""
     extractor = network.branch.extractor
     if isinstance(extractor, LiteExtractor):
         extractor.freeze(settings.frozen)
@@ -338,7 +341,7 @@ def set_threads(threads: int) -> None:
 
 
 def open_device(name: str) -> torch.device:
-    """The torch device with the given name.
+    """Return the torch device with the given name.
 
     Raises:
         InputError: the device is unknown or not available.
@@ -351,7 +354,7 @@ def open_device(name: str) -> torch.device:
 
 
 def _mixed_precision(settings: TrainSettings, device: torch.device) -> bool:
-    """Whether the network computes in bfloat16."""
+    """Return whether the network computes in bfloat16."""
     supported = device.type == "cpu" or torch.cuda.is_bf16_supported()
     if settings.mixed_precision and not supported:
         raise InputError("mixed_precision: this GPU does not support bfloat16; leave it out.")
@@ -361,7 +364,7 @@ def _mixed_precision(settings: TrainSettings, device: torch.device) -> bool:
 
 
 def write_log(path: Path, history: list[dict[str, float]]) -> None:
-    """Write the figures of each epoch as a CSV file.
+    """Write the loss and the validation measures of each epoch as a CSV file.
 
     Raises:
         ResultsError: the file cannot be written.

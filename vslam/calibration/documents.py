@@ -66,7 +66,10 @@ class Document:
         return self._numbers(key, f"{wanted} numbers" if counts else "numbers", *counts)
 
     def matrix(self, key: str, rows: int, columns: int) -> Array:
-        """Return the ``(rows, columns)`` matrix at a key. Its rows may be nested lists or one list."""
+        """Return the ``(rows, columns)`` matrix at a key.
+
+        The value may be a list of rows, or a flat list of the numbers row by row.
+        """
         found = self._numbers(key, f"{rows}x{columns} numbers", rows * columns)
         return np.array(found).reshape(rows, columns)
 

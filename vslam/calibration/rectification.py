@@ -213,7 +213,10 @@ def _inner_rectangle(model: CameraModel, R_own_rectified: Array, source: str) ->
 
 
 def _check_view(model: CameraModel, R_own_rectified: Array, camera: Camera, source: str) -> None:
-    """Reject a rectified camera if the original image shows part of its view twice or not at all."""
+    """Reject a rectified camera if the original image shows its view twice or not at all.
+
+    This applies to every part of the view.
+    """
     xy = np.concatenate(_borders(camera.width, camera.height))
     rays = camera.backproject(xy, np.ones(len(xy))) @ R_own_rectified.T
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)

@@ -15,9 +15,10 @@ DRIFT = se3_exp(np.array([2.0, 0.3, -4.0, 0.01, 0.12, 0.0]))
 
 
 class Street:
-    """A map as consistency asks it: keyframes 2 m apart, driven twice, covisible up to 6 m.
+    """A map that has only what the check of consistency needs.
 
-    The second pass starts with keyframe 100 and has drifted.
+    Its keyframes are 2 m apart on a street that is driven twice. Keyframes up to 6 m apart are
+    covisible. The second pass starts with keyframe 100 and has drifted.
     """
 
     def covisible(self, keyframe: int, minimum: int = 1):

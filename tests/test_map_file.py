@@ -121,7 +121,7 @@ def test_all_of_a_map_comes_back(slam, file, check_map):
 
 
 def test_observations_keep_their_order(slam, file):
-    """The newest ones vote on the descriptor of a landmark."""
+    """Only the newest observations determine the descriptor of a landmark."""
     before, after = slam.map, load_map(file).map
     keyframe = int(before.living_keyframes()[5])
     old = before.landmarks_of(keyframe)
@@ -172,7 +172,10 @@ def test_loops_images_drives_and_world_come_back(slam, tmp_path):
 
 
 def test_what_the_detector_knew_comes_back(slam, file, ring):
-    """Words need not be looked up again: the same candidates with the same scores."""
+    """The detector finds the same candidates with the same scores.
+
+    It need not look up the words again.
+    """
     again = create_detector("bow", CONFIG)
     stored = load_map(file)
     again.restore(stored.detector)
@@ -464,7 +467,7 @@ def test_a_damaged_checkpoint_is_refused(apply, at_checkpoint, tmp_path):
 
 
 def test_a_drive_that_has_made_no_keyframe_yet_is_resumed(at_checkpoint, tmp_path):
-    """One that began in the map of another drive."""
+    """The drive began in the map of a different drive."""
     path = tmp_path / "m.npz"
     begun = {"last_frame": -1, "last_timestamp": -np.inf}
     checkpoint = header_of(at_checkpoint)["checkpoint"]

@@ -85,7 +85,7 @@ def test_an_appended_map_is_as_it_was(drives, check_map):
 
 
 def test_drives_that_meet_become_one_map(drives, ring, check_map, tmp_path):
-    """The second one only by way of the third."""
+    """The first and the second drive are connected only through the third drive."""
     merged = merge_maps(drives, CONFIG, create)
     assert merged.joined == [2, 1]
     assert merged.left_out == []

@@ -270,7 +270,7 @@ def test_the_map_is_not_to_be_had_while_a_keyframe_is_mapped(workers):
 
 
 def test_a_trajectory_is_not_to_be_had_even_if_all_frames_follow_the_reference_keyframe():
-    """As at the beginning of another drive in a map."""
+    """This is the state at the beginning of a new drive in an existing map."""
     drive = Drive()
     drive.steps([0, 3], 6)
     map_ = drive.mapper.complete()
@@ -308,7 +308,10 @@ MOVES = [se3_exp(np.array(twist)) for twist in ([0.3, 0, 0, 0, 0.02, 0], [0, 0, 
 
 @late_and_early
 def test_held_frames_follow_a_merge(workers):
-    """One that is placed follows its keyframe, one that is not follows the reference keyframe."""
+    """A placed frame follows its keyframe.
+
+    A frame that is not placed follows the reference keyframe.
+    """
 
     def move(map_: Map, keyframe: int) -> None:
         for k in range(keyframe + 1 if keyframe else 0):
@@ -436,7 +439,10 @@ def test_where_the_unit_of_a_monocular_map_changes_speeds_and_poses_change_with_
 
 @pytest.mark.parametrize("adjusting", [False, True])
 def test_where_culled_landmarks_are_dropped_frames_track_the_same_points(adjusting, monkeypatch):
-    """Not while a global bundle adjustment runs, which knows landmarks by their numbers."""
+    """Culled landmarks are not dropped during a global bundle adjustment.
+
+    It refers to landmarks by their numbers.
+    """
 
     def kill(map_: Map, keyframe: int) -> None:
         if keyframe == 1:
@@ -509,7 +515,10 @@ def test_a_place_is_old_when_its_keyframe_is(known_after_s, known):
 
 @pytest.mark.parametrize("is_due", [False, True])
 def test_an_old_keyframe_can_serve_in_place_of_a_new_one(is_due):
-    """If a global bundle adjustment is due then, it is merged as a keyframe would be."""
+    """The old keyframe also counts for the merge of a global bundle adjustment.
+
+    If its result is due, it is merged as with a new keyframe.
+    """
     drive = Drive(known_after_s=0.3)
     drive.steps([0, 3], 6)
     mapper, frame = drive.mapper, drive.last
@@ -685,7 +694,10 @@ def test_a_detector_that_fails_costs_its_loops_alone(tmp_path, caplog):
 
 
 def test_a_mapper_that_is_restored_goes_on_as_the_one_that_was_not():
-    """The reference keyframe is not the newest, as after a frame was found in the map."""
+    """The reference keyframe is not the newest keyframe.
+
+    This happens after a frame was relocalised in the map.
+    """
     one = Drive()
     one.steps([0, 3], 6)
     one.mapper.append_pose(one.next_frame(), tracked=True, near=0)

@@ -197,7 +197,7 @@ def test_ratio_test_of_features_on_one_level(ratio):
 
 
 def test_ratio_test_spares_a_rival_of_another_level():
-    """ORB-SLAM compares best and second best only where both are of one pyramid level."""
+    """The ratio test of ORB-SLAM applies only to matches on the same pyramid level."""
     rng = np.random.default_rng(0)
     descriptor = random_descriptors(rng, 1)
     features = np.concatenate([with_flips(rng, descriptor, 20), with_flips(rng, descriptor, 22)])

@@ -62,7 +62,10 @@ def found(frame: Frame) -> Found:
 
 
 def test_localising_leaves_the_map_alone():
-    """To the byte, the counts of what frames saw included."""
+    """The map is byte-identical afterwards.
+
+    This includes the counts of how often landmarks were seen.
+    """
     drive = Building.with_a_map()
     mapper, mode = drive.mapper, Mode(drive.mapper)
     lost, tracked = drive.lost_frame(10), drive.placed_frame()
@@ -131,7 +134,10 @@ def test_a_monocular_map_begins_with_the_second_view():
 
 @pytest.mark.parametrize("twist", [TWIST, None])
 def test_a_sub_map_is_placed_by_the_prediction_if_the_speed_is_known(twist):
-    """The frame tracks nothing of the map before, even if it did when it was lost."""
+    """The frame tracks no landmark of the previous map.
+
+    It may have tracked some when it was lost.
+    """
     drive = Building.with_a_map()
     drive.tracker.resume(twist)
     frame = drive.placed_frame()
@@ -145,7 +151,10 @@ def test_a_sub_map_is_placed_by_the_prediction_if_the_speed_is_known(twist):
 
 @pytest.mark.parametrize(("young_keyframes", "patience"), [(2, 1), (1, 3)])
 def test_a_lost_stereo_camera_begins_a_sub_map_sooner_in_a_young_map(young_keyframes, patience):
-    """Of two keyframes: after one frame where that is young, else after three."""
+    """A map with two keyframes is young.
+
+    There, a sub-map begins after one lost frame. Otherwise, it begins after three.
+    """
     drive = Building.with_a_map(tracking={"young_keyframes": young_keyframes})
     for n in range(1, patience + 1):
         begun = drive.mode.begin_after_loss(drive.lost_frame(1))
@@ -235,7 +244,7 @@ def test_a_frame_of_the_right_camera_becomes_no_keyframe():
 
 @pytest.mark.parametrize(("idle", "made"), [(True, True), (False, False)])
 def test_a_frame_that_is_not_urgent_waits_for_mapping(idle, made):
-    """It tracks seven tenths of what the reference keyframe sees."""
+    """The frame tracks seven tenths of the landmarks that the reference keyframe sees."""
     drive = Building.with_a_map(min_tracked_close=0, merge_after_frames=50, max_interval_s=50.0)
     if not idle:
         drive.mapper.insert(drive.placed_frame())

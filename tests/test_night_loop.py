@@ -42,7 +42,7 @@ def test_the_loop_says_that_the_network_found_and_verified_it(compared):
 
 
 def test_the_library_closes_it_without_being_told_how(round_the_block, compared):
-    """``Slam(camera)`` gives the trajectory of the command, to the byte."""
+    """``Slam(camera)`` gives a trajectory that is byte-identical to that of the command."""
     slam = Slam(round_the_block.camera)
     for k, timestamp in enumerate(round_the_block.timestamps):
         left, right = round_the_block.read(k)

@@ -227,7 +227,10 @@ def test_too_few_sequences_for_a_test_are_said(written):
 
 
 def test_wilcoxon_pairs_sequences_not_runs():
-    """Six sequences, three runs each: n is 6, and p the least that 6 pairs can give."""
+    """There are six sequences with three runs each.
+
+    Therefore, n is 6, and p is the smallest value that is possible with 6 pairs.
+    """
     assert least_pairs() == 6
     runs = [
         entry(
@@ -447,7 +450,7 @@ def thresholds(run_folder: Path, tmp_path: Path) -> Path:
 
 
 def test_thresholds_do_not_concern_other_systems(thresholds: Path):
-    """Their runs have no ``run.json``."""
+    """Runs of other systems have no ``run.json``."""
     for folder in thresholds.iterdir():
         (folder / "run.json").unlink()
     assert {run.system for run in collect([thresholds], []).runs} == {"bow"}
@@ -684,7 +687,10 @@ page.src = "report.html";
 
 @pytest.mark.slow
 def test_report_in_a_browser_as_wide_as_a_phone(written, tmp_path: Path):
-    """Chromium, 400 px: all figures are drawn, nothing sticks out, nothing is asked for."""
+    """In Chromium at a width of 400 px, all figures are drawn.
+
+    Nothing is wider than the page. The page requests nothing from the network.
+    """
     chromium()
     served = tmp_path / "served"
     served.mkdir()

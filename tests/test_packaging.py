@@ -139,7 +139,10 @@ def test_the_readme_of_a_registry_has_no_link_that_leads_nowhere(wheels, tmp_pat
 
 
 def test_a_plain_installation_stays_lean():
-    """What only some need is in an extra, and the error names the extra."""
+    """Packages that only some users need are in an extra.
+
+    If one is missing, the message names the extra.
+    """
     plain = " ".join(PROJECT["dependencies"])
     extras = {
         re.split(r"[<>=\[]", item)[0]

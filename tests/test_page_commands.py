@@ -322,7 +322,10 @@ def is_shell(command: str) -> bool:
 
 @pytest.mark.parametrize("path", PAGES, ids=name)
 def test_every_page_with_commands_has_rules(path: Path):
-    """A page is run here, or elsewhere; and what is not run is on the page still."""
+    """Every page is tested here or in another test.
+
+    The commands that are not run still exist on the page.
+    """
     commands = list(commands_of(path.read_text()))
     if is_elsewhere(path):
         return

@@ -113,7 +113,7 @@ def test_few_frames_need_features_and_the_pose_is_as_good(corridor):
 
 
 def test_image_alignment_that_follows_a_moving_object_is_not_believed(corridor, monkeypatch):
-    """The patches are searched for again from the predicted pose."""
+    """The patches are searched for again, starting from the predicted pose."""
 
     misled_poses = []
 

@@ -130,7 +130,7 @@ def test_damaged_image_data_is_not_taken_for_an_image():
 
 
 def test_no_mutation_is_accepted_with_other_pixels_than_opencvs():
-    """What is decoded here OpenCV decodes to the same pixels."""
+    """If vslam decodes a damaged file, OpenCV decodes it to the same pixels."""
     image = picture(24, 40)
     whole = png(image, zlib.compress(filtered(image, np.resize([4, 1, 2, 3], 24))), pieces=2)
     rng = np.random.default_rng(0)
@@ -175,7 +175,7 @@ def test_an_image_with_a_wrong_check_sum_is_named(tmp_path):
 
 
 def test_a_chunk_that_is_longer_than_the_file_is_seen_and_takes_no_memory(tmp_path):
-    """OpenCV would take 2 GB for it."""
+    """OpenCV would allocate 2 GB for such a chunk."""
     grey = np.random.default_rng(0).integers(0, 256, (48, 64), dtype=np.uint8)
     data = cv2.imencode(".png", grey)[1].tobytes()
     at = data.index(b"IDAT") - 4

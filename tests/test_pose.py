@@ -115,7 +115,10 @@ def test_finds_gtsams_optimum_of_the_inliers(kind):
 
 
 def test_octaves_weigh_the_observations():
-    """Half of the points are displaced by 1 px: the better half wins if its sigma is smaller."""
+    """Half of the points are displaced by 1 px.
+
+    The pose follows the other half if its sigma is smaller.
+    """
     points, uvr, _ = observations("stereo")
     uvr[::2, :2] += 1.0
     weight = np.ones(120)

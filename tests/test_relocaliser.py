@@ -223,7 +223,7 @@ def test_a_doubtful_frame_that_is_found_nowhere_stays_exactly_as_it_is():
 
 
 def test_what_a_frame_tracked_before_is_gone_where_it_is_found():
-    """Its old matches are not mixed with those of the place."""
+    """The previous matches of the frame are not mixed with those at the new place."""
     place, n_there = by_orb()
     track_elsewhere(place.frame)
     place.find_better(10)

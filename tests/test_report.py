@@ -590,7 +590,10 @@ def test_a_right_loop_on_a_revisit_too_short_to_count_is_explained() -> None:
 
 
 def test_before_is_drawn_in_the_frame_of_the_ground_truth() -> None:
-    """An estimate in a world of its own, aligned: the keyframes before follow the alignment."""
+    """The estimate has its own world frame and is aligned.
+
+    The keyframes before the correction are aligned in the same way.
+    """
     outcome = two_laps()
     T = np.eye(4)
     T[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
@@ -659,7 +662,10 @@ def test_without_ground_truth(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_ground_truth_of_some_frames(tmp_path: Path) -> None:
-    """Errors are of these frames; of loops nobody can say where the drive comes back."""
+    """Errors are computed for the frames with ground truth.
+
+    Loops are not evaluated, because revisits cannot be determined.
+    """
     whole = make_outcome(60, lost=slice(20, 21))
     known = whole.sequence.ground_truth.copy()
     known[:15] = np.nan

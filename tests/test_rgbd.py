@@ -283,8 +283,10 @@ def test_few_images_without_a_partner_are_not_worth_a_warning(tmp_path):
 
 
 def test_images_whose_depth_is_paired_with_another_image_are_counted_apart(copy):
-    """Depth begins with the fourth image, and at half of the rate: one depth image lies between
-    the images 3 and 4, nearer to the first."""
+    """Depth begins with the fourth image and has half of the rate.
+
+    One depth image lies between the images 3 and 4, and is nearer to image 3.
+    """
     times = [100.0, 100.1, 100.2, 100.3, 100.33]
     rgb, depth = (
         [line.split()[1] for line in (copy / f"{name}.txt").read_text().splitlines()

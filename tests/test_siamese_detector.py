@@ -296,7 +296,10 @@ def test_the_network_sees_nothing_until_the_camera_may_be_back():
 
 @pytest.mark.slow
 def test_a_run_takes_the_weights_of_a_file(kitti_tree, tmp_path):
-    """With random weights places are found by similarity alone: geometry must refuse them."""
+    """With random weights, many wrong places are similar.
+
+    Geometric verification must reject them.
+    """
     path = tmp_path / "capsule.onnx"
     export_onnx(small_network(), path)
     settings = tmp_path / "config.json"
@@ -375,7 +378,7 @@ def test_train_writes_weights_and_card(tmp_path):
 
 @pytest.mark.parametrize("name", ["capsule", "capsule-pruned", "capsule-paper"])
 def test_shipped_weights_know_a_place_again(name):
-    """Moved and darker they are still the same place."""
+    """The images are moved and darker, but show the same place."""
     about = open_network(name).about
     assert about["validation"]["average_precision"] > 0.4
     again = [np.uint8(np.roll(wall, 12, 1) * 0.7) for wall in WALLS]

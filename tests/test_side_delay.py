@@ -105,8 +105,11 @@ def test_a_delay_is_measured_and_reported_unless_the_calibration_gives_it(delay)
 
 @pytest.mark.slow
 def test_a_known_delay_costs_a_drive_little():
-    """A quarter of a ring road at 15 m/s, the right image 5 ms late. What is left comes from the
-    first frame, whose motion is not known."""
+    """The car drives a quarter of a ring road at 15 m/s.
+
+    The right image is 5 ms late. The remaining error comes from the first frame, whose motion is
+    not known.
+    """
     frames = [float(k) for k in range(LAP // 4)]
     T_start = inverse(Ring.create().pose(0))
     truth = np.array([(T_start @ Ring.create().pose(k))[:3, 3] for k in frames])
@@ -138,7 +141,7 @@ def test_a_few_frames_are_not_believed():
 
 
 def test_contradicting_frames_are_doubted():
-    """A delay in every other group of frames is none of the rig."""
+    """A delay in only every other group of frames is not a property of the rig."""
     found = SideDelay(CAMERA, CONFIG)
     for k, twist in enumerate(drive(60)):
         add(found, seen(twist, 6e-3 * (k // 5 % 2), seed=k)[0], twist)

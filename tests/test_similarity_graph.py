@@ -58,8 +58,11 @@ def test_similarities_compose_by_matrix_product():
 
 
 def test_scale_alone_spreads_by_the_variances():
-    """With all keyframes in one place, least squares distributes the scale error of the loop over
-    the chain: each edge gets its sigma^2 divided by the sum of all, including the loop's."""
+    """All keyframes are at the same place.
+
+    Least squares distributes the scale error of the loop over the chain. The share of an edge is
+    its sigma^2 divided by the sum over all edges, including the loop edge.
+    """
     n, drift = 9, 0.02
     config = CONFIG.model_copy(update={"robust_scale": 1e3})  # Gaussian, for the closed form
     graph = chain(np.tile(np.eye(4), (n, 1, 1)), np.eye(4), np.exp(drift))
@@ -104,7 +107,11 @@ def test_a_lap_whose_scale_drifted_closes():
 
 
 def test_where_tracking_was_lost_the_error_of_a_lap_spreads_if_the_camera_drove_on():
-    """Lost half way: the unit jumps by a third, the gap is predicted too short and askew."""
+    """Tracking is lost half-way.
+
+    The unit changes by a third, and the predicted motion in the gap is too short and has a wrong
+    direction.
+    """
     growth, after = 1.004, 60
     truth, estimate = drifted_lap(growth)
     steps = inverses(estimate)[:-1] @ estimate[1:]

@@ -167,7 +167,7 @@ def test_the_calibration_of_the_tutorial_is_read(tmp_path: Path):
 @pytest.mark.slow
 @pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
 def test_commands_of_the_tutorials_run(path: Path, corridor, tmp_path: Path):
-    """Every shell block, on fewer frames; the video is the corridor of the tests."""
+    """Every shell block is run with fewer frames. The video shows the corridor of the tests."""
     pairs = [np.hstack(pair) for pair in zip(corridor.left, corridor.right, strict=True)]
     write_video(tmp_path / "drive.mkv", corridor.left[:12])
     write_video(tmp_path / "pair.mkv", pairs[:12])
@@ -211,7 +211,10 @@ next();
 
 @pytest.mark.slow
 def test_pages_in_a_browser_as_wide_as_a_phone(site: Path, tmp_path: Path):
-    """Chromium, 400 px: nothing sticks out, letters are large enough, no other host is asked."""
+    """In Chromium at a width of 400 px, nothing is wider than the page.
+
+    Letters are large enough. The pages request nothing from other hosts.
+    """
     chromium()
     shown = ["index", "tutorial/first_run", "reference/commands", "reference/thresholds",
              "explanation/design", "howto/plugins", "reference/generated/vslam.slam",

@@ -77,7 +77,10 @@ def test_sub_pixel_disparity(disparity):
 
 
 def test_sub_pixel_offsets_follow_the_shift():
-    """Rounding to whole pixels would make steps of 1 of these steps of a quarter."""
+    """The shifts differ by a quarter of a pixel.
+
+    If disparities were rounded to whole pixels, they would differ by 0 or 1.
+    """
     medians = []
     for dx in (8.0, 8.25, 8.5, 8.75):
         left, found = match(dx)
@@ -94,7 +97,7 @@ def test_infinitely_far_points_get_a_tiny_positive_disparity():
 
 
 def test_nothing_beyond_the_greatest_disparity():
-    """Disparity fx is a point one baseline away."""
+    """A disparity of fx pixels belongs to a point at a depth of one baseline."""
     left, found = match(60.0, fx=70.0)
     assert np.count_nonzero(np.isfinite(found)) > 0.5 * np.count_nonzero(seen_by_both(left, 60.0))
     _, beyond = match(60.0, fx=40.0)

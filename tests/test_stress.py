@@ -463,7 +463,7 @@ def test_a_template_must_hold_both_places(template):
 
 @pytest.mark.slow
 def test_from_the_command_line_with_another_system(tmp_path):
-    """The clean run is perfect; darkness turns the ruler's path to a wrong one."""
+    """The run on unperturbed images is perfect. In dark images, the trajectory is wrong."""
     root = make_kitti(tmp_path / "data")
     script = tmp_path / "ruler.py"
     measured = """

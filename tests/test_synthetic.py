@@ -259,7 +259,7 @@ def test_moving_cars_keep_clear(unpainted):
 
 @pytest.mark.slow
 def test_sight_lines_are_closed_at_bends(unpainted):
-    """All over the demo's loop hardly a ray near the horizon meets nothing."""
+    """Along the whole loop of the demo, nearly every ray near the horizon meets a surface."""
     route = built_in_route("demo")
     town = build_town(route, Variation())
     renderer = Renderer(route.camera, town.atlas, town.sky, 2)

@@ -126,7 +126,7 @@ def test_the_camera_moves_on_while_it_is_lost():
 
 
 def test_the_speed_is_measured_from_the_last_frame_that_was_tracked():
-    """Not from the poses predicted in between, which here are those of a camera that stands."""
+    """Predicted poses are not used. Here, they are the poses of a camera that stands still."""
     drive = Drive()
     drive.accept(0)
     drive.lose(1)
@@ -180,8 +180,11 @@ def test_a_continued_drive_has_the_speed_that_it_is_told():
 
 @pytest.mark.parametrize(("pixels", "found_again"), [(12, True), (200, False)])
 def test_what_the_last_frame_saw_is_looked_for_near_the_prediction(pixels, found_again):
-    """12 pixels off: too far for the window around landmarks of the map. The reference keyframe
-    shows nothing here."""
+    """The points are 12 pixels away.
+
+    This is too far for the window around landmarks of the map. The reference keyframe has no
+    matches here.
+    """
     drive, view = Drive.of_two_frames(), POINTS.view(nearest=NOTHING)
     frame = drive.next_frame()
     found = drive.track(frame, view, ahead(0.0, pixels / CAMERA.fx) @ at(2))
@@ -192,7 +195,7 @@ def test_what_the_last_frame_saw_is_looked_for_near_the_prediction(pixels, found
 
 
 def test_where_the_last_frame_shows_other_things_the_reference_keyframe_is_tried():
-    """By descriptors alone: here the prediction is far from where the camera is."""
+    """Only descriptors are compared, because the predicted pose is far from the true pose."""
     drive, frame_sees = Drive.of_two_frames(SEEN_LAST), SEEN_NOW
     T_predicted = ahead(0.0, 0.5) @ at(2)
     frame = drive.next_frame(frame_sees)
@@ -209,7 +212,10 @@ def test_where_the_last_frame_shows_other_things_the_reference_keyframe_is_tried
 def test_where_neither_is_recognised_all_around_is_looked_for_near_the_prediction(
     pixels, found_again
 ):
-    """In a window of 7 pixels, or 11 where a landmark is seen from the side; 2.5 or 4 are usual."""
+    """The window has 7 pixels, or 11 if a landmark is seen from the side.
+
+    Usually, it has 2.5 or 4 pixels.
+    """
     drive, view = Drive.of_two_frames(SEEN_LAST), POINTS.view(nearest=SEEN_LAST)
     frame = drive.next_frame(SEEN_NOW)
     found = drive.track(frame, view, ahead(0.0, pixels / CAMERA.fx) @ at(2))
@@ -232,7 +238,10 @@ def test_a_prediction_with_few_inliers_is_not_trusted(last_saw, n_inliers, found
 @pytest.mark.parametrize("last_saw", [SEEN_LAST, ALL], ids=["predicted", "motion"])
 @pytest.mark.parametrize(("n_wrong", "found_again"), [(70, True), (71, False)])
 def test_a_prediction_with_a_small_share_of_inliers_is_not_trusted(last_saw, n_wrong, found_again):
-    """30 things are where they are expected, and 70 or 71 are six pixels off."""
+    """30 points are at their predicted positions.
+
+    70 or 71 points are six pixels away from theirs.
+    """
     drive, view = Drive.of_two_frames(last_saw), POINTS.view(nearest=NOTHING)
     features = POINTS.see(at(2), slice(139, 240))
     features.xy[30 : 30 + n_wrong, 1] += np.where(np.arange(n_wrong) % 2, 6.0, -6.0)
@@ -248,7 +257,7 @@ def test_without_a_speed_there_is_no_prediction_to_look_near():
 
 
 def test_a_found_frame_tracks_all_landmarks_around_and_says_which_it_should_see():
-    """The last frame saw few of them. The newest landmark is behind the camera."""
+    """The last frame saw few of these landmarks. The newest landmark is behind the camera."""
     points = Points(np.vstack([POINTS.xyz, [[0.0, 0.0, -20.0]]]),
                     np.vstack([POINTS.descriptors, POINTS.descriptors[:1] ^ 255]))  # fmt: skip
     drive = Drive.of_two_frames(FEW)
@@ -285,7 +294,7 @@ OLD, YOUNG = 6, 5  # keyframes: a map of five is young
 
 
 def test_a_frame_after_a_gap_with_few_inliers_is_doubtful():
-    """Frames come every tenth of a second; a gap is more than one and a half of that."""
+    """Frames arrive every tenth of a second. A gap is longer than 1.5 times this interval."""
     drive = Drive.of_two_frames()
     view = POINTS.view(n_reference=121, n_keyframes=YOUNG)
     assert drive.doubts(drive.next_frame(FEW, seconds=0.16), view)
@@ -307,7 +316,7 @@ def test_less_than_half_of_the_reference_keyframe_is_few(n_reference, few):
 
 
 def test_a_frame_with_few_inliers_next_to_one_found_in_the_map_is_doubtful():
-    """Where the camera moved in between is unknown."""
+    """The motion of the camera between the two frames is unknown."""
     drive = Drive.of_two_frames(FEW)
     drive.lose(2)
     drive.accept(3, FEW, keyframe=4)
@@ -366,7 +375,7 @@ def test_before_the_first_frame_there_is_nothing_to_remember():
 
 @pytest.mark.parametrize("lost", [0, 2])
 def test_a_tracker_that_is_restored_goes_on_as_the_one_that_was_not(lost):
-    """Its last frame tracked 121 landmarks; the next one tracks 60."""
+    """The last frame tracked 121 landmarks. The next frame tracks 60 landmarks."""
     drive = Drive()
     drive.accept(0)
     last = POINTS.tracked_frame(1, 0.1, at(1))

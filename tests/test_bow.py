@@ -243,7 +243,8 @@ def match_in_plain_python(a, b, node_a, node_b, max_distance, ratio):
     """Match features in plain Python.
 
     Each feature of a is matched to the closest feature of b under the same node. Then, each feature
-    of b keeps only the closest feature of a. If nodes are equally good, the first is used.
+    of b keeps only the closest feature of a. If several are equally close, the one with the first
+    node is kept.
     """
     bits_a, bits_b = (np.unpackbits(x.view(np.uint8), axis=1) for x in (a, b))
     table = (bits_a[:, None] != bits_b[None]).sum(axis=2)

@@ -55,7 +55,7 @@ def ros_matrix(array: np.ndarray) -> str:
 
 
 def rectifying(models: Models) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """R and P as OpenCV's stereo calibration puts them into ROS's and ORB-SLAM2's files."""
+    """Compute R and P as OpenCV's stereo calibration does, for the files of ROS and ORB-SLAM2."""
     T_right_left = inverse(T_LEFT_RIGHT)
     D = [np.array(c.distortion) for c in models]
     R1, R2, _, P2, *_ = cv2.stereoRectify(

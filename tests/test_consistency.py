@@ -38,7 +38,10 @@ def candidates(query: int, *matches: int) -> list[LoopCandidate]:
 
 
 def verified(query: int, match: int, error=(0.0, 0.0, 0.0), turn: float = 0.0) -> LoopEdge:
-    """An edge with the true relative pose, wrong by ``error`` (m) and ``turn`` (degrees)."""
+    """Make an edge with the true relative pose and an error.
+
+    The error consists of ``error`` metres and ``turn`` degrees.
+    """
     true = compose(
         inverse(se3_exp(np.array([0.0, 0.0, 2.0 * (query - 100), 0.0, 0.0, 0.0]))),
         inverse(STREET.keyframe_pose(match)),

@@ -122,7 +122,7 @@ class Colmap:
     points: dict[int, tuple]
 
     def errors(self) -> np.ndarray:
-        """Distance of each keypoint to the projection of its point, by COLMAP's conventions."""
+        """Compute the reprojection error of each keypoint in COLMAP's conventions."""
         fx, fy, cx, cy = self.camera[2:]
         found = []
         for pose, _, xy, ids in self.images.values():

@@ -70,7 +70,10 @@ def test_known_streets_give_the_same_bytes_with_one_thread_and_two():
 
 
 def with_some_of(features: Features, other: Features, n: int) -> Features:
-    """Features and n of another view, as where a street repeats itself."""
+    """Return features together with n features of a different view.
+
+    This simulates a street that looks repetitive.
+    """
     some = np.linspace(0, len(other) - 1, n).astype(int)
     names = ("xy", "octave", "angle", "descriptors", "u_right")
     columns = ((getattr(features, name), getattr(other, name)) for name in names)

@@ -60,7 +60,10 @@ class World:
     def add_keyframe(
         self, T_cw: np.ndarray, *, mono: bool = False, noise: float = 0.0, among=None
     ) -> int:
-        """A keyframe that sees every point (``among`` some) in its image, in random order."""
+        """Add a keyframe that sees every point, or only those in ``among``.
+
+        The features of its image are in random order.
+        """
         in_camera = transform(T_cw, self.points)
         uvr = CAMERA.project(np.where(in_camera[:, 2:] > 0.5, in_camera, 1.0))
         uvr += noise * white_noise(self.rng, np.full(len(uvr), not mono))

@@ -32,7 +32,7 @@ CONFIG = Config()
 
 
 def driven(slam: Slam, ring: Ring, places, start: float = 0.0) -> Slam:
-    """Drive along the ring at ten frames a second."""
+    """Drive along the ring at ten frames per second."""
     for i, k in enumerate(places):
         slam.step_features(Extracted(ring.see(k, seed=int(start))), start + 0.1 * i)
     slam.finish()
@@ -46,7 +46,7 @@ def ring() -> Ring:
 
 @pytest.fixture(scope="module")
 def slam(ring) -> Slam:
-    """Half a lap, one keyframe of it culled."""
+    """A ``Slam`` after half a lap. One of its keyframes is culled."""
     done = driven(Slam(CAMERA, CONFIG, create_detector("bow", CONFIG), threads=1), ring, range(100))
     assert len(done.map.living_keyframes()) < done.map.n_keyframes
     return done
@@ -60,7 +60,7 @@ def file(slam, tmp_path_factory) -> Path:
 
 
 def changed(file: Path, to: Path, **arrays: np.ndarray) -> Path:
-    """The file with some of its arrays replaced, None to leave one out."""
+    """Return the file with some of its arrays replaced. None removes an array."""
     with np.load(file) as before:
         data = {name: before[name] for name in before.files}
     data |= arrays
@@ -388,7 +388,7 @@ def test_a_map_at_a_checkpoint_comes_back_with_what_died(slam, at_checkpoint, tm
 
 
 def same(one: object, other: object) -> bool:
-    """Whether two states hold the same."""
+    """Return whether two states have the same contents."""
     if isinstance(one, np.ndarray):
         return np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
     if is_dataclass(one):

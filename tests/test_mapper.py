@@ -39,8 +39,11 @@ AT_THE_END = -1  # in place of a keyframe
 
 
 class Closing:
-    """Loop closing that does to the map what a test wants, at the end of each mapping job and at
-    the end of the drive. It finds no loops."""
+    """Loop closing that finds no loops.
+
+    At the end of each mapping job and at the end of the drive, it changes the map as a test
+    requires.
+    """
 
     def __init__(self, job: Callable[[Map, int], None] | None = None) -> None:
         self.is_adjusting = False
@@ -77,12 +80,15 @@ def see_points(k: int) -> Features:
 
 
 def at(k: int) -> np.ndarray:
-    """``T_cw`` of a camera that drives on by 0.2 m a frame."""
+    """Return ``T_cw`` of a camera that drives ahead by 0.2 m per frame."""
     return ahead(0.2 * k, 0.002 * k)
 
 
 class Drive:
-    """A mapper, and frames that are tracked in what it shows: ten a second, 0.2 m apart."""
+    """A mapper, and frames that are tracked in its view of the map.
+
+    There are ten frames per second, which are 0.2 m apart.
+    """
 
     def __init__(
         self,
@@ -103,7 +109,7 @@ class Drive:
         self._see, self._at = see, poses
 
     def next_frame(self) -> Frame:
-        """The frame to come, at its true pose, tracked in what the mapper shows."""
+        """Return the next frame at its true pose. It is tracked in the mapper's view of the map."""
         k, mapper = len(self.mapper.frames), self.mapper
         frame = frame_of(self._see(k), k, 0.1 * k, camera=self.context.camera)
         frame.T_cw = self._at(k)
@@ -116,7 +122,7 @@ class Drive:
         return frame
 
     def step(self, *, keyframe: bool = False) -> Frame:
-        """Track another frame, place it and, if asked to, make it a keyframe."""
+        """Track the next frame and place it. If requested, make it a keyframe."""
         self.mapper.merge_if_due(len(self.mapper.frames))
         frame = self.next_frame()
         self.mapper.hold(self.last, frame)
@@ -127,13 +133,13 @@ class Drive:
         return frame
 
     def steps(self, keyframes: Iterable[int], n: int) -> None:
-        """n frames of which some become keyframes."""
+        """Track and place n frames. Some of them become keyframes."""
         for k in range(n):
             self.step(keyframe=k in keyframes)
 
 
 def bytes_of_view(view: MapView) -> bytes:
-    """All that a view shows."""
+    """Return everything that a view of the map shows, as bytes."""
     values = (getattr(view, field.name) for field in fields(view))
     arrays = (x for value in values for x in (value if isinstance(value, tuple) else (value,)))
     return b"".join(np.ascontiguousarray(x).tobytes() for x in arrays)
@@ -207,8 +213,11 @@ def test_a_keyframe_merges_the_one_before():
 
 
 def trace_on_the_ring(workers, look: Callable[[Mapper], object] = lambda mapper: None) -> list:
-    """Drive on the ring with noisy features; returns what tracking sees at each frame, and the
-    final map. ``look`` is called after each frame."""
+    """Drive on the ring with noisy features.
+
+    Returns what tracking sees at each frame, and the final map. ``look`` is called after each
+    frame.
+    """
     drive = Drive(
         workers,
         camera=ring.CAMERA,
@@ -369,7 +378,7 @@ def see_without_depth(k: int) -> Features:
 
 
 def monocular_drive(workers, closing: Closing) -> Drive:
-    """A monocular map of two keyframes, 0.6 m apart."""
+    """Make a monocular map of two keyframes that are 0.6 m apart."""
     camera = CAMERA.left_camera()
     drive = Drive(workers, closing, camera, see_without_depth, merge_after_frames=9)
     begin_with_two_views(drive)
@@ -377,7 +386,7 @@ def monocular_drive(workers, closing: Closing) -> Drive:
 
 
 def begin_with_two_views(drive: Drive) -> None:
-    """Begin the map with frames 0 and 3."""
+    """Begin the map with the frames 0 and 3."""
     frames = []
     for _ in range(4):
         frames.append(drive.next_frame())
@@ -405,7 +414,7 @@ def test_a_monocular_map_begins_with_two_keyframes():
 
 
 def drive_twist(k: int) -> np.ndarray:
-    """``(6,)`` twist from frame 0 to frame k."""
+    """Return the ``(6,)`` twist from frame 0 to frame k."""
     return np.array([0.0, 0.0, -0.2 * k, 0.0, -0.002 * k, 0.0])
 
 
@@ -561,7 +570,7 @@ INCOMPLETE = r"^mapping [^.]*failed [^.]*incomplete; continue from a map that wa
 
 
 class BrokenError(Exception):
-    """What a mapping job fails with in these tests."""
+    """The error that a failing mapping job raises in these tests."""
 
 
 def fail(map_: Map, keyframe: int) -> None:
@@ -671,7 +680,7 @@ def test_a_map_that_is_incomplete_is_not_saved(failing, threads, tmp_path, monke
 
 def test_a_detector_that_fails_costs_its_loops_alone(tmp_path, caplog):
     class Detector(NoDetector):
-        """Fails at each keyframe."""
+        """A detector that fails at each keyframe."""
 
         def add(self, keyframe, image, features):
             raise BrokenError

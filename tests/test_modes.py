@@ -20,7 +20,7 @@ TWIST = np.array([0.0, 0.0, -2.0, 0.0, 0.0, 0.0])
 
 
 class Building(Drive):
-    """A mapper with the mode that builds its map, and the tracker that this mode works with."""
+    """A mapper with the mode that builds its map, and the tracker that this mode uses."""
 
     def __init__(self, camera: Camera = CAMERA, **options) -> None:
         see = see_without_depth if camera.monocular else see_points
@@ -30,14 +30,17 @@ class Building(Drive):
 
     @classmethod
     def with_a_map(cls, **options) -> Building:
-        """With keyframes at frames 0 and 3, and two frames after the last one."""
+        """Make a map with keyframes at the frames 0 and 3. Two more frames follow."""
         drive = cls(**options)
         drive.steps([0, 3], 6)
         drive.mapper.merge()
         return drive
 
     def placed_frame(self, *, tracked: bool = True) -> Frame:
-        """The next frame, placed; one that is not tracked has no landmarks."""
+        """Return the next frame after it is placed.
+
+        A frame that is not tracked has no landmarks.
+        """
         frame = self.next_frame()
         if not tracked:
             frame.landmark[:], frame.xyz[:] = -1, np.nan
@@ -46,14 +49,14 @@ class Building(Drive):
         return frame
 
     def lost_frame(self, n: int) -> Frame:
-        """The last one of n frames that were lost."""
+        """Return the last one of n lost frames."""
         for _ in range(n):
             self.tracker.lose()
         return self.placed_frame(tracked=False)
 
 
 def found(frame: Frame) -> Found:
-    """The result of a frame that is tracked by all the landmarks that it should see."""
+    """Return the result of a frame that tracks all landmarks that it should see."""
     landmarks = frame.landmark[frame.landmark >= 0]
     return Found(TrackingState.OK, len(landmarks), len(landmarks), landmarks)
 

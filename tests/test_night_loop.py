@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def compared(round_the_block):
-    """The drive with the default detector and, beside it, with ``bow``."""
+    """The drive with the default detector, which is compared with ``bow``."""
     settings = RunOptions(threads=2, compare=("bow",))
     return run_sequence(round_the_block, parse_perturbation("none", 0), settings, Recorder())
 

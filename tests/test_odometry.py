@@ -237,7 +237,7 @@ def test_the_tool_finds_covariances_that_promise_too_much(promised):
 
 
 def steps(poses: list[np.ndarray]) -> np.ndarray:
-    """Distance from each position to the next one, metres."""
+    """Return the distance from each position to the next one in metres."""
     return np.linalg.norm(np.diff([pose[:3, 3] for pose in poses], axis=0), axis=1)
 
 

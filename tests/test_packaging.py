@@ -35,7 +35,10 @@ def build(source: Path, out: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Built from two copies in different folders, with different times of their files."""
+    """Two wheels that were built from copies in different folders.
+
+    The files have different times.
+    """
     root = tmp_path_factory.mktemp("wheels")
     made = []
     for number in range(2):
@@ -108,7 +111,7 @@ def test_an_old_python_is_refused_in_one_sentence():
 
 
 def readme_for(source: str, tmp_path: Path) -> str:
-    """As setup.py makes it where pyproject.toml names this page of the repository."""
+    """Return the README that setup.py makes if pyproject.toml names this page."""
     for name in ("setup.py", "README.md"):
         shutil.copyfile(ROOT / name, tmp_path / name)
     urls = f"[project.urls]\nSource = '{source}'\n" if source else ""

@@ -29,7 +29,10 @@ def texture(seed: int, shape: tuple[int, int] = (160, 480)) -> np.ndarray:
 
 
 def wall(metres: float) -> tuple[np.ndarray, np.ndarray]:
-    """A pair that shows a wall, facing the rig, at a distance whose disparity is whole."""
+    """Make a stereo pair that shows a wall, which faces the cameras.
+
+    The distance of the wall is such that its disparity is a whole number.
+    """
     d = CAMERA.bf / metres
     assert d == round(d)
     wide = texture(2)
@@ -37,8 +40,10 @@ def wall(metres: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def drive_of(camera: Camera = CAMERA, *, poses: bool = True) -> Source:
-    """A camera that turns to the right; it looks at a wall that moves 4 pixels to the left a
-    frame."""
+    """Make the images of a camera that turns to the right.
+
+    The camera looks at a wall, which moves 4 pixels to the left per frame.
+    """
     timestamps = 5.0 + 0.1 * np.arange(20)
     T_wc = np.tile(np.eye(4), (20, 1, 1))
     turned = np.outer(RATE * (timestamps - 5.0), [0.0, 1.0, 0.0])

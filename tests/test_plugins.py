@@ -42,7 +42,7 @@ NO_FEATURES = Features(
 
 
 def written_package(folder: Path) -> Path:
-    """The package as the page has it."""
+    """The package as the page shows it."""
     text = PAGE.read_text()
     folder.mkdir()
     blocks = re.findall(r"```(toml|python)\n# (\S+)\n(.*?)```", text, re.DOTALL)
@@ -54,7 +54,7 @@ def written_package(folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def target(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder that the package of the page is installed in, by pip, without a network."""
+    """A folder into which pip installed the package of the page, without a network."""
     root = tmp_path_factory.mktemp("plugins")
     package = written_package(root / "package")
     command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index"]
@@ -73,7 +73,7 @@ def installed(target: Path, monkeypatch) -> Path:
 
 @pytest.fixture
 def broken(tmp_path: Path, monkeypatch):
-    """Pretend that a package ``broken 2.0`` with this source and these entry points is there."""
+    """Simulate an installed package ``broken 2.0`` with this source and these entry points."""
 
     def install(source: str, entry_points: str, package: str = "broken") -> None:
         folder = tmp_path / package

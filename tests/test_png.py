@@ -17,7 +17,10 @@ from vslam.errors import UnreadableImageError
 
 
 def picture(height, width):
-    """Smooth with noise, and patches of black and of white, where predictors are tied."""
+    """Make a smooth image with noise.
+
+    Some patches are black or white, so that predictors give equal values.
+    """
     rng = np.random.default_rng(height * 1000 + width)
     y, x = np.mgrid[:height, :width]
     image = 120 + 60 * np.sin(x / 9.0) + 50 * np.cos(y / 7.0) + rng.normal(0, 6, (height, width))
@@ -37,7 +40,10 @@ def header(image, depth=8, colour=0, interlaced=0):
 
 
 def filtered(image, filters):
-    """Lines with the filter of each in front (PNG specification, section 9), written from it."""
+    """Filter the lines of an image and put the filter number before each line.
+
+    The code follows the PNG specification, section 9.
+    """
     padded = np.zeros((image.shape[0] + 1, image.shape[1] + 1), np.int64)
     padded[1:, 1:] = image
     a, b, c = padded[1:, :-1], padded[:-1, 1:], padded[:-1, :-1]

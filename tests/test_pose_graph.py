@@ -41,8 +41,11 @@ def turn(yaw: float) -> np.ndarray:
 
 
 def chain_graph(T_wc: np.ndarray, loops=(), measured=(), reach: int = 1, weak=()) -> PoseGraph:
-    """Odometry edges to the next ``reach`` keyframes, measured by the poses, and loop edges.
-    Nothing but a weak tree edge leads past the keyframes ``weak``."""
+    """Make odometry edges to the next ``reach`` keyframes, and loop edges.
+
+    The odometry edges are computed from the poses. Only a weak tree edge leads past the keyframes
+    in ``weak``.
+    """
     n = len(T_wc)
     pairs = [(i, i + s) for s in range(1, reach + 1) for i in range(n - s)]
     past = {p: any(p[0] < w <= p[1] for w in weak) for p in pairs}
@@ -145,7 +148,10 @@ def test_same_bytes_every_time():
 
 
 def make_map(views: list[range], T_cw: np.ndarray) -> Map:
-    """A map in which keyframe k observes the landmarks ``views[k]``; parents in a chain."""
+    """Make a map in which keyframe k observes the landmarks ``views[k]``.
+
+    Each keyframe is the parent of the next one.
+    """
     map_ = Map(1.2 ** np.arange(8))
     n = max(view.stop for view in views)
     for k, view in enumerate(views):
@@ -166,13 +172,16 @@ def make_map(views: list[range], T_cw: np.ndarray) -> Map:
 
 
 def line_map(n: int = 8, shift: int = 60) -> Map:
-    """Keyframes along a line, 240 landmarks each: 180, 120, 60 shared with the next three."""
+    """Make a map of keyframes along a line with 240 landmarks each.
+
+    A keyframe shares 180, 120 and 60 landmarks with the next three keyframes.
+    """
     T_cw = inverses(np.array([translation(0, 0, k) for k in range(n)]))
     return make_map([range(shift * k, shift * k + 240) for k in range(n)], T_cw)
 
 
 def named(graph: PoseGraph) -> dict[tuple[int, int], int]:
-    """Kind of each edge by the ids of its keyframes."""
+    """Return the kind of each edge by the ids of its keyframes."""
     pairs = map(tuple, graph.keyframes[graph.edges].tolist())
     return dict(zip(pairs, graph.kind.tolist(), strict=True))
 
@@ -344,7 +353,7 @@ SIDES = (70.0, 40.0)
 
 
 def route(n: int, step: float = 1.2) -> np.ndarray:
-    """``(n, 4, 4)`` T_wc round a rectangle of 220 m, again and again."""
+    """Return ``(n, 4, 4)`` T_wc of several laps around a rectangle of 220 m."""
     long, short = SIDES
     along = np.arange(n) * step % (2 * (long + short))
     corners = np.array([0.0, long, long + short, 2 * long + short])
@@ -359,11 +368,11 @@ def route(n: int, step: float = 1.2) -> np.ndarray:
 def simulate(
     seed: int, n: int = 420, drift: float = 1.0, bias: bool = False
 ) -> tuple[np.ndarray, list[tuple[int, int]], np.ndarray]:
-    """Odometry ``T_wc`` with ``drift`` per cent of error over a hundred metres and more, and loops
-    one lap apart with what verification would measure.
+    """Simulate odometry ``T_wc`` and loops between poses that are one lap apart.
 
-    The error is a random walk of heading and position, or with ``bias`` one that always turns and
-    stretches the same way.
+    The error of odometry is ``drift`` per cent over a hundred metres and more. It is a random walk
+    of heading and position. With ``bias``, the error always turns and stretches the path in the
+    same way. Loops are as verification would measure them.
     """
     rng = np.random.default_rng(seed)
     true = route(n)

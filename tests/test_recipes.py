@@ -25,7 +25,7 @@ RECIPES = {
 
 @pytest.fixture(scope="module")
 def after(corridor: StereoSequence, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What a program holds after each recipe, by the title of the recipe."""
+    """The variables of a program after each recipe, by the title of the recipe."""
     c = corridor
     depths = [corridor_depth(c.camera, T).astype(np.float32) for T in c.T_wc]
     values: dict[str, Any] = {

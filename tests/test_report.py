@@ -59,7 +59,7 @@ class _Sequence:
 
 
 def _drive(frames: int) -> NDArray[np.float64]:
-    """``T_wc`` of a car on a bent loop at 1 m a frame, facing where it goes."""
+    """Return ``T_wc`` of a car on a bent loop. It moves 1 m per frame and looks ahead."""
     s = np.linspace(0.0, 2.0 * np.pi * frames / 600.0, frames)
     radius = 95.0 + 22.0 * np.sin(3.0 * s)
     x, z = radius * (1.0 - np.cos(s)), radius * np.sin(s)
@@ -78,7 +78,10 @@ def make_outcome(
     ground_truth: bool = True,
     keyframe_every: int = 4,
 ) -> RunOutcome:
-    """A run with drift, weak frames around the lost ones, and slower keyframes."""
+    """Make the outcome of a run with drift.
+
+    The frames around the lost frames have few inliers, and keyframes take longer.
+    """
     rng = np.random.default_rng(0)
     timestamps = np.arange(frames) * 0.1
     truth = _drive(frames)
@@ -134,7 +137,10 @@ def make_outcome(
 
 
 def two_laps(frames: int = 500, *, keyframe_every: int = 4) -> RunOutcome:
-    """A run twice around a circle of 200 m with four loops, one of them wrong, and 300 rejected."""
+    """Make a run of two laps around a circle of 200 m.
+
+    It has four loops, of which one is wrong, and 300 rejected loops.
+    """
     plain = make_outcome(frames, lost=slice(0, 0), keyframe_every=keyframe_every)
     angle = 2.0 * np.pi * np.arange(frames) / 250.0
     truth = np.tile(np.eye(4), (frames, 1, 1))
@@ -190,7 +196,10 @@ def two_laps(frames: int = 500, *, keyframe_every: int = 4) -> RunOutcome:
 
 
 def report_of(outcome: RunOutcome, folder: Path) -> ReportJson:
-    """Write the report as the command line does; what is on the disk is what is returned."""
+    """Write the report as the command line does.
+
+    Check that the file on the disk equals the result.
+    """
     report = write_results(folder, outcome)
     assert ReportJson.model_validate_json((folder / "report.json").read_bytes()) == report
     return report

@@ -47,7 +47,10 @@ def write_list(path: Path, times, folder: str) -> None:
 
 @pytest.fixture(scope="module")
 def tree(corridor: StereoSequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The corridor's beginning in TUM's layout, depth 3 ms late and of 1000 a metre."""
+    """The beginning of the corridor in TUM's layout.
+
+    Depth is 3 ms late, and its unit is a thousandth of a metre.
+    """
     root = tmp_path_factory.mktemp("tum") / "corridor"
     times = corridor.timestamps[:FRAMES]
     for name in ("rgb", "depth"):
@@ -70,7 +73,7 @@ def tree(corridor: StereoSequence, tmp_path_factory: pytest.TempPathFactory) -> 
 
 @pytest.fixture
 def copy(tree: Path, tmp_path: Path) -> Path:
-    """The same with files of its own to spoil."""
+    """A copy of the sequence whose files a test may damage."""
     root = tmp_path / "corridor"
     for path in tree.rglob("*"):
         if path.is_file():

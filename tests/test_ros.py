@@ -63,7 +63,7 @@ def types_of_ros():
 
 
 def read(path: Path) -> dict[str, list]:
-    """The messages of each topic, with the times at which they were written."""
+    """Return the messages of each topic, with the times at which they were written."""
     found: dict[str, list] = {}
     with path.open("rb") as file:
         bag = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
@@ -289,7 +289,10 @@ def test_files_of_a_run_that_were_lost_or_changed(folder, tmp_path, name, text, 
 
 
 def infos(baseline: float = 0.5, **changed: object) -> list[SimpleNamespace]:
-    """``camera_info`` of a rectified pair; ``changed`` are fields of the right one."""
+    """Return the ``camera_info`` of a rectified pair.
+
+    ``changed`` are fields of the right camera.
+    """
     pair = []
     for side in (0, 1):
         P = [700.0, 0, 310, -side * 700 * baseline, 0, 710, 120, 0, 0, 0, 1, 0]

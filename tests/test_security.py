@@ -39,7 +39,7 @@ SOURCES = [
 
 
 def png(width: int, height: int, rows: int = 10) -> bytes:
-    """An image whose header speaks of more rows than there are."""
+    """Make an image whose header states more rows than the image has."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return (
@@ -67,7 +67,7 @@ def write_zip(path: Path, members: dict[str, bytes]) -> Path:
 
 
 class Touch:
-    """Unpickled, it makes a file."""
+    """An object that creates a file when it is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -160,7 +160,7 @@ def test_images_of_absurd_size_are_refused_by_their_header(tmp_path: Path, width
 
 def test_a_video_of_absurd_size_is_refused_by_its_header(tmp_path: Path, monkeypatch):
     class Capture:
-        """A video of 144 million pixels a frame, of which no frame may be read."""
+        """A video with 144 million pixels per frame. No frame of it may be read."""
 
         def get(self, kind: int) -> float:
             return 12_000.0

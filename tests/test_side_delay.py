@@ -32,8 +32,11 @@ SCALES = 1.2 ** np.arange(8)
 def seen(
     twist: np.ndarray, delay: float, n: int = 200, seed: int = 0, noise: float = 0.1
 ) -> tuple[Extracted, np.ndarray]:
-    """Points in both images by their exact projections, the right one so much later; and the
-    columns there without delay."""
+    """Return the exact projections of points into both images.
+
+    The right image is late by the given delay. Also return the columns in the right image without
+    delay.
+    """
     rng = np.random.default_rng(seed)
     z = rng.uniform(4.0, 40.0, n)
     xy = np.stack([rng.uniform(0, 400, n), rng.uniform(0, 200, n)], axis=1).astype(np.float32)
@@ -61,7 +64,7 @@ def add(found: SideDelay, extracted: Extracted, twist: np.ndarray | None) -> Non
 
 
 def drive(frames: int) -> list[np.ndarray]:
-    """Ahead with changing speed, nodding and turning."""
+    """Return the poses of a car that drives ahead with varying speed, nods and turns."""
     t = 0.1 * np.arange(frames)
     zero = np.zeros(frames)
     return list(

@@ -33,7 +33,10 @@ LOADS = {"script": "src", "img": "src", "iframe": "src", "source": "src", "link"
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Built as ``make docs`` does, from a copy: the build writes pages beside the others."""
+    """The site, which is built from a copy as ``make docs`` builds it.
+
+    A copy is used because the build writes pages next to the others.
+    """
     root = tmp_path_factory.mktemp("site")
     for name in ("docs", "loopclosure", "tools"):
         shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -120,7 +123,7 @@ def test_the_reference_has_every_command_and_option(site):
 
 
 def vslam_commands(text: str) -> list[list[str]]:
-    """The words of every ``vslam`` command in the shell blocks of a page."""
+    """Return the words of every ``vslam`` command in the shell blocks of a page."""
     found = []
     for block in SHELL.findall(text):
         for line in block.replace("\\\n", " ").splitlines():

@@ -37,7 +37,7 @@ def run(
     left_black: Iterable[int] = (),
     skipped: Iterable[int] = (),
 ) -> tuple[Slam, list[TrackResult]]:
-    """Track some frames, black or missing ones among them."""
+    """Track some frames. Some of them may be black or missing."""
     slam = Slam(sequence.camera, config, "none", threads=threads)
     results = []
     nothing = np.zeros_like(sequence.left[0])
@@ -54,7 +54,10 @@ def run(
 
 
 def position_errors(slam: Slam, sequence, frames=slice(None)) -> np.ndarray:
-    """Metres, without alignment: the first frame is the world of both."""
+    """Return the position errors in metres without alignment.
+
+    The first frame is the world frame of both trajectories.
+    """
     return np.linalg.norm(slam.trajectory().T_wc[:, :3, 3] - sequence.T_wc[frames, :3, 3], axis=1)
 
 
@@ -63,7 +66,7 @@ def rmse(errors: np.ndarray) -> float:
 
 
 def states(results: list[TrackResult]) -> str:
-    """One letter a frame: O, W or L."""
+    """Return the state of each frame as one letter: O, W or L."""
     return "".join(result.state[0] for result in results)
 
 
@@ -512,7 +515,7 @@ def test_a_step_after_finish_goes_on(corridor):
 
 
 class Onlooker(NoDetector):
-    """Keeps the image of every keyframe that it is shown."""
+    """A detector that keeps the image of every keyframe."""
 
     def __init__(self) -> None:
         self.images: list[np.ndarray] = []

@@ -298,7 +298,7 @@ def test_a_camera_at_a_url(folder, served):
 
 
 class FakeCamera:
-    """In place of a device: films without end."""
+    """A camera that delivers frames without end."""
 
     images: list[np.ndarray]
 
@@ -399,7 +399,10 @@ def test_a_sequence_written_side_by_side_comes_back(kitti_tree, tmp_path):
 
 
 class There:
-    """The corridor there and back as a stream; counts the images that somebody holds."""
+    """The corridor forwards and backwards as a stream.
+
+    It counts the images that are held in memory.
+    """
 
     def __init__(self, corridor):
         self.corridor = corridor

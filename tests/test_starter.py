@@ -27,7 +27,10 @@ def starter(camera=LEFT_CAMERA, **thresholds: float) -> Starter:
 def frame(
     index: int, seconds: float, moved: float = 0.0, among: slice = ALL, camera=LEFT_CAMERA
 ) -> Frame:
-    """A frame that is ``moved`` times as far aside as two views should be, and not tracked."""
+    """Make a frame that is not tracked.
+
+    It has ``moved`` times the lateral distance that two views should have.
+    """
     features = POINTS.see(se3_exp(moved * ASIDE), among)
     if camera.monocular:
         features.u_right[:] = np.nan
@@ -143,7 +146,7 @@ def test_a_map_needs_enough_points_to_begin_with(min_landmarks, enough):
 
 
 def two_views() -> TwoViewStart:
-    """A start in which the camera moves by 0.5 units in 0.25 s."""
+    """Make a start in which the camera moves by 0.5 units in 0.25 s."""
     T_2_1 = se3_exp(np.array([0.3, 0.0, 0.4, 0.0, 0.02, 0.0]))
     T_2_1[:3, 3] *= 0.5 / np.linalg.norm(T_2_1[:3, 3])
     features = np.arange(240), np.arange(240)

@@ -16,14 +16,14 @@ ORB = OrbConfig(n_features=600)
 
 
 def texture(seed: int = 0) -> np.ndarray:
-    """Smooth enough to be shifted by fractions of a pixel."""
+    """Make a texture that is so smooth that it can be shifted by fractions of a pixel."""
     rng = np.random.default_rng(seed)
     blocks = np.kron(rng.uniform(20, 235, (HEIGHT // 6 + 1, WIDTH // 6 + 1)), np.ones((6, 6)))
     return cv2.GaussianBlur(blocks[:HEIGHT, :WIDTH].astype(np.float32), (0, 0), 1.2)
 
 
 def shifted(image: np.ndarray, dx: float, dy: float = 0.0) -> np.ndarray:
-    """``image`` moved left by ``dx`` and down by ``dy`` pixels, by the phase of its spectrum."""
+    """Move ``image`` left by ``dx`` and down by ``dy`` pixels, using the phase of its spectrum."""
     fy = np.fft.fftfreq(image.shape[0])[:, None]
     fx = np.fft.fftfreq(image.shape[1])[None, :]
     spectrum = np.fft.fft2(image) * np.exp(2j * np.pi * (fx * dx - fy * dy))
@@ -37,7 +37,10 @@ def extracted(image: np.ndarray) -> Extraction:
 def match(
     dx: float, dy: float = 0.0, fx: float = 240.0, noise: float = 0.0
 ) -> tuple[Extraction, np.ndarray]:
-    """Left features of a plane at disparity ``dx``, and the disparities found."""
+    """Match a plane at disparity ``dx``.
+
+    Return its left features and the disparities that are found.
+    """
     image = texture()
     rng = np.random.default_rng(9)
     left = extracted(image + noise * rng.normal(size=image.shape))
@@ -49,7 +52,7 @@ def match(
 
 
 def seen_by_both(left: Extraction, dx: float) -> np.ndarray:
-    """Features whose match, with the search of the patch, lies inside the right image."""
+    """Return which features have a match, with its search range, inside the right image."""
     return left.xy[:, 0] - dx > 30 * 1.2 ** left.octave.astype(float)
 
 

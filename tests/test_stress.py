@@ -158,8 +158,11 @@ def strength_of(cell: Cell) -> float:
 
 
 class World:
-    """Runs cells in a moment: bow fails beyond strength 3, the other one beyond 1 + seed, and ends
-    with an error beyond 9."""
+    """A world in which a cell needs no time.
+
+    bow fails beyond strength 3. The other system fails beyond 1 + seed, and ends with an error
+    beyond 9.
+    """
 
     def __init__(self, out: Path) -> None:
         self.out, self.ran = out, []

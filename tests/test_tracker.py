@@ -26,19 +26,19 @@ TWIST = STEP / 0.1  # at ten frames a second
 
 
 def at(k: float) -> np.ndarray:
-    """``T_cw`` of a camera that moves at a constant speed, at frame k."""
+    """Return ``T_cw`` at frame k of a camera that moves at a constant speed."""
     return se3_exp(k * STEP)
 
 
 def restored(tracker: Tracker) -> Tracker:
-    """A new tracker that remembers what this one does, in the same map."""
+    """Return a new tracker in the same map, which has the memory of the given tracker."""
     state, other = tracker.state(), Tracker(CONTEXT)
     other.restore(state, np.where((state.landmark >= 0)[:, None], POINTS.xyz, np.nan))
     return other
 
 
 def select(features: Features, n: int) -> Features:
-    """The first n of some features."""
+    """Return the first n features."""
     names = ("xy", "octave", "angle", "descriptors", "u_right")
     return Features(*(getattr(features, name)[:n] for name in names))
 
@@ -55,14 +55,20 @@ class Drive:
 
     @classmethod
     def of_two_frames(cls, among: slice = ALL) -> Drive:
-        """Two frames, so that the camera's speed is known; the last one saw some of the points."""
+        """Return a drive of two frames, so that the speed of the camera is known.
+
+        The last frame saw some of the points.
+        """
         drive = cls()
         drive.accept(0)
         drive.accept(1, among)
         return drive
 
     def accept(self, k: int, among: slice = ALL, *, keyframe: int = -1) -> Frame:
-        """Go on from a frame that was found; near ``keyframe`` if it was looked for in the map."""
+        """Continue from a frame that was found.
+
+        ``keyframe`` is given if it was found by relocalisation.
+        """
         frame = POINTS.tracked_frame(len(self.frames), 0.1 * k, at(k), among)
         found = Found(TrackingState.OK, keyframe=keyframe)
         if k == 0:
@@ -73,7 +79,7 @@ class Drive:
         return frame
 
     def lose(self, k: int) -> None:
-        """A frame that is not tracked, at the pose that is predicted for it."""
+        """Return a frame that is not tracked, at its predicted pose."""
         T_cw = self.predict(k)
         self.frames.append(0.1 * k, T_cw, tracked=False)
         self.tracker.lose()
@@ -82,17 +88,17 @@ class Drive:
         return self.tracker.predict(0.1 * k, self.frames, POINTS.view())
 
     def next_frame(self, among: slice = ALL, *, seconds: float = 0.1) -> Frame:
-        """The frame after the last one, which sees some of the points."""
+        """Return the frame after the last one, which sees some of the points."""
         last = self.frames.timestamp(-1)
         return POINTS.frame(len(self.frames), last + seconds, at(10.0 * (last + seconds)), among)
 
     def track(self, frame: Frame, view: MapView, T_cw: np.ndarray | None = None) -> Found:
-        """Track a frame where it is expected, by default where it really is."""
+        """Track a frame from a predicted pose, which is by default its true pose."""
         T_cw = at(10.0 * frame.timestamp) if T_cw is None else T_cw
         return self.tracker.track(frame, T_cw, view, self.frames)
 
     def doubts(self, frame: Frame, view: MapView) -> bool:
-        """Whether the frame, tracked where it is, is doubtful."""
+        """Track a frame at its true pose, and return whether the result is doubtful."""
         return self.track(frame, view).is_doubtful
 
 

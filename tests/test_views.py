@@ -35,14 +35,14 @@ SHIFT = 16  # columns between the two views of 81
 
 
 def wide_images(n: int, seed: int = 0, width: int = 81) -> torch.Tensor:
-    """Noise with equal mean and contrast in every column, so that no part stands out."""
+    """Make noise with equal mean and contrast in every column, so that no part is distinctive."""
     x = torch.randn(n, 1, 48, width, generator=torch.Generator().manual_seed(seed))
     x = (x - x.mean(2, keepdim=True)) / x.std(2, keepdim=True)
     return (0.5 + 0.1 * x).expand(-1, 3, -1, -1)
 
 
 def wide_views(places: int) -> object:
-    """As ``views``, squashed to images of 48x81."""
+    """Make the images of ``views`` with a size of 48x81."""
     collection = views(places)
     resize = [cv2.resize(image, (81, 48)) for image in collection.images]
     return replace(collection, images=np.stack(resize))
@@ -200,7 +200,10 @@ def test_one_against_many_is_pair_by_pair():
 
 
 def lite_network() -> SiameseNetwork:
-    """Three views of 49 of the 81 columns, 16 apart."""
+    """Make a network with three views.
+
+    Each has 49 of the 81 columns, and they are 16 columns apart.
+    """
     shape = CapsuleShape(
         extractor="lite0", pixels=48, width=81, views=3, view_width=49, types=4, outputs=4
     )

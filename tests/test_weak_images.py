@@ -34,7 +34,7 @@ DISPARITY = 7
 
 
 def scene(spread: float = 35.0, grain_px: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
-    """Both sides of a textured wall, float64 grey values."""
+    """Return both images of a textured wall, as float64 grey values."""
     rough = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(200, 420)), (0, 0), grain_px)
     grey = 110.0 + spread * rough / rough.std()
     return grey[:, :400], grey[:, DISPARITY : 400 + DISPARITY]
@@ -52,7 +52,7 @@ def spiked(image: np.ndarray, share: float, seed: int) -> np.ndarray:
 
 
 def right_matches(left: np.ndarray, right: np.ndarray, config: Config) -> int:
-    """Stereo matches within a pixel of the truth."""
+    """Return which stereo matches are within a pixel of the true position."""
     ours, theirs = extract_in_any_light([left, right], config)
     u_right = inliers_only(match_stereo(ours, theirs, CAMERA, config.stereo), ours.octave)
     return int(np.count_nonzero(np.abs(ours.xy[:, 0] - u_right - DISPARITY) < 1.0))
@@ -172,7 +172,7 @@ def test_nothing_is_made_of_nothing():
 
 
 def drive(corridor, change, config: Config) -> tuple[str, float]:
-    """States, one letter a frame, and the largest error in metres."""
+    """Return the state of each frame as one letter, and the largest error in metres."""
     slam = Slam(corridor.camera, config, "none", threads=1)
     states = ""
     for k, (left, right) in enumerate(zip(corridor.left, corridor.right, strict=True)):

@@ -33,7 +33,7 @@ sys.meta_path[sys.meta_path.index(PathFinder)] = Finder
 
 @pytest.fixture(scope="module")
 def pairs(corridor: StereoSequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two places, each seen by both cameras, as ``vslam synth --pairs`` writes them."""
+    """Two places that both cameras see, as ``vslam synth --pairs`` writes them."""
     folder = tmp_path_factory.mktemp("pairs")
     rows = []
     for k in (0, len(corridor) - 1):

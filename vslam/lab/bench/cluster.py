@@ -85,7 +85,7 @@ def _require_certificates(scheduler: str) -> None:
 
 
 def _run_on_worker(cell: Cell, options: RunOptions, stop: str) -> CellOutcome:
-    """Run a cell on this worker. Kill the run when the benchmark sets the event named ``stop``."""
+    """Run a cell on this worker. Kill it when the benchmark sets the event named ``stop``."""
     from distributed import Event
 
     event = Event(stop)

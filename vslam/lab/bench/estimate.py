@@ -24,7 +24,8 @@ class Estimate:
     """How much time and disk space the cells of a benchmark need.
 
     Attributes:
-        seconds: wall time in seconds, if ``jobs`` cells always run at the same time.
+        seconds: wall time in seconds. It is assumed that as many cells run at the same time as the
+            user requested.
         kept: size of the files that are kept, in bytes.
         scratch: size of the files that are deleted after each run, in bytes.
         basis: text that says on what the estimated time is based.
@@ -48,7 +49,7 @@ def estimate(
     time per frame is used.
 
     Args:
-        missing: cells that have not run yet.
+        missing: cells (one run each) that have not run yet.
         finished: finished cells and their reports.
         frames: number of frames of each sequence.
         jobs: number of cells that run at the same time.

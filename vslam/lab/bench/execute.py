@@ -79,7 +79,7 @@ CellOutcome = Finished | Failed
 def run_cell(
     cell: Cell, options: RunOptions, stopped: Callable[[], bool] = lambda: False
 ) -> CellOutcome:
-    """Run one cell in a temporary folder and return its files.
+    """Run one cell of a benchmark (a single run) in a temporary folder. Return its files.
 
     Args:
         stopped: function that is called repeatedly. The run is killed when the function returns
@@ -145,7 +145,7 @@ def run_here(
 
 
 def finished_cells(cells: Collection[Cell], out: Path, config: str) -> list[Cell]:
-    """Return those of the cells whose results are already in the folder ``out``."""
+    """Return the cells of a benchmark whose results are already in the folder ``out``."""
     return [cell for cell in cells if is_finished(cell, out / cell.name, config)]
 
 

@@ -201,7 +201,7 @@ def tracked_nothing(folder: Path) -> bool:
 
 
 def is_finished(cell: Cell, folder: Path, config: str) -> bool:
-    """Return whether ``folder`` contains a complete run of exactly this cell.
+    """Return whether ``folder`` contains a complete run of exactly this cell of a benchmark.
 
     Args:
         config: thresholds, as the text of a file ``config.json``.

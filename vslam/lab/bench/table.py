@@ -24,7 +24,7 @@ class GridProgress:
     Attributes:
         cells: all cells of the benchmark.
         reports: reports of the finished cells, in the order in which the cells ended.
-        failed: the reason, in one line, why each failed cell failed.
+        failed: for each failed cell, one line that says why it failed.
     """
 
     def __init__(

@@ -167,7 +167,7 @@ def _gain(
 ) -> Gain:
     """Compute by how much the average precision (AP) of two detectors differs.
 
-    The interval is computed by a bootstrap over the queries.
+    The result contains a 95 % interval, which is computed by a bootstrap over the queries.
     """
     known, rng = relation != UNKNOWN, np.random.default_rng(0)
 

@@ -52,7 +52,7 @@ class Window:
                 is also the default of DLoopDetector.
 
         Returns:
-            ``(n,)`` int64.
+            ``(n,)`` int64 numbers of images.
         """
         clock = np.arange(n, dtype=np.float64) if times is None or not self.timed else times
         # The times are rounded multiples of the frame interval, so that a tolerance is needed.
@@ -105,7 +105,8 @@ def decide(scores: NDArray[np.float64], searchable: NDArray[np.int64]) -> Decisi
 
     Args:
         scores: ``(N, N)`` similarities of the images. Each row belongs to one query.
-        searchable: ``(N,)``, the result of `Window.searchable`.
+        searchable: ``(N,)`` number of images from the start of the drive that may be searched, for
+            each image (`Window.searchable`).
     """
     match, score = np.full(len(scores), -1, np.int64), np.full(len(scores), -np.inf)
     for k in np.flatnonzero(searchable):
@@ -141,13 +142,14 @@ class Judged:
 def judge(
     decisions: Decisions, relation: NDArray[np.int8], searchable: NDArray[np.int64]
 ) -> Judged:
-    """Compare the decisions of a loop detector with the ground truth.
+    """Compare the decisions of a loop detector for N images with the ground truth.
 
     Args:
         decisions: the decisions for N images.
         relation: ``(N, N)`` int8. 1 means that two images show the same place, -1 means another
             place, and pairs with 0 are unknown (`vslam.lab.loopbench.sets.QuerySet`).
-        searchable: ``(N,)``, the result of `Window.searchable`.
+        searchable: ``(N,)`` number of images from the start of the drive that may be searched, for
+            each image (`Window.searchable`).
 
     Raises:
         InputError: no image has a marked image before its window.

@@ -219,9 +219,9 @@ def is_tie(difference: float, measure: str) -> bool:
 
 
 def strengths(drives: Iterable[Drive], law: str) -> dict[Drive, float]:
-    """For each drive with only the given perturbation or none, return the perturbation's strength.
+    """Return the strength of a perturbation in each drive.
 
-    The strength is 0 for unperturbed drives.
+    Drives with other perturbations are left out. The strength is 0 for unperturbed drives.
 
     Args:
         law: name of the perturbation, without strength.

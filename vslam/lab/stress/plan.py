@@ -49,7 +49,7 @@ class Search:
         return replace(self.clean, perturb=name, seed=self.seed)
 
     def position(self) -> float | None:
-        """Return the next position to test; None if the search has ended."""
+        """Return the next strength to test, as a position from 0 to 1; None if the search has ended."""
         return next_position({p: bool(v) for p, v in self.verdicts.items()}, self.steps)
 
     def wants(self) -> Cell | None:
@@ -81,8 +81,9 @@ class Plan:
 
     Attributes:
         clean: the runs of each system on the unperturbed images of each sequence.
-        laws: names of the perturbations for which the strength that makes a run fail is searched.
-        seeds: number of seeds for each law.
+        laws: names of the perturbations to test. For each of them, the strength at which runs fail
+            is searched.
+        seeds: number of seeds for each perturbation.
         steps: number of bisections in each search.
         baseline: the system with which the errors of a preset are compared.
         criterion: criterion that decides whether a run has failed.

@@ -44,7 +44,7 @@ def strength_at(kind: LawKind, position: float) -> float:
 
 
 def bracket(failed: Mapping[float, bool], steps: int) -> tuple[float, float, float | None]:
-    """Return the state of the bisection, given the tests so far.
+    """Return the interval in which a system begins to fail, and the next position to test.
 
     Args:
         failed: whether the run failed, by tested position. A position is a strength on a scale from

@@ -49,7 +49,7 @@ class Search:
         return replace(self.clean, perturb=name, seed=self.seed)
 
     def position(self) -> float | None:
-        """Return the next strength to test, as a position from 0 to 1; None if the search has ended."""
+        """Return the next position (0 to 1) to test; None if the search has ended."""
         return next_position({p: bool(v) for p, v in self.verdicts.items()}, self.steps)
 
     def wants(self) -> Cell | None:

@@ -35,14 +35,20 @@ NO_SHIFT = np.zeros((1, 2), np.float32)
 
 
 def seen(scene, x=0.0, y=0.0, zoom=1.0, gain=1.0, offset=0.0):
-    """The patch ``(1, PATCH_PIXELS)`` of a scene whose origin lies at x, y from its middle."""
+    """Return the ``(1, PATCH_PIXELS)`` patch of a scene.
+
+    The origin of the scene is at x, y from the middle of the patch.
+    """
     at = np.arange(-PATCH_RADIUS, PATCH_RADIUS + 1)
     u, v = np.meshgrid((at - x) / zoom, (at - y) / zoom)
     return np.rint(np.clip(gain * scene(u, v) + offset, 0, 255)).astype(np.uint8).reshape(1, -1)
 
 
 def random_scene(seed):
-    """Waves of all directions, 6 pixels long or longer: about what the blur of a lens leaves."""
+    """Make a scene of waves in all directions.
+
+    The waves are at least 6 pixels long, which is about what the blur of a lens leaves.
+    """
     rng = np.random.default_rng(seed)
     waves = rng.uniform(0.3, 1.0, 12)
     turn, phase = rng.uniform(0, 2 * np.pi, (2, 12))
@@ -167,7 +173,10 @@ def extracted_at(u, v, octave, n):
 
 
 def one_landmark(shift=0.0):
-    """A map of one keyframe with a landmark 10 m ahead, and the patches of the keyframe."""
+    """Make a map of one keyframe with a landmark 10 m ahead.
+
+    Also return the patches of the keyframe.
+    """
     map_ = Map(CONTEXT.scales)
     patch = seen(random_scene(1))
     keyframe = map_.add_keyframe(features_at(320, 240, 2, 1), np.eye(4), 0.0, 0)
@@ -177,7 +186,7 @@ def one_landmark(shift=0.0):
 
 
 def patches_of(map_, ids, keyframes, capacity=3):
-    """``RecentPatches.of``, and the pixels and shifts of each."""
+    """Return the result of ``RecentPatches.of``, and the pixels and shifts of each patch."""
     recent = RecentPatches(capacity)
     for one in keyframes:
         recent.add(one)
@@ -236,7 +245,7 @@ def test_landmarks_that_no_recent_keyframe_observes_have_none():
 
 
 def wide_scene(texture):
-    """An image that a camera sees of the plane 10 m ahead of the world's origin."""
+    """Return what a camera sees of the plane 10 m ahead of the world's origin."""
 
     def image(T_cw):
         u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
@@ -259,8 +268,10 @@ def wide_scene(texture):
     ],
 )
 def test_matches_are_aligned_however_the_camera_has_moved(motion):
-    """To a tenth of a pixel, where keypoints lie up to a pixel beside what they are matched
-    with."""
+    """Matches are accurate to a tenth of a pixel after alignment.
+
+    Before it, keypoints are up to a pixel away from the points that they match.
+    """
     image = wide_scene(random_scene(4))
     T_cw = se3_exp(np.array(motion))
     rng = np.random.default_rng(0)
@@ -336,8 +347,10 @@ def test_an_aligned_frame_observes_where_matches_were_aligned_to():
 
 
 def test_a_pose_follows_aligned_matches():
-    """Half of the matches contradict the other half by half a pixel; aligned ones have four times
-    the weight."""
+    """Half of the matches contradict the other half by half a pixel.
+
+    Aligned matches have four times the weight of other matches.
+    """
     rng = np.random.default_rng(0)
     n = 100
     frame = Frame.of(extracted_at(100, 50, 0, n), CAMERA)
@@ -369,7 +382,7 @@ def test_the_map_knows_how_sure_each_observation_is(two_keyframes):
 
 @pytest.fixture
 def two_keyframes():
-    """A second keyframe that tracks two landmarks of the first."""
+    """Add a second keyframe, which tracks two landmarks of the first keyframe."""
     from vslam.closing import LoopClosing
     from vslam.loopclosure.detector import NoDetector
     from vslam.loopclosure.verifier import verifier_for

@@ -76,7 +76,7 @@ def drive(
     compare: tuple[str, ...] = (),
     **options: object,
 ) -> RunOutcome:
-    """Run over the corridor; with a folder, saving whenever that is possible."""
+    """Run over the corridor. If a folder is given, save whenever possible."""
     sequence = change(open_sequence("kitti", root, "00"))
     settings = RunOptions(detector="bow", threads=2, thresholds=config, compare=compare)
     autosave = {} if folder is None else {"autosave": FolderAutosave(folder, 1e-6, "kitti 00")}
@@ -157,14 +157,14 @@ def test_ctrl_c_ends_a_run_and_a_save_is_offered_while_frames_are_dropped(kitti_
 
 
 def with_times(source: Source, times: np.ndarray) -> Source:
-    """The first frames of a source, at other times."""
+    """Return the first frames of a source with different times."""
     timed = zip(source.stored[: len(times)], times.tolist(), strict=True)
     stored = tuple(replace(frame, timestamp=time) for frame, time in timed)
     return replace(source, stored=stored, ground_truth=None)
 
 
 def black_until(source: Source, index: int) -> Source:
-    """A source whose right side is black until a frame."""
+    """Return a source whose right images are black until a given frame."""
 
     def read(k, image_map):
         left, right = source.read(k, image_map)

@@ -111,7 +111,7 @@ def test_bags_without_rosbags(folder, monkeypatch):
 @pytest.mark.parametrize("kind", ["ros1", "mcap", "ros2"])
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.6])
 def test_bags_cut_off(folder, tmp_path, kind, share):
-    """Their index is gone: the sentence says what can bring it back."""
+    """A truncated bag has no index. The message says how to restore it."""
     source = source_path(folder, kind)
     source = next(source.glob("*.db3")) if source.is_dir() else source
     data = source.read_bytes()
@@ -161,7 +161,7 @@ def test_calibrations(folder):
 
 @pytest.mark.parametrize(("rows", "what"), [(0, "column"), (1, "column and row")])
 def test_an_encoder_that_cuts_off_a_column_is_named(corridor, tmp_path, rows, what):
-    """OpenCV's does so with images of odd sizes."""
+    """OpenCV's encoder cuts off a column of images with odd sizes."""
     images = [np.pad(image, ((0, rows), (0, 1))) for image in corridor.left[:3]]
     path = write_video(tmp_path / "a.mkv", images)
     camera = replace(corridor.camera, width=481, height=160 + rows)

@@ -54,7 +54,7 @@ def test_compressed_bags_are_read(tmp_path: Path, kind: str, compression: str):
 
 @pytest.mark.parametrize(("kind", "compression"), KINDS)
 def test_what_unpacks_to_too_much_is_refused(tmp_path, monkeypatch, kind: str, compression: str):
-    """Images of one colour: 3 MB in a file of a few kilobytes, where 1 MB is the limit."""
+    """Images of one colour have 3 MB in a file of a few kilobytes. The limit is 1 MB."""
     black = [np.zeros((1000, 1000), np.uint8)] * 3
     path = compressed(tmp_path, kind, compression, {LEFT: black, RIGHT: black})
     assert sum(p.stat().st_size for p in tmp_path.rglob("*") if p.is_file()) < 100_000

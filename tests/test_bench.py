@@ -274,7 +274,7 @@ def test_table_counts_cells(stub: Path, tmp_path: Path):
 def test_the_table_stays_only_if_cells_are_missing_or_failed(
     monkeypatch, capsys, stub: Path, tmp_path: Path, color: bool
 ):
-    """``color`` makes rich take stderr for a terminal."""
+    """With ``color``, rich treats stderr as a terminal."""
     if color:
         monkeypatch.setenv("FORCE_COLOR", "1")
     for cells, stays in ((CELLS[:2], True), (CELLS[:1], False)):
@@ -292,7 +292,10 @@ def test_the_table_stays_only_if_cells_are_missing_or_failed(
 
 @pytest.fixture
 def bench(stub: Path, kitti_tree: Path, tmp_path: Path, monkeypatch, capsys):
-    """``vslam bench`` with the stub in place of runs: (exit code, stdout, stderr)."""
+    """Run ``vslam bench`` with a stub in place of runs.
+
+    Returns the exit code, stdout and stderr.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
         execute, "RunOptions", functools.partial(execute.RunOptions, command=COMMAND)
@@ -439,7 +442,10 @@ def test_bench_refuses_before_it_starts(bench, words, parts):
 
 @pytest.mark.slow
 def test_a_real_grid_killed_and_resumed(kitti_tree: Path, tmp_path: Path):
-    """SIGKILL in the second cell: its process ends, too, and the next start does that cell only."""
+    """The benchmark is killed by SIGKILL in its second cell.
+
+    The process of this cell also ends. The next start runs only this cell.
+    """
     out = tmp_path / "bench"
     command = [sys.executable, "-m", "vslam", "bench", "--data", str(kitti_tree), "--seqs", "00"]
     command += ["--max-frames", "6", "--perturb", "none,brightness", "--detectors", "none"]
@@ -490,7 +496,7 @@ def test_a_run_ends_by_itself_though_its_standard_input_is_open():
 
 @pytest.mark.slow
 def test_a_video_is_a_grid_of_one_sequence(corridor, tmp_path: Path, monkeypatch):
-    """It runs once, and the same command again finds that done."""
+    """The video is run once. When the same command is called again, the run is already finished."""
     pairs = [np.hstack(pair) for pair in zip(corridor.left, corridor.right, strict=True)][:5]
     video = write_video(tmp_path / "drive.mkv", pairs)
     calib = write_calibration(tmp_path / "stereo.yaml", corridor.camera)

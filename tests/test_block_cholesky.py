@@ -31,7 +31,7 @@ SYSTEMS = {
 
 
 def random_system(n: int, pairs: list[tuple[int, int]], seed: int = 0) -> np.ndarray:
-    """Dense symmetric positive definite matrix with a block for each pair."""
+    """Make a dense symmetric positive definite matrix with a block for each pair."""
     rng = np.random.default_rng(seed)
     dense = np.zeros((6 * n, 6 * n))
     for i, j in pairs:
@@ -43,7 +43,10 @@ def random_system(n: int, pairs: list[tuple[int, int]], seed: int = 0) -> np.nda
 
 
 def in_panels(structure: Structure, dense: np.ndarray) -> np.ndarray:
-    """Lower triangle of a dense matrix (in the caller's order), as ``factor_solve`` takes it."""
+    """Convert the lower triangle of a dense matrix to the input of ``factor_solve``.
+
+    The matrix is in the order of the caller.
+    """
     S = np.zeros(36 * len(structure.row))
     for c in range(len(structure.order)):
         begin, width = panel(structure, c)
@@ -72,7 +75,10 @@ def test_solution_is_numpys(name):
 
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_structure_is_that_of_elimination(name):
-    """Column by column against sets: the neighbours at the moment of elimination."""
+    """The structure of each column is compared with that of a slow elimination.
+
+    The slow elimination keeps the neighbours of each block in sets.
+    """
     n, pairs = SYSTEMS[name]
     structure = analyse(n, np.array(pairs).reshape(-1, 2))
     assert sorted(structure.order.tolist()) == list(range(n))
@@ -106,7 +112,10 @@ def test_arrows_and_chains_do_not_fill():
 
 
 def test_a_long_chain_with_loops_stays_sparse():
-    """A thousand keyframes, each bound to ten before and after, two places seen twice."""
+    """Each of a thousand keyframes is coupled to ten before it and ten after it.
+
+    Two places are visited twice.
+    """
     pairs = chain(1000, 10)
     pairs += [(a + s, b + s + t) for a, b in ((0, 700), (300, 850)) for s in range(100)
               for t in range(-5, 5)]  # fmt: skip

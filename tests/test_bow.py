@@ -35,7 +35,10 @@ def features_of(descriptors: np.ndarray) -> Features:
 
 @pytest.fixture(scope="module")
 def tree() -> Vocabulary:
-    """20 x 20 words that all weigh the same; word w has the descriptor of node 21 + w."""
+    """Make a vocabulary of 20 x 20 words with equal weights.
+
+    Word w has the descriptor of node 21 + w.
+    """
     rng = np.random.default_rng(0)
     nodes = rng.integers(0, 256, (21 + WORDS, 32), dtype=np.uint8)
     for word in range(WORDS):  # near its parent, or else a descent would not find it
@@ -46,14 +49,15 @@ def tree() -> Vocabulary:
 
 
 def image_of(tree: Vocabulary, words: list[int] | np.ndarray) -> Features:
-    """An image with exactly these words."""
+    """Make an image that contains exactly these words."""
     return features_of(tree.descriptors[21 + np.asarray(words, np.int64)].view(np.uint8))
 
 
 class World:
     """A map and a detector that get the same keyframes.
 
-    A keyframe has its words as features; those in ``sees`` observe the landmark of that number.
+    The features of a keyframe have its words. The features in ``sees`` observe the landmarks with
+    the given numbers.
     """
 
     def __init__(self, tree: Vocabulary, **config: float) -> None:
@@ -236,7 +240,12 @@ def test_features_are_grouped_by_node(tree):
 
 
 def match_in_plain_python(a, b, node_a, node_b, max_distance, ratio):
-    """Closest of the same node, then each of b to the closest of a, the earlier node of equals."""
+    """Match features in plain Python.
+
+    Each feature of a is matched to the closest feature of b under the same node. Then, each feature
+    of b keeps only the closest feature of a. If several are equally close, the one with the first
+    node is kept.
+    """
     bits_a, bits_b = (np.unpackbits(x.view(np.uint8), axis=1) for x in (a, b))
     table = (bits_a[:, None] != bits_b[None]).sum(axis=2)
     table[node_a[:, None] != node_b[None]] = 999

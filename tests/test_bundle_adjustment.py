@@ -21,7 +21,10 @@ N_FREE, N_FIXED = 4, 2
 def make_problem(
     *, noise: float = 0.0, outliers: int = 0, n_points: int = 150, seed: int = 0
 ) -> tuple[BundleProblem, np.ndarray, np.ndarray]:
-    """A perturbed problem with mono and stereo observations; true poses and points."""
+    """Make a perturbed problem with monocular and stereo observations.
+
+    Also return the true poses and points.
+    """
     rng = np.random.default_rng(seed)
     n_cameras = N_FREE + N_FIXED
     truth = np.array(
@@ -67,7 +70,7 @@ def landmark_of_observation(problem: BundleProblem) -> np.ndarray:
 
 
 def robust_cost(problem: BundleProblem, T_cw: np.ndarray, points: np.ndarray) -> float:
-    """Half the sum of Huber losses, by NumPy."""
+    """Compute half the sum of the Huber losses using NumPy."""
     p = landmark_of_observation(problem)
     T = T_cw[problem.camera]
     in_camera = np.einsum("oij,oj->oi", T[:, :3, :3], points[p]) + T[:, :3, 3]
@@ -80,7 +83,10 @@ def robust_cost(problem: BundleProblem, T_cw: np.ndarray, points: np.ndarray) ->
 
 
 def gtsam_graph(problem: BundleProblem):
-    """The same problem as a factor graph: cameras 0..K-1, then the points."""
+    """Make the same problem as a factor graph of GTSAM.
+
+    The variables are the cameras 0 to K - 1, followed by the points.
+    """
     mono = gtsam.Cal3_S2(CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy)
     stereo = gtsam.Cal3_S2Stereo(CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy, CAMERA.baseline)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -243,7 +249,10 @@ def test_a_point_seen_once_in_mono_does_not_spoil_the_rest():
 
 
 def test_without_fixed_cameras_the_free_ones_settle_near_the_start():
-    """Six directions are free of cost; damping holds them."""
+    """Motion in six directions does not change the cost.
+
+    Damping keeps the cameras near the start.
+    """
     problem, _, _ = make_problem()
     camera = problem.camera
     keep = camera < N_FREE
@@ -288,7 +297,7 @@ def test_cholesky_solve_agrees_with_numpy(n):
 
 
 def test_cholesky_solve_of_a_banded_system():
-    """Blocks without coupling are skipped by a test for zero."""
+    """The solver skips blocks without coupling, which it finds by a test for zero."""
     rng = np.random.default_rng(0)
     S = np.zeros((60, 60))
     for k in range(0, 54, 6):

@@ -44,7 +44,10 @@ T_LEFT_RIGHT[:3, 3] = 0.06, 0.001, -0.002
 
 
 def poses(board: Board, model: CameraModel, n: int) -> list[np.ndarray]:
-    """``T_camera_board`` of views spread over the image and tilted in all directions."""
+    """Return ``T_camera_board`` of several views.
+
+    The board is in all parts of the image and is tilted in all directions.
+    """
     points = board_points(board)
     middle, extent = points.mean(axis=0), float(np.ptp(points, axis=0).max())
     upright = np.diag([1.0, -1.0, -1.0]) if board.kind == "aprilgrid" else np.eye(3)
@@ -70,7 +73,7 @@ def rendered(board: Board, model: CameraModel, views: list[np.ndarray], seed: in
 
 
 def exact_views(board: Board, model: CameraModel, poses: list[np.ndarray]) -> list[View]:
-    """Projected corners with a little noise, without images."""
+    """Make views from projected corners with a little noise, without images."""
     rng, points = np.random.default_rng(0), board_points(board)
     found = []
     for k, T in enumerate(poses):
@@ -81,7 +84,7 @@ def exact_views(board: Board, model: CameraModel, poses: list[np.ndarray]) -> li
 
 @pytest.fixture
 def calibrate(call):
-    """Run ``vslam calibrate`` in an empty folder: (exit code, stdout, stderr)."""
+    """Run ``vslam calibrate`` in an empty folder. Returns the exit code, stdout and stderr."""
     return partial(call, "calibrate")
 
 

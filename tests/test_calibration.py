@@ -95,7 +95,10 @@ RIGS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("rig", RIGS)
 def test_rectified_rows_correspond_and_disparity_is_depth(rig):
-    """Points in both images come from one row, at the disparity of the rectified camera."""
+    """A point has the same row in both rectified images.
+
+    Its disparity is that of the rectified camera.
+    """
     calibration = RIGS[rig]
     found = rectify(calibration)
     camera = found.camera
@@ -132,7 +135,7 @@ def test_no_pixel_of_a_rectified_image_is_black(rig):
 
 
 def test_most_of_the_view_is_kept():
-    """One row or column on a border is at the border of an image."""
+    """At least two sides of the rectified image show the border of the original image."""
     found = rectify(Calibration(replace(PINHOLE, distortion=RADTAN[:4])))
     c = found.camera
     ramp = np.tile(np.arange(480)[:, None] * 0.5, (1, 752)).astype(np.uint8)
@@ -189,7 +192,7 @@ def test_a_distortion_that_folds_the_image():
 
 @pytest.mark.slow
 def test_a_wide_lens_may_fold_its_corners():
-    """As fits of action cameras do, whose targets never reach the corners."""
+    """This is common for action cameras, if the target was never near the corners."""
     wide = CameraModel(582.0, 582.0, 640, 360, 1280, 720, "pinhole", (-0.24, 0.05, 0, 0, -0.004))
     corner, middle = np.array([[0.0, 0.0]]), np.array([[0.0, 360.0]])
     assert np.isnan(unproject(wide, corner)).all()
@@ -201,7 +204,7 @@ def test_a_wide_lens_may_fold_its_corners():
 
 
 def drawn(corridor: StereoSequence, right: list) -> RawSource:
-    """Images in memory as a raw source."""
+    """Make a raw source from images in memory."""
     stored = stored_frames(corridor.timestamps, lambda k, image_map: (corridor.left[k], right[k]))
     n_sides = 1 if right[0] is None else 2
     size = corridor.camera.width, corridor.camera.height

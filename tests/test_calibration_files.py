@@ -55,7 +55,7 @@ def ros_matrix(array: np.ndarray) -> str:
 
 
 def rectifying(models: Models) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """R and P as OpenCV's stereo calibration puts them into ROS's and ORB-SLAM2's files."""
+    """Compute R and P as OpenCV's stereo calibration does, for the files of ROS and ORB-SLAM2."""
     T_right_left = inverse(T_LEFT_RIGHT)
     D = [np.array(c.distortion) for c in models]
     R1, R2, _, P2, *_ = cv2.stereoRectify(
@@ -136,7 +136,7 @@ def ros_message(folder: Path, models: Models) -> list[Path]:
 
 
 def opencv(folder: Path, models: Models) -> list[Path]:
-    """Written by OpenCV itself, as its stereo sample does."""
+    """Write a calibration using OpenCV, as its stereo sample does."""
     paths = [folder / "intrinsics.yml", folder / "extrinsics.yml"]
     first, second = (cv2.FileStorage(str(p), cv2.FILE_STORAGE_WRITE) for p in paths)
     for k, c in enumerate(models, start=1):
@@ -200,7 +200,7 @@ def test_a_fisheye_pair(tmp_path, write):
 
 
 def complaint(given: list[Path]) -> str:
-    """What the reader says against files, nothing where it takes them for a camera's."""
+    """Return the error message of the reader for these files; empty if it accepts them."""
     try:
         assert read_calibration(given, SIZE).left.fx > 0
     except InputError as error:
@@ -210,7 +210,10 @@ def complaint(given: list[Path]) -> str:
 
 @pytest.mark.parametrize("write", RADIAL, ids=lambda f: f.__name__)
 def test_truncated_and_damaged_files(tmp_path, write):
-    """Either an `InputError` of one line, or numbers that are no camera's are not let through."""
+    """The reader raises an `InputError` of one line.
+
+    If it accepts the file, all numbers are possible for a camera.
+    """
     given = write(tmp_path, (LEFT, RIGHT))
     files = [p for p in tmp_path.rglob("*") if p.is_file()]
     whole = {path: path.read_text() for path in files}
@@ -291,7 +294,10 @@ def test_a_size_that_neither_file_nor_image_tells(tmp_path):
 
 
 def test_settings_of_an_rgbd_camera(tmp_path):
-    """ORB-SLAM2's TUM1.yaml, which has neither size nor type."""
+    """The file is like ORB-SLAM2's TUM1.yaml.
+
+    It states neither the image size nor the camera type.
+    """
     path = tmp_path / "TUM1.yaml"
     path.write_text(
         "%YAML:1.0\nCamera.fx: 517.306408\nCamera.fy: 516.469215\nCamera.cx: 318.643040\n"

@@ -75,7 +75,7 @@ def test_routing_turns_to_the_majority():
 
 
 def routed(u, W, iterations, over="primary", alive=None):
-    """Output capsules and coupling coefficients."""
+    """Return the output capsules and the coupling coefficients."""
     v, e, total = capsules.route(u, W, iterations, over, alive)
     return v, capsules.couplings(e, total)
 
@@ -179,7 +179,10 @@ def test_gain_and_bias_of_the_camera_drop_out():
 
 
 def test_what_shows_no_texture_changes_nothing_else():
-    """Neither what covers a part of the image, nor how bright it is."""
+    """An object without texture hides a part of the image.
+
+    Neither the object nor its brightness changes the output for the rest of the image.
+    """
     x = images(1)[:, :1]
     dark, bright = x.clone(), x.clone()
     dark[..., 40:], bright[..., 40:] = 0.0, 1.0

@@ -51,7 +51,7 @@ FRAMES = 12
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """A KITTI tree in which the right camera lacks the last two frames."""
+    """A KITTI sequence whose right camera lacks the last two frames."""
     data = tmp_path / "kitti"
     folder = data / "sequences" / "00"
     rng = np.random.default_rng(0)
@@ -285,7 +285,7 @@ def test_thresholds_are_given_as_values_too(call, tmp_path):
 
 
 def commands(group: Any, words: str = "vslam") -> Iterator[tuple[str, Any]]:
-    """Every command that is shown, with the words that call it."""
+    """Return every visible command with the words that call it."""
     for name, found in group.commands.items():
         if hasattr(found, "commands"):
             yield from commands(found, f"{words} {name}")
@@ -393,7 +393,7 @@ def test_an_option_that_only_other_commands_have(call, words, parts):
 
 
 def shaken(trajectory: Trajectory) -> Trajectory:
-    """Every other pose 0.2 m off, which is an ATE of 0.1 m."""
+    """Move every other pose by 0.2 m, which gives an ATE of 0.1 m."""
     T_wc = trajectory.T_wc.copy()
     T_wc[::2, 1, 3] += 0.2
     return replace(trajectory, T_wc=T_wc)
@@ -406,7 +406,10 @@ def fake_result(index: int, T_wc: np.ndarray) -> TrackResult:
 
 @pytest.fixture
 def pipeline(monkeypatch) -> SimpleNamespace:
-    """In place of SLAM: returns the ground truth, shifted; notes what it was called with."""
+    """A replacement of SLAM that returns a shifted ground truth.
+
+    It records the arguments of its calls.
+    """
     calls = SimpleNamespace(interrupted=None, loops=[], lost=False)
 
     def run_sequence(
@@ -529,7 +532,7 @@ def test_summary_without_a_detector(call, root, pipeline):
 
 
 def detectors_in(out: str) -> list[list[str]]:
-    """Cells of the table of detectors that a run prints, its head first."""
+    """Return the cells of the table of detectors that a run prints. The first row is the head."""
     table = out.split("Detectors\n\n")[1].split("\n\n")[0]
     head, _, *rows = [re.split(r"  +", line.strip()) for line in table.splitlines()]
     return [head, *rows]

@@ -30,7 +30,7 @@ DENSE = Config(keyframes=KeyframeConfig(max_interval_s=0.35))  # many keyframes,
 
 
 class Deceived(Oracle):
-    """Takes the opposite side of the ring for the place."""
+    """A detector that mistakes each place for the place on the opposite side of the ring."""
 
     def query(self, keyframe, map_):
         opposite = int(np.argmin(np.abs(np.array(map_.frames) - map_.frames[keyframe] + LAP // 2)))
@@ -40,8 +40,11 @@ class Deceived(Oracle):
 
 
 class Sticker(Ring):
-    """Where the camera is carried from one place to another, the first image shows, beside what is
-    there, a few things that look just like those it saw before."""
+    """A drive in which the camera is carried from one place to another.
+
+    The first image after that shows a few things that look like things that the camera saw before.
+    It also shows what is really there.
+    """
 
     def see(self, k, seed):
         features = super().see(k, seed)
@@ -60,8 +63,10 @@ CARRIED = [*ROUND[:60], *ROUND[90:]]
 
 
 def run(ring, frames, detector="none", *, threads=1, dark=(), finish=True, config=None, look=None):
-    """Drive along ``frames`` of the ring, ten a second; ``dark`` ones show nothing. ``look`` is
-    called after each frame."""
+    """Drive along ``frames`` of the ring at ten frames per second.
+
+    Frames in ``dark`` show nothing. ``look`` is called after each frame.
+    """
     slam = Slam(CAMERA, config, detector, threads=threads)
     results = []
     for i, k in enumerate(frames):
@@ -76,7 +81,10 @@ def run(ring, frames, detector="none", *, threads=1, dark=(), finish=True, confi
 
 
 def errors(slam, ring, frames):
-    """``(N,)`` metres between estimated and true positions, in the world of the first frame."""
+    """Return the ``(N,)`` distances in metres between estimated and true positions.
+
+    Positions are in the world of the first frame.
+    """
     T_0 = inverse(ring.pose(frames[0]))
     truth = np.array([(T_0 @ ring.pose(k))[:3, 3] for k in frames])
     return np.linalg.norm(slam.trajectory().T_wc[:, :3, 3] - truth, axis=1)
@@ -177,8 +185,11 @@ def test_same_bytes_with_one_thread_and_two():
 
 @pytest.mark.slow
 def test_two_slams_may_share_the_features_of_their_frames():
-    """As those of compared detectors do: neither writes to them, one closes the loop. All that is
-    corrected in features is: disparities, and a right side that is late."""
+    """Two ``Slam`` objects share features, as those of compared detectors do.
+
+    Only one of them closes the loop. Neither of them changes the shared features, although both
+    corrections of features are active: that of disparities, and that of a delay of the right image.
+    """
     late = 0.004
     ring = replace(Ring.create(focal_error=0.015), right_delay=late)
 
@@ -266,7 +277,7 @@ def test_two_seconds_of_darkness_lose_no_pose(check_map):
 
 
 class Accepting(Verifier):
-    """Takes every candidate for one and the same verified loop."""
+    """A verifier that accepts every candidate as the same verified loop."""
 
     def __init__(self, edge):
         super().__init__(Config(), CAMERA)
@@ -277,7 +288,7 @@ class Accepting(Verifier):
 
 
 def closing_of(edge, config, threads=1):
-    """Loop closing that accepts one loop as soon as it is a candidate."""
+    """Make loop closing that accepts one loop as soon as it is a candidate."""
     at_once = ConsistencyConfig(min_keyframes=1, min_verified=1)
     config = config.model_copy(update={"consistency": at_once})
     return LoopClosing(NoDetector(), Accepting(edge), CAMERA, config, threads=threads)
@@ -285,7 +296,10 @@ def closing_of(edge, config, threads=1):
 
 @cache
 def open_loop(gap):
-    """A map of two sub-maps, and a verified loop between them that is not closed yet."""
+    """Make a map of two sub-maps.
+
+    Also return a verified loop between the sub-maps that is not closed yet.
+    """
     if gap == "dark":  # the camera went on for a second
         ring, frames, dark = DRIFTING, ROUND, range(60, 70)
     else:  # 90 m between two frames
@@ -383,7 +397,7 @@ def test_a_global_adjustment_that_fails_leaves_the_map_as_it_was(monkeypatch, ca
 
 
 def test_loop_closing_restored_from_its_state_closes_the_loop_that_waits():
-    """A loop that one keyframe verifies waits for the next one."""
+    """A loop that was verified from only one keyframe waits for the next keyframe."""
     ring, frames = EXACT, [*ROUND[:80], *ROUND[140:]]
     map_ = copy.deepcopy(open_loop("carried")[0])
     oracle, last = Oracle(ring, frames), map_.n_keyframes - 1
@@ -407,7 +421,10 @@ def test_loop_closing_restored_from_its_state_closes_the_loop_that_waits():
 
 
 def test_where_no_speed_was_known_a_restart_is_unpredicted():
-    """Lost at once, the map has no velocity to predict the gap with."""
+    """Tracking is lost at once.
+
+    The map has no velocity from which the motion during the gap can be predicted.
+    """
     frames = [0.0, *ROUND[30:60]]
     slam, results = run(EXACT, frames)
     assert [r.state for r in results[:3]].count(TrackingState.LOST) == 1
@@ -416,7 +433,7 @@ def test_where_no_speed_was_known_a_restart_is_unpredicted():
 
 @pytest.mark.slow
 def test_a_wrong_keyframe_bends_the_map_and_the_loops_that_tell_are_refused():
-    """A camera is carried 45 m on, and its next image agrees with wrong landmarks."""
+    """The camera is carried 45 m away, and its next image agrees with wrong landmarks."""
     ring = Sticker(EXACT.points, EXACT.descriptors)
     slam, results = run(ring, CARRIED, Oracle(ring, CARRIED), config=DENSE)
     assert results[60].state == TrackingState.WEAK
@@ -438,14 +455,14 @@ def test_a_wrong_keyframe_bends_the_map_and_the_loops_that_tell_are_refused():
 
 
 def twofold() -> Ring:
-    """A ring whose second half looks exactly like its first."""
+    """Make a ring whose second half looks exactly like its first half."""
     first = EXACT.points[:, 2] > 0.0
     points, descriptors = EXACT.points[first], EXACT.descriptors[first]
     return Ring(np.concatenate([points, points * [-1, 1, -1]]), np.tile(descriptors, (2, 1)))
 
 
 class Confused(Oracle):
-    """Takes what looks the same for the same."""
+    """A detector that treats places as equal if they look the same."""
 
     def _near(self, frame, query, map_, last):
         here = self.frames[frame] % (LAP / 2)

@@ -29,7 +29,7 @@ pytest.importorskip("distributed", reason="no dask here: pip install 'vslam[clus
 
 @pytest.fixture
 def cluster(stub: Path, tmp_path: Path) -> Iterator[tuple[str, list[psutil.Popen]]]:
-    """Address of a scheduler, and its two workers of one thread each."""
+    """The address of a scheduler, and its two workers with one thread each."""
     log = tmp_path / "dask.txt"
     processes: list[psutil.Popen] = []
 
@@ -112,7 +112,10 @@ def test_no_scheduler_is_one_sentence(tmp_path: Path, monkeypatch):
     [("foo://bar", "no scheduler answers"), ("tls://127.0.0.1:9", "Dask has no certificates")],
 )
 def test_an_address_that_cannot_be_used_leaves_no_client_behind(address: str, said: str):
-    """A client that never began cannot close: that took 20 s, and ended in a traceback."""
+    """A client that never connected cannot be closed.
+
+    Closing it once took 20 s and ended in a traceback.
+    """
     code = (
         "from vslam.lab.bench.cluster import run_on_cluster\n"
         "from vslam.lab.bench.execute import RunOptions\n"

@@ -15,7 +15,7 @@ from vslam.loops import LoopCandidate
 
 
 class Told:
-    """Finds what it is told to."""
+    """A detector that returns the candidates that it was given."""
 
     def __init__(self, name: str, matches: list[int], *, similarity: float | None) -> None:
         self.name, self.added = name, []

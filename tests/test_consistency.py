@@ -15,9 +15,10 @@ DRIFT = se3_exp(np.array([2.0, 0.3, -4.0, 0.01, 0.12, 0.0]))
 
 
 class Street:
-    """A map as consistency asks it: keyframes 2 m apart, driven twice, covisible up to 6 m.
+    """A map that has only what the check of consistency needs.
 
-    The second pass starts with keyframe 100 and has drifted.
+    Its keyframes are 2 m apart on a street that is driven twice. Keyframes up to 6 m apart are
+    covisible. The second pass starts with keyframe 100 and has drifted.
     """
 
     def covisible(self, keyframe: int, minimum: int = 1):
@@ -37,7 +38,10 @@ def candidates(query: int, *matches: int) -> list[LoopCandidate]:
 
 
 def verified(query: int, match: int, error=(0.0, 0.0, 0.0), turn: float = 0.0) -> LoopEdge:
-    """An edge with the true relative pose, wrong by ``error`` (m) and ``turn`` (degrees)."""
+    """Make an edge with the true relative pose and an error.
+
+    The error consists of ``error`` metres and ``turn`` degrees.
+    """
     true = compose(
         inverse(se3_exp(np.array([0.0, 0.0, 2.0 * (query - 100), 0.0, 0.0, 0.0]))),
         inverse(STREET.keyframe_pose(match)),

@@ -97,7 +97,7 @@ TRAINING_COMMANDS = "vslam.cli.train"
 
 
 def sources() -> dict[str, Path]:
-    """Every module of the package, by its installed name."""
+    """Return the source of every module of the package by its installed name."""
     found = {}
     for folder, package in FOLDERS.items():
         for path in sorted((ROOT / folder).rglob("*.py")):
@@ -111,7 +111,10 @@ def within(module: str, package: str) -> bool:
 
 
 def imports_of(source: str, module: str = "", *, package: bool = False) -> set[str]:
-    """Absolute names of all that a source imports, in functions and under TYPE_CHECKING too."""
+    """Return the absolute names of all imports in a source.
+
+    Imports in functions and under TYPE_CHECKING are included.
+    """
     names = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -128,8 +131,11 @@ def imports_of(source: str, module: str = "", *, package: bool = False) -> set[s
 
 
 def modules_of(names: set[str], known: set[str]) -> set[str]:
-    """The modules among imported names: ``from a.b import c`` needs the module a.b, unless c is a
-    module itself: then a.b is only where it lies."""
+    """Return the modules among imported names.
+
+    ``from a.b import c`` needs the module a.b. If c is itself a module, a.b is only the package in
+    which c lies, and does not count.
+    """
     found = names & known
     parents = {
         name
@@ -148,14 +154,17 @@ ARROWS = {module: modules_of(names, set(SOURCES)) for module, names in IMPORTS.i
 
 
 def level_of(module: str) -> tuple[int, str]:
-    """Level of a module, and the name there that it lies within."""
+    """Return the level of a module, and the name in the table of levels to which it belongs."""
     names = [(name, k) for k, level in enumerate(LEVELS) for name in level if within(module, name)]
     name, level = max(names, key=lambda found: len(found[0]))
     return level, name
 
 
 def upward(arrows: dict[str, set[str]]) -> list[str]:
-    """Imports that lead up, or across a level where nothing allows it."""
+    """Return the imports that lead to a higher level.
+
+    Imports within a level are also returned if they are not allowed.
+    """
     wrong = []
     for module, targets in arrows.items():
         level, place = level_of(module)
@@ -225,7 +234,7 @@ def test_an_upward_import_and_a_circle_would_be_seen():
 
 
 def test_no_module_is_started_by_name_from_below():
-    """``python -m vslam.x`` is an import that no reader of imports sees."""
+    """``python -m vslam.x`` imports a module without an import statement."""
     started = {
         (module, name)
         for module, path in SOURCES.items()
@@ -248,8 +257,11 @@ def test_heavy_libraries_stay_where_they_belong(library):
 
 
 def test_only_training_reaches_the_libraries_of_the_extra_train():
-    """However long the chain of imports: runs, maps, loops and benchmarks do without them, but for
-    the check of networks that vslam does not ship, which asks for onnx in one sentence."""
+    """Chains of imports may have any length.
+
+    Runs, maps, loops and benchmarks do not need the extra. There is one exception: the check of
+    networks that are not shipped needs onnx. If onnx is missing, one sentence says so.
+    """
     extra = {"torch", "safetensors", "onnx", "onnxscript"}
     need = {m for m, names in IMPORTS.items() if {name.partition(".")[0] for name in names} & extra}
     need -= {"vslam.loopclosure.siamese.onnx_limits"}
@@ -267,7 +279,7 @@ def test_only_its_commands_import_the_training():
 
 
 def names_of(path: Path) -> set[str]:
-    """What a module can be asked for by name: all that it binds outside of functions."""
+    """Return all names that a module binds outside of functions."""
     names, waiting = set(), list(ast.parse(path.read_text()).body)
     while waiting:
         node = waiting.pop()
@@ -282,7 +294,10 @@ def names_of(path: Path) -> set[str]:
 
 
 def test_the_tools_import_what_there_is():
-    """No test runs an experiment for hours: this shows when what it needs has moved."""
+    """No test runs an experiment for hours.
+
+    This test finds imports in the tools that no longer exist.
+    """
     missing = []
     for path in sorted((ROOT / "tools").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
@@ -318,8 +333,10 @@ def test_tracking_and_mapping_load_no_heavy_library():
 
 @pytest.mark.slow
 def test_a_run_loads_what_it_needs(kitti_tree, tmp_path):
-    """A third of the start are imports: without pages, recording or ground truth a run does
-    without these."""
+    """A third of the start-up time is imports.
+
+    A run without pages, recording or ground truth does not import the modules for them.
+    """
     (tmp_path / "sequences").symlink_to(kitti_tree / "sequences")
     script = (
         "import atexit, sys\n"

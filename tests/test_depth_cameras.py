@@ -24,7 +24,7 @@ PACKAGES = {"realsense": "pyrealsense2", "oakd": "depthai"}
 
 @dataclass
 class Recorded:
-    """What a device has seen, and how it fails."""
+    """The frames that a device has recorded, and how the device fails."""
 
     camera: Any
     left: list[np.ndarray]
@@ -46,14 +46,17 @@ class Recorded:
 
 
 def colours(grey: np.ndarray) -> np.ndarray:
-    """Red, green, blue that differ but have this grey value."""
+    """Make pixels of different red, green and blue that have this grey value."""
     rgb = np.repeat(grey[..., None], 3, axis=2).astype(int)
     rgb[..., 2] = np.clip(rgb[..., 2] + 3, 0, 255)  # blue has a weight of 0.114
     return rgb.astype(np.uint8)
 
 
 def realsense(recorded: Recorded, serials: tuple[str, ...] = ("817", "918")) -> SimpleNamespace:
-    """The part of pyrealsense2 that vslam uses; depth is registered to colour only by ``align``."""
+    """Replace the part of pyrealsense2 that vslam uses.
+
+    Depth is registered to colour only by ``align``.
+    """
     r, c = recorded, recorded.camera
     names = ("color", "depth", "infrared")
     option = SimpleNamespace(emitter_enabled="emitter", stereo_baseline="baseline")
@@ -136,7 +139,10 @@ def realsense(recorded: Recorded, serials: tuple[str, ...] = ("817", "918")) -> 
 
 
 def depthai(recorded: Recorded, platform: str = "RVC2") -> SimpleNamespace:
-    """The part of depthai that vslam uses: a graph of nodes, through which images are pulled."""
+    """Replace the part of depthai that vslam uses.
+
+    It is a graph of nodes through which images are passed.
+    """
     r, c = recorded, recorded.camera
 
     class Frame:
@@ -266,7 +272,7 @@ def depthai(recorded: Recorded, platform: str = "RVC2") -> SimpleNamespace:
 
 
 class QueueGoneError(Exception):
-    """As depthai's, this is no RuntimeError."""
+    """An error that is no RuntimeError, like the error of depthai."""
 
 
 FAKES = {"realsense": realsense, "oakd": depthai}
@@ -285,7 +291,7 @@ def connect(monkeypatch, dataset: str, recorded: Recorded, *more: Any) -> None:
 
 
 def taken(source) -> list[Any]:
-    """The frames of a source until the device stops."""
+    """Return the frames of a source until the device stops."""
     frames = []
     with pytest.raises(BrokenSourceError, match="stopped after"):
         frames.extend(source.frames())  # extend keeps what came before the error

@@ -30,7 +30,7 @@ STAMPS = [k * 10**8 for k in range(FRAMES)]
 
 @pytest.fixture(scope="module")
 def depths(corridor: StereoSequence) -> list[np.ndarray]:
-    """Millimetres, 0 where there is sky."""
+    """Depth in millimetres, which is 0 in the sky."""
     poses = corridor.T_wc[:FRAMES]
     metres = [corridor_depth(corridor.camera, T_wc) for T_wc in poses]
     return [np.rint(1000 * m).clip(0, 65535).astype(np.uint16) for m in metres]
@@ -43,7 +43,7 @@ def calib(corridor, tmp_path_factory) -> Path:
 
 
 def with_baseline(path: Path, camera: Camera, more: str = "") -> Path:
-    """A calibration with the virtual baseline of the camera."""
+    """Write a calibration with the virtual baseline of the camera."""
     path.write_text(f'{path.read_text()[:-1]}, "virtual_baseline": {camera.baseline}{more}}}')
     return path
 
@@ -120,7 +120,10 @@ def test_the_camera_info_of_the_images_is_enough(corridor, depths, tmp_path):
 
 
 def test_each_image_gets_the_nearest_depth(corridor, depths, calib, tmp_path):
-    """A Kinect's: depth at 30 Hz, 18 ms before and 15 ms after the images."""
+    """The times are those of a Kinect.
+
+    Depth arrives at 30 Hz, 18 ms before and 15 ms after the images.
+    """
     stamps = [k * 33_000_000 for k in range(FRAMES)]
     sides = {DEPTH: depths, COLOUR: corridor.left[:FRAMES]}
     bag = write_bag(tmp_path / "a.bag", "ros1", sides, stamps, lag=18_000_000)
@@ -131,7 +134,10 @@ def test_each_image_gets_the_nearest_depth(corridor, depths, calib, tmp_path):
 
 
 def test_images_of_a_bag_without_depth_are_counted(corridor, depths, calib, tmp_path, caplog):
-    """Depth comes 95 ms late: near the next image as long as this follows after 100 ms."""
+    """Each depth image is 95 ms late.
+
+    It is near the next image as long as this image follows after 100 ms.
+    """
     stamps = [k * 1_000_000 for k in (0, 100, 200, 300, 430, 560, 690, 820)]
     sides = {COLOUR: corridor.left[:FRAMES], DEPTH: depths}
     bag = write_bag(tmp_path / "a.bag", "ros1", sides, stamps, lag=95_000_000)

@@ -17,8 +17,11 @@ N_CAMERAS = 8
 
 
 def drive(offset: float, speed: float = 1.1, noise: float = 0.0, seed: int = 0) -> BundleProblem:
-    """A street seen from a car that drives ahead; its pair sees ``offset`` px too little. The map
-    is what such a pair would make: its depths come from the wrong disparities of one frame."""
+    """Simulate a car that drives ahead along a street.
+
+    All disparities of its stereo pair are ``offset`` px too small. The map is as such a pair would
+    make it: its depths come from the wrong disparities of one frame.
+    """
     rng = np.random.default_rng(seed)
     points = np.column_stack(
         [rng.uniform(-12, 12, 400), rng.uniform(-4, 1.6, 400), rng.uniform(16, 70, 400)]

@@ -34,7 +34,7 @@ FEW = OrbConfig(n_features=500)  # for images of 480x160
 
 @dataclass(frozen=True)
 class Seen:
-    """Images in memory as a sequence; ``second``: right images or depth."""
+    """A sequence of images in memory. ``second`` contains right images or depth."""
 
     camera: Camera
     left: list
@@ -88,7 +88,7 @@ def shifted(times: np.ndarray) -> np.ndarray:
 
 
 def timed(seen: Seen, times: np.ndarray) -> Seen:
-    """The left camera alone, at other times."""
+    """Return the left camera alone, with different times."""
     return replace(seen, second=[None] * len(seen), timestamps=times)
 
 
@@ -155,7 +155,10 @@ def test_a_planted_fault_is_found_alone(clean, fault):
     ("baseline", "verdict"), [(0.12, "good"), (12.0, "fault"), (1e-4, "fault")]
 )
 def test_what_the_calibration_says_of_lengths_is_shown(clean, baseline, verdict):
-    """A baseline in another unit is told by its size; the depth of the matches grows with it."""
+    """A baseline in a wrong unit is recognised by its size.
+
+    The depths of the matches are proportional to the baseline.
+    """
     seen = replace(clean, camera=replace(clean.camera, baseline=baseline))
     (finding,) = (f for f in examine(seen, FEW).findings if f.check == "scale")
     assert finding.verdict == verdict
@@ -199,7 +202,7 @@ def test_sides_of_different_places(clean):
 
 
 def boxes(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Textured boxes of several depths, and their depth."""
+    """Make an image of textured boxes at several depths, and their depth."""
     rng = np.random.default_rng(seed)
     image = rng.integers(90, 110, (240, 320)).astype(np.uint8)
     depth = np.full(image.shape, 4.0, np.float32)
@@ -228,7 +231,10 @@ def test_depth_of_another_camera(depth_images):
 
 
 def test_one_view_does_not_tell_that_depth_is_off(depth_images):
-    """Eight frames of one view are evidence of one: its edges may fit elsewhere by chance."""
+    """Eight frames of the same view count as one piece of evidence.
+
+    Its edges may agree with a different calibration by chance.
+    """
     image, depth = depth_images.left[0], np.roll(depth_images.second[0], 9, axis=1)
     shaken = [np.roll(image, k, axis=1) for k in range(8)]
     moved = [np.roll(depth, k, axis=1) for k in range(8)]
@@ -245,7 +251,7 @@ def test_one_view_does_not_tell_that_depth_is_off(depth_images):
 
 
 def windows_of_desk() -> list[tuple[list, list]]:
-    """Images and depth of eight frames each, from nine windows of 60."""
+    """Return images and depth of nine windows of 60 frames. Each window has eight frames."""
     desk = open_tum(REAL / "tum", "rgbd_dataset_freiburg1_desk")
     starts = range(0, 9 * 60, 60)
     frames = [np.linspace(k, k + 59, 8).round().astype(int).tolist() for k in starts]
@@ -341,7 +347,7 @@ def test_the_command(kitti_tree, tmp_path):
 
 @pytest.mark.slow
 def test_the_command_looks_at_the_beginning_of_a_video(corridor, tmp_path, monkeypatch):
-    """Frames of a stream cannot be had again: the first ones are kept."""
+    """The frames of a stream cannot be read again. Therefore, the first frames are kept."""
     monkeypatch.setattr("vslam.datasets.frames._FIRST_FRAMES", 9)
     pairs = [np.hstack(pair) for pair in zip(corridor.left, corridor.right, strict=True)]
     video = write_video(tmp_path / "drive.mkv", pairs)
@@ -423,7 +429,7 @@ def test_a_wrong_focal_length_shows_when_the_camera_turns(clean, factor):
 
 @pytest.mark.slow
 def test_straight_ahead_no_focal_length_shows(clean):
-    """Frames 0 to 7 go straight on."""
+    """In the frames 0 to 7, the camera moves straight ahead."""
     straight = replace(
         clean, left=clean.left[:8], second=clean.second[:8], timestamps=clean.timestamps[:8],
         camera=replace(clean.camera, fx=1.3 * clean.camera.fx, fy=1.3 * clean.camera.fy),

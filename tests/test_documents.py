@@ -41,7 +41,10 @@ def test_links_and_files_named_exist(document):
 
 
 def files_named(text: str) -> list[str]:
-    """Without those of lines that name the commit of a removed script."""
+    """Return the files that a page names.
+
+    Lines that name the commit of a removed script are left out.
+    """
     lines = [line for line in text.splitlines() if not IN_HISTORY.search(line)]
     return SOURCE.findall("\n".join(lines))
 
@@ -56,7 +59,7 @@ def test_what_is_kept_in_the_history_is_there():
 
 
 def is_in_history(what: str) -> bool:
-    """Whether git has a commit, or a file in a commit (``COMMIT:FILE``)."""
+    """Return whether git has a commit, or a file in a commit (``COMMIT:FILE``)."""
     return not subprocess.run(
         ["git", "cat-file", "-e", what], cwd=ROOT, check=False, capture_output=True
     ).returncode
@@ -91,7 +94,7 @@ def test_tests_that_documents_name_exist():
 
 
 def test_the_example_of_the_readme_runs():
-    """Its names are those of the package, and it tracks a frame."""
+    """The example uses names that the package has, and it tracks a frame."""
     import numpy as np
 
     (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)

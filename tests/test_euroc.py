@@ -44,7 +44,10 @@ def sensor(T: np.ndarray, camera) -> str:
 
 @pytest.fixture
 def root(corridor: StereoSequence, tmp_path: Path) -> Path:
-    """The corridor's beginning, its right images 1 ms late, with ground truth of the body."""
+    """The beginning of the corridor in EuRoC's layout.
+
+    Right images are 1 ms late. The ground truth is that of the body.
+    """
     base = tmp_path / "V9_01" / "mav0"
     T_left_right = np.eye(4)
     T_left_right[0, 3] = corridor.camera.baseline
@@ -159,7 +162,10 @@ def test_ground_truth_of_some_frames(root, corridor, caplog):
 
 
 def test_ground_truth_between_measurements():
-    """Half-way between two poses; not across a gap, nor beyond the ends."""
+    """A pose half-way between two measurements is interpolated.
+
+    There are no poses in a gap, before the first or after the last measurement.
+    """
     T_wc = np.tile(np.eye(4), (4, 1, 1))
     T_wc[:, 0, 3] = 0.0, 1.0, 2.0, 3.0
     T_wc[1, :3, :3] = Rotation.from_rotvec([0.0, 0.2, 0.0]).as_matrix()

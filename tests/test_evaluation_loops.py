@@ -19,8 +19,11 @@ NO_EDGES: list[LoopEdge] = []
 
 
 def along(*corners: tuple[float, float], step: float = STEP_M) -> Poses:
-    """``T_wc`` of a car through the corners (x, z), looking where it goes, a pose every ``step``
-    metres and one at each corner, with the heading of the way that leads there."""
+    """Return ``T_wc`` of a car that drives through the corners (x, z) and looks ahead.
+
+    There is a pose every ``step`` metres and one at each corner. A corner has the heading of the
+    path that leads to it.
+    """
     poses = []
     for (x0, z0), (x1, z1) in pairwise(corners):
         length = np.hypot(x1 - x0, z1 - z0)
@@ -39,14 +42,16 @@ def pose(x: float, z: float, heading: float, y: float = 0.0) -> Poses:
 
 
 def laps(count: float, radius: float = 40.0, step: float = STEP_M) -> Poses:
-    """Circles to the right at a pose a metre."""
+    """Return the poses of circles to the right, one pose per metre."""
     angles = np.arange(0.0, 2.0 * np.pi * count, step / radius)
     return np.array([pose(radius * (1 - np.cos(a)), radius * np.sin(a), a) for a in angles])
 
 
 def block(*, offset: float = 0.0, overlap: float = 60.0) -> Poses:
-    """Once around a block of 100 m, then ``overlap`` metres along its first side again, in a lane
-    ``offset`` metres to the right."""
+    """Drive once around a block of 100 m, then ``overlap`` metres along the first side again.
+
+    The second time, the car is in a lane ``offset`` metres to the right.
+    """
     corners = [(0, 0), (0, 100), (100, 100), (100, -20), (offset, -20)]
     return along(*corners, (offset, overlap))
 
@@ -81,7 +86,7 @@ def test_second_lap_is_one_revisit_of_the_first():
 
 
 def ramp() -> Poses:
-    """Around the block, ever higher."""
+    """Drive around the block and rise all the time."""
     T_wc = block()
     T_wc[:, 1, 3] = -np.linspace(0.0, 20.0, len(T_wc))
     return T_wc
@@ -124,7 +129,7 @@ def test_acute_crossing_is_as_long_as_the_lanes_are_near():
 
 @pytest.mark.parametrize(("interruption", "expected"), [(8, 1), (12, 2)])
 def test_short_interruption_does_not_split(interruption, expected):
-    """The camera looks away for some metres of the way."""
+    """The camera looks in a different direction for a few metres of the revisit."""
     T_wc = block(overlap=80.0)
     away = slice(len(T_wc) - 45, len(T_wc) - 45 + interruption)
     T_wc[away, :3, :3] = pose(0.0, 0.0, np.radians(60.0))[:3, :3]
@@ -158,7 +163,10 @@ def test_too_few_frames(frames):
 
 
 def test_kidnapping_is_no_path():
-    """Nobody drove between the two frames 200 m apart: passing there is no revisit."""
+    """The camera jumps by 200 m between two frames.
+
+    A later drive through the gap is no revisit, because the camera was never there.
+    """
     there = along((0, 0), (0, 60))
     far = along((0, 260), (0, 300), (100, 300), (100, 90), (0, 90), (0, 240))
     T_wc = np.concatenate([there, far])

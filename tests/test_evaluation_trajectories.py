@@ -26,7 +26,10 @@ from vslam.trajectory import Trajectory, trajectory_format, write_kitti, write_t
 
 
 def drive(n: int = 2001, step: float = 0.5, turn: float = 0.004) -> Trajectory:
-    """A camera on a circle: ``step`` metres forward and ``turn`` radians of yaw a frame."""
+    """Return the poses of a camera on a circle.
+
+    It moves ``step`` metres forward and turns ``turn`` radians per frame.
+    """
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec([0, turn, 0]).as_matrix()
     T[2, 3] = step

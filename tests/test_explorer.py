@@ -32,7 +32,7 @@ FRAMES = 150
 
 
 def filled(n_keyframes: int, every: int = 1) -> MomentRecorder:
-    """A recorder that has seen keyframes whose images tell them apart."""
+    """A recorder that has seen several keyframes with distinguishable images."""
     recorder, outcome = MomentRecorder(), make_outcome(n_keyframes * every)
     rng = np.random.default_rng(0)
     xy = np.stack([rng.uniform(0, 720, 50), rng.uniform(0, 200, 50)], axis=1).astype(np.float32)
@@ -196,7 +196,10 @@ fetch("report.html").then(answer => answer.text())
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [400, 1200])
 def test_the_explorer_in_a_browser(run: Path, tmp_path: Path, width: int):
-    """The slider moves through time, buttons zoom, nothing is asked for."""
+    """The slider moves through time, and the buttons zoom.
+
+    The page requests nothing from the network.
+    """
     chromium()
     shutil.copy(run / "report.html", tmp_path)
     (tmp_path / "probe.html").write_text(_PROBE.replace("WIDTH", str(width)))
@@ -307,7 +310,10 @@ def policy_of(server, path: str) -> str:
 
 
 def test_a_report_of_a_stranger_is_sandboxed(server):
-    """Its scripts have no origin, so that they can read no other report, and load nothing."""
+    """The scripts of the report have no origin.
+
+    Therefore, they can neither read other reports nor load anything.
+    """
     policy = policy_of(server, "/run/0").split("; ")
     assert policy[:2] == ["sandbox allow-scripts", "default-src 'none'"]
     for path in ("/", "/compare?run=0&run=1"):

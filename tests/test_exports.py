@@ -47,8 +47,11 @@ NOISE = 0.2  # pixels
 
 
 def small_map() -> Map:
-    """Seven keyframes in a curve, the third one culled, every third frame one; 90 landmarks, each
-    seen by most of them, one of them erased; keypoints that observe nothing between the others."""
+    """Make a map with seven keyframes in a curve and 90 landmarks.
+
+    Every third frame is a keyframe. The third keyframe is culled, and one landmark is erased. Each
+    landmark is seen by most of the keyframes. Some keypoints observe nothing.
+    """
     rng = np.random.default_rng(4)
     xyz = rng.uniform([-3, -2, 7], [5, 2, 14], (90, 3))
     map_ = Map(1.2 ** np.arange(8))
@@ -109,15 +112,17 @@ def test_a_reconstruction_is_the_living_part_of_a_map(small):
 
 @dataclass
 class Colmap:
-    """A model as the files have it: images (pose, name, xy, point ids) and points (xyz, rgb,
-    error, track) by their ids."""
+    """The contents of COLMAP's files.
+
+    Images (pose, name, xy, point ids) and points (xyz, rgb, error, track) are given by their ids.
+    """
 
     camera: tuple
     images: dict[int, tuple]
     points: dict[int, tuple]
 
     def errors(self) -> np.ndarray:
-        """Distance of each keypoint to the projection of its point, by COLMAP's conventions."""
+        """Compute the reprojection error of each keypoint in COLMAP's conventions."""
         fx, fy, cx, cy = self.camera[2:]
         found = []
         for pose, _, xy, ids in self.images.values():
@@ -239,8 +244,11 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def nerfstudio_errors(folder: Path, reconstruction: Reconstruction) -> np.ndarray:
-    """Pixels between the points of ``ply_file_path`` as nerfstudio's cameras see them, which look
-    along -z with y up, and what the keyframes observed."""
+    """Return the reprojection errors of the points of ``ply_file_path`` in nerfstudio's cameras.
+
+    Errors are the distances in pixels to what the keyframes observed. The cameras look along -z,
+    and y is up.
+    """
     content = json.loads((folder / "transforms.json").read_text())
     xyz, _ = read_ply(folder / content["ply_file_path"])
     T_cw = np.linalg.inv([frame["transform_matrix"] for frame in content["frames"]])
@@ -544,7 +552,10 @@ def test_what_can_be_exported_of_a_live_camera(corridor_run, tmp_path):
 
 
 def test_images_are_opened_as_the_run_opened_them(corridor_run, kitti_tree, tmp_path):
-    """By its calibration, every second frame, in another place."""
+    """The run used its own calibration and every second frame.
+
+    The images were moved to a different folder.
+    """
     camera = read_run(corridor_run).camera
     calib = write_calibration(tmp_path / "own.yaml", camera)
     words = ("--calib", calib, "--every", "2", "--no-record", "--no-report", "--quiet")
@@ -564,7 +575,7 @@ def test_images_are_opened_as_the_run_opened_them(corridor_run, kitti_tree, tmp_
 
 
 def test_a_phone_video_in_two_commands(corridor, tmp_path, monkeypatch):
-    """Keyframes and landmarks come in colour, though the run itself was grey."""
+    """Keyframes and landmarks are exported in colour, although the run itself used grey images."""
     monkeypatch.chdir(tmp_path)
     tinted = [np.dstack([image // 2, image, 255 - image]) for image in corridor.left]
     write_video(Path("phone.mkv"), tinted)

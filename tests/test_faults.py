@@ -47,7 +47,10 @@ def test_every_point_names_a_function_that_exists():
 
 @pytest.mark.slow
 def test_what_fails_in_a_run_costs_itself_alone(tmp_path):
-    """In a process of its own, which forks: this one may have threads."""
+    """The test runs in a separate process, which forks.
+
+    The process of the tests may have threads and cannot fork.
+    """
     table = tmp_path / "faults.csv"
     words = ["--once", "--points", *SOME, "--out", str(table)]
     done = subprocess.run(
@@ -65,7 +68,7 @@ def test_what_fails_in_a_run_costs_itself_alone(tmp_path):
     "point", [one for one in POINTS if one.function.startswith(CORE)], ids=lambda one: one.name
 )
 def test_a_slam_goes_on_after_a_fault_or_refuses(point, tmp_path, monkeypatch):
-    """As docs/howto/python.md promises."""
+    """The test checks the behaviour that docs/howto/python.md promises."""
     failing(point, min(5, point.last_call), FAULTS["RuntimeError"], monkeypatch.setattr)
     frames = 40 if point.last_call > 2 else FRAMES
     slam = Slam(CAMERA, None, Oracle(RING, [float(k) for k in range(FRAMES)]), threads=2)

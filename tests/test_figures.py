@@ -61,7 +61,10 @@ def figures(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.fixture
 def project(tmp_path: Path, figures, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A repository whose two tables can be made, one is from long ago, and one lacks its data."""
+    """A repository with tables.
+
+    Two tables can be made, one is from long ago, and one lacks its data.
+    """
     monkeypatch.delenv("NOWHERE_ROOT", raising=False)
     root = tmp_path / "project"
     (root / "tools").mkdir(parents=True)
@@ -119,7 +122,7 @@ def test_a_failed_command_leaves_the_others_and_the_old_table(
 
 @pytest.fixture
 def made(figures, project: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The project with all tables, and stamps for those that git knows."""
+    """The project after all tables were made. Tables that are in git's history have stamps."""
     monkeypatch.setenv("NOWHERE_ROOT", str(project))
     entries = ENTRIES.replace('run = "false"', 'run = "echo x,y > $OUT/real.csv"')
     (project / "tools/figures.toml").write_text(entries)

@@ -26,7 +26,7 @@ N = 150
 
 
 def points() -> np.ndarray:
-    """``(N, 3)`` metres, in front of the world's origin."""
+    """Return ``(N, 3)`` points in metres, in front of the world's origin."""
     rng = np.random.default_rng(0)
     return np.column_stack([rng.uniform(-5, 5, (N, 2)), rng.uniform(8, 20, N)])
 
@@ -36,7 +36,7 @@ def descriptors() -> np.ndarray:
 
 
 def seen_from(T_camera_w: np.ndarray) -> Features:
-    """The points in the image of a camera, without stereo matches."""
+    """Return the features of the points in the image of a camera, without stereo matches."""
     xy = CAMERA.project(transform(T_camera_w, points()))[:, :2]
     nothing = np.full(N, np.nan, np.float32)
     octave, angle = np.zeros(N, np.uint8), np.zeros(N, np.float32)
@@ -44,7 +44,10 @@ def seen_from(T_camera_w: np.ndarray) -> Features:
 
 
 def place() -> LocalMap:
-    """The landmarks of a map whose only keyframe, at the world's origin, sees all points."""
+    """Return the landmarks of a map whose only keyframe sees all points.
+
+    The keyframe is at the world's origin.
+    """
     map_ = Map(CONTEXT.scales)
     map_.add_keyframe(seen_from(np.eye(4)), np.eye(4), 0.0, 0)
     ids = map_.add_landmarks(points(), descriptors().view(np.uint64), 0)
@@ -70,7 +73,7 @@ def test_the_pose_of_a_frame_is_that_of_the_left_camera(side):
 
 @pytest.mark.parametrize("side", Side)
 def test_whichever_camera_saw_a_frame_the_left_one_is_found(side):
-    """Refined from a pose nearby, and looked for in a map."""
+    """The pose is refined from a nearby pose, and found by relocalisation in a map."""
     T_camera_w = T_CW if side == Side.LEFT else compose(CAMERA.T_right_left, T_CW)
     extracted = Extracted(seen_from(T_camera_w), side=side)
     refined = Frame.of(extracted, CAMERA)

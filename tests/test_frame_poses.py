@@ -10,7 +10,7 @@ from vslam.geometry import inverse, se3_exp
 
 
 class Keyframes:
-    """Keyframes that a test moves at will."""
+    """Keyframes whose poses a test can change."""
 
     def __init__(self) -> None:
         self.poses: list[np.ndarray] = []

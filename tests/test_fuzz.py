@@ -46,7 +46,10 @@ def test_every_reader_survives_damaged_files(fuzz, tmp_path: Path):
 
 @pytest.mark.slow
 def test_maps_that_say_what_cannot_be_are_refused_or_used_to_the_end(fuzz):
-    """Of the right kinds and shapes, with wrong values: kernels rely on them unseen."""
+    """The arrays of the maps have the right types and shapes but wrong values.
+
+    Kernels use these values without a check.
+    """
     found = fuzz.fuzz("map-meaning", 8 * INPUTS, 0)
     assert found["failures"] == []
     assert found["tried"] == 8 * INPUTS
@@ -65,7 +68,7 @@ def test_mutations_are_seeded_and_change_the_file(fuzz):
     ("hang", "wall", "code"), [("import time; time.sleep(60)", 15, 1), ("pass", 300, -27)]
 )
 def test_the_harness_sees_an_exception_a_crash_and_a_hang(tmp_path, hang, wall, code):
-    """It would not help if it were blind."""
+    """The test would be useless if it could not detect failures."""
     script = f"""
 import sys
 sys.path.insert(0, {str(ROOT / "tools")!r})

@@ -21,9 +21,11 @@ from vslam.geometry import inverses, se3_exp, transform
 def loop_problem(
     *, n: int = 36, noise: float = 0.5, mono: float = 0.3, seed: int = 0
 ) -> tuple[BundleProblem, np.ndarray]:
-    """Cameras on a circle look outwards at a ring of points, so that each is coupled to its
-    neighbours and the last one to the first. Returns a start with drift, and the true ``T_cw``, the
-    fixed camera last."""
+    """Make a problem of cameras on a circle that look outwards at a ring of points.
+
+    Each camera is coupled to its neighbours, and the last camera to the first. Returns a start with
+    drift, and the true ``T_cw`` with the fixed camera last.
+    """
     rng = np.random.default_rng(seed)
     angle = 2 * np.pi * np.arange(n) / n
     T_wc = np.array([se3_exp(np.array([0, 0, 0, 0, a, 0.0])) for a in angle])

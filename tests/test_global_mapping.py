@@ -28,7 +28,7 @@ def world_of(n: int, noise: float = 0.0) -> World:
 
 
 def shifted(snapshot, T: np.ndarray, *, inlier=None) -> BundleSolution:
-    """A solution that moves the whole world by ``T``."""
+    """Return a solution that moves the whole world by ``T``."""
     p = snapshot.problem
     return BundleSolution(
         T_cw=np.array([T_cw @ inverse(T) for T_cw in p.T_cw]),
@@ -86,7 +86,7 @@ def test_adjusting_a_snapshot_repairs_the_map(check_map):
 
 
 def test_what_was_made_since_moves_along(check_map):
-    """Merging a motion of the whole world moves newer keyframes and landmarks by it too."""
+    """The solution moves the whole world. Newer keyframes and landmarks move with it."""
     world = world_of(4)
     map_ = world.map
     snapshot = take_snapshot(map_, CAMERA)
@@ -108,7 +108,10 @@ def test_what_was_made_since_moves_along(check_map):
 
 
 def test_newer_keyframes_keep_their_pose_relative_to_their_parent():
-    """Keyframes that move differently: each newer one follows its parent, in a chain."""
+    """The keyframes in the solution move differently.
+
+    Newer keyframes form a chain, and each follows its parent.
+    """
     world = world_of(4)
     map_ = world.map
     snapshot = take_snapshot(map_, CAMERA)

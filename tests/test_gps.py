@@ -70,7 +70,10 @@ def test_the_oxts_folder_of_kitti_raw_is_read(tmp_path):
 
 
 def bag_of(path, rows, kind="ros1", topics=("/gps/fix",)):
-    """``rows``: seconds, status, latitude, type of the covariance."""
+    """Write a bag of GPS fixes.
+
+    Each entry of ``rows`` has the seconds, status, latitude and type of covariance.
+    """
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import StoragePlugin
     from rosbags.rosbag2 import Writer as Writer2
@@ -192,7 +195,10 @@ def test_a_missing_library_is_named(call, kitti_tree, tmp_path, monkeypatch):
 
 
 def drive(n, *, turn=0.05, drift=0.0, shrink=0.0, seed=0):
-    """True poses of n keyframes, 3 m apart, and those of odometry, which drifts."""
+    """Return the true poses of n keyframes that are 3 m apart.
+
+    Also return the poses of odometry, which drifts.
+    """
     rng = np.random.default_rng(seed)
     true, found = [np.eye(4)], [np.eye(4)]
     for k in range(n - 1):
@@ -217,7 +223,10 @@ def graph_of(T_wc, seconds):
 
 
 def measured(true, sigma=1.0, seed=0, antenna=(0.0, 0.0, 0.0)):
-    """Fixes of all keyframes with a second between them, and the true positions of the camera."""
+    """Return GPS fixes of all keyframes, one per second.
+
+    Also return the true positions of the camera.
+    """
     enu = true[:, :3, 3] @ R_ENU_CAMERA.T + np.array([50.0, -20.0, 3.0])
     fixes = enu + true[:, :3, :3] @ np.array(antenna) @ R_ENU_CAMERA.T
     fixes += np.random.default_rng(seed).normal(0.0, sigma, enu.shape)
@@ -259,7 +268,7 @@ def test_the_test_refuses_what_has_jumped_and_little_else():
 
 @pytest.mark.parametrize(("drift", "gain"), [(0.02, 0.75), (2.0, 1.1)])
 def test_an_accurate_map_is_bent_less_than_one_that_drifts(monkeypatch, drift, gain):
-    """The fixes decide how far the edges are believed."""
+    """The fixes determine how much weight the edges of the map get."""
     true, found = drive(300, drift=drift)
     positions, _ = measured(true)
     graph = graph_of(found, positions.seconds)
@@ -291,7 +300,7 @@ def test_the_alignment_ignores_wrong_fixes(metric):
 
 
 def test_an_error_of_the_calibration_is_found_where_the_drive_is_long_enough():
-    """A baseline that is 2 % too long."""
+    """The baseline in the calibration is 2 % too long."""
     for n, share in ((500, 1.0), (15, 0.0)):
         true, found = drive(n)
         found[:, :3, 3] *= 1.02
@@ -332,7 +341,10 @@ def test_a_short_drive_is_refused():
 
 
 def test_two_keyframes_suffice_for_an_accurate_receiver():
-    """Their edge is so short that GTSAM cannot solve the system without the fixes."""
+    """The edge between the keyframes is very short.
+
+    Without the fixes, GTSAM cannot solve the system.
+    """
     true = np.tile(np.eye(4), (2, 1, 1))
     true[1, 2, 3] = 0.35
     keyframe, ahead = np.array([0, 1, 1, 1, 1, 1]), 0.35 * np.arange(6.0)
@@ -362,7 +374,10 @@ def test_the_scale_of_a_monocular_map_is_found_where_it_drifts():
 
 @pytest.mark.parametrize("metric", [True, False])
 def test_the_antenna_need_not_be_at_the_camera(metric):
-    """It is behind and above the camera, on a drive that turns through more than 90 degrees."""
+    """The antenna is behind and above the camera.
+
+    During the drive, the camera turns by more than 90 degrees.
+    """
     true, found = drive(300, turn=0.1, drift=0.5)
     if not metric:
         found[:, :3, 3] *= 0.2
@@ -376,7 +391,7 @@ def test_the_antenna_need_not_be_at_the_camera(metric):
 
 
 def test_each_part_of_a_map_is_aligned_by_itself():
-    """After a loss of the camera, nothing is known about where the next part lies."""
+    """After tracking is lost, the position of the next part of the map is unknown."""
     true, found = drive(300)
     elsewhere = se3_exp(np.array([200.0, 5.0, -300.0, 0.1, 2.0, 0.0]))
     found[150:] = elsewhere @ found[150:]

@@ -19,7 +19,7 @@ TICKS = 90_000  # of a second
 
 
 def write_h264(path: Path, images, times, *, options=None, container=None) -> Path:
-    """Lossless but for the colours; ``times`` in seconds."""
+    """Write a video that is lossless except for its colours. ``times`` are in seconds."""
     height, width = images[0].shape
     with av.open(str(path), "w", options=container or {}) as file:
         stream = file.add_stream("libx264", rate=30, options={"crf": "1"} | (options or {}))
@@ -51,7 +51,7 @@ def opened(path: Path, options: SourceOptions):
 
 @pytest.mark.slow
 def test_a_video_as_encoders_write_it(corridor, beside, options, tmp_path):
-    """With frames that are stored in another order than they are shown in."""
+    """The order in which frames are stored differs from the order in which they are shown."""
     times = np.arange(FRAMES) / 10
     path = write_h264(tmp_path / "a.mp4", beside, times, options={"bf": "3"})
     source = opened(path, options)

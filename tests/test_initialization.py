@@ -22,7 +22,10 @@ AHEAD = se3_exp(np.array([0.05, 0.0, -1.5, 0.01, 0.04, -0.01]))
 
 
 def scene(kind: str, n: int = 300, seed: int = 0) -> np.ndarray:
-    """``(n, 3)`` points before the camera: in a volume, on a slanted wall, or on the floor."""
+    """Return ``(n, 3)`` points in front of the camera.
+
+    They are in a volume, on a slanted wall, or on the floor.
+    """
     rng = np.random.default_rng(seed)
     xy = rng.uniform([-4.0, -3.0], [4.0, 3.0], (n, 2))
     if kind == "wall":
@@ -34,7 +37,10 @@ def scene(kind: str, n: int = 300, seed: int = 0) -> np.ndarray:
 
 
 def views(points, T_2_1, *, noise=0.5, outliers=0.0, seed=0):
-    """Pixels of both views, ``(N, 2)`` each; a share of the second's is anywhere."""
+    """Return the ``(N, 2)`` pixels of the points in both views.
+
+    A share of the pixels in the second view is random.
+    """
     rng = np.random.default_rng(seed)
     seen = [CAMERA.project(p)[:, :2] for p in (points, transform(T_2_1, points))]
     xy_1, xy_2 = (xy + rng.normal(0, noise, xy.shape) for xy in seen)
@@ -118,7 +124,7 @@ def test_a_wall_leaves_two_motions_and_none_is_taken():
 
 
 def test_motion_along_a_floor():
-    """The second motion that a plane allows would put half of the floor behind the camera."""
+    """A plane allows a second motion. This motion would put half of the floor behind the camera."""
     aside = se3_exp(np.array([-1.0, 0.0, 0.1, 0.0, 0.1, 0.0]))
     points = scene("floor", 400)
     xy_1, xy_2, right = views(points, aside, noise=0.2, outliers=0.2)

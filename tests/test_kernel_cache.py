@@ -59,7 +59,7 @@ print("scipy.linalg" in sys.modules, "numba.np.arrayobj" in sys.modules)
 
 
 def run(folder: Path, *words: str, **variables: str) -> list[str]:
-    """What Python prints; its warnings are in the file ``errors``."""
+    """Run Python and return what it prints. Its warnings are in the file ``errors``."""
     environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache")} | variables
     done = subprocess.run(
         [sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True
@@ -86,7 +86,10 @@ def test_a_kernel_is_compiled_from_loaded_ones(tmp_path: Path) -> None:
 
 
 def test_the_installed_release_of_numba_is_known() -> None:
-    """Another one works, with its own cache; see whether ``_KernelCache`` does with it."""
+    """A different release works with its own cache.
+
+    For a new release, check that ``_KernelCache`` still works.
+    """
     from vslam.kernels import TESTED_NUMBA
 
     assert numba.__version__.startswith(TESTED_NUMBA)
@@ -109,7 +112,7 @@ def damage(path: Path, how: str) -> None:
 @pytest.mark.parametrize("how", ["emptied", "cut", "zeroed"])
 @pytest.mark.parametrize("kind", ["nbi", "nbc"])
 def test_damaged_kernels_are_compiled_again(tmp_path: Path, how: str, kind: str) -> None:
-    """As a power cut leaves files that were just written."""
+    """A power failure can damage files that have just been written."""
     (tmp_path / "inner.py").write_text(INNER)
     run(tmp_path, "-c", CALL)
     for path in tmp_path.rglob(f"*.{kind}"):

@@ -167,7 +167,7 @@ def policy(camera=CAMERA) -> KeyframePolicy:
 
 
 def frame(*, close: int, far: int = 0) -> Frame:
-    """A frame that tracks so many of the points that are close, and of those that are far."""
+    """Make a frame that tracks the given numbers of close and of far points."""
     tracked = POINTS.tracked_frame(3, 0.3, np.eye(4))
     is_close = POINTS.xyz[:, 2] < 20.0
     for among, n in ((is_close, close), (~is_close, far)):
@@ -177,7 +177,10 @@ def frame(*, close: int, far: int = 0) -> Frame:
 
 
 def observe(of: KeyframePolicy, seen: Frame, **changes) -> KeyframeEvidence:
-    """What a policy makes of a frame 0.3 s after a keyframe, while nothing is being mapped."""
+    """Return the decision of a policy about a frame 0.3 s after a keyframe.
+
+    No keyframe is being mapped at this time.
+    """
     known = {"seconds_since_keyframe": 0.3, "mapping_idle": True}
     return of.observe(seen, POINTS.view(n_reference=200), **known | changes)
 
@@ -217,7 +220,10 @@ def test_only_the_first_frame_after_a_keyframe_tells_what_keyframes_gain():
 
 
 def test_a_keyframe_is_planned_for_the_frame_that_will_have_lost_too_many_close_points():
-    """0.4 of the 1,000 close points are 400; a frame tracks 0.8 of those of the one before."""
+    """The limit is 0.4 of the 1,000 close points, which is 400.
+
+    Each frame tracks 0.8 of the close points of the frame before.
+    """
     one = policy()
     losing = replace(
         CONTENT, untracked_close=None, first_close=1000, n_inliers=900, close_ratio=0.8
@@ -281,7 +287,7 @@ def test_a_policy_decides_for_a_stereo_pair(changes, wanted):
     ({"seconds_since_keyframe": 0.3}, True),
 ])  # fmt: skip
 def test_a_policy_makes_keyframes_of_a_depth_camera_sooner(changes, wanted):
-    """``depth_max_interval_s`` is 0.3 s."""
+    """The threshold ``depth_max_interval_s`` is 0.3 s."""
     assert policy(replace(CAMERA, depth=True)).wants_keyframe(replace(CONTENT, **changes)) == wanted
 
 

@@ -31,7 +31,10 @@ CONFIG = Config()
 
 
 def wall(seed: int) -> np.ndarray:
-    """A painted wall of 40 by 16 metres, 80 pixels a metre: rectangles, lines, spots."""
+    """Make a painted wall of 40 by 16 metres with 80 pixels per metre.
+
+    It has rectangles, lines and spots.
+    """
     rng = np.random.default_rng(seed)
     image = np.full((1280, 3200), 128, np.uint8)
     for _ in range(900):
@@ -46,7 +49,7 @@ def wall(seed: int) -> np.ndarray:
 
 
 def seen(painting: np.ndarray, T_cw: np.ndarray) -> np.ndarray:
-    """The wall, which stands at z = 8 around the axis, from a camera."""
+    """Return the image of the wall from a camera. The wall is at z = 8."""
     K = np.array([[400.0, 0, 320], [0, 400, 96], [0, 0, 1]])
     to_wall = np.array([[1 / 80, 0, -20], [0, 1 / 80, -8], [0, 0, 0], [0, 0, 1.0]])
     to_wall[2, 2] = DEPTH
@@ -55,7 +58,7 @@ def seen(painting: np.ndarray, T_cw: np.ndarray) -> np.ndarray:
 
 
 def by_night(image: np.ndarray) -> np.ndarray:
-    """Darker, a lamp at one side, more noise."""
+    """Return a darker image with more noise and with a lamp at one side."""
     rng = np.random.default_rng(0)
     lamp = np.exp(-(((np.arange(640) - 150) / 200.0) ** 2))
     dark = 20 + image * (0.12 + 0.4 * lamp) + rng.normal(0, 4, image.shape)
@@ -68,7 +71,10 @@ def network() -> LocalDescriptors:
 
 
 class World:
-    """Keyframe 0 before a wall; keyframe 1 somewhere, with other landmarks and no ORB in common."""
+    """Two keyframes: keyframe 0 is in front of a wall, and keyframe 1 is at a given place.
+
+    They have different landmarks and no ORB features in common.
+    """
 
     def __init__(
         self,
@@ -244,7 +250,7 @@ def test_candidates_that_no_detector_compared_are_compared_where_the_camera_may_
 
 
 def test_no_network_sees_what_an_image_shows_already(network):
-    """Keyframe 2 shares 40 of its 100 landmarks with keyframe 0, keyframe 1 none."""
+    """Keyframe 2 shares 40 of its 100 landmarks with keyframe 0. Keyframe 1 shares none."""
     map_ = Map(1.2 ** np.arange(8.0))
     features = Features(
         np.zeros((100, 2), np.float32), np.zeros(100, np.uint8), np.zeros(100, np.float32),

@@ -172,7 +172,7 @@ def test_a_calibration_of_a_camera_that_cannot_be_is_named():
 
 
 def write_header(file: Path, **entries: object) -> None:
-    """Replace entries of the header of a map file."""
+    """Replace entries in the header of a map file."""
     with np.load(file) as saved:
         arrays = dict(saved)
     header = json.loads(arrays["header"].tobytes()) | entries

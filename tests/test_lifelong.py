@@ -27,7 +27,10 @@ def view(k: int) -> Features:
 
 @cache
 def laps(known_after_s: float, threads: int = 1) -> tuple[Slam, tuple[int, ...], list]:
-    """Five laps of the ring, 21 s each; the keyframes alive after each."""
+    """Drive five laps of the ring, 21 s each.
+
+    Returns the number of keyframes that exist after each lap.
+    """
     config = Config.model_validate({"keyframes": {"known_after_s": known_after_s}})
     slam = Slam(CAMERA, config, Oracle(RING, PLACES), threads=threads)
     keyframes, results = [], []
@@ -67,7 +70,10 @@ def test_known_streets_give_the_same_bytes_with_one_thread_and_two():
 
 
 def with_some_of(features: Features, other: Features, n: int) -> Features:
-    """Features and n of another view, as where a street repeats itself."""
+    """Return features together with n features of a different view.
+
+    This simulates a street that looks repetitive.
+    """
     some = np.linspace(0, len(other) - 1, n).astype(int)
     names = ("xy", "octave", "angle", "descriptors", "u_right")
     columns = ((getattr(features, name), getattr(other, name)) for name in names)
@@ -76,8 +82,11 @@ def with_some_of(features: Features, other: Features, n: int) -> Features:
 
 @pytest.mark.parametrize("merge_after_frames", [1, 3])
 def test_a_camera_that_is_carried_is_not_left_where_little_agrees(merge_after_frames):
-    """Every frame becomes a keyframe, which is merged when the next frame comes, or is still being
-    mapped. Of 80 things that look like those expected enough agree on a pose, a wrong one."""
+    """A carried camera sees 80 points that look like expected ones.
+
+    Enough of them agree on the same wrong pose. Every frame becomes a keyframe. It is merged when
+    the next frame arrives, or it is still being mapped then.
+    """
     places = [*map(float, range(14)), 3.0]
     keyframes = {"max_interval_s": 0.05, "merge_after_frames": merge_after_frames}
     config = Config.model_validate({"keyframes": keyframes})

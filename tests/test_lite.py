@@ -28,7 +28,7 @@ BLOCKS = [
 
 
 def imagenet_state(seed: int = 0) -> dict[str, torch.Tensor]:
-    """Random weights under the names of the published file."""
+    """Return random weights with the names of the published file."""
     g = torch.Generator().manual_seed(seed)
     state: dict[str, torch.Tensor] = {}
 
@@ -53,7 +53,10 @@ def imagenet_state(seed: int = 0) -> dict[str, torch.Tensor]:
 
 
 def reference(state: dict[str, torch.Tensor], images: torch.Tensor) -> torch.Tensor:
-    """The published network on colour images ``(x - 127) / 128``, TensorFlow's padding and all."""
+    """Compute the published network on colour images ``(x - 127) / 128``.
+
+    The padding is that of TensorFlow.
+    """
 
     def layer(x, conv, norm, stride=1, groups=1, active=True):
         weight = state[f"{conv}.weight"]
@@ -87,7 +90,10 @@ def imagenet(tmp_path: Path) -> Path:
 @pytest.mark.slow
 @torch.no_grad()
 def test_the_published_network_is_computed(imagenet):
-    """Grey images of deviation 1 in, what the network makes of them at deviation 0.5 out."""
+    """The input are grey images with a standard deviation of 1.
+
+    The output must equal that of the published network at a standard deviation of 0.5.
+    """
     extractor = LiteExtractor()
     extractor.load_imagenet(imagenet)
     grey = torch.randn(2, 1, 97, 97, generator=torch.Generator().manual_seed(1))
@@ -187,7 +193,10 @@ def test_a_lite_network_is_pruned_trained_and_read_again(tmp_path, imagenet):
 
 
 def test_a_turned_camera_sees_what_was_beside_its_middle():
-    """At 80 degrees across, 40 degrees to the right the image's edge becomes its middle."""
+    """The field of view is 80 degrees.
+
+    After a rotation by 40 degrees to the right, the edge of the image is in its middle.
+    """
     H = turn_homography(200, 60, 40.0)
     x, y, w = H @ [200.0, 30.0, 1.0]
     assert (x / w, y / w) == pytest.approx((100.0, 30.0))

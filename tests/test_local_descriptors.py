@@ -48,7 +48,7 @@ def test_the_shipped_file_says_what_torch_says(network):
 
 
 def test_cells_lie_where_their_features_are(network):
-    """A change of the image around a cell changes the descriptor there the most."""
+    """A change of the image around a cell changes the descriptor of this cell most."""
     image = picture(1, 192, 640)
     other = image.copy()
     other[88:105, 312:329] = 255 - other[88:105, 312:329]  # around cell (6, 20)

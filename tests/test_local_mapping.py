@@ -43,9 +43,10 @@ FLIPPED_BITS = 8
 
 @dataclass
 class World:
-    """Points, a map of what cameras see of them, and the truth.
+    """Random points, a map of what cameras see of them, and the true values.
 
-    ``point_of_row`` tells which point each row of the map shows, ``truth`` the true ``T_cw``.
+    ``point_of_row`` is the point that each row of the map's observations shows. ``truth`` contains
+    the true ``T_cw``.
     """
 
     points: np.ndarray
@@ -59,7 +60,10 @@ class World:
     def add_keyframe(
         self, T_cw: np.ndarray, *, mono: bool = False, noise: float = 0.0, among=None
     ) -> int:
-        """A keyframe that sees every point (``among`` some) in its image, in random order."""
+        """Add a keyframe that sees every point, or only those in ``among``.
+
+        The features of its image are in random order.
+        """
         in_camera = transform(T_cw, self.points)
         uvr = CAMERA.project(np.where(in_camera[:, 2:] > 0.5, in_camera, 1.0))
         uvr += noise * white_noise(self.rng, np.full(len(uvr), not mono))
@@ -92,7 +96,10 @@ class World:
         return k
 
     def link_truth(self, keyframes, chosen=None) -> np.ndarray:
-        """One landmark at each point (``chosen`` some) that the keyframes see; ids by point."""
+        """Create one landmark for each point (or those in ``chosen``) that the keyframes see.
+
+        Returns the ids by point.
+        """
         a = self.map.arrays
         landmark_of = np.full(len(self.points), -1, np.int64)
         for k in keyframes:
@@ -110,7 +117,10 @@ class World:
         return landmark_of
 
     def point_of_landmark(self, landmark: int) -> set[int]:
-        """Points whose rows a landmark holds: one, unless the map mixed them up."""
+        """Return the points that a landmark observes.
+
+        It is a single point, unless the map has confused points.
+        """
         rows = np.flatnonzero(self.map.arrays.landmark[: self.map.n_rows] == landmark)
         return set(self.point_of_row[rows].tolist())
 
@@ -132,7 +142,7 @@ def make_world(n: int = 400, seed: int = 0, depth: tuple[float, float] = (6, 40)
 
 
 def sideways(metres: float, yaw: float = 0.0, forward: float = 0.0) -> np.ndarray:
-    """``T_cw`` of a camera moved to the right of the world's origin."""
+    """Return ``T_cw`` of a camera that is to the right of the world's origin."""
     return inverse(se3_exp(np.array([metres, 0.0, forward, 0.0, yaw, 0.0])))
 
 
@@ -551,7 +561,10 @@ def test_the_window_is_capped_at_the_most_covisible_keyframes():
 
 
 def redundant_world(own: int = 30) -> World:
-    """Six keyframes share 100 points; all but keyframe 2 see ``own`` points that no other sees."""
+    """Make a world in which six keyframes share 100 points.
+
+    Each keyframe except keyframe 2 also sees ``own`` points that no other keyframe sees.
+    """
     world = make_world(n=100 + 6 * own, depth=(8, 16))
     world.points[:, 0] *= 0.5
     for k in range(6):

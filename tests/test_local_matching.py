@@ -21,7 +21,7 @@ def unit(x: np.ndarray) -> np.ndarray:
 
 
 def field(seed: int, rows: int = 12, columns: int = 40) -> np.ndarray:
-    """A smooth field of descriptors at every pixel of the image that a network reads."""
+    """Make a smooth field of descriptors at every pixel of the image that a network reads."""
     rng = np.random.default_rng(seed)
     coarse = rng.standard_normal((rows, columns, 32)).astype(np.float32)
     size = columns * 16, rows * 16
@@ -30,7 +30,10 @@ def field(seed: int, rows: int = 12, columns: int = 40) -> np.ndarray:
 
 
 def maps(pixels: np.ndarray, scale: float = 1.0) -> DescriptorMaps:
-    """Coarse descriptors see more of the image than fine ones do."""
+    """Make maps of descriptors.
+
+    Coarse descriptors depend on a larger part of the image than fine descriptors.
+    """
     wide = np.stack([cv2.GaussianBlur(pixels[..., c], (0, 0), 12.0)
                      for c in range(pixels.shape[2])], 2)  # fmt: skip
     return DescriptorMaps(unit(wide[::16, ::16]), unit(pixels[::4, ::4]), scale)
@@ -90,7 +93,10 @@ def test_nothing_is_found_where_nothing_leads_or_nothing_is_alike():
 
 
 def test_a_point_must_lead_back():
-    """Two places of a look like one of b: what is found from the wrong one leads to the other."""
+    """Two places in image a look like one place in image b.
+
+    The match of the wrong place leads back to the other place.
+    """
     pixels = field(5)
     twice = pixels.copy()
     twice[:, 320:328] = pixels[:, 304:312] * 0.9 + 0.1 * field(6)[:, 304:312]

@@ -36,7 +36,7 @@ def new(threads: int = 1) -> Slam:
 
 
 def drive(slam: Slam, ring: Ring, places, seed: int, start: float = 0.0) -> list[TrackResult]:
-    """Ten frames a second; None is a black image."""
+    """Drive at ten frames per second. None stands for a black image."""
     results = [
         slam.step_features(NOTHING if k is None else Extracted(ring.see(k, seed)), start + 0.1 * i)
         for i, k in enumerate(places)
@@ -50,13 +50,13 @@ def states(results: list[TrackResult]) -> str:
 
 
 def off(slam: Slam, ring: Ring, places, first: float = 0.0) -> np.ndarray:
-    """Metres from each frame to where it was, in the world of the map."""
+    """Return the distance in metres of each frame to its true position, in the world of the map."""
     true = np.array([inverse(ring.pose(first)) @ ring.pose(k) for k in places])
     return np.linalg.norm(slam.trajectory().T_wc[:, :3, 3] - true[:, :3, 3], axis=1)
 
 
 def everything(slam: Slam) -> bytes:
-    """All that a map file would hold, and what it leaves out."""
+    """Return everything that a map file would hold, and everything that it leaves out."""
     map_, memory = slam.map, slam.detector.memory()
     arrays = [*map_.arrays, *map_.keyframes, *(table.values for table in memory.tables.values())]
     return b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)
@@ -64,7 +64,7 @@ def everything(slam: Slam) -> bytes:
 
 @pytest.fixture(scope="module")
 def file(ring, tmp_path_factory) -> Path:
-    """The first 100 places of the ring."""
+    """A map file of the first 100 places of the ring."""
     slam = new()
     drive(slam, ring, range(100), seed=0)
     path = tmp_path_factory.mktemp("maps") / "ring.npz"
@@ -87,7 +87,10 @@ def test_localising_finds_every_frame_and_changes_nothing(file, ring):
 
 
 def test_localising_backwards_through_the_map_looks_around_where_it_is(file, ring):
-    """The reference keyframe follows: it is not the one at which the camera was found."""
+    """The reference keyframe follows the camera.
+
+    It does not stay the keyframe at which the camera was relocalised.
+    """
     slam = Slam.load(file, threads=1, localize=True)
     places = [80 - 0.5 * k for k in range(120)]
     results = drive(slam, ring, places, seed=2)

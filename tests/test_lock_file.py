@@ -73,7 +73,10 @@ while entered < 100:
 
 @pytest.mark.slow
 def test_processes_that_race_get_in_one_at_a_time(tmp_path):
-    """The one that leaves removes the file that others may just have opened."""
+    """When a process releases the lock, it removes the file.
+
+    Other processes may have opened this file just before.
+    """
     command = [sys.executable, "-c", RACER, str(tmp_path)]
     racers = [subprocess.Popen(command) for _ in range(4)]
     assert [racer.wait(timeout=300) for racer in racers] == [0] * 4

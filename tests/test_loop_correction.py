@@ -28,7 +28,7 @@ def moved_poses(keyframes) -> np.ndarray:
 
 
 def reprojection(world: World, keyframe: int, landmarks: np.ndarray) -> np.ndarray:
-    """``(N, 3)`` projections of landmarks into a keyframe."""
+    """Return ``(N, 3)`` projections of landmarks into a keyframe."""
     a = world.map.arrays
     return CAMERA.project(transform(a.T_cw[keyframe], a.xyz[landmarks]))
 
@@ -62,7 +62,7 @@ def test_only_the_named_keyframes_and_what_is_anchored_in_them_move():
 
 
 def test_a_common_motion_leaves_nothing_to_refresh():
-    """Normals and distance ranges follow a rigid motion of the whole map exactly."""
+    """If the whole map moves rigidly, the normals and distance ranges move with it."""
     world = world_of_five()
     a, n = world.map.arrays, world.map.n_landmarks
     motion = se3_exp(np.array([3.0, -1.0, 2.0, 0.3, -0.8, 0.5]))

@@ -24,7 +24,7 @@ FRAMES = [3, 10, 40]  # of these keyframes
 
 
 def features(n: int) -> Features:
-    """Features at different pixels: the k-th one is at (10 + k, 20 + 2 k)."""
+    """Make features at different pixels. The k-th feature is at (10 + k, 20 + 2 k)."""
     k = np.arange(n)
     xy = np.stack([10 + k, 20 + 2 * k], axis=1).astype(np.float32)
     nothing = np.zeros(n, np.float32)
@@ -34,10 +34,10 @@ def features(n: int) -> Features:
 
 @pytest.fixture
 def closed_map() -> Map:
-    """Three keyframes of one place after a loop was closed, and the landmarks 0 to 5.
+    """Make a map of three keyframes of one place after a loop was closed, and the landmarks 0 to 5.
 
-    The features 0 to 5 of the query observed them when the loop was verified. The match itself
-    observes landmarks 0 and 1, its neighbour all of them.
+    When the loop was verified, the features 0 to 5 of the query observed these landmarks. The
+    matched keyframe observes the landmarks 0 and 1. Its neighbour observes all of them.
     """
     map_ = Map(1.2 ** np.arange(8))
     T_cw = np.eye(4)
@@ -96,7 +96,10 @@ def result(frame: int) -> TrackResult:
 
 
 def told(frames: list[int]) -> LoopPictureRecorder:
-    """A recorder that has seen these keyframes, whose images are as bright as their number."""
+    """Make a recorder that has seen these keyframes.
+
+    The brightness of each image is the number of its keyframe.
+    """
     pictures = LoopPictureRecorder()
     pictures.begin(CAMERA, None)
     for frame in frames:

@@ -38,7 +38,10 @@ def score(data: str, detector: str, ap: float, sequence: float | None) -> Score:
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of tables of two detectors on a town and on KITTI, which has an order."""
+    """The folder of the tables of two detectors, on a town and on KITTI.
+
+    Only KITTI has an order.
+    """
     online = OnlineScore(
         data="kitti00", detector="bow", window="20 s", verified_by="orb", images=10, answerable=4,
         right=3, near=1, far=0, recall_at_100_precision=0.5, recall_at_100_precision_far=0.75,
@@ -92,7 +95,7 @@ def test_a_table_holds_the_figures_of_the_report(written, table, row):
 
 @pytest.mark.parametrize("name", ["average_precision", "places_found", "verification", "sequences"])
 def test_columns_have_the_names_that_pages_use(written, name):
-    """The tables of the documents have further detectors that are no longer part of vslam."""
+    """The tables in the documentation have more detectors, which are no longer part of vslam."""
     kept = rows(ROOT / "docs" / "research" / "loops" / f"{name}.csv")
     here = rows(written / f"{name}.csv")
     assert {"condition", *kept[0]} >= here[0].keys() - {"images"}

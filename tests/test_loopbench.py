@@ -55,7 +55,7 @@ def vocabulary():
 
 @pytest.mark.parametrize("apart", [10.0, 2.0])
 def test_the_curve_that_is_drawn_has_the_area_of_the_whole_one(apart):
-    """Of 20,000 pairs 50 are of one place, and a good detector has them all among the first."""
+    """Only 50 of 20,000 pairs show the same place. A good detector ranks all of them first."""
     rng = np.random.default_rng(0)
     same = np.arange(20_000) < 50
     whole = precision_recall(same, rng.standard_normal(same.size) + apart * same)
@@ -177,7 +177,7 @@ def test_one_epipolar_geometry_tells_a_place_from_another(vocabulary):
 
 
 class Told:
-    """Knows the truth, or its opposite."""
+    """A detector that knows the ground truth, or its opposite."""
 
     probability = True
 
@@ -219,7 +219,10 @@ def test_figures_of_detectors_that_know_and_that_err(vocabulary):
 
 
 def test_a_sequence_is_the_mean_along_the_best_line():
-    """Three queries, three images: speeds 0.8 to 1.2 all step by one image over two queries."""
+    """There are three queries and three images.
+
+    At all speeds from 0.8 to 1.2, a line advances by one image over two queries.
+    """
     scores = np.array([[0.3, 0.0, 0.6], [0.0, 0.9, 0.0], [0.6, 0.0, 0.3]])
     found = sequence_scores(scores)
     np.testing.assert_allclose(found[0], scores[0])
@@ -230,7 +233,7 @@ def test_a_sequence_is_the_mean_along_the_best_line():
 
 @pytest.mark.slow
 def test_a_sequence_outvotes_an_image_that_looks_like_all(vocabulary):
-    """The way is driven again, but one image of the gallery resembles every query most."""
+    """The route is driven again, but one gallery image is the most similar image of every query."""
     n = 30
     relation = np.where(np.eye(n) > 0, SAME, DIFFERENT).astype(np.int8)
     p = np.full((n, n), 0.1) + 0.6 * np.eye(n)

@@ -54,7 +54,7 @@ def add_landmark(map_: Map, rng: np.random.Generator, keyframe: int = 0) -> int:
 
 
 def random_map(seed: int, operations: int, each=lambda map_: None) -> Map:
-    """A map after random sequences of everything that changes observations."""
+    """Make a map by random sequences of all operations that change observations."""
     rng = np.random.default_rng(seed)
     map_ = Map(SCALES)
     for _ in range(3):
@@ -257,7 +257,10 @@ def test_pose_of_a_keyframe_is_a_copy():
 
 @pytest.mark.slow
 def test_a_long_chain_of_culled_keyframes_still_has_poses():
-    """A camera that stands still culls keyframes by the thousand, each the next one's parent."""
+    """If the camera stands still, thousands of keyframes are culled.
+
+    Each is the parent of the next.
+    """
     rng = np.random.default_rng(0)
     map_ = Map(SCALES)
     for _ in range(1500):

@@ -49,8 +49,10 @@ def assert_same(found: dict[str, NDArray], expected: dict[str, NDArray]) -> None
 
 @pytest.fixture
 def map_() -> Map:
-    """A map in which each column and each number differs from that of a new map, from entry to
-    entry where it can."""
+    """A map in which every column and every number differs from that of a new map.
+
+    If possible, the entries of a column also differ from each other.
+    """
     found, rng = Map(1.2 ** np.arange(8)), np.random.default_rng(0)
     nothing = np.zeros(PER, np.float32)
     features = Features(

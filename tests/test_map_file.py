@@ -32,7 +32,7 @@ CONFIG = Config()
 
 
 def driven(slam: Slam, ring: Ring, places, start: float = 0.0) -> Slam:
-    """Drive along the ring at ten frames a second."""
+    """Drive along the ring at ten frames per second."""
     for i, k in enumerate(places):
         slam.step_features(Extracted(ring.see(k, seed=int(start))), start + 0.1 * i)
     slam.finish()
@@ -46,7 +46,7 @@ def ring() -> Ring:
 
 @pytest.fixture(scope="module")
 def slam(ring) -> Slam:
-    """Half a lap, one keyframe of it culled."""
+    """A ``Slam`` after half a lap. One of its keyframes is culled."""
     done = driven(Slam(CAMERA, CONFIG, create_detector("bow", CONFIG), threads=1), ring, range(100))
     assert len(done.map.living_keyframes()) < done.map.n_keyframes
     return done
@@ -60,7 +60,7 @@ def file(slam, tmp_path_factory) -> Path:
 
 
 def changed(file: Path, to: Path, **arrays: np.ndarray) -> Path:
-    """The file with some of its arrays replaced, None to leave one out."""
+    """Return the file with some of its arrays replaced. None removes an array."""
     with np.load(file) as before:
         data = {name: before[name] for name in before.files}
     data |= arrays
@@ -121,7 +121,7 @@ def test_all_of_a_map_comes_back(slam, file, check_map):
 
 
 def test_observations_keep_their_order(slam, file):
-    """The newest ones vote on the descriptor of a landmark."""
+    """Only the newest observations determine the descriptor of a landmark."""
     before, after = slam.map, load_map(file).map
     keyframe = int(before.living_keyframes()[5])
     old = before.landmarks_of(keyframe)
@@ -172,7 +172,10 @@ def test_loops_images_drives_and_world_come_back(slam, tmp_path):
 
 
 def test_what_the_detector_knew_comes_back(slam, file, ring):
-    """Words need not be looked up again: the same candidates with the same scores."""
+    """The detector finds the same candidates with the same scores.
+
+    It need not look up the words again.
+    """
     again = create_detector("bow", CONFIG)
     stored = load_map(file)
     again.restore(stored.detector)
@@ -385,7 +388,7 @@ def test_a_map_at_a_checkpoint_comes_back_with_what_died(slam, at_checkpoint, tm
 
 
 def same(one: object, other: object) -> bool:
-    """Whether two states hold the same."""
+    """Return whether two states have the same contents."""
     if isinstance(one, np.ndarray):
         return np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
     if is_dataclass(one):
@@ -464,7 +467,7 @@ def test_a_damaged_checkpoint_is_refused(apply, at_checkpoint, tmp_path):
 
 
 def test_a_drive_that_has_made_no_keyframe_yet_is_resumed(at_checkpoint, tmp_path):
-    """One that began in the map of another drive."""
+    """The drive began in the map of a different drive."""
     path = tmp_path / "m.npz"
     begun = {"last_frame": -1, "last_timestamp": -np.inf}
     checkpoint = header_of(at_checkpoint)["checkpoint"]

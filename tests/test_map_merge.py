@@ -40,7 +40,10 @@ def ring() -> Ring:
 
 @pytest.fixture(scope="module")
 def drives(ring) -> list[StoredMap]:
-    """The first meets the third, the third the second; each has a world of its own."""
+    """Three drives: the first meets the third, and the third meets the second.
+
+    Each drive has its own world frame.
+    """
     parts = (range(80), range(110, 180), range(55, 130))
     return [driven(ring, part, seed) for seed, part in enumerate(parts)]
 
@@ -59,7 +62,10 @@ def frames_of(drives: list[StoredMap], starts: list[int]) -> list[np.ndarray]:
 
 
 def errors(map_, ring: Ring, starts: list[int]) -> np.ndarray:
-    """Metres from each keyframe to where it was, in the world of the first."""
+    """Return how far each keyframe is from its true position, in metres.
+
+    Positions are in the world of the first drive.
+    """
     places = [starts[s] + f for s, f in zip(map_.sessions, map_.frames, strict=True)]
     true = np.array([inverse(ring.pose(starts[0])) @ ring.pose(k) for k in places])
     T_wc = inverses(map_.arrays.T_cw[: map_.n_keyframes])
@@ -85,7 +91,7 @@ def test_an_appended_map_is_as_it_was(drives, check_map):
 
 
 def test_drives_that_meet_become_one_map(drives, ring, check_map, tmp_path):
-    """The second one only by way of the third."""
+    """The first and the second drive are connected only through the third drive."""
     merged = merge_maps(drives, CONFIG, create)
     assert merged.joined == [2, 1]
     assert merged.left_out == []

@@ -39,8 +39,11 @@ AT_THE_END = -1  # in place of a keyframe
 
 
 class Closing:
-    """Loop closing that does to the map what a test wants, at the end of each mapping job and at
-    the end of the drive. It finds no loops."""
+    """Loop closing that finds no loops.
+
+    At the end of each mapping job and at the end of the drive, it changes the map as a test
+    requires.
+    """
 
     def __init__(self, job: Callable[[Map, int], None] | None = None) -> None:
         self.is_adjusting = False
@@ -77,12 +80,15 @@ def see_points(k: int) -> Features:
 
 
 def at(k: int) -> np.ndarray:
-    """``T_cw`` of a camera that drives on by 0.2 m a frame."""
+    """Return ``T_cw`` of a camera that drives ahead by 0.2 m per frame."""
     return ahead(0.2 * k, 0.002 * k)
 
 
 class Drive:
-    """A mapper, and frames that are tracked in what it shows: ten a second, 0.2 m apart."""
+    """A mapper, and frames that are tracked in its view of the map.
+
+    There are ten frames per second, which are 0.2 m apart.
+    """
 
     def __init__(
         self,
@@ -103,7 +109,7 @@ class Drive:
         self._see, self._at = see, poses
 
     def next_frame(self) -> Frame:
-        """The frame to come, at its true pose, tracked in what the mapper shows."""
+        """Return the next frame at its true pose. It is tracked in the mapper's view of the map."""
         k, mapper = len(self.mapper.frames), self.mapper
         frame = frame_of(self._see(k), k, 0.1 * k, camera=self.context.camera)
         frame.T_cw = self._at(k)
@@ -116,7 +122,7 @@ class Drive:
         return frame
 
     def step(self, *, keyframe: bool = False) -> Frame:
-        """Track another frame, place it and, if asked to, make it a keyframe."""
+        """Track the next frame and place it. If requested, make it a keyframe."""
         self.mapper.merge_if_due(len(self.mapper.frames))
         frame = self.next_frame()
         self.mapper.hold(self.last, frame)
@@ -127,13 +133,13 @@ class Drive:
         return frame
 
     def steps(self, keyframes: Iterable[int], n: int) -> None:
-        """n frames of which some become keyframes."""
+        """Track and place n frames. Some of them become keyframes."""
         for k in range(n):
             self.step(keyframe=k in keyframes)
 
 
 def bytes_of_view(view: MapView) -> bytes:
-    """All that a view shows."""
+    """Return everything that a view of the map shows, as bytes."""
     values = (getattr(view, field.name) for field in fields(view))
     arrays = (x for value in values for x in (value if isinstance(value, tuple) else (value,)))
     return b"".join(np.ascontiguousarray(x).tobytes() for x in arrays)
@@ -207,8 +213,11 @@ def test_a_keyframe_merges_the_one_before():
 
 
 def trace_on_the_ring(workers, look: Callable[[Mapper], object] = lambda mapper: None) -> list:
-    """Drive on the ring with noisy features; returns what tracking sees at each frame, and the
-    final map. ``look`` is called after each frame."""
+    """Drive on the ring with noisy features.
+
+    Returns what tracking sees at each frame, and the final map. ``look`` is called after each
+    frame.
+    """
     drive = Drive(
         workers,
         camera=ring.CAMERA,
@@ -270,7 +279,7 @@ def test_the_map_is_not_to_be_had_while_a_keyframe_is_mapped(workers):
 
 
 def test_a_trajectory_is_not_to_be_had_even_if_all_frames_follow_the_reference_keyframe():
-    """As at the beginning of another drive in a map."""
+    """This is the state at the beginning of a new drive in an existing map."""
     drive = Drive()
     drive.steps([0, 3], 6)
     map_ = drive.mapper.complete()
@@ -308,7 +317,10 @@ MOVES = [se3_exp(np.array(twist)) for twist in ([0.3, 0, 0, 0, 0.02, 0], [0, 0, 
 
 @late_and_early
 def test_held_frames_follow_a_merge(workers):
-    """One that is placed follows its keyframe, one that is not follows the reference keyframe."""
+    """A placed frame follows its keyframe.
+
+    A frame that is not placed follows the reference keyframe.
+    """
 
     def move(map_: Map, keyframe: int) -> None:
         for k in range(keyframe + 1 if keyframe else 0):
@@ -366,7 +378,7 @@ def see_without_depth(k: int) -> Features:
 
 
 def monocular_drive(workers, closing: Closing) -> Drive:
-    """A monocular map of two keyframes, 0.6 m apart."""
+    """Make a monocular map of two keyframes that are 0.6 m apart."""
     camera = CAMERA.left_camera()
     drive = Drive(workers, closing, camera, see_without_depth, merge_after_frames=9)
     begin_with_two_views(drive)
@@ -374,7 +386,7 @@ def monocular_drive(workers, closing: Closing) -> Drive:
 
 
 def begin_with_two_views(drive: Drive) -> None:
-    """Begin the map with frames 0 and 3."""
+    """Begin the map with the frames 0 and 3."""
     frames = []
     for _ in range(4):
         frames.append(drive.next_frame())
@@ -402,7 +414,7 @@ def test_a_monocular_map_begins_with_two_keyframes():
 
 
 def drive_twist(k: int) -> np.ndarray:
-    """``(6,)`` twist from frame 0 to frame k."""
+    """Return the ``(6,)`` twist from frame 0 to frame k."""
     return np.array([0.0, 0.0, -0.2 * k, 0.0, -0.002 * k, 0.0])
 
 
@@ -436,7 +448,10 @@ def test_where_the_unit_of_a_monocular_map_changes_speeds_and_poses_change_with_
 
 @pytest.mark.parametrize("adjusting", [False, True])
 def test_where_culled_landmarks_are_dropped_frames_track_the_same_points(adjusting, monkeypatch):
-    """Not while a global bundle adjustment runs, which knows landmarks by their numbers."""
+    """Culled landmarks are not dropped during a global bundle adjustment.
+
+    It refers to landmarks by their numbers.
+    """
 
     def kill(map_: Map, keyframe: int) -> None:
         if keyframe == 1:
@@ -509,7 +524,10 @@ def test_a_place_is_old_when_its_keyframe_is(known_after_s, known):
 
 @pytest.mark.parametrize("is_due", [False, True])
 def test_an_old_keyframe_can_serve_in_place_of_a_new_one(is_due):
-    """If a global bundle adjustment is due then, it is merged as a keyframe would be."""
+    """The old keyframe also counts for the merge of a global bundle adjustment.
+
+    If its result is due, it is merged as with a new keyframe.
+    """
     drive = Drive(known_after_s=0.3)
     drive.steps([0, 3], 6)
     mapper, frame = drive.mapper, drive.last
@@ -552,7 +570,7 @@ INCOMPLETE = r"^mapping [^.]*failed [^.]*incomplete; continue from a map that wa
 
 
 class BrokenError(Exception):
-    """What a mapping job fails with in these tests."""
+    """The error that a failing mapping job raises in these tests."""
 
 
 def fail(map_: Map, keyframe: int) -> None:
@@ -662,7 +680,7 @@ def test_a_map_that_is_incomplete_is_not_saved(failing, threads, tmp_path, monke
 
 def test_a_detector_that_fails_costs_its_loops_alone(tmp_path, caplog):
     class Detector(NoDetector):
-        """Fails at each keyframe."""
+        """A detector that fails at each keyframe."""
 
         def add(self, keyframe, image, features):
             raise BrokenError
@@ -685,7 +703,10 @@ def test_a_detector_that_fails_costs_its_loops_alone(tmp_path, caplog):
 
 
 def test_a_mapper_that_is_restored_goes_on_as_the_one_that_was_not():
-    """The reference keyframe is not the newest, as after a frame was found in the map."""
+    """The reference keyframe is not the newest keyframe.
+
+    This happens after a frame was relocalised in the map.
+    """
     one = Drive()
     one.steps([0, 3], 6)
     one.mapper.append_pose(one.next_frame(), tracked=True, near=0)

@@ -34,7 +34,7 @@ HOOD = 110  # first row that the hood covers
 
 @pytest.fixture(scope="module")
 def mask(corridor) -> np.ndarray:
-    """White above the hood, black on it."""
+    """A mask that is white above the hood and black on the hood."""
     mask = np.full(corridor.left[0].shape, 255, np.uint8)
     mask[HOOD:] = 0
     return mask
@@ -42,7 +42,7 @@ def mask(corridor) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def hooded(corridor):
-    """The corridor with a textured hood that stays where it is in both images."""
+    """The corridor with a textured hood, which stays at the same place in both images."""
     blocks = np.random.default_rng(3).integers(0, 256, (40, 120), dtype=np.uint8)
     hood = cv2.resize(blocks, (480, 160), interpolation=cv2.INTER_NEAREST)[HOOD:]
 
@@ -57,7 +57,7 @@ def hooded(corridor):
 
 
 def driven(corridor, images, mask, method="auto"):
-    """The SLAM after all frames, its results, and its ATE in metres."""
+    """Return the SLAM after all frames, its results, and its ATE in metres."""
     slam = Slam(corridor.camera, {"tracking": {"method": method}}, "none", threads=1)
     results = [
         slam.step(left, right, t, mask=mask)
@@ -175,8 +175,10 @@ def test_step_refuses_a_mask_that_does_not_fit(corridor):
 
 @pytest.fixture(scope="module")
 def folder(corridor, tmp_path_factory):
-    """Four pairs of the corridor as images and as a video, with a calibration that needs no
-    rectification and one that does."""
+    """A folder with four pairs of the corridor, as images and as a video.
+
+    It has one calibration that requires rectification, and one that does not.
+    """
     folder = tmp_path_factory.mktemp("masked")
     sides = {"left": corridor.left[:4], "right": corridor.right[:4]}
     write_images(folder, sides, [f"{k}.jpg" for k in range(4)])

@@ -25,7 +25,7 @@ def random_descriptors(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def with_flips(rng: np.random.Generator, descriptors: np.ndarray, bits: int) -> np.ndarray:
-    """Copies with ``bits`` random bits flipped in each."""
+    """Return copies of descriptors with ``bits`` random bits flipped in each."""
     flat = np.unpackbits(descriptors.view(np.uint8), axis=1)
     for row in flat:
         row[rng.choice(256, bits, replace=False)] ^= 1
@@ -91,7 +91,7 @@ def test_grid_of_nothing():
 
 
 def search_windows_by_hand(scene: dict, max_distance: int, ratio: float):
-    """Every landmark against every feature, without a grid."""
+    """Compare every landmark with every feature, without a grid."""
     distance = hamming_table(scene["descriptors"], scene["frame_descriptors"])
     xy, uvr = scene["xy"].astype(float), scene["uvr"]
     claims: dict[int, list[tuple[int, int]]] = {}
@@ -121,7 +121,10 @@ def search_windows_by_hand(scene: dict, max_distance: int, ratio: float):
 
 
 def scene(seed: int, *, octaves: int = 8, n: int = 400, m: int = 300) -> dict:
-    """Landmarks projected near features that they resemble, some of them near the same one."""
+    """Make landmarks that are projected near features that they resemble.
+
+    Some of the landmarks are near the same feature.
+    """
     rng = np.random.default_rng(seed)
     xy = rng.uniform([0, 0], [WIDTH, HEIGHT], (n, 2)).astype(np.float32)
     frame_descriptors = random_descriptors(rng, n)
@@ -197,7 +200,7 @@ def test_ratio_test_of_features_on_one_level(ratio):
 
 
 def test_ratio_test_spares_a_rival_of_another_level():
-    """ORB-SLAM compares best and second best only where both are of one pyramid level."""
+    """The ratio test of ORB-SLAM applies only to matches on the same pyramid level."""
     rng = np.random.default_rng(0)
     descriptor = random_descriptors(rng, 1)
     features = np.concatenate([with_flips(rng, descriptor, 20), with_flips(rng, descriptor, 22)])

@@ -31,7 +31,10 @@ Clip = tuple[Camera, Iterator[tuple[NDArray, NDArray, float]]]
 
 @pytest.fixture
 def clips(request: pytest.FixtureRequest) -> dict[str, Callable[[], Clip]]:
-    """Camera and frames by name; nothing is rendered before a clip is asked for."""
+    """Return the camera and the frames of each reference clip by its name.
+
+    A clip is rendered only when it is requested.
+    """
 
     def stereo() -> Clip:
         corridor = request.getfixturevalue("corridor")
@@ -51,7 +54,7 @@ def clips(request: pytest.FixtureRequest) -> dict[str, Callable[[], Clip]]:
 
 
 def positions(clip: Clip) -> NDArray[np.float64]:
-    """``(N, 3)`` metres: final positions of the camera with the default detector."""
+    """Return the final ``(N, 3)`` positions of the camera in metres, with the default detector."""
     camera, frames = clip
     slam = Slam(camera)
     for left, second, timestamp in frames:
@@ -78,7 +81,10 @@ def test_the_version_of_the_method_is_that_of_its_trajectories(name, clips):
 
 
 def moved(found: NDArray[np.float64], reference: NDArray[np.float64]) -> float:
-    """Largest distance between two trajectories, metres; infinite if their lengths differ."""
+    """Return the largest distance between two trajectories in metres.
+
+    It is infinite if the trajectories differ in length.
+    """
     if found.shape != reference.shape:
         return np.inf
     return float(np.linalg.norm(found - reference, axis=1).max())

@@ -20,7 +20,7 @@ TWIST = np.array([0.0, 0.0, -2.0, 0.0, 0.0, 0.0])
 
 
 class Building(Drive):
-    """A mapper with the mode that builds its map, and the tracker that this mode works with."""
+    """A mapper with the mode that builds its map, and the tracker that this mode uses."""
 
     def __init__(self, camera: Camera = CAMERA, **options) -> None:
         see = see_without_depth if camera.monocular else see_points
@@ -30,14 +30,17 @@ class Building(Drive):
 
     @classmethod
     def with_a_map(cls, **options) -> Building:
-        """With keyframes at frames 0 and 3, and two frames after the last one."""
+        """Make a map with keyframes at the frames 0 and 3. Two more frames follow."""
         drive = cls(**options)
         drive.steps([0, 3], 6)
         drive.mapper.merge()
         return drive
 
     def placed_frame(self, *, tracked: bool = True) -> Frame:
-        """The next frame, placed; one that is not tracked has no landmarks."""
+        """Return the next frame after it is placed.
+
+        A frame that is not tracked has no landmarks.
+        """
         frame = self.next_frame()
         if not tracked:
             frame.landmark[:], frame.xyz[:] = -1, np.nan
@@ -46,14 +49,14 @@ class Building(Drive):
         return frame
 
     def lost_frame(self, n: int) -> Frame:
-        """The last one of n frames that were lost."""
+        """Return the last one of n lost frames."""
         for _ in range(n):
             self.tracker.lose()
         return self.placed_frame(tracked=False)
 
 
 def found(frame: Frame) -> Found:
-    """The result of a frame that is tracked by all the landmarks that it should see."""
+    """Return the result of a frame that tracks all landmarks that it should see."""
     landmarks = frame.landmark[frame.landmark >= 0]
     return Found(TrackingState.OK, len(landmarks), len(landmarks), landmarks)
 
@@ -62,7 +65,10 @@ def found(frame: Frame) -> Found:
 
 
 def test_localising_leaves_the_map_alone():
-    """To the byte, the counts of what frames saw included."""
+    """The map is byte-identical afterwards.
+
+    This includes the counts of how often landmarks were seen.
+    """
     drive = Building.with_a_map()
     mapper, mode = drive.mapper, Mode(drive.mapper)
     lost, tracked = drive.lost_frame(10), drive.placed_frame()
@@ -131,7 +137,10 @@ def test_a_monocular_map_begins_with_the_second_view():
 
 @pytest.mark.parametrize("twist", [TWIST, None])
 def test_a_sub_map_is_placed_by_the_prediction_if_the_speed_is_known(twist):
-    """The frame tracks nothing of the map before, even if it did when it was lost."""
+    """The frame tracks no landmark of the previous map.
+
+    It may have tracked some when it was lost.
+    """
     drive = Building.with_a_map()
     drive.tracker.resume(twist)
     frame = drive.placed_frame()
@@ -145,7 +154,10 @@ def test_a_sub_map_is_placed_by_the_prediction_if_the_speed_is_known(twist):
 
 @pytest.mark.parametrize(("young_keyframes", "patience"), [(2, 1), (1, 3)])
 def test_a_lost_stereo_camera_begins_a_sub_map_sooner_in_a_young_map(young_keyframes, patience):
-    """Of two keyframes: after one frame where that is young, else after three."""
+    """A map with two keyframes is young.
+
+    There, a sub-map begins after one lost frame. Otherwise, it begins after three.
+    """
     drive = Building.with_a_map(tracking={"young_keyframes": young_keyframes})
     for n in range(1, patience + 1):
         begun = drive.mode.begin_after_loss(drive.lost_frame(1))
@@ -235,7 +247,7 @@ def test_a_frame_of_the_right_camera_becomes_no_keyframe():
 
 @pytest.mark.parametrize(("idle", "made"), [(True, True), (False, False)])
 def test_a_frame_that_is_not_urgent_waits_for_mapping(idle, made):
-    """It tracks seven tenths of what the reference keyframe sees."""
+    """The frame tracks seven tenths of the landmarks that the reference keyframe sees."""
     drive = Building.with_a_map(min_tracked_close=0, merge_after_frames=50, max_interval_s=50.0)
     if not idle:
         drive.mapper.insert(drive.placed_frame())

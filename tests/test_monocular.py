@@ -20,8 +20,11 @@ ROUND = [float(k) for k in range(LAP + 40)]
 
 
 def see(k):
-    """What the left camera sees at frame k; near points at coarse levels of the pyramid, as in an
-    image: what is mapped from two places must be found from a third."""
+    """Return what the left camera sees at frame k.
+
+    As in a real image, near points are at coarse levels of the pyramid. Points that are mapped from
+    two places must be found from a third place.
+    """
     features = RING.see(k, 1)
     depth = CAMERA.bf / (features.xy[:, 0] - features.u_right)
     octave = np.clip(np.ceil(np.log(30.0 / np.clip(depth, 1.0, None)) / np.log(1.2)), 0, 7)
@@ -41,7 +44,7 @@ def run(frames, detector="none", *, threads=1, dark=()):
 
 
 def error(slam, frames, chosen=slice(None)):
-    """ATE RMSE after Sim3 alignment, metres."""
+    """Return the ATE RMSE in metres after Sim3 alignment."""
     found = slam.trajectory()
     truth = Trajectory(found.timestamps, np.array([RING.pose(k) for k in frames]))
     indices = np.arange(len(frames))[chosen]

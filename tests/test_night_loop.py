@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def compared(round_the_block):
-    """The drive with the default detector and, beside it, with ``bow``."""
+    """The drive with the default detector, which is compared with ``bow``."""
     settings = RunOptions(threads=2, compare=("bow",))
     return run_sequence(round_the_block, parse_perturbation("none", 0), settings, Recorder())
 
@@ -42,7 +42,7 @@ def test_the_loop_says_that_the_network_found_and_verified_it(compared):
 
 
 def test_the_library_closes_it_without_being_told_how(round_the_block, compared):
-    """``Slam(camera)`` gives the trajectory of the command, to the byte."""
+    """``Slam(camera)`` gives a trajectory that is byte-identical to that of the command."""
     slam = Slam(round_the_block.camera)
     for k, timestamp in enumerate(round_the_block.timestamps):
         left, right = round_the_block.read(k)

@@ -53,9 +53,12 @@ def test_the_adjoint_carries_a_small_motion_to_the_other_side_of_a_pose():
 @pytest.mark.parametrize("kind", ["mono", "mixed", "stereo"])
 @pytest.mark.parametrize("believed", [0.7, 1.0])
 def test_errors_of_a_pose_are_those_that_its_covariance_predicts(kind, believed):
-    """Also if the observations are better than their inverse variances say. If they are not, one in
-    twenty fails the test for inliers, which makes the residuals of the others smaller. The spread
-    of a gradient in a finite number of cells is itself uncertain, which makes the mean larger."""
+    """The covariance is also right if the observations are more accurate than their weights assume.
+
+    If they are as accurate as assumed, one observation in twenty fails the test for inliers. This
+    reduces the residuals of the others. The variance of a gradient that is estimated from few cells
+    is itself uncertain. This increases the mean.
+    """
     squared = []
     for seed in range(200):
         points, uvr, weight = observations(kind, n=500, noise=believed, seed=seed)
@@ -67,8 +70,11 @@ def test_errors_of_a_pose_are_those_that_its_covariance_predicts(kind, believed)
 
 
 def test_the_covariance_holds_where_errors_are_unequal_and_neighbours_share_them():
-    """Near points have errors three times as large, and every corner is observed four times. A
-    covariance that believed the weights would be several times too small."""
+    """Near points have errors that are three times as large.
+
+    Every corner is observed four times. A covariance that is computed from the weights alone would
+    be several times too small.
+    """
     squared = []
     for seed in range(100):
         rng = np.random.default_rng(seed)
@@ -85,8 +91,10 @@ def test_the_covariance_holds_where_errors_are_unequal_and_neighbours_share_them
 
 
 def test_a_wrong_offset_makes_the_motion_too_long_or_too_short():
-    """The landmarks of one frame are placed by disparities that are 0.05 px too large; the next
-    frame is tracked by its left image."""
+    """The landmarks of one frame are computed from disparities that are 0.05 px too large.
+
+    The next frame is tracked using its left image.
+    """
     points, _, weight = observations("mono", n=500)
     in_camera = points @ TRUTH[:3, :3].T + TRUTH[:3, 3]
     offset = 0.05
@@ -106,8 +114,11 @@ def test_a_wrong_offset_makes_the_motion_too_long_or_too_short():
 
 
 def test_the_error_of_the_offset_adds_up_along_a_drive():
-    """It is the same all the time, so that its share of the covariance grows with the square of
-    the distance, and it cancels if the camera comes back."""
+    """The error of the offset is constant.
+
+    Its part of the covariance therefore grows with the square of the distance. It cancels if the
+    camera returns.
+    """
     effect = np.zeros((6, 3))
     effect[:3] = 0.001 * np.eye(3)
     model, states = Odometry(), []
@@ -209,7 +220,7 @@ NEES = runpy.run_path(
 
 @pytest.mark.parametrize("promised", [1.0, 0.25])
 def test_the_tool_finds_covariances_that_promise_too_much(promised):
-    """Errors of every frame, drawn with the variance that the covariance has, or four times it."""
+    """The errors of the frames are drawn with the estimated variance, or with four times it."""
     rng = np.random.default_rng(0)
     C = np.diag([1e-4, 1e-4, 4e-4, 1e-6, 1e-6, 1e-6])
     truth, results = [], []
@@ -226,7 +237,7 @@ def test_the_tool_finds_covariances_that_promise_too_much(promised):
 
 
 def steps(poses: list[np.ndarray]) -> np.ndarray:
-    """Distance from each position to the next one, metres."""
+    """Return the distance from each position to the next one in metres."""
     return np.linalg.norm(np.diff([pose[:3, 3] for pose in poses], axis=0), axis=1)
 
 

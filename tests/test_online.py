@@ -50,7 +50,7 @@ def no_bar(what: str, total: int):
 
 
 class Scores:
-    """A scorer that was told its scores."""
+    """A detector that returns the scores that it was given."""
 
     name, probability = "told", False
 
@@ -270,7 +270,10 @@ def texture(seed: int, height: int = 188, width: int = 620) -> np.ndarray:
 
 
 def write_drive(folder, places) -> ImageSource:
-    """A drive past textures, one for each place; equal places are the same."""
+    """Write a drive along textures.
+
+    Each place has a texture, and equal places have the same one.
+    """
     files = []
     for k, place in enumerate(places):
         files.append(folder / f"{k:06d}.png")

@@ -27,7 +27,10 @@ from vslam.frontend.orb import (
 
 
 def textured(height: int = 240, width: int = 320, seed: int = 0) -> np.ndarray:
-    """Blocks of random grey, slightly blurred: many corners of every strength."""
+    """Make blocks of random grey values, slightly blurred.
+
+    They have many corners of every strength.
+    """
     rng = np.random.default_rng(seed)
     blocks = rng.uniform(0, 255, (height // 8 + 1, width // 8 + 1))
     image = np.kron(blocks, np.ones((8, 8)))[:height, :width]
@@ -149,7 +152,11 @@ def test_no_two_corners_touch_and_none_is_near_the_border():
 
 
 def clustered(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """3,000 strong corners in one 60 x 60 px cluster and 300 weak ones over 640 x 240 px."""
+    """Make an image with 3,000 strong corners in a small area and 300 weak corners elsewhere.
+
+    The strong corners are in a cluster of 60 x 60 px. The weak corners are spread over 640 x 240
+    px.
+    """
     rng = np.random.default_rng(seed)
     dense = np.stack([rng.integers(300, 360, 3000), rng.integers(90, 150, 3000)], axis=1)
     sparse = np.stack([rng.integers(20, 620, 300), rng.integers(20, 220, 300)], axis=1)

@@ -40,7 +40,7 @@ LAWS = ("none", "brightness:0.5", "brightness:1")
 
 
 def copy_run(source: Path, folder: Path, **changes: object) -> Path:
-    """Another run with the trajectory of ``source``."""
+    """Write a further run that has the trajectory of ``source``."""
     folder.mkdir(parents=True)
     for name in ("trajectory.tum", "trajectory_kitti.txt", "ground_truth_kitti.txt", "config.json"):
         shutil.copy(source / name, folder)
@@ -52,7 +52,10 @@ def copy_run(source: Path, folder: Path, **changes: object) -> Path:
 
 @pytest.fixture(scope="module")
 def runs(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two sequences, three strengths, two detectors, two seeds where seeds matter, and debris."""
+    """Runs on two sequences with three strengths and two detectors, and other files.
+
+    There are two seeds if the perturbation is random.
+    """
     root = tmp_path_factory.mktemp("runs")
     for s, sequence in enumerate(("00", "05")):
         for k, perturb in enumerate(LAWS):
@@ -105,7 +108,7 @@ def entry(
 
 
 def table_of(report: OverviewJson, title: str) -> Table:
-    """The table of a section of the page."""
+    """Return the table in a section of the page."""
     (section,) = (one for one in overview_page(report, []).sections if one.title == title)
     (table,) = section.parts
     return table
@@ -227,7 +230,10 @@ def test_too_few_sequences_for_a_test_are_said(written):
 
 
 def test_wilcoxon_pairs_sequences_not_runs():
-    """Six sequences, three runs each: n is 6, and p the least that 6 pairs can give."""
+    """There are six sequences with three runs each.
+
+    Therefore, n is 6, and p is the smallest value that is possible with 6 pairs.
+    """
     assert least_pairs() == 6
     runs = [
         entry(
@@ -280,7 +286,10 @@ def loops(found: int, missed: int, lost: int = 0, rpe: float = 0.02) -> dict[str
 
 @pytest.fixture
 def two_conditions() -> list[RunEntry]:
-    """Six sequences; ``both`` closes the loop of each under brightness, ``bow`` of none."""
+    """Runs on six sequences.
+
+    ``both`` closes the loop of each sequence under brightness, and ``bow`` closes no loop.
+    """
     runs = []
     for name in (f"{k:02d}" for k in range(6)):
         for system in ("bow", "both"):
@@ -437,7 +446,10 @@ def thresholds_of(folder: Path, **values: object) -> None:
 
 @pytest.fixture
 def thresholds(run_folder: Path, tmp_path: Path) -> Path:
-    """Three sets of thresholds, one of them twice; all runs share a fourth threshold."""
+    """Runs with three sets of thresholds, one of which occurs twice.
+
+    All runs also share the value of a further threshold.
+    """
     for k, n in enumerate((2000, 1000, 1000, 1500)):
         folder = copy_run(
             run_folder, tmp_path / "runs" / str(k), detector="bow", seed=k, ate_rmse_m=1.0 + k
@@ -447,7 +459,7 @@ def thresholds(run_folder: Path, tmp_path: Path) -> Path:
 
 
 def test_thresholds_do_not_concern_other_systems(thresholds: Path):
-    """Their runs have no ``run.json``."""
+    """Runs of other systems have no ``run.json``."""
     for folder in thresholds.iterdir():
         (folder / "run.json").unlink()
     assert {run.system for run in collect([thresholds], []).runs} == {"bow"}
@@ -572,7 +584,7 @@ def test_a_report_of_an_unknown_town_is_left_out_with_a_note(run_folder: Path, t
 
 @pytest.fixture(scope="module")
 def monocular(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run whose trajectory is right but for its unit, as a monocular one is."""
+    """A run whose trajectory is right except for its unit, as in a monocular run."""
     folder = copy_run(
         run_folder, tmp_path_factory.mktemp("mono") / "mono", sensor="mono", detector="bow",
         perturb="none", alignment="sim3", ate_rmse_m=0.25,
@@ -684,7 +696,10 @@ page.src = "report.html";
 
 @pytest.mark.slow
 def test_report_in_a_browser_as_wide_as_a_phone(written, tmp_path: Path):
-    """Chromium, 400 px: all figures are drawn, nothing sticks out, nothing is asked for."""
+    """In Chromium at a width of 400 px, all figures are drawn.
+
+    Nothing is wider than the page. The page requests nothing from the network.
+    """
     chromium()
     served = tmp_path / "served"
     served.mkdir()

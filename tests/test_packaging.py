@@ -35,7 +35,10 @@ def build(source: Path, out: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Built from two copies in different folders, with different times of their files."""
+    """Two wheels that were built from copies in different folders.
+
+    The files have different times.
+    """
     root = tmp_path_factory.mktemp("wheels")
     made = []
     for number in range(2):
@@ -108,7 +111,7 @@ def test_an_old_python_is_refused_in_one_sentence():
 
 
 def readme_for(source: str, tmp_path: Path) -> str:
-    """As setup.py makes it where pyproject.toml names this page of the repository."""
+    """Return the README that setup.py makes if pyproject.toml names this page."""
     for name in ("setup.py", "README.md"):
         shutil.copyfile(ROOT / name, tmp_path / name)
     urls = f"[project.urls]\nSource = '{source}'\n" if source else ""
@@ -139,7 +142,10 @@ def test_the_readme_of_a_registry_has_no_link_that_leads_nowhere(wheels, tmp_pat
 
 
 def test_a_plain_installation_stays_lean():
-    """What only some need is in an extra, and the error names the extra."""
+    """Packages that only some users need are in an extra.
+
+    If one is missing, the message names the extra.
+    """
     plain = " ".join(PROJECT["dependencies"])
     extras = {
         re.split(r"[<>=\[]", item)[0]

@@ -50,8 +50,11 @@ INSTALL = "`make test` builds and installs the wheel"
 
 @dataclass(frozen=True)
 class Rules:
-    """``shorter``: patterns of the page's text and what stands for them; ``not_run``: beginnings of
-    commands, with the reason."""
+    """The rules by which the commands of a page are run.
+
+    ``shorter`` contains patterns in the text of the page and their replacements. ``not_run``
+    contains the beginnings of commands that are not run, with the reason.
+    """
 
     shorter: tuple[tuple[str, str], ...] = ()
     not_run: tuple[tuple[str, str], ...] = ()
@@ -285,7 +288,10 @@ def is_elsewhere(path: Path) -> bool:
 
 
 def commands_of(text: str) -> Iterator[str]:
-    """Shell blocks command by command, loops and what is read up to ``END`` as a whole."""
+    """Split shell blocks into commands.
+
+    A loop is one command. Text that a command reads up to ``END`` belongs to the command.
+    """
     rest = []
     at = 0
     for block in FENCE.finditer(text):
@@ -316,13 +322,16 @@ def _logical_lines(block: str) -> Iterator[str]:
 
 
 def is_shell(command: str) -> bool:
-    """More than one ``vslam`` with its words."""
+    """Return whether a command is more than a single call of ``vslam``."""
     return not command.startswith("vslam ") or any(x in command for x in ("; ", "&&", " > "))
 
 
 @pytest.mark.parametrize("path", PAGES, ids=name)
 def test_every_page_with_commands_has_rules(path: Path):
-    """A page is run here, or elsewhere; and what is not run is on the page still."""
+    """Every page is tested here or in another test.
+
+    The commands that are not run still exist on the page.
+    """
     commands = list(commands_of(path.read_text()))
     if is_elsewhere(path):
         return
@@ -346,7 +355,7 @@ def test_the_reader_of_commands_sees_all_kinds():
 
 @pytest.fixture(scope="module")
 def home(corridor, kitti_tree: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the data sets that pages name; each sequence is the corridor."""
+    """A folder with the data sets that the pages name. Each sequence shows the corridor."""
     root, c = tmp_path_factory.mktemp("home"), corridor.camera
     for sequence in ("00", "05", "06"):
         for kind, file in (("sequences", "00"), ("poses", "00.txt")):
@@ -391,7 +400,7 @@ def _write_tum(folder: Path, corridor, depth: list[np.ndarray]) -> None:
 
 @pytest.fixture(scope="module")
 def towns(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where rendered ones are kept, from page to page."""
+    """The folder of rendered towns, which the tests of all pages share."""
     return tmp_path_factory.mktemp("towns")
 
 
@@ -399,7 +408,7 @@ def towns(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def desk(
     home: Path, towns: Path, corridor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Path:
-    """The folder that commands are typed in, with the files that they name."""
+    """The folder in which commands are run, with the files that they name."""
     c = corridor.camera
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(home))
@@ -439,14 +448,14 @@ def _video_and_mask(desk: Path, corridor) -> None:
 
 
 def _fixes(desk: Path, corridor) -> None:
-    """A row north of one metre is 9 millionths of a degree."""
+    """Write GPS fixes. A metre to the north is 9 millionths of a degree."""
     north = enumerate(corridor.T_wc[:N, 2, 3].tolist())
     rows = [f"{0.1 * k},{48 + 9e-6 * metres:.9f},11,500,0.01" for k, metres in north]
     (desk / "fixes.csv").write_text("\n".join(["time,latitude,longitude,altitude,sigma", *rows]))
 
 
 def _depth_sources(desk: Path, corridor) -> None:
-    """Images in ``FOLDER``, a bag with depth."""
+    """Write images into ``FOLDER``, and a bag with depth."""
     c = corridor.camera
     names = [f"{10**18 + 10**8 * k}.png" for k in range(N)]
     depth = [
@@ -459,7 +468,10 @@ def _depth_sources(desk: Path, corridor) -> None:
 
 
 def _pair_sources(desk: Path, corridor) -> None:
-    """Images in ``FOLDER``, in two folders, with depth; a video; a bag of a pair."""
+    """Write images into ``FOLDER``, into two folders, and with depth.
+
+    Also write a video and a bag of stereo pairs.
+    """
     _videos(desk, corridor)
     names = [f"{10**18 + 10**8 * k}.png" for k in range(N)]
     sides = {"LEFT": corridor.left[:N], "RIGHT": corridor.right[:N], "RGB": corridor.left[:N]}
@@ -481,7 +493,7 @@ def _earlier_run(desk: Path, corridor) -> None:
 
 
 def _another_system(desk: Path, corridor) -> None:
-    """``run_mine``, which knows the truth of its frames."""
+    """Write ``run_mine``, a SLAM system that knows the true poses of its frames."""
     script = desk / "bin" / "run_mine"
     truth = desk / "poses" / "07.txt"
     script.write_text(
@@ -524,7 +536,7 @@ PREPARE: dict[str, Callable[[Path, object], None]] = {
 
 
 def run_words(words: list[str]) -> None:
-    """``vslam`` in this process; runs are short and draw no pages."""
+    """Run ``vslam`` in this process. Runs are short and write no pages."""
     from vslam.cli import main as cli
 
     if words[0] == "run":
@@ -556,8 +568,11 @@ def run_command(command: str) -> None:
 
 @pytest.fixture
 def dask(desk: Path) -> Iterator[Callable[[str], str]]:
-    """Takes the commands of the cluster's page: starts what it says, on loopback; gives the address
-    of the scheduler."""
+    """Return a function that starts the commands on the page about clusters.
+
+    The programs are started on the loopback interface. The function returns the address of the
+    scheduler.
+    """
     pytest.importorskip("distributed", reason="no dask here: pip install 'vslam[cluster]'")
     log, processes, address = desk / "dask.txt", [], ""
 

@@ -36,7 +36,7 @@ def coarse(image):
 
 @pytest.fixture(scope="module")
 def points(corridor):
-    """Stereo points of the first frame, in the world."""
+    """Return the stereo points of the first frame in the world."""
     context = TrackingContext.create(corridor.camera, CONFIG)
     images = FrameImages(corridor.left[FIRST], lambda: corridor.right[FIRST], context)
     features = images.extracted.features
@@ -47,7 +47,7 @@ def points(corridor):
 
 
 def aligned(corridor, points, image, off=OFF):
-    """Turn (degrees) and shift (metres) between the pose that is found and the true one."""
+    """Align an image, and return the difference from the true pose in degrees and in metres."""
     T_true = inverse(corridor.T_wc[SECOND])
     T_before, camera = inverse(corridor.T_wc[FIRST]), corridor.camera
     T_predicted = se3_exp(off) @ T_true
@@ -113,7 +113,7 @@ def test_few_frames_need_features_and_the_pose_is_as_good(corridor):
 
 
 def test_image_alignment_that_follows_a_moving_object_is_not_believed(corridor, monkeypatch):
-    """The patches are searched for again from the predicted pose."""
+    """The patches are searched for again, starting from the predicted pose."""
 
     misled_poses = []
 
@@ -137,7 +137,10 @@ def test_image_alignment_that_follows_a_moving_object_is_not_believed(corridor, 
 
 
 def run(kitti_tree, threads=1, sequence=None):
-    """A run over the corridor's files by patches; reads of the right image are counted."""
+    """Run patch-based tracking over the files of the corridor.
+
+    Reads of the right image are counted.
+    """
     sequence = sequence or open_sequence("kitti", kitti_tree, "00")
     reads = []
 

@@ -29,7 +29,10 @@ def texture(seed: int, shape: tuple[int, int] = (160, 480)) -> np.ndarray:
 
 
 def wall(metres: float) -> tuple[np.ndarray, np.ndarray]:
-    """A pair that shows a wall, facing the rig, at a distance whose disparity is whole."""
+    """Make a stereo pair that shows a wall, which faces the cameras.
+
+    The distance of the wall is such that its disparity is a whole number.
+    """
     d = CAMERA.bf / metres
     assert d == round(d)
     wide = texture(2)
@@ -37,8 +40,10 @@ def wall(metres: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def drive_of(camera: Camera = CAMERA, *, poses: bool = True) -> Source:
-    """A camera that turns to the right; it looks at a wall that moves 4 pixels to the left a
-    frame."""
+    """Make the images of a camera that turns to the right.
+
+    The camera looks at a wall, which moves 4 pixels to the left per frame.
+    """
     timestamps = 5.0 + 0.1 * np.arange(20)
     T_wc = np.tile(np.eye(4), (20, 1, 1))
     turned = np.outer(RATE * (timestamps - 5.0), [0.0, 1.0, 0.0])
@@ -110,7 +115,10 @@ def test_night_takes_stops_and_counts_electrons():
 
 
 def test_exposure_follows_with_its_time_constant():
-    """After the light falls by 3 stops the error is 3 stops, and 1/e of that after the lag."""
+    """When the light decreases by 3 stops, the error of the exposure is 3 stops.
+
+    After the time constant, it is 1/e of this.
+    """
     law = parse_perturbation("exposure:0.5", 0)
     grey = np.full((2, 2), 128, np.uint8)
     level = np.array([law.apply(k, 0.01 * k, grey, None)[0][0, 0] for k in range(4000)], float)
@@ -164,7 +172,10 @@ def test_a_blackout_lasts_its_time_whatever_the_frame_rate(ms):
 
 
 def test_motion_blur_is_as_long_as_the_turn_while_the_shutter_is_open():
-    """0.4 rad/s, 400 pixels, 50 ms: 8 pixels."""
+    """The camera turns at 0.4 rad/s for 50 ms.
+
+    With a focal length of 400 pixels, the blur is 8 pixels long.
+    """
     point = np.zeros((160, 320), np.uint8)
     point[80, 160] = 255
     images = seen("motion:50", (point, point))
@@ -175,7 +186,7 @@ def test_motion_blur_is_as_long_as_the_turn_while_the_shutter_is_open():
 
 
 def test_motion_blur_without_poses_takes_the_motion_of_the_image():
-    """4 pixels in 0.1 s, 100 ms: 4 pixels."""
+    """The image moves 4 pixels in 0.1 s. An exposure of 100 ms gives a blur of 4 pixels."""
     point = np.zeros((160, 320), np.uint8)
     point[80, 160] = 255
     drive = drive_of(poses=False)
@@ -223,7 +234,10 @@ def test_dirt_covers_its_share_and_stays():
 
 
 def test_rain_is_that_of_marshall_and_palmer():
-    """Water of all drops above 1 mm, falling, is at most what the rate says, and most of it."""
+    """Only drops above 1 mm are drawn.
+
+    The water in these drops is most of the stated rate, and never more than the rate.
+    """
     for mm_per_h in (5.0, 25.0, 100.0):
         n, rate = drops_per_m3(mm_per_h)
         d = 1.0 + np.linspace(0.0, 8.0, 4000)
@@ -311,7 +325,10 @@ def test_stereo_gain_takes_stops_of_the_right_side_alone():
 
 @pytest.mark.parametrize(("law", "axis"), [("yaw", 1), ("pitch", 0)])
 def test_a_turned_camera_moves_the_image_by_arc_minutes(law, axis):
-    """30 arc minutes of 400 pixels: 3.49 pixels, to the left or downwards."""
+    """With a focal length of 400 pixels, 30 arc minutes are 3.49 pixels.
+
+    The image moves to the left or downwards.
+    """
     image = np.zeros((160, 320), np.uint8)
     image[76:85, 156:165] = 255
     ours, theirs = seen(f"{law}:30", (image, image))
@@ -407,7 +424,10 @@ def test_a_law_that_does_not_know_its_scene_says_so():
 
 
 def test_faults_are_of_the_images_so_far():
-    """Fog looks at clean images for its depth: noise before it does not change where it lies."""
+    """Fog computes depth from the unperturbed images.
+
+    Noise that is applied before fog does not change where the fog is.
+    """
     images = wall(20.0)
     noisy_fog = seen("noise:1,fog:20", images)[0]
     fog = seen("fog:20", images)[0]

@@ -42,7 +42,7 @@ NO_FEATURES = Features(
 
 
 def written_package(folder: Path) -> Path:
-    """The package as the page has it."""
+    """The package as the page shows it."""
     text = PAGE.read_text()
     folder.mkdir()
     blocks = re.findall(r"```(toml|python)\n# (\S+)\n(.*?)```", text, re.DOTALL)
@@ -54,7 +54,7 @@ def written_package(folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def target(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder that the package of the page is installed in, by pip, without a network."""
+    """A folder into which pip installed the package of the page, without a network."""
     root = tmp_path_factory.mktemp("plugins")
     package = written_package(root / "package")
     command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index"]
@@ -73,7 +73,7 @@ def installed(target: Path, monkeypatch) -> Path:
 
 @pytest.fixture
 def broken(tmp_path: Path, monkeypatch):
-    """Pretend that a package ``broken 2.0`` with this source and these entry points is there."""
+    """Simulate an installed package ``broken 2.0`` with this source and these entry points."""
 
     def install(source: str, entry_points: str, package: str = "broken") -> None:
         folder = tmp_path / package
@@ -118,8 +118,11 @@ def test_the_package_of_the_page_is_found(installed):
 
 @pytest.mark.slow
 def test_a_run_with_reader_perturbation_and_detector(target: Path, corridor, tmp_path: Path, call):
-    """In a process of its own, as a user types it; the help lists all three. Without the package,
-    the run can neither be resumed nor its map continued."""
+    """The command runs in a separate process, as a user would start it.
+
+    The help lists all three plug-ins. Without the package, the run can neither be resumed nor its
+    map continued.
+    """
     data = write_frames(tmp_path / "data", corridor, 12)
     environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(target), "COLUMNS": "200"}
     environment["HOME"] = str(Path.home())
@@ -163,7 +166,7 @@ def test_a_run_with_reader_perturbation_and_detector(target: Path, corridor, tmp
 
 
 def test_the_detector_of_the_page_finds_the_same_image(installed, corridor):
-    """Enough keyframes later the first image comes again: it is the one candidate."""
+    """The first image appears again after enough keyframes. It is the only candidate."""
     require_detector("thumbnail")
     detector = create_detector("thumbnail", Config())
     map_ = Map(np.array([1.0]))
@@ -375,7 +378,7 @@ STREAM = (
 
 
 def test_a_reader_that_streams(broken, kitti_tree):
-    """Frames are selected, and a failure ends the stream."""
+    """Frames of the stream are selected. A failure ends the stream."""
     broken(STREAM.replace("LIVE", "True"), "[vslam.readers]\nmine = broken:reader\n")
     source = open_from("mine", kitti_tree, start=1, every=2, sensor="mono")
     assert not source.seekable

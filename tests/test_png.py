@@ -17,7 +17,10 @@ from vslam.errors import UnreadableImageError
 
 
 def picture(height, width):
-    """Smooth with noise, and patches of black and of white, where predictors are tied."""
+    """Make a smooth image with noise.
+
+    Some patches are black or white, so that predictors give equal values.
+    """
     rng = np.random.default_rng(height * 1000 + width)
     y, x = np.mgrid[:height, :width]
     image = 120 + 60 * np.sin(x / 9.0) + 50 * np.cos(y / 7.0) + rng.normal(0, 6, (height, width))
@@ -37,7 +40,10 @@ def header(image, depth=8, colour=0, interlaced=0):
 
 
 def filtered(image, filters):
-    """Lines with the filter of each in front (PNG specification, section 9), written from it."""
+    """Filter the lines of an image and put the filter number before each line.
+
+    The code follows the PNG specification, section 9.
+    """
     padded = np.zeros((image.shape[0] + 1, image.shape[1] + 1), np.int64)
     padded[1:, 1:] = image
     a, b, c = padded[1:, :-1], padded[:-1, 1:], padded[:-1, :-1]
@@ -130,7 +136,7 @@ def test_damaged_image_data_is_not_taken_for_an_image():
 
 
 def test_no_mutation_is_accepted_with_other_pixels_than_opencvs():
-    """What is decoded here OpenCV decodes to the same pixels."""
+    """If vslam decodes a damaged file, OpenCV decodes it to the same pixels."""
     image = picture(24, 40)
     whole = png(image, zlib.compress(filtered(image, np.resize([4, 1, 2, 3], 24))), pieces=2)
     rng = np.random.default_rng(0)
@@ -175,7 +181,7 @@ def test_an_image_with_a_wrong_check_sum_is_named(tmp_path):
 
 
 def test_a_chunk_that_is_longer_than_the_file_is_seen_and_takes_no_memory(tmp_path):
-    """OpenCV would take 2 GB for it."""
+    """OpenCV would allocate 2 GB for such a chunk."""
     grey = np.random.default_rng(0).integers(0, 256, (48, 64), dtype=np.uint8)
     data = cv2.imencode(".png", grey)[1].tobytes()
     at = data.index(b"IDAT") - 4

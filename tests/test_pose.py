@@ -18,7 +18,10 @@ KINDS = ["mono", "stereo", "mixed"]
 
 
 def observations(kind: str, n: int = 120, noise: float = 0.0, seed: int = 0):
-    """World points, what the camera at TRUTH sees of them and the inverse variances."""
+    """Make world points and what the camera at TRUTH sees of them.
+
+    Also return the inverse variances of the observations.
+    """
     rng = np.random.default_rng(seed)
     depth = rng.uniform(3, 40, n)
     pixels = rng.uniform([0, 0], [CAMERA.width, CAMERA.height], (n, 2))
@@ -79,7 +82,7 @@ def test_inliers_are_those_of_the_chi_square_test(kind):
 
 
 def gtsam_pose(points, uvr, inverse_sigma2) -> np.ndarray:
-    """The pose that minimises the squared error, by GTSAM with the points held."""
+    """Compute the pose that minimises the squared error, using GTSAM with fixed points."""
     stereo = gtsam.Cal3_S2Stereo(CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy, CAMERA.baseline)
     mono = gtsam.Cal3_S2(CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -115,7 +118,10 @@ def test_finds_gtsams_optimum_of_the_inliers(kind):
 
 
 def test_octaves_weigh_the_observations():
-    """Half of the points are displaced by 1 px: the better half wins if its sigma is smaller."""
+    """Half of the points are displaced by 1 px.
+
+    The pose follows the other half if its sigma is smaller.
+    """
     points, uvr, _ = observations("stereo")
     uvr[::2, :2] += 1.0
     weight = np.ones(120)

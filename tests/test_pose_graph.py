@@ -41,8 +41,11 @@ def turn(yaw: float) -> np.ndarray:
 
 
 def chain_graph(T_wc: np.ndarray, loops=(), measured=(), reach: int = 1, weak=()) -> PoseGraph:
-    """Odometry edges to the next ``reach`` keyframes, measured by the poses, and loop edges.
-    Nothing but a weak tree edge leads past the keyframes ``weak``."""
+    """Make odometry edges to the next ``reach`` keyframes, and loop edges.
+
+    The odometry edges are computed from the poses. Only a weak tree edge leads past the keyframes
+    in ``weak``.
+    """
     n = len(T_wc)
     pairs = [(i, i + s) for s in range(1, reach + 1) for i in range(n - s)]
     past = {p: any(p[0] < w <= p[1] for w in weak) for p in pairs}
@@ -64,8 +67,10 @@ def chain_graph(T_wc: np.ndarray, loops=(), measured=(), reach: int = 1, weak=()
 
 
 def test_translation_error_spreads_evenly():
-    """Twelve keyframes in a circle without rotation have equal edges. Each edge, including the
-    loop's, takes a twelfth of the error."""
+    """Twelve keyframes form a circle without rotation, and all edges have equal weights.
+
+    Each edge, including the loop edge, takes a twelfth of the error.
+    """
     n = 12
     angle = 2 * np.pi * np.arange(n) / n
     T_wc = np.array([translation(10 * np.sin(a), 0, 10 * np.cos(a)) for a in angle])
@@ -83,7 +88,10 @@ def test_translation_error_spreads_evenly():
 
 @pytest.mark.parametrize("share", [1.0, 3.0])
 def test_rotation_error_spreads_by_the_variances(share):
-    """Turning on the spot: an edge with ``share`` times the variance takes that much more."""
+    """The camera turns on the spot.
+
+    An edge with ``share`` times the variance takes ``share`` times as much of the error.
+    """
     n, missing = 9, 0.3
     T_wc = np.array([turn(2 * np.pi * k / n) for k in range(n)])
     graph = chain_graph(T_wc, [(n - 1, 0)], [turn(2 * np.pi / n + missing)])
@@ -116,7 +124,10 @@ def test_error_of_an_edge_is_the_whitened_twist():
 
 
 def test_redundant_edges_do_not_make_the_path_stiffer():
-    """Stretch a path by a metre: the chi-square is the same with edges to one or to six others."""
+    """A path is stretched by a metre.
+
+    The chi-square is the same for edges to the next one and to the next six keyframes.
+    """
     straight = np.array([translation(0, 0, k) for k in range(200)])
     stretched = inverses(np.array([translation(0, 0, k * (1 + 1 / 199)) for k in range(200)]))
     chi2 = {}
@@ -137,7 +148,10 @@ def test_same_bytes_every_time():
 
 
 def make_map(views: list[range], T_cw: np.ndarray) -> Map:
-    """A map in which keyframe k observes the landmarks ``views[k]``; parents in a chain."""
+    """Make a map in which keyframe k observes the landmarks ``views[k]``.
+
+    Each keyframe is the parent of the next one.
+    """
     map_ = Map(1.2 ** np.arange(8))
     n = max(view.stop for view in views)
     for k, view in enumerate(views):
@@ -158,13 +172,16 @@ def make_map(views: list[range], T_cw: np.ndarray) -> Map:
 
 
 def line_map(n: int = 8, shift: int = 60) -> Map:
-    """Keyframes along a line, 240 landmarks each: 180, 120, 60 shared with the next three."""
+    """Make a map of keyframes along a line with 240 landmarks each.
+
+    A keyframe shares 180, 120 and 60 landmarks with the next three keyframes.
+    """
     T_cw = inverses(np.array([translation(0, 0, k) for k in range(n)]))
     return make_map([range(shift * k, shift * k + 240) for k in range(n)], T_cw)
 
 
 def named(graph: PoseGraph) -> dict[tuple[int, int], int]:
-    """Kind of each edge by the ids of its keyframes."""
+    """Return the kind of each edge by the ids of its keyframes."""
     pairs = map(tuple, graph.keyframes[graph.edges].tolist())
     return dict(zip(pairs, graph.kind.tolist(), strict=True))
 
@@ -222,7 +239,10 @@ def test_culled_keyframes_are_left_out_and_their_loops_kept():
 
 
 def test_the_loop_edge_wins_over_the_edge_of_the_same_keyframes():
-    """A drifted covisibility edge won, and the ATE rose from 0.96 to 5.2 m (design.md, 13)."""
+    """A drifted covisibility edge between the same keyframes is replaced.
+
+    When the covisibility edge was kept instead, the ATE rose from 0.96 to 5.2 m (design.md, 13).
+    """
     map_ = line_map()
     T_covisible, T_tree = translation(0, 0, 1.5), translation(0, 0, 0.75)
     for loops in (
@@ -241,7 +261,10 @@ def test_the_loop_edge_wins_over_the_edge_of_the_same_keyframes():
 
 
 def test_a_drifted_covisibility_edge_would_hold_the_drift():
-    """What de-duplication is for: the same loop with and without the drifted edge beside it."""
+    """This is why duplicate edges are removed.
+
+    The same loop is closed with and without the drifted edge.
+    """
     T_wc, loops, true = simulate(3)
     graph = chain_graph(T_wc, loops, true, reach=3)
     alone = check_pose_graph(graph, optimise(graph, CONFIG), CONFIG)
@@ -258,7 +281,7 @@ def test_a_drifted_covisibility_edge_would_hold_the_drift():
 
 
 def test_edges_that_fusing_would_add_are_not_in_the_graph_before_it():
-    """An edge between the two sides of the loop would measure the drift as true."""
+    """An edge between the two sides of the loop would contain the drift as if it were measured."""
     map_ = line_map()
     loop = closed(7, 0, np.eye(4))
     before = named(essential_graph(map_, [loop], CONFIG))
@@ -330,7 +353,7 @@ SIDES = (70.0, 40.0)
 
 
 def route(n: int, step: float = 1.2) -> np.ndarray:
-    """``(n, 4, 4)`` T_wc round a rectangle of 220 m, again and again."""
+    """Return ``(n, 4, 4)`` T_wc of several laps around a rectangle of 220 m."""
     long, short = SIDES
     along = np.arange(n) * step % (2 * (long + short))
     corners = np.array([0.0, long, long + short, 2 * long + short])
@@ -345,11 +368,11 @@ def route(n: int, step: float = 1.2) -> np.ndarray:
 def simulate(
     seed: int, n: int = 420, drift: float = 1.0, bias: bool = False
 ) -> tuple[np.ndarray, list[tuple[int, int]], np.ndarray]:
-    """Odometry ``T_wc`` with ``drift`` per cent of error over a hundred metres and more, and loops
-    one lap apart with what verification would measure.
+    """Simulate odometry ``T_wc`` and loops between poses that are one lap apart.
 
-    The error is a random walk of heading and position, or with ``bias`` one that always turns and
-    stretches the same way.
+    The error of odometry is ``drift`` per cent over a hundred metres and more. It is a random walk
+    of heading and position. With ``bias``, the error always turns and stretches the path in the
+    same way. Loops are as verification would measure them.
     """
     rng = np.random.default_rng(seed)
     true = route(n)
@@ -441,7 +464,10 @@ def test_a_loop_off_by_ten_metres_after_two_hundred_is_refused():
 
 @pytest.mark.parametrize(("metres", "yaw"), [(5.0, 0.3), (60.0, 1.6), (200.0, 3.0)])
 def test_a_part_that_began_anew_is_joined_from_wherever_it_was(metres, yaw):
-    """A loop across a weak edge moves all that came after the restart, and bends none of it."""
+    """A loop across a weak edge moves the part after the restart as a whole.
+
+    It does not deform this part.
+    """
     T_wc, loops, measured = simulate(1, n=260, drift=0.5)
     jump = T_wc[119] @ turn(yaw) @ translation(0.6 * metres, 0, 0.8 * metres) @ inverse(T_wc[119])
     lost = T_wc.copy()

@@ -14,13 +14,20 @@ SIZE, HALF_ANGLE = (97, 217), 40.0
 
 
 def walls(direction: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Grey of a cylinder around the camera, in radians and in radii of the image's half height."""
+    """Return the grey values of a cylinder around the camera.
+
+    ``direction`` is in radians. ``height`` is 1 at the upper and lower border of the image, in the
+    middle column.
+    """
     stripes = np.sin(9 * direction) + np.cos(4 * direction + 2 * height)
     return 0.5 + 0.15 * stripes + 0.1 * np.sin(5 * height)
 
 
 def flat_image(heading: float) -> torch.Tensor:
-    """The walls as a pinhole camera sees them that has turned by ``heading`` radians."""
+    """Return the image of a pinhole camera that looks at the walls.
+
+    The camera has turned by ``heading`` radians.
+    """
     y, x = (((np.arange(n) + 0.5) / n * 2 - 1) for n in SIZE)
     direction = np.arctan(x * math.tan(math.radians(HALF_ANGLE)))
     image = walls(direction + heading, y[:, None] * np.cos(direction))

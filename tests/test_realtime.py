@@ -53,7 +53,7 @@ def test_no_frame_comes_before_its_time_and_the_last_one_always_comes(threads):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_who_is_late_gets_the_newest_frame(threads):
-    """The camera sends nine frames while the first one is used."""
+    """The camera sends nine frames while the first frame is processed."""
     sent = threading.Event()
 
     def film():
@@ -115,7 +115,10 @@ def test_an_error_of_the_camera_comes_after_its_frames():
 
 
 def test_a_live_camera_sets_the_pace_and_dropped_frames_are_let_go():
-    """Times of a live camera do not matter, and only what waits or is used is held."""
+    """The time stamps of a live camera do not matter.
+
+    Only frames that wait or are being processed are kept in memory.
+    """
     alive, most = set(), []
 
     def film():
@@ -137,7 +140,10 @@ def test_a_live_camera_sets_the_pace_and_dropped_frames_are_let_go():
 
 
 def test_frames_that_were_dropped_are_not_lost(corridor, check_map):
-    """Of seven frames four are dropped: tracking goes on, and their poses lie on the way."""
+    """Four of seven frames are dropped.
+
+    Tracking continues, and the poses of the dropped frames lie on the path.
+    """
     slam = Slam(corridor.camera, Config(orb=OrbConfig(n_features=800)), "none", threads=1)
     states = []
     for k in range(len(corridor.left)):
@@ -165,7 +171,10 @@ def test_one_camera_in_real_time(kitti_tree, threads):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_an_unreadable_image_in_real_time(kitti_tree, threads, tmp_path):
-    """Of the last frame, the one that is never dropped: the run ends all the same."""
+    """The unreadable image belongs to the last frame, which is never dropped.
+
+    The run still ends normally.
+    """
     root = tmp_path / "kitti"
     shutil.copytree(kitti_tree, root)
     image = root / "sequences" / "00" / "image_0" / "000005.png"
@@ -179,7 +188,7 @@ def test_an_unreadable_image_in_real_time(kitti_tree, threads, tmp_path):
 
 
 def test_a_compared_detector_drops_the_frames_that_the_main_one_drops(kitti_tree):
-    """As a live camera has it, whose frames come once."""
+    """With a live camera, this must be the case, because each frame arrives only once."""
     sequence = open_sequence("kitti", kitti_tree, "00", max_frames=8)
     settings = RunOptions(detector="bow", threads=2, realtime=True, compare=("none",))
     outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())

@@ -25,7 +25,7 @@ RECIPES = {
 
 @pytest.fixture(scope="module")
 def after(corridor: StereoSequence, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What a program holds after each recipe, by the title of the recipe."""
+    """The variables of a program after each recipe, by the title of the recipe."""
     c = corridor
     depths = [corridor_depth(c.camera, T).astype(np.float32) for T in c.T_wc]
     values: dict[str, Any] = {
@@ -55,7 +55,7 @@ def test_live_poses_end_where_the_camera_does(after, corridor):
 
 
 def test_a_loop_is_told_once(after, capsys):
-    """The corridor has no loop: this one is made up."""
+    """The corridor has no loop. Therefore, the test makes one up."""
     edge = LoopEdge(4, 0, 0.5, True, "closed", 90, 60)
 
     class Closing(Slam):

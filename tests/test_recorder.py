@@ -67,7 +67,7 @@ def _result(frame: int) -> TrackResult:
 
 
 def _image(rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Texture at several scales: a JPEG of it is somewhat larger than one of a KITTI image."""
+    """Make a texture at several scales. As a JPEG, it is slightly larger than a KITTI image."""
     import cv2
 
     image = np.zeros((CAMERA.height, CAMERA.width))
@@ -88,7 +88,7 @@ def _features(rng: np.random.Generator, n: int = 2000) -> Features:
 
 
 def record(recorder: Recorder, frames: int = FRAMES, camera: Camera = CAMERA) -> None:
-    """Play a run into a recorder as the pipeline does."""
+    """Send a run to a recorder in the same way as the pipeline."""
     rng = np.random.default_rng(0)
     image = _image(rng)
     poses = np.array([_pose(frame) for frame in range(frames)])
@@ -118,7 +118,7 @@ def record(recorder: Recorder, frames: int = FRAMES, camera: Camera = CAMERA) ->
 
 
 def rows(path: Path, entity: str) -> list[dict[str, Any]]:
-    """All rows of an entity, static ones too, in the order of their frames."""
+    """Return all rows of an entity in the order of their frames. Static rows are included."""
     from rerun.chunk import RrdReader
 
     found: list[dict[str, Any]] = []
@@ -325,7 +325,10 @@ time.sleep(60)
 
 @pytest.fixture
 def window(monkeypatch):
-    """In place of the viewer's window: a process that receives what it is sent."""
+    """A process in place of the viewer's window.
+
+    It receives the data that are sent to the window.
+    """
     started = []
 
     def start(port, words):

@@ -25,7 +25,10 @@ T_TRUE = forward(1.2, 0.3)
 
 
 class Recognise:
-    """Recognises a frame by ``n`` of its features, or not at all; keeps what it was asked."""
+    """A verifier that recognises a frame by ``n`` of its features, or not at all.
+
+    It records its calls.
+    """
 
     def __init__(self, n: int = 0) -> None:
         self.asked: list[tuple] = []
@@ -43,7 +46,7 @@ class Recognise:
 
 @dataclass(frozen=True)
 class Place:
-    """A frame in a mapped street, and a relocaliser that is shown some keyframes to look at."""
+    """A frame in a mapped street, and a relocaliser that gets some keyframes to compare."""
 
     world: World
     frame: Frame
@@ -68,22 +71,25 @@ class Place:
         return cls(world, frame, Relocaliser(context, locate, recognise), candidates)
 
     def check(self, found: Found) -> Found:
-        """What the relocaliser makes of the frame while no keyframe is being mapped."""
+        """Return what the relocaliser decides about the frame while no keyframe is being mapped."""
         return self.relocaliser.relocalise_if_needed(
             self.frame, found, Owner(self.world.map, is_merged=True)
         )
 
     def find(self) -> Found:
-        """Where the frame is found if it was lost."""
+        """Return where a lost frame is found."""
         return self.check(LOST)
 
     def find_better(self, n_inliers: int) -> Found:
-        """Where the frame is found if it was tracked with so many inliers, and is doubtful."""
+        """Return where a doubtful frame is found.
+
+        The frame was tracked with the given number of inliers.
+        """
         return self.check(doubtful(n_inliers))
 
 
 class Owner:
-    """The owner of a map, which may have to wait for a keyframe before it gives it."""
+    """The owner of a map. It may have to wait for a keyframe before it provides the map."""
 
     def __init__(self, map_: Map, is_merged: bool) -> None:
         self.is_merged = is_merged
@@ -102,7 +108,7 @@ def doubtful(n_inliers: int) -> Found:
 
 
 def track_elsewhere(frame: Frame) -> None:
-    """Let a frame track some landmarks, at a wrong pose."""
+    """Let a frame track some landmarks at a wrong pose."""
     frame.T_cw = se3_exp(np.full(6, 0.1))
     frame.landmark[:40] = np.arange(100, 140)
     frame.xyz[:40] = 7.0
@@ -112,7 +118,7 @@ def track_elsewhere(frame: Frame) -> None:
 
 
 def everything(frame: Frame) -> list[bytes]:
-    """All that a frame holds."""
+    """Return everything that a frame holds."""
     return [
         value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
         for value in (getattr(frame, field.name) for field in fields(frame))
@@ -181,13 +187,13 @@ def test_a_frame_that_nothing_recognises_is_found_nowhere():
 
 
 def by_orb(**thresholds: float) -> tuple[Place, int]:
-    """A place where ORB descriptors find the frame, and with how many inliers they do."""
+    """Make a place where ORB descriptors find the frame. Also return the number of inliers."""
     n = Place.create([HERE], Recognise()).find().n_inliers
     return Place.create([HERE], Recognise(), **thresholds), n
 
 
 def by_others(**thresholds: float) -> tuple[Place, int]:
-    """The same for a place where other descriptors find it."""
+    """Make a place where other descriptors find the frame. Also return the number of inliers."""
     return Place.create([NOT_HERE], Recognise(30), **thresholds), 30
 
 
@@ -223,7 +229,7 @@ def test_a_doubtful_frame_that_is_found_nowhere_stays_exactly_as_it_is():
 
 
 def test_what_a_frame_tracked_before_is_gone_where_it_is_found():
-    """Its old matches are not mixed with those of the place."""
+    """The previous matches of the frame are not mixed with those at the new place."""
     place, n_there = by_orb()
     track_elsewhere(place.frame)
     place.find_better(10)

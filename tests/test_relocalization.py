@@ -28,7 +28,10 @@ def mapped_street() -> World:
 
 
 def lost_frame(world: World, T_cw: np.ndarray, *, mono: bool = False, among=None) -> Frame:
-    """What a camera sees of the street; its points but ``among`` look different now."""
+    """Return what a camera sees of the street.
+
+    All points except those in ``among`` look different now.
+    """
     if among is not None:
         changed = ~np.isin(np.arange(len(world.points)), among)
         world.descriptors[changed] = world.rng.integers(

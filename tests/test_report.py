@@ -59,7 +59,7 @@ class _Sequence:
 
 
 def _drive(frames: int) -> NDArray[np.float64]:
-    """``T_wc`` of a car on a bent loop at 1 m a frame, facing where it goes."""
+    """Return ``T_wc`` of a car on a bent loop. It moves 1 m per frame and looks ahead."""
     s = np.linspace(0.0, 2.0 * np.pi * frames / 600.0, frames)
     radius = 95.0 + 22.0 * np.sin(3.0 * s)
     x, z = radius * (1.0 - np.cos(s)), radius * np.sin(s)
@@ -78,7 +78,10 @@ def make_outcome(
     ground_truth: bool = True,
     keyframe_every: int = 4,
 ) -> RunOutcome:
-    """A run with drift, weak frames around the lost ones, and slower keyframes."""
+    """Make the outcome of a run with drift.
+
+    The frames around the lost frames have few inliers, and keyframes take longer.
+    """
     rng = np.random.default_rng(0)
     timestamps = np.arange(frames) * 0.1
     truth = _drive(frames)
@@ -134,7 +137,10 @@ def make_outcome(
 
 
 def two_laps(frames: int = 500, *, keyframe_every: int = 4) -> RunOutcome:
-    """A run twice around a circle of 200 m with four loops, one of them wrong, and 300 rejected."""
+    """Make a run of two laps around a circle of 200 m.
+
+    It has four loops, of which one is wrong, and 300 rejected loops.
+    """
     plain = make_outcome(frames, lost=slice(0, 0), keyframe_every=keyframe_every)
     angle = 2.0 * np.pi * np.arange(frames) / 250.0
     truth = np.tile(np.eye(4), (frames, 1, 1))
@@ -190,7 +196,10 @@ def two_laps(frames: int = 500, *, keyframe_every: int = 4) -> RunOutcome:
 
 
 def report_of(outcome: RunOutcome, folder: Path) -> ReportJson:
-    """Write the report as the command line does; what is on the disk is what is returned."""
+    """Write the report as the command line does.
+
+    Check that the file on the disk equals the result.
+    """
     report = write_results(folder, outcome)
     assert ReportJson.model_validate_json((folder / "report.json").read_bytes()) == report
     return report
@@ -590,7 +599,10 @@ def test_a_right_loop_on_a_revisit_too_short_to_count_is_explained() -> None:
 
 
 def test_before_is_drawn_in_the_frame_of_the_ground_truth() -> None:
-    """An estimate in a world of its own, aligned: the keyframes before follow the alignment."""
+    """The estimate has its own world frame and is aligned.
+
+    The keyframes before the correction are aligned in the same way.
+    """
     outcome = two_laps()
     T = np.eye(4)
     T[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
@@ -659,7 +671,10 @@ def test_without_ground_truth(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_ground_truth_of_some_frames(tmp_path: Path) -> None:
-    """Errors are of these frames; of loops nobody can say where the drive comes back."""
+    """Errors are computed for the frames with ground truth.
+
+    Loops are not evaluated, because revisits cannot be determined.
+    """
     whole = make_outcome(60, lost=slice(20, 21))
     known = whole.sequence.ground_truth.copy()
     known[:15] = np.nan

@@ -135,7 +135,10 @@ ALL = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PARTS)
 def test_a_result_that_fails_costs_itself_alone(tmp_path, monkeypatch, name):
-    """Whatever it raises: a fault of the figures once took the map with it."""
+    """This holds for any exception.
+
+    An error in the figures once prevented that the map was saved.
+    """
 
     def fails(*args):
         raise KeyError("a fault\nof vslam")

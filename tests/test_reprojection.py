@@ -23,7 +23,10 @@ CAMERA = Camera(700.0, 710.0, 320.0, 120.0, 0.5, 640, 240)
 
 @kernel
 def errors_of(points, uvr, inverse_sigma2, intrinsics):
-    """For each of N observations: ratio of the test, residuals, their chi-square and its limit."""
+    """Compute the errors of N observations.
+
+    For each observation, return the ratio of the test, the residual, its chi-square and the limit.
+    """
     n = len(points)
     ratio, r, chi2, limit = np.empty(n), np.empty((n, 3)), np.empty(n), np.empty(n)
     pinhole = unpacked(intrinsics)

@@ -47,7 +47,10 @@ def write_list(path: Path, times, folder: str) -> None:
 
 @pytest.fixture(scope="module")
 def tree(corridor: StereoSequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The corridor's beginning in TUM's layout, depth 3 ms late and of 1000 a metre."""
+    """The beginning of the corridor in TUM's layout.
+
+    Depth is 3 ms late, and its unit is a thousandth of a metre.
+    """
     root = tmp_path_factory.mktemp("tum") / "corridor"
     times = corridor.timestamps[:FRAMES]
     for name in ("rgb", "depth"):
@@ -70,7 +73,7 @@ def tree(corridor: StereoSequence, tmp_path_factory: pytest.TempPathFactory) -> 
 
 @pytest.fixture
 def copy(tree: Path, tmp_path: Path) -> Path:
-    """The same with files of its own to spoil."""
+    """A copy of the sequence whose files a test may damage."""
     root = tmp_path / "corridor"
     for path in tree.rglob("*"):
         if path.is_file():
@@ -283,8 +286,10 @@ def test_few_images_without_a_partner_are_not_worth_a_warning(tmp_path):
 
 
 def test_images_whose_depth_is_paired_with_another_image_are_counted_apart(copy):
-    """Depth begins with the fourth image, and at half of the rate: one depth image lies between
-    the images 3 and 4, nearer to the first."""
+    """Depth begins with the fourth image and has half of the rate.
+
+    One depth image lies between the images 3 and 4, and is nearer to image 3.
+    """
     times = [100.0, 100.1, 100.2, 100.3, 100.33]
     rgb, depth = (
         [line.split()[1] for line in (copy / f"{name}.txt").read_text().splitlines()

@@ -63,7 +63,7 @@ def types_of_ros():
 
 
 def read(path: Path) -> dict[str, list]:
-    """The messages of each topic, with the times at which they were written."""
+    """Return the messages of each topic, with the times at which they were written."""
     found: dict[str, list] = {}
     with path.open("rb") as file:
         bag = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
@@ -176,7 +176,10 @@ def track(T: np.ndarray, local: np.ndarray | None) -> TrackResult:
 
 
 def test_the_axes_are_those_of_rep_103():
-    """The camera drives ahead, then turns right and drives ahead again: x grows, then y falls."""
+    """The camera drives ahead, turns right and drives ahead again.
+
+    First x increases, then y decreases.
+    """
     types = types_of_ros()
     before, now = AHEAD, AHEAD @ RIGHT_TURN @ AHEAD
     poses = [FramePose.of(track(T, None), t) for T, t in ((before, 10**9), (now, 3 * 10**9))]
@@ -191,8 +194,11 @@ def test_the_axes_are_those_of_rep_103():
 
 
 def test_covariances_are_those_of_errors_in_the_axes_of_ros():
-    """Errors that are drawn as ``vslam.odometry`` defines them, and measured as ROS does: of the
-    position and the rotation in the axes of odom, of the velocity in those of base_link."""
+    """Errors are drawn as ``vslam.odometry`` defines them, and measured as ROS defines them.
+
+    Errors of position and rotation are in the axes of odom. Errors of velocity are in the axes of
+    base_link.
+    """
     rng = np.random.default_rng(0)
     near = np.diag([1.0, 4.0, 9.0, 0.01, 0.04, 0.09]) * 1e-6
     local = near / PoseUncertainty(np.eye(6), np.zeros((6, 6)), 0).near[0, 0]
@@ -283,7 +289,10 @@ def test_files_of_a_run_that_were_lost_or_changed(folder, tmp_path, name, text, 
 
 
 def infos(baseline: float = 0.5, **changed: object) -> list[SimpleNamespace]:
-    """``camera_info`` of a rectified pair; ``changed`` are fields of the right one."""
+    """Return the ``camera_info`` of a rectified pair.
+
+    ``changed`` are fields of the right camera.
+    """
     pair = []
     for side in (0, 1):
         P = [700.0, 0, 310, -side * 700 * baseline, 0, 710, 120, 0, 0, 0, 1, 0]
@@ -316,7 +325,7 @@ def test_the_node_refuses_messages_of_no_rectified_pair(camera_of, pair, why):
 
 
 def test_the_node_is_a_program_of_at_most_150_lines():
-    """It cannot be imported without ROS."""
+    """The node cannot be imported without ROS."""
     text = (ROOT / "examples" / "ros2" / "node.py").read_text()
     compile(text, "node.py", "exec")
     assert len(text.splitlines()) <= 150

@@ -39,7 +39,7 @@ SOURCES = [
 
 
 def png(width: int, height: int, rows: int = 10) -> bytes:
-    """An image whose header speaks of more rows than there are."""
+    """Make an image whose header states more rows than the image has."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return (
@@ -67,7 +67,7 @@ def write_zip(path: Path, members: dict[str, bytes]) -> Path:
 
 
 class Touch:
-    """Unpickled, it makes a file."""
+    """An object that creates a file when it is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -106,7 +106,7 @@ def test_arrays_that_promise_more_than_there_is(tmp_path: Path, data: bytes, say
 
 
 def test_a_zip_that_unpacks_beyond_the_memory(tmp_path: Path, monkeypatch):
-    """4 MB of zeros in a few kB, where only 1 MB is free."""
+    """The file contains 4 MB of zeros in a few kB, and only 1 MB of memory is free."""
     import psutil
 
     path = write_zip(tmp_path / "a.npz", {"a.npy": npy((2**19,), bytes(2**22))})
@@ -137,7 +137,7 @@ def test_arrays_come_back_as_numpy_reads_them(tmp_path: Path):
 
 @pytest.mark.parametrize(("width", "height"), [(100_000, 100_000), (12_000, 12_000)])
 def test_images_of_absurd_size_are_refused_by_their_header(tmp_path: Path, width, height):
-    """In a process of its own: OpenCV learns the limit when it is imported."""
+    """The test uses a separate process, because OpenCV reads the limit when it is imported."""
     assert width * height > MOST_PIXELS
     (tmp_path / "a.png").write_bytes(png(width, height))
     script = (
@@ -160,7 +160,7 @@ def test_images_of_absurd_size_are_refused_by_their_header(tmp_path: Path, width
 
 def test_a_video_of_absurd_size_is_refused_by_its_header(tmp_path: Path, monkeypatch):
     class Capture:
-        """A video of 144 million pixels a frame, of which no frame may be read."""
+        """A video with 144 million pixels per frame. No frame of it may be read."""
 
         def get(self, kind: int) -> float:
             return 12_000.0
@@ -247,7 +247,7 @@ def test_no_source_executes_what_it_reads():
 
 
 def test_yaml_is_bounded_by_its_size(tmp_path: Path):
-    """6 MB of it once took 2.3 GB and a minute."""
+    """Before there was a limit, 6 MB of YAML took 2.3 GB and a minute."""
     pytest.importorskip("rosbags")
     path = tmp_path / "a.yaml"
     path.write_text("a: [" + "1, " * 40_000 + "1]\n")
@@ -264,7 +264,7 @@ def test_yaml_is_bounded_by_its_size(tmp_path: Path):
 
 @pytest.mark.parametrize("read", [load_map, read_progress])
 def test_a_header_that_is_a_number_is_not_that_many_bytes(tmp_path: Path, read):
-    """bytes(3_000_000_000) are 3 GB of zeros; the file that asked for them had 192 bytes."""
+    """bytes(3_000_000_000) makes 3 GB of zeros. The file that requested them had 192 bytes."""
     path = tmp_path / "a.npz"
     np.savez(path, header=np.array(100_000_000))
     tracemalloc.start()
@@ -277,7 +277,7 @@ def test_a_header_that_is_a_number_is_not_that_many_bytes(tmp_path: Path, read):
 @pytest.mark.slow
 @pytest.mark.parametrize("read", [lambda p: read_npz(p, "a map"), load_map, read_progress])
 def test_an_archive_may_not_unpack_to_far_more_than_its_size(tmp_path: Path, read):
-    """There may be memory for it, but not for a small file."""
+    """A small file is rejected even if there is enough memory for its contents."""
     path = write_zip(tmp_path / "a.npz", {"header.npy": npy((2**25,), bytes(2**28))})
     assert path.stat().st_size < 300_000
     with pytest.raises(InputError, match=r"unpacks from 0\.2 MB to 256 MB, so it is probably not"):

@@ -57,7 +57,7 @@ def features(n: int) -> Features:
 
 
 def a_map(keyframes: int, covisible: tuple[tuple[int, int], ...] = ()) -> Map:
-    """Keyframes of 20 features; those of a pair share 16 landmarks."""
+    """Make a map of keyframes with 20 features each. The keyframes of a pair share 16 landmarks."""
     map_ = Map(np.ones(8))
     for k in range(keyframes):
         map_.add_keyframe(features(100), np.eye(4), float(k), k)
@@ -81,7 +81,7 @@ WALLS = [
 
 @functools.cache
 def exported() -> OnnxNetwork:
-    """The small network as a run sees it."""
+    """The small network in the form in which a run uses it."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "capsule.onnx"
         export_onnx(small_network(), path)
@@ -89,7 +89,7 @@ def exported() -> OnnxNetwork:
 
 
 def detector(config: SiameseConfig | None = None, places: list[int] | None = None):
-    """A detector that was given one image for each keyframe, by the number of its scene."""
+    """Make a detector that was given one image for each keyframe, by the number of the scene."""
     config = config or SiameseConfig(recent_keyframes=3, threshold=0.0)
     found = SiameseDetector(exported(), config)
     for keyframe, place in enumerate(places or []):
@@ -212,7 +212,7 @@ def test_a_late_network_is_loaded_by_the_first_image_and_missed_before(monkeypat
 
 
 class CountingNetwork:
-    """``exported()``; ``seen``: how many images it was given."""
+    """The network of ``exported()``. ``seen`` counts the images that it was given."""
 
     def __init__(self) -> None:
         self.seen = 0
@@ -226,7 +226,7 @@ class CountingNetwork:
 
 
 def driven(x: list[float], *, stereo: bool = True) -> Map:
-    """A map whose keyframes lie at so many metres along x."""
+    """Make a map whose keyframes have the given positions along x, in metres."""
     map_ = a_map(len(x))
     map_.arrays.u_right[: map_.n_rows] = 1.0 if stereo else np.nan
     map_.arrays.T_cw[: len(x), 0, 3] = [-one for one in x]
@@ -296,7 +296,10 @@ def test_the_network_sees_nothing_until_the_camera_may_be_back():
 
 @pytest.mark.slow
 def test_a_run_takes_the_weights_of_a_file(kitti_tree, tmp_path):
-    """With random weights places are found by similarity alone: geometry must refuse them."""
+    """With random weights, many wrong places are similar.
+
+    Geometric verification must reject them.
+    """
     path = tmp_path / "capsule.onnx"
     export_onnx(small_network(), path)
     settings = tmp_path / "config.json"
@@ -375,7 +378,7 @@ def test_train_writes_weights_and_card(tmp_path):
 
 @pytest.mark.parametrize("name", ["capsule", "capsule-pruned", "capsule-paper"])
 def test_shipped_weights_know_a_place_again(name):
-    """Moved and darker they are still the same place."""
+    """The images are moved and darker, but show the same place."""
     about = open_network(name).about
     assert about["validation"]["average_precision"] > 0.4
     again = [np.uint8(np.roll(wall, 12, 1) * 0.7) for wall in WALLS]
@@ -437,7 +440,7 @@ def number(name: str, *values: int) -> onnx.TensorProto:
 
 
 def endless() -> bytes:
-    """A loop that goes on while a constant is true."""
+    """Make a loop that never ends, because it continues while a constant is true."""
     outputs = [
         helper.make_tensor_value_info("still", TensorProto.BOOL, []),
         helper.make_tensor_value_info("kept", TensorProto.UINT8, [8, 8]),
@@ -457,13 +460,13 @@ def endless() -> bytes:
 
 
 def promised() -> bytes:
-    """Weights that are not in the file."""
+    """Make a network that names weights that are not in the file."""
     weights = TensorProto(name="w", data_type=TensorProto.UINT8, dims=[2**16, 2**16])
     return graph_of([helper.make_node("Add", ["image", "w"], ["descriptor"])], [weights])
 
 
 def squares() -> bytes:
-    """A chain of products of an image with itself, which may have any size."""
+    """Make a chain of products of an image with itself. The image may have any size."""
     cast = helper.make_node("Cast", ["image"], ["x0"], to=TensorProto.FLOAT)
     nodes = [cast, *(helper.make_node("MatMul", [f"x{k}"] * 2, [f"x{k + 1}"]) for k in range(5000))]
     nodes.append(helper.make_node("Cast", ["x5000"], ["descriptor"], to=TensorProto.UINT8))

@@ -32,8 +32,11 @@ SCALES = 1.2 ** np.arange(8)
 def seen(
     twist: np.ndarray, delay: float, n: int = 200, seed: int = 0, noise: float = 0.1
 ) -> tuple[Extracted, np.ndarray]:
-    """Points in both images by their exact projections, the right one so much later; and the
-    columns there without delay."""
+    """Return the exact projections of points into both images.
+
+    The right image is late by the given delay. Also return the columns in the right image without
+    delay.
+    """
     rng = np.random.default_rng(seed)
     z = rng.uniform(4.0, 40.0, n)
     xy = np.stack([rng.uniform(0, 400, n), rng.uniform(0, 200, n)], axis=1).astype(np.float32)
@@ -61,7 +64,7 @@ def add(found: SideDelay, extracted: Extracted, twist: np.ndarray | None) -> Non
 
 
 def drive(frames: int) -> list[np.ndarray]:
-    """Ahead with changing speed, nodding and turning."""
+    """Return the poses of a car that drives ahead with varying speed, nods and turns."""
     t = 0.1 * np.arange(frames)
     zero = np.zeros(frames)
     return list(
@@ -105,8 +108,11 @@ def test_a_delay_is_measured_and_reported_unless_the_calibration_gives_it(delay)
 
 @pytest.mark.slow
 def test_a_known_delay_costs_a_drive_little():
-    """A quarter of a ring road at 15 m/s, the right image 5 ms late. What is left comes from the
-    first frame, whose motion is not known."""
+    """The car drives a quarter of a ring road at 15 m/s.
+
+    The right image is 5 ms late. The remaining error comes from the first frame, whose motion is
+    not known.
+    """
     frames = [float(k) for k in range(LAP // 4)]
     T_start = inverse(Ring.create().pose(0))
     truth = np.array([(T_start @ Ring.create().pose(k))[:3, 3] for k in frames])
@@ -138,7 +144,7 @@ def test_a_few_frames_are_not_believed():
 
 
 def test_contradicting_frames_are_doubted():
-    """A delay in every other group of frames is none of the rig."""
+    """A delay in only every other group of frames is not a property of the rig."""
     found = SideDelay(CAMERA, CONFIG)
     for k, twist in enumerate(drive(60)):
         add(found, seen(twist, 6e-3 * (k // 5 % 2), seed=k)[0], twist)

@@ -96,7 +96,7 @@ def test_a_bright_strip_that_one_side_sees_is_no_gain(side):
 @pytest.mark.parametrize("sky", [160.0, 190.0, 220.0, 245.0])
 @pytest.mark.parametrize("noise", [1.0, 8.0])
 def test_a_sky_that_one_side_sees_is_no_gain(side, share, sky, noise):
-    """The other camera sees the underside of a bridge."""
+    """The other camera sees the underside of a bridge instead of the sky."""
     pair = list(scene(mean=100.0, spread=25.0))
     rows = int(share * 200)
     grain = noise * np.random.default_rng(1).normal(size=(rows, 400))
@@ -135,7 +135,7 @@ def test_a_black_side_is_named_but_not_by_night():
 
 
 def test_video_of_limited_range_needs_other_limits():
-    """Its black is 16 and its white 235."""
+    """In such a video, black is 16 and white is 235."""
     limited = CONFIG.model_copy(update={"black_below": 22.0, "clipped_from": 230})
     left, right = scene()
     black = np.full_like(left, 16)
@@ -148,7 +148,7 @@ def test_video_of_limited_range_needs_other_limits():
 
 @pytest.mark.parametrize("stops", [1.0, 2.0])
 def test_disparities_stay_true_when_a_side_is_dark(stops):
-    """Without the mend, a side two stops darker leaves few matches and wrong ones."""
+    """Without the correction, a side that is two stops darker gives few and wrong matches."""
     left, right = scene()
     context = TrackingContext.create(CAMERA, Config())
     clean, dark = (
@@ -164,7 +164,10 @@ def test_disparities_stay_true_when_a_side_is_dark(stops):
 
 
 def test_drives_have_clocks_of_their_own():
-    """A second drive through the same places, a second later by its own clock, is no motion."""
+    """A second drive visits the same places one second later by its own clock.
+
+    This is not treated as motion.
+    """
     two = driven(delay_s=5e-3)
     n = two.n_keyframes
     alone = measure_rig(two, CAMERA)
@@ -200,7 +203,10 @@ TWIST = np.array([0.3, 0.0, -8.0, 0.0, -0.3, 0.0])  # per second: ahead and to t
 
 
 def driven(delay_s: float = 0.0, turned_px: float = 0.0, n: int = 5000) -> SimpleNamespace:
-    """A map of 10 keyframes with exact observations, but for what the right side does."""
+    """Make a map of 10 keyframes with exact observations.
+
+    Only those of the right image have errors.
+    """
     rng = np.random.default_rng(1)
     times = 0.1 * np.arange(10)
     T_cw = np.array([se3_exp(TWIST * t) for t in times])

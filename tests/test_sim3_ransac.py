@@ -17,9 +17,9 @@ SETTINGS = {"min_inliers": 15, "max_draws": 600, "confidence": 0.99}
 
 
 def scene(seed: int, n: int, outliers: float, scale: float = 1.0, noise: float = NOISE):
-    """``T_a_b``, the observations of n landmarks from a and b, and which matches are wrong.
+    """Make ``T_a_b``, observations of n landmarks from a and b, and a mask of the wrong matches.
 
-    Landmarks are as uncertain along the line of sight as 0.1 px of disparity.
+    Along the line of sight, the uncertainty of a landmark corresponds to 0.1 px of disparity.
     """
     rng = np.random.default_rng(seed)
     T = se3_exp(np.r_[rng.normal(size=3) * [1.0, 0.2, 1.0], 0.15 * rng.normal(size=3)])
@@ -41,7 +41,7 @@ def scene(seed: int, n: int, outliers: float, scale: float = 1.0, noise: float =
 
 
 def errors(T: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
-    """Metres and degrees."""
+    """Return the differences in metres and in degrees."""
     twist = se3_log(T @ inverse(truth))
     return float(np.linalg.norm(twist[:3])), float(np.degrees(np.linalg.norm(twist[3:])))
 

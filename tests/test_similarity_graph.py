@@ -30,8 +30,10 @@ CONFIG = PoseGraphConfig()
 
 
 def chain(T_wc: np.ndarray, T_first_last: np.ndarray, scale: float, **lost: int) -> PoseGraph:
-    """Odometry from each pose to the next, and one loop from the first to the last; ``after=k,
-    kind=GAP``: tracking was lost after the k-th pose."""
+    """Make odometry edges from each pose to the next, and one loop from the first to the last pose.
+
+    ``after=k, kind=GAP`` means that tracking was lost after the k-th pose.
+    """
     n = len(T_wc)
     edges = np.array([*((i, i + 1) for i in range(n - 1)), (0, n - 1)])
     kind = np.array([TREE] * (n - 1) + [LOOP], np.uint8)
@@ -58,8 +60,11 @@ def test_similarities_compose_by_matrix_product():
 
 
 def test_scale_alone_spreads_by_the_variances():
-    """With all keyframes in one place, least squares distributes the scale error of the loop over
-    the chain: each edge gets its sigma^2 divided by the sum of all, including the loop's."""
+    """All keyframes are at the same place.
+
+    Least squares distributes the scale error of the loop over the chain. The share of an edge is
+    its sigma^2 divided by the sum over all edges, including the loop edge.
+    """
     n, drift = 9, 0.02
     config = CONFIG.model_copy(update={"robust_scale": 1e3})  # Gaussian, for the closed form
     graph = chain(np.tile(np.eye(4), (n, 1, 1)), np.eye(4), np.exp(drift))
@@ -71,8 +76,11 @@ def test_scale_alone_spreads_by_the_variances():
 
 
 def drifted_lap(growth: float, n: int = 120):
-    """A lap on a circle of radius 30, and its odometry with a shrinking unit: each step is
-    ``growth`` times as many units as the previous one. Returns true and estimated ``T_wc``."""
+    """Make a lap on a circle of radius 30, and its odometry with a shrinking unit.
+
+    Each step is ``growth`` times as many units as the previous step. Returns the true and the
+    estimated ``T_wc``.
+    """
     step = se3_exp(np.array([0.0, 0.0, 2 * np.pi * 30 / n, 0.0, 2 * np.pi / n, 0.0]))
     truth, estimate = [np.eye(4)], [np.eye(4)]
     for k in range(n):
@@ -104,7 +112,11 @@ def test_a_lap_whose_scale_drifted_closes():
 
 
 def test_where_tracking_was_lost_the_error_of_a_lap_spreads_if_the_camera_drove_on():
-    """Lost half way: the unit jumps by a third, the gap is predicted too short and askew."""
+    """Tracking is lost half-way.
+
+    The unit changes by a third, and the predicted motion in the gap is too short and has a wrong
+    direction.
+    """
     growth, after = 1.004, 60
     truth, estimate = drifted_lap(growth)
     steps = inverses(estimate)[:-1] @ estimate[1:]
@@ -151,7 +163,10 @@ def test_the_same_bytes_every_time():
 
 
 def small_map() -> tuple[Map, np.ndarray]:
-    """Three keyframes in a row, each with landmarks of its own; the second one was culled."""
+    """Make a map of three keyframes in a row.
+
+    Each keyframe has its own landmarks. The second keyframe is culled.
+    """
     map_, rng = Map(1.2 ** np.arange(8)), np.random.default_rng(0)
     for k in range(3):
         T_cw = inverse(se3_exp(np.array([2.0 * k, 0, 0, 0, 0.2 * k, 0.0])))

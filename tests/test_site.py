@@ -33,7 +33,10 @@ LOADS = {"script": "src", "img": "src", "iframe": "src", "source": "src", "link"
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Built as ``make docs`` does, from a copy: the build writes pages beside the others."""
+    """The site, which is built from a copy as ``make docs`` builds it.
+
+    A copy is used because the build writes pages next to the others.
+    """
     root = tmp_path_factory.mktemp("site")
     for name in ("docs", "loopclosure", "tools"):
         shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -120,7 +123,7 @@ def test_the_reference_has_every_command_and_option(site):
 
 
 def vslam_commands(text: str) -> list[list[str]]:
-    """The words of every ``vslam`` command in the shell blocks of a page."""
+    """Return the words of every ``vslam`` command in the shell blocks of a page."""
     found = []
     for block in SHELL.findall(text):
         for line in block.replace("\\\n", " ").splitlines():
@@ -167,7 +170,7 @@ def test_the_calibration_of_the_tutorial_is_read(tmp_path: Path):
 @pytest.mark.slow
 @pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
 def test_commands_of_the_tutorials_run(path: Path, corridor, tmp_path: Path):
-    """Every shell block, on fewer frames; the video is the corridor of the tests."""
+    """Every shell block is run with fewer frames. The video shows the corridor of the tests."""
     pairs = [np.hstack(pair) for pair in zip(corridor.left, corridor.right, strict=True)]
     write_video(tmp_path / "drive.mkv", corridor.left[:12])
     write_video(tmp_path / "pair.mkv", pairs[:12])
@@ -211,7 +214,10 @@ next();
 
 @pytest.mark.slow
 def test_pages_in_a_browser_as_wide_as_a_phone(site: Path, tmp_path: Path):
-    """Chromium, 400 px: nothing sticks out, letters are large enough, no other host is asked."""
+    """In Chromium at a width of 400 px, nothing is wider than the page.
+
+    Letters are large enough. The pages request nothing from other hosts.
+    """
     chromium()
     shown = ["index", "tutorial/first_run", "reference/commands", "reference/thresholds",
              "explanation/design", "howto/plugins", "reference/generated/vslam.slam",

@@ -37,7 +37,7 @@ def run(
     left_black: Iterable[int] = (),
     skipped: Iterable[int] = (),
 ) -> tuple[Slam, list[TrackResult]]:
-    """Track some frames, black or missing ones among them."""
+    """Track some frames. Some of them may be black or missing."""
     slam = Slam(sequence.camera, config, "none", threads=threads)
     results = []
     nothing = np.zeros_like(sequence.left[0])
@@ -54,7 +54,10 @@ def run(
 
 
 def position_errors(slam: Slam, sequence, frames=slice(None)) -> np.ndarray:
-    """Metres, without alignment: the first frame is the world of both."""
+    """Return the position errors in metres without alignment.
+
+    The first frame is the world frame of both trajectories.
+    """
     return np.linalg.norm(slam.trajectory().T_wc[:, :3, 3] - sequence.T_wc[frames, :3, 3], axis=1)
 
 
@@ -63,7 +66,7 @@ def rmse(errors: np.ndarray) -> float:
 
 
 def states(results: list[TrackResult]) -> str:
-    """One letter a frame: O, W or L."""
+    """Return the state of each frame as one letter: O, W or L."""
     return "".join(result.state[0] for result in results)
 
 
@@ -90,7 +93,7 @@ def test_tracks_every_frame_to_centimetres(corridor, check_map):
 
 
 def test_while_the_left_side_is_black_the_right_one_tracks(corridor, check_map):
-    """A pose that were that of the right camera would be half a baseline off and more."""
+    """If the pose were that of the right camera, it would be wrong by more than half a baseline."""
     dark = range(10, 16)
     slam, results = run(corridor, EAGER, left_black=dark)
     assert states(results) == "O" * len(corridor)
@@ -107,7 +110,10 @@ def test_while_the_left_side_is_black_the_right_one_tracks(corridor, check_map):
     ("threads", "said"), [(1, "every frame was tracked"), (2, "create it after the fork")]
 )
 def test_a_fork_tracks_with_one_thread_and_is_refused_with_more(corridor, threads, said):
-    """Its copy of the map has no thread that works on it: it would wait for ever."""
+    """In a fork, no thread would work on the copy of the map.
+
+    A fork with several threads would wait forever.
+    """
     slam = Slam(corridor.camera, EAGER, "none", threads=threads)
 
     def go_on(frames: range) -> None:
@@ -185,7 +191,10 @@ def test_two_in_threads_of_their_own_have_the_bytes_of_one(corridor):
 @pytest.mark.slow
 @pytest.mark.parametrize("config", [CONFIG, EAGER], ids=["usual", "a keyframe each frame"])
 def test_tracking_sees_nothing_of_mapping_before_the_merge(corridor, config, monkeypatch):
-    """Mapping as late as can be (when it is merged) and as early as can be: a race would show."""
+    """Mapping runs either as late as possible (when its result is merged) or as early as possible.
+
+    A race condition would lead to different results.
+    """
     late = bytes_of(*run(corridor, config, threads=1))
     monkeypatch.setattr("vslam.slam.Workers", InstantWorkers)
     assert bytes_of(*run(corridor, config, threads=2)) == late
@@ -240,7 +249,7 @@ def test_the_map_cannot_be_read_while_a_keyframe_is_mapped(corridor):
 
 @pytest.mark.slow
 def test_map_stays_sound_with_a_keyframe_each_frame(corridor, check_map):
-    """Fusion merges landmarks that the frame in hand tracks both."""
+    """Fusion merges two landmarks that the current frame tracks."""
     slam, results = run(corridor, EAGER)
     assert all(r.is_keyframe for r in results)
     assert states(results) == "O" * len(corridor)
@@ -280,7 +289,7 @@ def test_black_frames_are_lost_at_the_predicted_pose_and_tracking_recovers(corri
 
 @pytest.mark.parametrize("after", [0, 1, 2])
 def test_a_black_frame_soon_after_a_keyframe_does_not_move_the_frame_before(corridor, after):
-    """The merge falls on the frame behind the black one, on the black one, or before."""
+    """The result of mapping is merged before, at or after the black frame."""
     _, plain = run(corridor)
     keyframe = next(r.index for r in plain if r.is_keyframe and r.index > 10)
     slam = Slam(corridor.camera, CONFIG, "none", threads=1)
@@ -299,7 +308,10 @@ def test_a_black_frame_soon_after_a_keyframe_does_not_move_the_frame_before(corr
 
 @pytest.mark.parametrize(("young", "lost"), [(0, 4), (20, 1)])
 def test_lost_for_long_mapping_restarts_at_the_predicted_pose(corridor, check_map, young, lost):
-    """For long: so many frames, or, where the map is hardly begun, one."""
+    """Mapping restarts after a number of lost frames.
+
+    If the map has only just begun, it restarts after one lost frame.
+    """
     tracking = TrackingConfig(lost_frames_before_restart=4, young_keyframes=young)
     config = Config(orb=ORB, tracking=tracking)
     # From frame 10 on the camera is elsewhere: the images of the corridor run backwards, upside
@@ -343,7 +355,10 @@ def test_starts_with_the_first_frame_that_shows_something(corridor):
 
 @pytest.mark.parametrize("first", [0, 2])
 def test_a_start_at_speed_is_tracked_by_far_points(corridor, check_map, first):
-    """2.8 m a frame from the first one on: what is close leaves the view at once."""
+    """The camera moves 2.8 m per frame from the first frame.
+
+    Therefore, near points leave the view at once.
+    """
     frames = range(first, 28, 8)
     slam, results = run(corridor, frames=frames)
     assert states(results) == "O" * len(frames)
@@ -400,7 +415,10 @@ def test_nothing_at_all(corridor):
 
 
 def test_dropped_frames_do_not_disturb_the_prediction(corridor):
-    """Velocity is in seconds: a gap of two frames is predicted as two frames' motion."""
+    """The velocity is per second.
+
+    Therefore, the motion over a gap of two frames is predicted as that of two frames.
+    """
     frames = [k for k in range(len(corridor)) if k not in (7, 14, 15, 21)]
     slam, results = run(corridor, frames=frames)
     assert states(results) == "O" * len(frames)
@@ -469,7 +487,7 @@ def test_the_kitti_tree_is_read_as_it_was_rendered(kitti_tree, corridor):
 
 
 def test_a_part_of_the_map_that_began_anew_is_held_by_its_oldest_keyframe(corridor):
-    """Bundle adjustment would otherwise shift all of it at will."""
+    """Otherwise, bundle adjustment could move the whole part freely."""
     slam, _ = run(corridor)
     detach_keyframe(slam.map.arrays, 0)
     anew = [int(k) for k in slam.map.living_keyframes() if k != 0]
@@ -497,7 +515,7 @@ def test_a_step_after_finish_goes_on(corridor):
 
 
 class Onlooker(NoDetector):
-    """Keeps the image of every keyframe that it is shown."""
+    """A detector that keeps the image of every keyframe."""
 
     def __init__(self) -> None:
         self.images: list[np.ndarray] = []
@@ -508,7 +526,10 @@ class Onlooker(NoDetector):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_caller_may_write_the_next_images_into_the_same_arrays(corridor, threads):
-    """As every camera loop does: a detector in the mapping thread must still see the keyframe."""
+    """Many camera loops do this.
+
+    A detector in the mapping thread must still see the image of the keyframe.
+    """
     onlooker = Onlooker()
     slam = Slam(corridor.camera, EAGER, onlooker, threads=threads)
     left, right = np.empty_like(corridor.left[0]), np.empty_like(corridor.right[0])
@@ -534,7 +555,10 @@ def test_the_capsule_network_beside_the_bag_of_words_is_the_default(corridor):
 def test_a_keyframe_that_cannot_be_mapped_is_the_last_thing_that_happens(
     corridor, monkeypatch, tmp_path
 ):
-    """The step that merges it raises; after that, nothing is made of half a map."""
+    """The step that merges the keyframe raises an error.
+
+    After that, the incomplete map is not used.
+    """
     slam = Slam(corridor.camera, EAGER, "none", threads=1)
 
     def drive(frames: range) -> None:

@@ -140,7 +140,7 @@ def test_a_bag_in_real_time_has_every_frame(folder):
 
 @pytest.mark.parametrize("kind", ["images", "video", "bgr8", "rgb8", "png"])
 def test_colours(corridor, tmp_path, kind):
-    """Read as they were taken beside the grey image, which stays what it is."""
+    """Colour images are read as they were taken. The grey images do not change."""
     tinted = [np.dstack([image, image // 2, 255 - image]) for image in corridor.left[:3]]
     calib = write_calibration(tmp_path / "left.yaml", corridor.camera, mono=True)
     options = SourceOptions(calib=(calib,), sensor="mono")
@@ -178,7 +178,7 @@ def test_a_bag_with_a_rectified_topic_uses_its_projection_matrix(corridor, tmp_p
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
 def test_bayer_patterns_are_told_apart(pattern):
-    """A red surface is dark grey, whatever the order of the filters; blue is darker."""
+    """A red surface is dark grey in every order of the filters. A blue surface is darker."""
     for colour, grey in (("r", 0.299), ("g", 0.587), ("b", 0.114)):
         tile = np.array([200 if c == colour else 0 for c in pattern], np.uint8).reshape(2, 2)
         pixels = np.tile(tile, (8, 8))
@@ -245,7 +245,10 @@ def test_times_in_exif(corridor, tmp_path):
 
 
 def test_an_image_too_large_for_pillow_has_no_time_in_exif(tmp_path):
-    """Above 179 million pixels Pillow raises an error of its own, though only EXIF is asked for."""
+    """Above 179 million pixels, Pillow raises an error of its own.
+
+    It does so even if only the EXIF data are read.
+    """
     for k in range(2):
         (tmp_path / f"IMG_{k}.png").write_bytes(png(20_000, 20_000))
     calib = write_calibration(tmp_path / "c.yaml", Camera(60.0, 60.0, 31.5, 23.5, 0.2, 64, 48))
@@ -295,7 +298,7 @@ def test_a_camera_at_a_url(folder, served):
 
 
 class FakeCamera:
-    """In place of a device: films without end."""
+    """A camera that delivers frames without end."""
 
     images: list[np.ndarray]
 
@@ -359,7 +362,10 @@ def test_a_contact_sheet_of_a_video(folder, tmp_path):
 
 @pytest.mark.slow
 def test_a_stress_test_of_a_video(folder, tmp_path):
-    """Its cells read the video as the command was told to; laws that look ahead are left out."""
+    """The runs read the video with the options of the command.
+
+    Perturbations that need later frames are left out.
+    """
     words = ["stress", folder / "pair.mkv", "--side-by-side", "--calib", folder / "stereo.yaml"]
     words += ["--laws", "bias,desync", "--detectors", "none", "--seeds", "1", "--steps", "1"]
     words += ["--max-frames", "8", "--out", tmp_path / "stress"]
@@ -393,7 +399,10 @@ def test_a_sequence_written_side_by_side_comes_back(kitti_tree, tmp_path):
 
 
 class There:
-    """The corridor there and back as a stream; counts the images that somebody holds."""
+    """The corridor forwards and backwards as a stream.
+
+    It counts the images that are held in memory.
+    """
 
     def __init__(self, corridor):
         self.corridor = corridor

@@ -27,7 +27,10 @@ def starter(camera=LEFT_CAMERA, **thresholds: float) -> Starter:
 def frame(
     index: int, seconds: float, moved: float = 0.0, among: slice = ALL, camera=LEFT_CAMERA
 ) -> Frame:
-    """A frame that is ``moved`` times as far aside as two views should be, and not tracked."""
+    """Make a frame that is not tracked.
+
+    It has ``moved`` times the lateral distance that two views should have.
+    """
     features = POINTS.see(se3_exp(moved * ASIDE), among)
     if camera.monocular:
         features.u_right[:] = np.nan
@@ -106,7 +109,10 @@ def test_a_view_that_has_waited_too_long_is_replaced(seconds, together):
 
 @pytest.mark.parametrize(("n_common", "together"), [(100, True), (99, False)])
 def test_a_view_that_shows_too_little_of_the_first_one_replaces_it(n_common, together):
-    """Of 240 points each shows 200 at least; what it shows besides looks like none of the first."""
+    """Each view shows at least 200 of 240 points.
+
+    Its other points look unlike those in the first view.
+    """
     one, second = starter(min_landmarks=50, min_points=20), frame(1, 0.1, 1.0)
     strange = np.random.default_rng(1).integers(0, 256, (240 - n_common, 32), dtype=np.uint8)
     second.features.descriptors[:] = np.vstack([POINTS.descriptors[:n_common], strange])
@@ -140,7 +146,7 @@ def test_a_map_needs_enough_points_to_begin_with(min_landmarks, enough):
 
 
 def two_views() -> TwoViewStart:
-    """A start in which the camera moves by 0.5 units in 0.25 s."""
+    """Make a start in which the camera moves by 0.5 units in 0.25 s."""
     T_2_1 = se3_exp(np.array([0.3, 0.0, 0.4, 0.0, 0.02, 0.0]))
     T_2_1[:3, 3] *= 0.5 / np.linalg.norm(T_2_1[:3, 3])
     features = np.arange(240), np.arange(240)
@@ -148,7 +154,10 @@ def two_views() -> TwoViewStart:
 
 
 def test_a_sub_map_takes_its_unit_from_the_speed_before():
-    """At 6 units a second the camera moves by 1.5 in 0.25 s: three times as far."""
+    """At 6 units per second, the camera moves by 1.5 units in 0.25 s.
+
+    This is three times the motion of the start.
+    """
     start = two_views()
     rescaled = start.at_speed(np.array([0.0, 3.6, 4.8, 0.1, 0.0, 0.0]), 10.0)
     assert rescaled.predicted
@@ -167,7 +176,10 @@ def test_a_sub_map_takes_its_unit_from_the_speed_before():
     (19.9, True), (20.1, False), (0.201, True), (0.199, False), (0.0, False),
 ])  # fmt: skip
 def test_a_speed_that_asks_for_too_much_rescaling_tells_nothing(speed, believed):
-    """The start has 2 units a second; ten times as much or as little is the limit."""
+    """The speed of the start is 2 units per second.
+
+    The limits are ten times this speed and a tenth of it.
+    """
     start = two_views()
     rescaled = start.at_speed(np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0]), 10.0)
     assert rescaled.predicted == believed

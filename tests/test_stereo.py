@@ -16,14 +16,14 @@ ORB = OrbConfig(n_features=600)
 
 
 def texture(seed: int = 0) -> np.ndarray:
-    """Smooth enough to be shifted by fractions of a pixel."""
+    """Make a texture that is so smooth that it can be shifted by fractions of a pixel."""
     rng = np.random.default_rng(seed)
     blocks = np.kron(rng.uniform(20, 235, (HEIGHT // 6 + 1, WIDTH // 6 + 1)), np.ones((6, 6)))
     return cv2.GaussianBlur(blocks[:HEIGHT, :WIDTH].astype(np.float32), (0, 0), 1.2)
 
 
 def shifted(image: np.ndarray, dx: float, dy: float = 0.0) -> np.ndarray:
-    """``image`` moved left by ``dx`` and down by ``dy`` pixels, by the phase of its spectrum."""
+    """Move ``image`` left by ``dx`` and down by ``dy`` pixels, using the phase of its spectrum."""
     fy = np.fft.fftfreq(image.shape[0])[:, None]
     fx = np.fft.fftfreq(image.shape[1])[None, :]
     spectrum = np.fft.fft2(image) * np.exp(2j * np.pi * (fx * dx - fy * dy))
@@ -37,7 +37,10 @@ def extracted(image: np.ndarray) -> Extraction:
 def match(
     dx: float, dy: float = 0.0, fx: float = 240.0, noise: float = 0.0
 ) -> tuple[Extraction, np.ndarray]:
-    """Left features of a plane at disparity ``dx``, and the disparities found."""
+    """Match a plane at disparity ``dx``.
+
+    Return its left features and the disparities that are found.
+    """
     image = texture()
     rng = np.random.default_rng(9)
     left = extracted(image + noise * rng.normal(size=image.shape))
@@ -49,7 +52,7 @@ def match(
 
 
 def seen_by_both(left: Extraction, dx: float) -> np.ndarray:
-    """Features whose match, with the search of the patch, lies inside the right image."""
+    """Return which features have a match, with its search range, inside the right image."""
     return left.xy[:, 0] - dx > 30 * 1.2 ** left.octave.astype(float)
 
 
@@ -77,7 +80,10 @@ def test_sub_pixel_disparity(disparity):
 
 
 def test_sub_pixel_offsets_follow_the_shift():
-    """Rounding to whole pixels would make steps of 1 of these steps of a quarter."""
+    """The shifts differ by a quarter of a pixel.
+
+    If disparities were rounded to whole pixels, they would differ by 0 or 1.
+    """
     medians = []
     for dx in (8.0, 8.25, 8.5, 8.75):
         left, found = match(dx)
@@ -94,7 +100,7 @@ def test_infinitely_far_points_get_a_tiny_positive_disparity():
 
 
 def test_nothing_beyond_the_greatest_disparity():
-    """Disparity fx is a point one baseline away."""
+    """A disparity of fx pixels belongs to a point at a depth of one baseline."""
     left, found = match(60.0, fx=70.0)
     assert np.count_nonzero(np.isfinite(found)) > 0.5 * np.count_nonzero(seen_by_both(left, 60.0))
     _, beyond = match(60.0, fx=40.0)

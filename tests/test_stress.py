@@ -158,8 +158,11 @@ def strength_of(cell: Cell) -> float:
 
 
 class World:
-    """Runs cells in a moment: bow fails beyond strength 3, the other one beyond 1 + seed, and ends
-    with an error beyond 9."""
+    """A world in which a cell needs no time.
+
+    bow fails beyond strength 3. The other system fails beyond 1 + seed, and ends with an error
+    beyond 9.
+    """
 
     def __init__(self, out: Path) -> None:
         self.out, self.ran = out, []
@@ -463,7 +466,7 @@ def test_a_template_must_hold_both_places(template):
 
 @pytest.mark.slow
 def test_from_the_command_line_with_another_system(tmp_path):
-    """The clean run is perfect; darkness turns the ruler's path to a wrong one."""
+    """The run on unperturbed images is perfect. In dark images, the trajectory is wrong."""
     root = make_kitti(tmp_path / "data")
     script = tmp_path / "ruler.py"
     measured = """

@@ -45,7 +45,7 @@ DOTS = 8  # a row and a column
 
 
 def straight(n=64, step=1.0):
-    """Poses of a straight drive with a little sway."""
+    """Return the poses of a straight drive with a little sway."""
     T = np.tile(np.eye(4), (n, 1, 1))
     T[:, 2, 3] = step * np.arange(n)
     T[:, 0, 3] = 0.2 * np.sin(0.1 * np.arange(n))
@@ -63,7 +63,10 @@ def town(route):
 
 
 def dotted_world():
-    """A wall with bright dots that stands askew before grey ground; dots in world coordinates."""
+    """Make a slanted wall with bright dots before grey ground.
+
+    Also return the dots in world coordinates.
+    """
     y, x = np.mgrid[0:SIDE, 0:SIDE] + 0.5
     pitch = SIDE / DOTS
     from_dot = ((x % pitch) - pitch / 2) ** 2 + ((y % pitch) - pitch / 2) ** 2
@@ -99,7 +102,7 @@ def draw(surfaces, atlas, sky, T_wc, threads=1):
 
 
 def centroids(image, near):
-    """Centres of gravity of bright dots close to the places ``near``."""
+    """Return the centroids of bright dots close to the places ``near``."""
     found = []
     for u, v in near:
         c, r = round(u), round(v)
@@ -193,7 +196,10 @@ def test_shadow_falls_away_from_the_sun():
 
 @pytest.fixture
 def unpainted(monkeypatch):
-    """Towns of the real shape whose textures cost nothing; their ground is far below."""
+    """Make towns with the real geometry, but with textures that need no time.
+
+    Their ground is far below.
+    """
     plain = np.full((2, 2), 99.0, np.float32)
     twice = (plain, plain)
     for module, names, value in (
@@ -210,7 +216,7 @@ def unpainted(monkeypatch):
 
 
 def clearance(surfaces, cameras):
-    """Smallest distance of cameras from surfaces, as far as it is below some 4 m."""
+    """Return the smallest distance of cameras from surfaces, if it is below about 4 m."""
     tree = cKDTree(cameras)
     middle = surfaces.origin + 0.5 * (surfaces.edge_s + surfaces.edge_t)
     lengths = [np.linalg.norm(edge, axis=1) for edge in (surfaces.edge_s, surfaces.edge_t)]
@@ -259,7 +265,7 @@ def test_moving_cars_keep_clear(unpainted):
 
 @pytest.mark.slow
 def test_sight_lines_are_closed_at_bends(unpainted):
-    """All over the demo's loop hardly a ray near the horizon meets nothing."""
+    """Along the whole loop of the demo, nearly every ray near the horizon meets a surface."""
     route = built_in_route("demo")
     town = build_town(route, Variation())
     renderer = Renderer(route.camera, town.atlas, town.sky, 2)
@@ -441,7 +447,7 @@ def test_two_processes_do_not_render_one_sequence(tmp_path, monkeypatch):
 
 
 class Renderings:
-    """Stands in for the renderer: writes files without looking at the town."""
+    """A replacement of the renderer that writes files without looking at the town."""
 
     calls = 0
     missing = None
@@ -501,7 +507,7 @@ def test_lamps_cast_pools():
 
 
 def rounds(n, radius=32.0, laps=1.6):
-    """Poses of a drive round a circle."""
+    """Return the poses of a drive around a circle."""
     angle = np.linspace(0, 2 * np.pi * laps, n)
     T = np.stack([turn(a) for a in angle])
     T = np.concatenate([T, np.zeros((n, 3, 1))], axis=2)
@@ -552,7 +558,10 @@ def test_routes(name):
 
 
 def revisits(xyz):
-    """Stretches of at least 15 frames within 4 m of a place passed 150 frames before."""
+    """Return the parts of a drive that revisit a place.
+
+    A part has at least 15 frames within 4 m of a place that was passed 150 frames before.
+    """
     near = [
         i >= 150 and np.linalg.norm(xyz[: i - 149] - xyz[i], axis=1).min() < 4.0
         for i in range(len(xyz))

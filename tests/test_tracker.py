@@ -26,19 +26,19 @@ TWIST = STEP / 0.1  # at ten frames a second
 
 
 def at(k: float) -> np.ndarray:
-    """``T_cw`` of a camera that moves at a constant speed, at frame k."""
+    """Return ``T_cw`` at frame k of a camera that moves at a constant speed."""
     return se3_exp(k * STEP)
 
 
 def restored(tracker: Tracker) -> Tracker:
-    """A new tracker that remembers what this one does, in the same map."""
+    """Return a new tracker in the same map, which has the memory of the given tracker."""
     state, other = tracker.state(), Tracker(CONTEXT)
     other.restore(state, np.where((state.landmark >= 0)[:, None], POINTS.xyz, np.nan))
     return other
 
 
 def select(features: Features, n: int) -> Features:
-    """The first n of some features."""
+    """Return the first n features."""
     names = ("xy", "octave", "angle", "descriptors", "u_right")
     return Features(*(getattr(features, name)[:n] for name in names))
 
@@ -55,14 +55,20 @@ class Drive:
 
     @classmethod
     def of_two_frames(cls, among: slice = ALL) -> Drive:
-        """Two frames, so that the camera's speed is known; the last one saw some of the points."""
+        """Return a drive of two frames, so that the speed of the camera is known.
+
+        The last frame saw some of the points.
+        """
         drive = cls()
         drive.accept(0)
         drive.accept(1, among)
         return drive
 
     def accept(self, k: int, among: slice = ALL, *, keyframe: int = -1) -> Frame:
-        """Go on from a frame that was found; near ``keyframe`` if it was looked for in the map."""
+        """Continue from a frame that was found.
+
+        ``keyframe`` is given if it was found by relocalisation.
+        """
         frame = POINTS.tracked_frame(len(self.frames), 0.1 * k, at(k), among)
         found = Found(TrackingState.OK, keyframe=keyframe)
         if k == 0:
@@ -73,7 +79,7 @@ class Drive:
         return frame
 
     def lose(self, k: int) -> None:
-        """A frame that is not tracked, at the pose that is predicted for it."""
+        """Return a frame that is not tracked, at its predicted pose."""
         T_cw = self.predict(k)
         self.frames.append(0.1 * k, T_cw, tracked=False)
         self.tracker.lose()
@@ -82,17 +88,17 @@ class Drive:
         return self.tracker.predict(0.1 * k, self.frames, POINTS.view())
 
     def next_frame(self, among: slice = ALL, *, seconds: float = 0.1) -> Frame:
-        """The frame after the last one, which sees some of the points."""
+        """Return the frame after the last one, which sees some of the points."""
         last = self.frames.timestamp(-1)
         return POINTS.frame(len(self.frames), last + seconds, at(10.0 * (last + seconds)), among)
 
     def track(self, frame: Frame, view: MapView, T_cw: np.ndarray | None = None) -> Found:
-        """Track a frame where it is expected, by default where it really is."""
+        """Track a frame from a predicted pose, which is by default its true pose."""
         T_cw = at(10.0 * frame.timestamp) if T_cw is None else T_cw
         return self.tracker.track(frame, T_cw, view, self.frames)
 
     def doubts(self, frame: Frame, view: MapView) -> bool:
-        """Whether the frame, tracked where it is, is doubtful."""
+        """Track a frame at its true pose, and return whether the result is doubtful."""
         return self.track(frame, view).is_doubtful
 
 
@@ -126,7 +132,7 @@ def test_the_camera_moves_on_while_it_is_lost():
 
 
 def test_the_speed_is_measured_from_the_last_frame_that_was_tracked():
-    """Not from the poses predicted in between, which here are those of a camera that stands."""
+    """Predicted poses are not used. Here, they are the poses of a camera that stands still."""
     drive = Drive()
     drive.accept(0)
     drive.lose(1)
@@ -180,8 +186,11 @@ def test_a_continued_drive_has_the_speed_that_it_is_told():
 
 @pytest.mark.parametrize(("pixels", "found_again"), [(12, True), (200, False)])
 def test_what_the_last_frame_saw_is_looked_for_near_the_prediction(pixels, found_again):
-    """12 pixels off: too far for the window around landmarks of the map. The reference keyframe
-    shows nothing here."""
+    """The points are 12 pixels away.
+
+    This is too far for the window around landmarks of the map. The reference keyframe has no
+    matches here.
+    """
     drive, view = Drive.of_two_frames(), POINTS.view(nearest=NOTHING)
     frame = drive.next_frame()
     found = drive.track(frame, view, ahead(0.0, pixels / CAMERA.fx) @ at(2))
@@ -192,7 +201,7 @@ def test_what_the_last_frame_saw_is_looked_for_near_the_prediction(pixels, found
 
 
 def test_where_the_last_frame_shows_other_things_the_reference_keyframe_is_tried():
-    """By descriptors alone: here the prediction is far from where the camera is."""
+    """Only descriptors are compared, because the predicted pose is far from the true pose."""
     drive, frame_sees = Drive.of_two_frames(SEEN_LAST), SEEN_NOW
     T_predicted = ahead(0.0, 0.5) @ at(2)
     frame = drive.next_frame(frame_sees)
@@ -209,7 +218,10 @@ def test_where_the_last_frame_shows_other_things_the_reference_keyframe_is_tried
 def test_where_neither_is_recognised_all_around_is_looked_for_near_the_prediction(
     pixels, found_again
 ):
-    """In a window of 7 pixels, or 11 where a landmark is seen from the side; 2.5 or 4 are usual."""
+    """The window has 7 pixels, or 11 if a landmark is seen from the side.
+
+    Usually, it has 2.5 or 4 pixels.
+    """
     drive, view = Drive.of_two_frames(SEEN_LAST), POINTS.view(nearest=SEEN_LAST)
     frame = drive.next_frame(SEEN_NOW)
     found = drive.track(frame, view, ahead(0.0, pixels / CAMERA.fx) @ at(2))
@@ -232,7 +244,10 @@ def test_a_prediction_with_few_inliers_is_not_trusted(last_saw, n_inliers, found
 @pytest.mark.parametrize("last_saw", [SEEN_LAST, ALL], ids=["predicted", "motion"])
 @pytest.mark.parametrize(("n_wrong", "found_again"), [(70, True), (71, False)])
 def test_a_prediction_with_a_small_share_of_inliers_is_not_trusted(last_saw, n_wrong, found_again):
-    """30 things are where they are expected, and 70 or 71 are six pixels off."""
+    """30 points are at their predicted positions.
+
+    70 or 71 points are six pixels away from theirs.
+    """
     drive, view = Drive.of_two_frames(last_saw), POINTS.view(nearest=NOTHING)
     features = POINTS.see(at(2), slice(139, 240))
     features.xy[30 : 30 + n_wrong, 1] += np.where(np.arange(n_wrong) % 2, 6.0, -6.0)
@@ -248,7 +263,7 @@ def test_without_a_speed_there_is_no_prediction_to_look_near():
 
 
 def test_a_found_frame_tracks_all_landmarks_around_and_says_which_it_should_see():
-    """The last frame saw few of them. The newest landmark is behind the camera."""
+    """The last frame saw few of these landmarks. The newest landmark is behind the camera."""
     points = Points(np.vstack([POINTS.xyz, [[0.0, 0.0, -20.0]]]),
                     np.vstack([POINTS.descriptors, POINTS.descriptors[:1] ^ 255]))  # fmt: skip
     drive = Drive.of_two_frames(FEW)
@@ -285,7 +300,7 @@ OLD, YOUNG = 6, 5  # keyframes: a map of five is young
 
 
 def test_a_frame_after_a_gap_with_few_inliers_is_doubtful():
-    """Frames come every tenth of a second; a gap is more than one and a half of that."""
+    """Frames arrive every tenth of a second. A gap is longer than 1.5 times this interval."""
     drive = Drive.of_two_frames()
     view = POINTS.view(n_reference=121, n_keyframes=YOUNG)
     assert drive.doubts(drive.next_frame(FEW, seconds=0.16), view)
@@ -307,7 +322,7 @@ def test_less_than_half_of_the_reference_keyframe_is_few(n_reference, few):
 
 
 def test_a_frame_with_few_inliers_next_to_one_found_in_the_map_is_doubtful():
-    """Where the camera moved in between is unknown."""
+    """The motion of the camera between the two frames is unknown."""
     drive = Drive.of_two_frames(FEW)
     drive.lose(2)
     drive.accept(3, FEW, keyframe=4)
@@ -366,7 +381,7 @@ def test_before_the_first_frame_there_is_nothing_to_remember():
 
 @pytest.mark.parametrize("lost", [0, 2])
 def test_a_tracker_that_is_restored_goes_on_as_the_one_that_was_not(lost):
-    """Its last frame tracked 121 landmarks; the next one tracks 60."""
+    """The last frame tracked 121 landmarks. The next frame tracks 60 landmarks."""
     drive = Drive()
     drive.accept(0)
     last = POINTS.tracked_frame(1, 0.1, at(1))

@@ -336,7 +336,10 @@ def test_augmentation_repeats_and_its_strengths_can_be_nothing():
 
 
 def test_a_zoom_is_what_driving_on_does():
-    """A dot beside the middle moves away from it, by at most the factor, in half of the images."""
+    """Half of the images are zoomed.
+
+    A dot beside the middle then moves away from the middle, at most by the given factor.
+    """
     image = np.zeros((65, 65), np.uint8)
     image[32, 44:47] = 255
     only = Augmentation(**dict.fromkeys(

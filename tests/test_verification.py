@@ -18,12 +18,12 @@ DRIFT = se3_exp(np.array([3.0, -0.4, 5.0, 0.02, 0.15, -0.01]))
 
 
 def forward(metres: float, sideways: float = 0.0, yaw: float = 0.0) -> np.ndarray:
-    """``T_cw`` of a camera on the street."""
+    """Return ``T_cw`` of a camera on the street."""
     return inverse(se3_exp(np.array([sideways, 0.0, metres, 0.0, yaw, 0.0])))
 
 
 def link_pass(world: World, keyframes: range) -> None:
-    """Landmarks that the keyframes of one pass see, at least two of them each."""
+    """Make the landmarks of one pass. Each landmark is seen by at least two of its keyframes."""
     a = world.map.arrays
     rows = np.concatenate([np.arange(a.first_row[k], a.first_row[k + 1]) for k in keyframes])
     shown = world.point_of_row[rows]
@@ -41,7 +41,7 @@ def link_pass(world: World, keyframes: range) -> None:
 
 
 def let_drift(world: World, keyframes: range) -> None:
-    """Move the keyframes of one pass, and their landmarks, as one rigid piece."""
+    """Move the keyframes of one pass, and their landmarks, as one rigid body."""
     a = world.map.arrays
     ids = np.unique(np.concatenate([world.map.landmarks_of(k) for k in keyframes]))
     for k in keyframes:
@@ -51,9 +51,10 @@ def let_drift(world: World, keyframes: range) -> None:
 
 
 def street(among=None, *, mono: bool = False, seed: int = 0, noise: float = 0.5) -> World:
-    """Two passes; in the second only the points ``among`` look as before.
+    """Make a map of a street that was driven twice.
 
-    The others are still there, but as different things: their descriptors are new.
+    In the second pass, only the points in ``among`` have the same descriptors. The other points
+    exist, but have new descriptors.
     """
     world = make_world(900, seed=seed)
     for i in range(PASS):
@@ -76,7 +77,7 @@ def check(world: World, config: VerificationConfig = CONFIG, query: int = 6, mat
 
 
 def error(world: World, edge) -> tuple[float, float]:
-    """Metres and degrees between the pose of an edge and the truth."""
+    """Return the error of the pose of an edge in metres and in degrees."""
     true = world.truth[edge.query] @ inverse(world.truth[edge.match])
     twist = se3_log(edge.T_query_match @ inverse(true))
     return float(np.linalg.norm(twist[:3])), float(np.degrees(np.linalg.norm(twist[3:])))
@@ -161,7 +162,7 @@ def test_chance_matches_agree_on_no_motion():
 
 
 def in_strip(world: World, left: float, right: float) -> np.ndarray:
-    """Points that appear between two columns of the first picture."""
+    """Return the points that appear between two columns of the first image."""
     u = CAMERA.project(world.points)[:, 0]
     return np.flatnonzero((u > left) & (u < right))
 

@@ -35,7 +35,10 @@ def network() -> LocalDescriptors:
 
 @pytest.fixture(scope="module")
 def by_night(network) -> World:
-    """Keyframe 1 shows the place of keyframe 0, but no ORB descriptor matches."""
+    """Make a map in which keyframe 1 shows the place of keyframe 0 at night.
+
+    No ORB descriptor matches.
+    """
     return World(network, T_1_0)
 
 

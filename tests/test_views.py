@@ -35,14 +35,14 @@ SHIFT = 16  # columns between the two views of 81
 
 
 def wide_images(n: int, seed: int = 0, width: int = 81) -> torch.Tensor:
-    """Noise with equal mean and contrast in every column, so that no part stands out."""
+    """Make noise with equal mean and contrast in every column, so that no part is distinctive."""
     x = torch.randn(n, 1, 48, width, generator=torch.Generator().manual_seed(seed))
     x = (x - x.mean(2, keepdim=True)) / x.std(2, keepdim=True)
     return (0.5 + 0.1 * x).expand(-1, 3, -1, -1)
 
 
 def wide_views(places: int) -> object:
-    """As ``views``, squashed to images of 48x81."""
+    """Make the images of ``views`` with a size of 48x81."""
     collection = views(places)
     resize = [cv2.resize(image, (81, 48)) for image in collection.images]
     return replace(collection, images=np.stack(resize))
@@ -88,7 +88,7 @@ def test_views_keep_their_share_of_another_size():
 @torch.no_grad()
 @pytest.mark.parametrize("extractor", ["light", "lite0"])
 def test_only_lite0_sees_a_little_beyond_a_view(extractor):
-    """Its early features are computed once, for the whole image."""
+    """The early features of this network are computed once for the whole image."""
     torch.manual_seed(0)
     network = build_network("capsule", SMALL.model_copy(update={"extractor": extractor})).eval()
     for module in network.modules():
@@ -119,7 +119,10 @@ def test_early_features_of_a_view_lie_where_its_pixels_do():
 
 @torch.no_grad()
 def test_what_both_cameras_see_is_compared():
-    """A camera turned by the distance between the views sees on its left what was on the right."""
+    """One camera is rotated by the angle between two views.
+
+    What it sees on the left is what the other sees on the right.
+    """
     network = small_network(**WIDE).eval()
     assert network.branch.shape.view == (48, 65)
     world = torch.rand(1, 3, 48, 81 + SHIFT, generator=torch.Generator().manual_seed(1))
@@ -161,7 +164,7 @@ def test_cosines_are_the_soft_maximum_of_all_alignments(views):
 
 
 def test_views_that_meet_by_chance_count_little():
-    """One view of four that finds its like elsewhere is no place."""
+    """If only one of four views matches somewhere, the images do not show the same place."""
     alike, most = torch.zeros(4, 4), torch.ones(4, 4)
     alike[0, 3] = 1.0
     nothing = 0.04 * np.log(5)  # five alignments, none better than another
@@ -172,7 +175,7 @@ def test_views_that_meet_by_chance_count_little():
 
 @torch.no_grad()
 def test_a_view_counts_as_much_as_it_shows():
-    """Half of an image is covered: what is left decides."""
+    """Half of an image is covered. The result depends only on the other half."""
     network = small_network(pixels=48, width=96, views=2, view_width=48).eval()
     place, other = wide_images(2, width=96).split(1)
     covered = place.clone()
@@ -197,7 +200,10 @@ def test_one_against_many_is_pair_by_pair():
 
 
 def lite_network() -> SiameseNetwork:
-    """Three views of 49 of the 81 columns, 16 apart."""
+    """Make a network with three views.
+
+    Each has 49 of the 81 columns, and they are 16 columns apart.
+    """
     shape = CapsuleShape(
         extractor="lite0", pixels=48, width=81, views=3, view_width=49, types=4, outputs=4
     )
@@ -229,7 +235,7 @@ def test_a_network_learns_with_views_and_is_read_again(tmp_path):
 
 
 def test_whole_images_become_views(tmp_path):
-    """Weights for whole squares are what a training with views starts from."""
+    """Training with views starts from weights that were trained on whole square images."""
     path = tmp_path / "capsule.safetensors"
     whole = small_network().eval()
     save_network(whole, path, {})

@@ -33,7 +33,7 @@ def bits(descriptors: np.ndarray) -> np.ndarray:
 
 
 def distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """``(M, N)`` Hamming distances."""
+    """Return ``(M, N)`` Hamming distances."""
     return (bits(a)[:, None] != bits(b)[None]).sum(axis=2)
 
 
@@ -42,7 +42,10 @@ def random_descriptors(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def noisy(rng: np.random.Generator, centres: np.ndarray, n: int, flips: int) -> np.ndarray:
-    """``n`` copies of each centre, one after the other, with ``flips`` bits turned in each."""
+    """Return ``n`` copies of each centre, with ``flips`` bits flipped in each copy.
+
+    The copies of a centre follow each other.
+    """
     copies = np.repeat(bits(centres), n, axis=0)
     for row in copies:
         row[rng.choice(256, flips, replace=False)] ^= 1
@@ -51,7 +54,10 @@ def noisy(rng: np.random.Generator, centres: np.ndarray, n: int, flips: int) -> 
 
 @pytest.fixture(scope="module")
 def small() -> Vocabulary:
-    """Up to 4 levels of 5, trained on 15 images of unlike size; leaves at several levels."""
+    """A vocabulary with up to 4 levels and 5 children per node, trained on 15 images.
+
+    The images have different numbers of features. The leaves are at several levels.
+    """
     rng = np.random.default_rng(3)
     return train([random_descriptors(rng, n) for n in range(3, 33, 2)], 5, 4, seed=1)
 

@@ -88,7 +88,10 @@ def test_kernels_are_cold_without_a_cache_newer_than_the_source(
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What ``compile_kernels`` does of its own on a cold machine with two cores."""
+    """Return the calls that ``compile_kernels`` makes on a machine with an empty cache.
+
+    The machine has two cores.
+    """
     made: list[str] = []
     monkeypatch.setattr(warmup, "is_cold", lambda: True)
     monkeypatch.setattr(warmup, "available_cores", lambda: 2)
@@ -97,8 +100,11 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def python_is(monkeypatch: pytest.MonkeyPatch, folder: Path, script: str) -> Path:
-    """Let a shell script stand for Python; it leaves its process id in the folder returned, in a
-    file named as its last argument."""
+    """Replace Python by a shell script.
+
+    The script writes its process id into the returned folder, in a file that is named as its last
+    argument.
+    """
     python, traces = folder / "python", folder / "started"
     traces.mkdir()
     leave = f"echo $$ > {folder}/$4 && mv {folder}/$4 {traces}/"

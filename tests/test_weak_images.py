@@ -34,7 +34,7 @@ DISPARITY = 7
 
 
 def scene(spread: float = 35.0, grain_px: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
-    """Both sides of a textured wall, float64 grey values."""
+    """Return both images of a textured wall, as float64 grey values."""
     rough = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(200, 420)), (0, 0), grain_px)
     grey = 110.0 + spread * rough / rough.std()
     return grey[:, :400], grey[:, DISPARITY : 400 + DISPARITY]
@@ -52,7 +52,7 @@ def spiked(image: np.ndarray, share: float, seed: int) -> np.ndarray:
 
 
 def right_matches(left: np.ndarray, right: np.ndarray, config: Config) -> int:
-    """Stereo matches within a pixel of the truth."""
+    """Return which stereo matches are within a pixel of the true position."""
     ours, theirs = extract_in_any_light([left, right], config)
     u_right = inliers_only(match_stereo(ours, theirs, CAMERA, config.stereo), ours.octave)
     return int(np.count_nonzero(np.abs(ours.xy[:, 0] - u_right - DISPARITY) < 1.0))
@@ -70,7 +70,10 @@ def test_usual_images_stay_the_same_objects():
 
 
 def test_a_textureless_image_of_good_light_is_not_touched():
-    """Few corners alone do not make an image faint: contrast in blocks tells."""
+    """An image with few corners does not always have low contrast.
+
+    The contrast in blocks of the image decides.
+    """
     stripes = np.tile(np.where(np.arange(400) // 12 % 2, 180, 60).astype(np.uint8), (200, 1))
     (found,) = extract_in_any_light([stripes], CONFIG)
     assert len(found.xy) < 0.5 * ORB.n_features
@@ -79,7 +82,7 @@ def test_a_textureless_image_of_good_light_is_not_touched():
 
 
 def test_an_image_out_of_focus_is_not_faint():
-    """It has as few corners and as little contrast as a faint one, but no detail."""
+    """The image has as few corners and as little contrast as a faint image, but no detail."""
     sharp, blurred = scene(spread=2.0)[0], scene(spread=2.0, grain_px=12.0)[0]
     assert contrast(camera_image(sharp)) < CONFIG.weak_images.low_contrast
     assert contrast(camera_image(blurred)) < CONFIG.weak_images.low_contrast
@@ -125,7 +128,10 @@ def test_images_of_one_moment_are_treated_alike():
 
 @pytest.mark.parametrize("stops", [4.0, 5.0, 6.0])
 def test_a_faint_pair_is_matched_where_nothing_was_found(stops):
-    """Half a grey level of noise spreads what rounding would drop: 35 levels become 0.5 to 2."""
+    """The contrast of 35 grey levels is reduced to between 0.5 and 2.
+
+    Noise of half a grey level keeps details that rounding would remove.
+    """
     pair = [camera_image(side * 2.0**-stops, 0.5, k) for k, side in enumerate(scene())]
     before, after = right_matches(*pair, BEFORE), right_matches(*pair, CONFIG)
     assert before < 20
@@ -134,7 +140,7 @@ def test_a_faint_pair_is_matched_where_nothing_was_found(stops):
 
 @pytest.mark.parametrize("noise", [50.0, 70.0])
 def test_a_noisy_pair_is_matched(noise):
-    """Texture of 4 pixels, as of a scene that is near."""
+    """The texture has a size of 4 pixels, as in a scene that is near the camera."""
     pair = [camera_image(side, noise, k) for k, side in enumerate(scene(grain_px=4.0))]
     before, after = right_matches(*pair, BEFORE), right_matches(*pair, CONFIG)
     assert after > 2.5 * before
@@ -166,7 +172,7 @@ def test_nothing_is_made_of_nothing():
 
 
 def drive(corridor, change, config: Config) -> tuple[str, float]:
-    """States, one letter a frame, and the largest error in metres."""
+    """Return the state of each frame as one letter, and the largest error in metres."""
     slam = Slam(corridor.camera, config, "none", threads=1)
     states = ""
     for k, (left, right) in enumerate(zip(corridor.left, corridor.right, strict=True)):
@@ -198,8 +204,11 @@ def test_a_drive_that_was_lost_is_tracked(corridor, change, lost):
 def test_what_the_frame_before_did_not_see_is_matched_around_the_prediction(
     corridor, window, monkeypatch
 ):
-    """One half of a frame is dark, and the other half of the next one. They have nothing in common,
-    but the map has both. Without a search around the prediction, the second frame is lost."""
+    """One half of a frame is dark, and the other half of the next frame.
+
+    The two frames have no landmarks in common, but the map contains those of both. Without a search
+    around the prediction, the second frame would be lost.
+    """
     slam = Slam(
         corridor.camera,
         Config(orb=ORB, tracking=TrackingConfig(method="orb", predicted_window=window)),

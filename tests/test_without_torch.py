@@ -33,7 +33,7 @@ sys.meta_path[sys.meta_path.index(PathFinder)] = Finder
 
 @pytest.fixture(scope="module")
 def pairs(corridor: StereoSequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two places, each seen by both cameras, as ``vslam synth --pairs`` writes them."""
+    """Two places that both cameras see, as ``vslam synth --pairs`` writes them."""
     folder = tmp_path_factory.mktemp("pairs")
     rows = []
     for k in (0, len(corridor) - 1):
@@ -51,7 +51,10 @@ def pairs(corridor: StereoSequence, tmp_path_factory: pytest.TempPathFactory) ->
 
 @pytest.mark.slow
 def test_all_but_training_works_without_torch(kitti_tree: Path, pairs: Path, tmp_path: Path):
-    """In processes that cannot import it, those that a benchmark starts included."""
+    """The test uses processes that cannot import torch.
+
+    These include the processes that a benchmark starts.
+    """
     blocked = tmp_path / "blocked"
     blocked.mkdir()
     (blocked / "sitecustomize.py").write_text(BLOCK)

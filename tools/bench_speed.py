@@ -4,15 +4,15 @@
         [--repeats 3] [--write docs/research/performance.md] [--csv docs/research/performance.csv] \
         [--orbslam3-python PY --vocabulary voc.txt]
 
-A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run
-alternately, one at a time. The first round is not counted. In each round, vslam runs
+A case is a folder in KITTI's format, a sequence in it and a number of frames. The two systems run
+alternately, and never at the same time. The first round is not counted. In each round, vslam runs
 
 - with its report,
 - with ``--no-report``,
 - with ``--no-report`` and each detector of ``--also`` instead of ``bow``,
 - in the last round, with ``--realtime``, which takes as long as the drive.
 
-The beginning of the page and the section "Limits" are written by hand. They are kept.
+The beginning of the page and the section "Limits" are written by hand. The script keeps them.
 
 The script measures the wall time, CPU time and peak memory of whole processes, as reported by the
 operating system. vslam.evaluation.trajectories computes the errors of both systems from their
@@ -111,9 +111,9 @@ class OrbSlam3(NamedTuple):
 
 
 class Process(NamedTuple):
-    """The output of a finished process, and the resources that it and its children used.
+    """The output of a finished process, and the resources that the process and its children used.
 
-    ``held`` is its memory over time, as pairs (s, MB).
+    ``held`` is the memory of the process over time, as pairs (s, MB).
     """
 
     output: str
@@ -124,9 +124,9 @@ class Process(NamedTuple):
 
 
 class Run(NamedTuple):
-    """One run of a system.
+    """One run of vslam or ORB-SLAM3.
 
-    ``report`` is the report of the system itself. It has at least the ``frames``, ``fps`` and
+    ``report`` is the report that the system wrote. It contains at least the ``frames``, ``fps`` and
     ``cpu_ms_per_frame`` of the frame loop. ``trajectory`` is a file in KITTI's or TUM's format,
     which is deleted together with the folder of the run.
     """
@@ -139,10 +139,10 @@ class Run(NamedTuple):
 
 
 def measure(command: list[str], folder: Path) -> Process:
-    """Run a command and measure it.
+    """Run a command, and measure its wall time, CPU time and peak memory.
 
-    No large package may be imported before the call, because the peak memory of a child process
-    starts at that of its parent.
+    The caller must not import large packages before the call, because the peak memory of a child
+    process starts at the peak memory of its parent.
     """
     log = folder / "output.txt"
     # Let Python store compiled modules, as pip does when it installs a package.
@@ -182,7 +182,7 @@ def sample_memory(
 
 
 def parse_case(text: str) -> Case:
-    """Parse ``TITLE=DATA:SEQ:FRAMES``."""
+    """Parse the text of a case, ``TITLE=DATA:SEQ:FRAMES``."""
     title, separator, place = text.partition("=")
     parts = place.rsplit(":", 2)
     if not separator or len(parts) != 3 or not parts[2].isdecimal():
@@ -198,12 +198,12 @@ def parse_case(text: str) -> Case:
 
 
 def sides(case: Case) -> list[Path]:
-    """Folders of the left and right images."""
+    """Return the folders of the left and right images of a case."""
     return [case.data / "sequences" / case.seq / f"image_{side}" for side in (0, 1)]
 
 
 def reading_ms(case: Case, system: str) -> float:
-    """CPU time for decoding both images of a frame in one thread, in milliseconds."""
+    """Measure the CPU time for decoding both images of a frame in one thread, in milliseconds."""
     files = [str(path) for side in sides(case) for path in sorted(side.iterdir())[: case.frames]]
     reader = "opencv" if system == ORBSLAM3 else "vslam"
     command = [sys.executable, "-c", READING, reader]
@@ -214,10 +214,10 @@ def reading_ms(case: Case, system: str) -> float:
 
 
 def run_vslam(case: Case, folder: Path, *words: str) -> Run:
-    """Run vslam. ``words`` are added to its command line.
+    """Run vslam on a case. ``words`` are added to its command line.
 
-    With --no-report, vslam gets no ground truth, because ORB-SLAM3 does not evaluate its trajectory
-    either.
+    With --no-report, vslam gets no ground truth and does not evaluate its trajectory. ORB-SLAM3
+    does not evaluate its trajectory either.
     """
     data = case.data
     if "--no-report" in words:
@@ -251,7 +251,7 @@ def measure_case(
     Each run has its own folder in ``scratch``.
 
     Returns:
-        The runs of each system, without the first round.
+        The runs by the name of the system, without the first round.
     """
     runs: dict[str, list[Run]] = {FULL: [], ORBSLAM3: [], LEAN: [], LIVE: []}
     words = {FULL: (), LEAN: ("--no-report",), LIVE: ("--no-report", "--realtime")}
@@ -279,7 +279,7 @@ def measure_case(
 
 
 def figures(run: Run, case: Case, reading: float) -> dict[str, float]:
-    """The value of each measure for one run; NaN if it is unknown."""
+    """Return the value of each measure for one run; NaN if it is unknown."""
     import numpy as np
 
     from vslam.datasets import open_sequence
@@ -315,7 +315,7 @@ def figures(run: Run, case: Case, reading: float) -> dict[str, float]:
 
 
 def comparison(measured: dict[str, list[dict[str, float]]]) -> str:
-    """A table of medians. If ORB-SLAM3 ran, the table also has the ratios to it."""
+    """Return a table of the medians of each system, and of the ratios to ORB-SLAM3 if it ran."""
     ours = [system for system in measured if system != ORBSLAM3]
     columns = ours + [ORBSLAM3] * (ORBSLAM3 in measured)
     head = [
@@ -334,9 +334,9 @@ def comparison(measured: dict[str, list[dict[str, float]]]) -> str:
 
 
 def spread(values: list[float], form: str) -> str:
-    """A text such as ``median (smallest - largest)``.
+    """Format values as ``median (smallest - largest)``.
 
-    It contains only the median if the smallest and the largest value are printed alike.
+    The text contains only the median if the smallest and the largest value are equal when printed.
     """
     low, high = format(min(values), form), format(max(values), form)
     median = format(statistics.median(values), form)
@@ -344,7 +344,10 @@ def spread(values: list[float], form: str) -> str:
 
 
 def latency(runs: dict[str, list[Run]], case: Case) -> str:
-    """A table of the latency from an image to its pose, and of ORB-SLAM3's tracking times."""
+    """Return a table of the latency from an image to its pose.
+
+    For ORB-SLAM3, the table contains its tracking times.
+    """
     ours = [run.report for run in runs[LIVE]]
     values = [
         spread([report["latency_ms"][key] for report in ours], ".0f")
@@ -366,16 +369,16 @@ def latency(runs: dict[str, list[Run]], case: Case) -> str:
 
 
 def rate(case: Case) -> float:
-    """Frames per second of the recording."""
+    """Return the frame rate at which the sequence of a case was recorded."""
     times = (case.data / "sequences" / case.seq / "times.txt").read_text().split()[: case.frames]
     return (len(times) - 1) / (float(times[-1]) - float(times[0]))
 
 
 def stages(report: dict[str, Any]) -> str:
-    """A table of the wall time of each stage.
+    """Return a table of the wall time of each stage of vslam.
 
-    Stages in the thread pool overlap with other stages. Therefore, the times do not add up to the
-    time of a frame.
+    Stages in the thread pool overlap with other stages. Therefore, the sum of these times is not
+    the time of a frame.
     """
     lines = ["| stage, ms | mean | p50 | p95 | p99 |", "|---|---|---|---|---|"]
     for name, ms in report["stage_ms"].items():
@@ -385,7 +388,7 @@ def stages(report: dict[str, Any]) -> str:
 
 
 def memory(run: Run) -> str:
-    """A sentence about the memory per keyframe.
+    """Return a sentence about the memory per keyframe.
 
     The memory per keyframe is the growth from the first frame to the peak, divided by the number of
     keyframes.
@@ -405,7 +408,7 @@ def memory(run: Run) -> str:
 def measures(
     case: Case, runs: dict[str, list[Run]], reading: dict[str, float]
 ) -> dict[str, list[dict[str, float]]]:
-    """The values of all measures for the runs of each system, except the runs in real time."""
+    """Return the values of all measures by system. Runs in real time are left out."""
     return {
         s: [figures(run, case, reading[ORBSLAM3 if s == ORBSLAM3 else FULL]) for run in runs[s]]
         for s in runs
@@ -419,7 +422,7 @@ def section(
     reading: dict[str, float],
     measured: dict[str, list[dict[str, float]]],
 ) -> str:
-    """The section of the page about a case."""
+    """Return the section of the page that describes the results of a case."""
     return (
         f"## {case.title}\n\nThe drive has {case.frames} frames. Decoding both images of a frame "
         f"takes {reading[FULL]:.1f} ms of CPU time with vslam's reader, and "
@@ -430,9 +433,9 @@ def section(
 
 
 def profile(case: Case) -> str:
-    """A table of the CPU time per frame by stage.
+    """Return a table of the CPU time per frame by stage.
 
-    It is empty if profiling fails, so that the other results are kept.
+    If profiling fails, the text is empty, so that the other results are not lost.
     """
     tool = str(Path(__file__).with_name("profile_frame.py"))
     command = [sys.executable, tool, str(case.data), case.seq, str(case.frames)]
@@ -443,7 +446,7 @@ def profile(case: Case) -> str:
 
 
 def orbslam3_of(options: argparse.Namespace) -> OrbSlam3 | None:
-    """The installation of ORB-SLAM3 that the options name; None if they name none."""
+    """Return the installation of ORB-SLAM3 that the options name; None if they name none."""
     given = (options.orbslam3_python, options.vocabulary)
     if not any(given):
         return None
@@ -473,9 +476,9 @@ def parse_options() -> argparse.Namespace:
 
 
 def setting_of(report: dict[str, Any], system: OrbSlam3 | None, repeats: int) -> str:
-    """A paragraph with the machine, the versions and the number of runs.
+    """Return a paragraph with the machine, the versions and the number of runs.
 
-    The machine and the versions are taken from a report of vslam.
+    The machine and the versions are taken from the report of a run of vslam.
     """
     ask = f"from importlib.metadata import version; print(version('{PACKAGE}'))"
     version = ""
@@ -501,7 +504,10 @@ def anonymous(command: str) -> str:
 
 
 def written(page: Path) -> tuple[str, str]:
-    """The hand-written parts of a page: the text before ``BEGIN``, and the text from ``END``."""
+    """Return the hand-written parts of a page.
+
+    These are the text before ``BEGIN``, and the text that starts at ``END``.
+    """
     text = page.read_text(encoding="utf-8") if page.exists() else ""
     above, begin, rest = text.partition(BEGIN)
     _, end, below = rest.partition(END)
@@ -511,7 +517,7 @@ def written(page: Path) -> tuple[str, str]:
 def write_table(path: Path, cases: dict[str, dict[str, list[dict[str, float]]]]) -> None:
     """Write a table with a row for each case and system.
 
-    A row has the median, the smallest and the largest value of each measure.
+    Each row has the median, the smallest and the largest value of each measure.
     """
     endings = {"": statistics.median, "_least": min, "_greatest": max}
     names = [f"{key}{ending}" for key, *_ in MEASURES for ending in endings]

@@ -5,14 +5,15 @@
     python tools/figures.py --adopt [VERSION]          # stamp files that were made by other means
 
 ``figures.toml`` lists every table and figure with the command that makes it. The command is run by
-bash in the root of the repository. It writes the files, under their names, into the folder
-``$OUT``. ``$TOWNS`` is the folder of rendered towns. Each version of the method has its own
-``$OUT`` in ``runs/figures``. This folder is kept, so that an interrupted command can be resumed.
+bash in the root of the repository. The command writes the files into the folder ``$OUT``. The
+folder ``$TOWNS`` contains rendered towns. Each version of the method has its own folder ``$OUT`` in
+``runs/figures``. The folder ``$OUT`` is kept, so that an interrupted command can be resumed.
 
 The files are then copied to their places in the repository. With ``--quick``, they are copied to
-``build/figures`` instead. For each file, a stamp is written to ``docs/stamps.json`` there. A stamp
-contains the commit, the version of the method, the machine, the seed, the command and the digest of
-the file. Files that have a valid stamp of the current version are not made again.
+``build/figures`` instead. For each file, a stamp is written to ``docs/stamps.json`` in the
+repository or in ``build/figures``. A stamp contains the commit, the version of the method, the
+machine, the seed, the command and the digest of the file. A file is not made again if it has a
+valid stamp of the current version of the method.
 
 sources.py explains how a page names the file from which its numbers are taken.
 """
@@ -46,17 +47,18 @@ KINDS = {".csv", ".json", ".svg", ".png", ".jpg"}  # suffixes of files in docs/ 
 
 @dataclass(frozen=True)
 class Entry:
-    """Files that are made together.
+    """An entry of figures.toml: files that are made by one command.
 
     Attributes:
-        files: paths of the files. An entry with a ``history`` may also have patterns.
+        files: paths of the files. If there is a ``history``, they may also be patterns.
         run: bash command that makes the files.
         quick: bash command that makes short variants of the files.
         needs: environment variables that must be set to a path.
         reads: files of other entries that the commands read.
         seed: seed of the random numbers.
-        trajectories: whether the files depend on the version of the method.
-        tested: the test that compares the files with the code. Such files need no stamp.
+        trajectories: whether the files depend on the version of the SLAM method.
+        tested: name of the test that compares the files with the code. Files with such a test need
+            no stamp.
         history: text that says how the files of a finished experiment were made, if there is no
             command for them.
     """
@@ -72,14 +74,14 @@ class Entry:
     history: str = ""
 
     def paths(self, root: Path) -> list[str]:
-        """The paths of the files. Patterns are replaced by the files that match them."""
+        """Return the paths of the files. Patterns are replaced by the files that match them."""
         found = [sorted(root.glob(one)) if "*" in one else [root / one] for one in self.files]
         return [path.relative_to(root).as_posix() for path in chain(*found)]
 
 
 @dataclass(frozen=True)
 class Stamp:
-    """How a file was made. A field is None if it is unknown, as for some older files."""
+    """A stamp, which records how a file was made. A field is None if it is unknown."""
 
     digest: str
     commit: str
@@ -93,8 +95,8 @@ class Stamp:
 class Report(NamedTuple):
     """The result of a check, as sentences.
 
-    ``faults`` must be repaired. ``older`` names files that are missing, or that were made by
-    another version of the SLAM method (``vslam.METHOD_VERSION``). ``typed`` names pages that have
+    ``faults`` must be repaired. ``older`` names files that are missing, or that were made by a
+    different version of the SLAM method (``vslam.METHOD_VERSION``). ``typed`` names pages that have
     tables without a source.
     """
 
@@ -104,7 +106,7 @@ class Report(NamedTuple):
 
 
 def read_entries(root: Path = ROOT) -> list[Entry]:
-    """The entries of figures.toml. An entry comes after the entries whose files it reads."""
+    """Read the entries of figures.toml. An entry comes after the entries whose files it reads."""
     tables = tomllib.loads((root / "tools" / "figures.toml").read_text())["figure"]
     entries = [
         Entry(**{k: tuple(v) if isinstance(v, list) else v for k, v in one.items()})
@@ -116,26 +118,29 @@ def read_entries(root: Path = ROOT) -> list[Entry]:
 
 
 def read_stamps(folder: Path) -> dict[str, Stamp]:
-    """The stamps by file; empty if there is no stamps.json."""
+    """Read the stamps by file; empty if there is no stamps.json."""
     path = folder / STAMPS
     known = json.loads(path.read_text()) if path.exists() else {}
     return {file: Stamp(**one) for file, one in known.items()}
 
 
 def write_stamps(folder: Path, stamps: dict[str, Stamp]) -> None:
-    """Write stamps.json, sorted by file."""
+    """Write the stamps to stamps.json, sorted by file."""
     (folder / STAMPS).parent.mkdir(parents=True, exist_ok=True)
     content = {file: asdict(stamps[file]) for file in sorted(stamps)}
     (folder / STAMPS).write_text(json.dumps(content, indent=1) + "\n")
 
 
 def digest_of(path: Path) -> str:
-    """The first 16 hexadecimal digits of the file's SHA-256."""
+    """Return the first 16 hexadecimal digits of the SHA-256 digest of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def is_older(stamp: Stamp, entry: Entry) -> bool:
-    """Whether a file depends on the method, and was made by another version of the method."""
+    """Return whether a file was made by a different version of the method than the current one.
+
+    Returns False if the file does not depend on the version.
+    """
     return entry.trajectories and stamp.method != METHOD_VERSION
 
 
@@ -218,7 +223,7 @@ def _run(entry: Entry, command: str, root: Path, target: Path) -> bool:
 
 
 def _stamp(path: Path, entry: Entry, command: str, root: Path, method: int) -> Stamp:
-    """The stamp of a file that has just been made."""
+    """Make the stamp of a file that has just been made."""
     from vslam.report.summary import this_machine
 
     machine = this_machine()
@@ -234,7 +239,7 @@ def _stamp(path: Path, entry: Entry, command: str, root: Path, method: int) -> S
 
 
 def _commit(root: Path) -> str:
-    """The commit that is checked out, with a remark if files outside of docs/ were changed."""
+    """Return the commit that is checked out. If files outside of docs/ were changed, say so."""
     head = _git(root, "rev-parse", "--short", "HEAD")
     changed = _git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs")
     return f"{head} with changes" if changed else head
@@ -250,9 +255,9 @@ def adopt(root: Path, method: int | None = None) -> list[str]:
 
     Args:
         root: root of the repository.
-        method: version of the method, if the commands of figures.toml made the files on this
-            machine. None if it is unknown. A stamp then contains only the commit that wrote the
-            file.
+        method: version of the method with which the commands of figures.toml made the files on this
+            machine. If it is None, the version is unknown, and a stamp contains only the commit
+            that wrote the file.
     """
     stamps, adopted = read_stamps(root), []
     entries = {file: entry for entry in read_entries(root) for file in entry.paths(root)}
@@ -308,31 +313,31 @@ def check(root: Path) -> Report:
 
 
 def pages(root: Path) -> list[Path]:
-    """README and the pages of the documentation, without pages that are generated from the code."""
+    """Find README and the pages of the documentation, except pages that are generated from code."""
     below = sorted((root / "docs").rglob("*.md"))
     made = root / "docs" / "reference"
     return [root / "README.md", *(page for page in below if made not in page.parents)]
 
 
 def used(page: Path, text: str, root: Path) -> set[str]:
-    """The files to which a page links, or which it shows or names as a source."""
+    """Find the files that a page shows, links to, or names as the source of a table."""
     links = re.findall(r"\]\(([^)#\s:]+)\)", text)
     named = {os.path.relpath(os.path.normpath(page.parent / link), root) for link in links}
     return named.union(*map(sources.files_of, sources.COMMENT.findall(text)))
 
 
 def origin(stamp: Stamp) -> str:
-    """The origin of a file as a text, for example ``version 1, commit 0123abc, 2026-11-25``."""
+    """Describe the origin of a file, for example ``version 1, commit 0123abc, 2026-11-25``."""
     version = "before version 1" if stamp.method is None else f"version {stamp.method}"
     return f"{version}, commit {stamp.commit}, {stamp.date[:10]}"
 
 
 def mark_older(page: Path, text: str, root: Path) -> str:
-    """Mark the files on a page that were made by another version of the method.
+    """Mark the files on a page that were made by a different version of the method.
 
     Returns:
-        The text of the page, with a line before each table from such a file, and with a list of
-        these files at the end.
+        The text of the page with marks. There is a line before each table from such a file, and a
+        list of all such files at the end.
     """
     stamps = read_stamps(root)
     older = {

@@ -1,4 +1,4 @@
-"""Fuzz every reader with damaged files.
+"""Test every reader with damaged files (fuzzing).
 
 A reader must quickly return a result or raise an `InputError`. Each input is a small valid file
 that is changed by a seeded mutation. A failure is any other exception, a crash, more than SECONDS
@@ -48,14 +48,14 @@ _SPECIAL = [0, 1, 0x7F, 0xFF, 0x7FFFFFFF, 0xFFFFFFFF, 0x80000000, 0x7FFFFFFFFFFF
 
 @dataclass(frozen=True)
 class Reader:
-    """A reader to fuzz.
+    """A reader that is tested with damaged files.
 
     Attributes:
-        write: writes valid files into a folder.
-        read: reads the files in a folder.
-        changed: pattern of the files to mutate, one file at a time.
+        write: function that writes valid files into a folder.
+        read: function that reads the files in a folder.
+        changed: pattern of the names of the files to damage. One file is damaged at a time.
         mutation: function of the content, a random generator and the file name, which returns the
-            changed content. None uses `mutate`.
+            changed content. If it is None, `mutate` is used.
     """
 
     write: Callable[[Path], object]
@@ -82,7 +82,7 @@ def _use(source) -> None:
 
 
 def _each(read: Callable[[str], object], names: Iterable[str]) -> None:
-    """Read all files. If some of them were rejected, raise one of the errors at the end."""
+    """Read all files. If some files were rejected, raise one of the errors at the end."""
     from vslam.errors import InputError
 
     refused = None
@@ -137,10 +137,10 @@ def _read_map(folder: Path) -> None:
 
 
 def _use_map(folder: Path) -> None:
-    """Use a map in every way.
+    """Use a saved map in every way that vslam offers.
 
-    It is exported, its drive is resumed, and it is continued with a new drive. Images are localised
-    in it, and it is merged with another map.
+    The map is exported. Its drive is resumed, and the map is continued with a new drive. Images are
+    localised in the map. Finally, the map is merged with another map.
     """
     with tempfile.TemporaryDirectory(dir=folder) as out:
         _use_map_in(folder / "map.npz", folder / "other.npz", Path(out))
@@ -249,7 +249,7 @@ _HEADER_VALUES = [
 def _mutate_meaning(data: bytes, rng: np.random.Generator, name: str) -> bytes:
     """Change one or two values in arrays or in the header of a map.
 
-    The types and shapes of the arrays stay unchanged.
+    The types and shapes of the arrays are not changed.
     """
     with np.load(io.BytesIO(data)) as file:
         arrays = {name: file[name].copy() for name in file.files}
@@ -267,7 +267,7 @@ def _mutate_meaning(data: bytes, rng: np.random.Generator, name: str) -> bytes:
 
 
 def _change(flat: np.ndarray, rng: np.random.Generator, length: int) -> None:
-    """Change one, some or all numbers in place."""
+    """Change one, some or all numbers of an array in place."""
     share = rng.choice([0.0, 0.1, 1.0], p=[0.6, 0.2, 0.2])
     at = np.flatnonzero(rng.random(len(flat)) < share)
     if not len(at):
@@ -292,7 +292,7 @@ def _change(flat: np.ndarray, rng: np.random.Generator, length: int) -> None:
 
 
 def _other_number(value: object, rng: np.random.Generator) -> object:
-    """Change one value in JSON data."""
+    """Replace one value in JSON data by a different value."""
     if isinstance(value, dict | list) and value and rng.random() < 0.95:
         keys = list(value) if isinstance(value, dict) else list(range(len(value)))
         key = keys[int(rng.integers(len(keys)))]
@@ -335,7 +335,10 @@ READERS: dict[str, Reader] = {
 
 
 def mutate(data: bytes, rng: np.random.Generator, name: str) -> bytes:
-    """Apply one to four changes to a file. Sometimes, apply one change specific to its format."""
+    """Damage the content of a file: apply one to four changes.
+
+    Sometimes, a single change that is specific to the format of the file is applied instead.
+    """
     if name.endswith(".npz") and rng.random() < 0.6:
         return _mutate_npz(data, rng)
     if data[:8] == b"\x89PNG\r\n\x1a\n" and rng.random() < 0.3:
@@ -349,9 +352,10 @@ def mutate(data: bytes, rng: np.random.Generator, name: str) -> bytes:
 
 
 def _place(data: bytes, rng: np.random.Generator) -> int:
-    """A random position in the data.
+    """Return a random position in the content of a file.
 
-    With a probability of one half, it is in the first 256 bytes, because headers are there.
+    With a probability of one half, the position is in the first 256 bytes, because these contain
+    the header.
     """
     return int(rng.integers(min(len(data), 256) if rng.random() < 0.5 else len(data)))
 
@@ -376,7 +380,7 @@ def _bytes(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _number(data: bytes, rng: np.random.Generator) -> bytes:
-    """Replace a number in a text by another number."""
+    """Replace a number in a text by a different number."""
     found = list(re.finditer(rb"-?\d+(\.\d+)?(e[-+]?\d+)?", data))
     if not found:
         return data
@@ -417,7 +421,7 @@ _GROWING = b"\n".join(
 
 
 def _mutate_npz(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change the values, shape or type of an array, or state a size of 100 GB in a header."""
+    """Change the values, shape or type of an array in an .npz file, or state a size of 100 GB."""
     with np.load(io.BytesIO(data)) as file:
         arrays = dict(file)
     name = str(rng.choice(sorted(arrays)))
@@ -444,7 +448,7 @@ def _mutate_npz(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _mutate_png(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change the size, depth or colour type in the header and correct the checksum."""
+    """Change the size, depth or colour type in the header of a PNG file. Correct the checksum."""
     sizes = [0, 1, 47, 64, 65, 11_000, 100_000, 2**31 - 1]
     width, height = (int(rng.choice(sizes)) for _ in range(2))
     depth, kind = int(rng.choice([1, 8, 16])), int(rng.choice([0, 2, 3, 6]))
@@ -468,10 +472,10 @@ def _reset_peak() -> None:
 
 
 def _work(name: str, first: int, inputs: int, seed: int, scratch: Path) -> None:
-    """Try inputs.
+    """Read damaged inputs in this process.
 
-    A JSON line with the number of each input is printed before it is read, and a line with the
-    outcome afterwards.
+    For each input, a JSON line with its number is printed before it is read. A second line with the
+    outcome is printed afterwards.
     """
     from vslam.errors import InputError
 
@@ -522,7 +526,7 @@ def _work(name: str, first: int, inputs: int, seed: int, scratch: Path) -> None:
 
 
 def fuzz(name: str, inputs: int, seed: int, keep: Path | None = None) -> dict[str, object]:
-    """Fuzz a reader, and return the numbers of read and of rejected inputs, and the failures."""
+    """Test a reader. Return how many inputs were read, how many were rejected, and the failures."""
     tried, read, refused, slowest, most = 0, 0, 0, 0.0, 0.0
     failures: list[dict[str, object]] = []
     with tempfile.TemporaryDirectory(prefix="vslam-fuzz-") as scratch:

@@ -1,8 +1,8 @@
-"""Kill a run at random times and resume it, to test that little work is lost.
+"""Kill runs at random times and resume them, to test that little work is lost.
 
-``kill -9`` ends the run after a random number of frames. For every other run, the script then waits
-for the next autosave and kills the run while it is being written. Afterwards, all files of the run
-are read, and the run is resumed.
+``kill -9`` ends a run after a random number of frames. In every other run, the script first waits
+for the next autosave and kills the run while the autosave is being written. Afterwards, all files
+of the run are read, and the run is resumed.
 
 The table contains the frame at which the run was killed, the number of saved frames, the seconds of
 work that were lost, and the ATE of the whole run. It also tells whether the trajectory is
@@ -35,17 +35,17 @@ BRIEF = ("--no-record", "--no-report", "--quiet")
 
 
 def report_of(folder: Path) -> dict[str, float]:
-    """The report of a finished run."""
+    """Read the report of a finished run."""
     return json.loads((folder / "report.json").read_text())
 
 
 def trajectory_of(folder: Path) -> bytes:
-    """The trajectory of a finished run."""
+    """Read the trajectory file of a finished run."""
     return (folder / "trajectory.tum").read_bytes()
 
 
 def frames_done(folder: Path) -> int:
-    """Number of frames that a run has tracked so far."""
+    """Return the number of frames that a run has tracked so far."""
     try:
         return (folder / ONLINE).read_bytes().count(b"\n")
     except OSError:
@@ -53,15 +53,15 @@ def frames_done(folder: Path) -> int:
 
 
 def is_saving(folder: Path) -> bool:
-    """Whether an autosave is being written."""
+    """Return whether a run is writing an autosave at this moment."""
     return any(folder.glob(".autosave*.part"))
 
 
 def kill_at(words: list[str], out: Path, frame: int, saving: bool) -> tuple[Path, int, float]:
-    """Start a run and kill it.
+    """Start a run, and kill it after some frames.
 
     Returns:
-        The folder of the run, the number of tracked frames, and the seconds since the first one.
+        The folder of the run, the number of tracked frames, and the seconds since the first frame.
     """
     process = subprocess.Popen([*RUN, *words, *BRIEF, "--out", str(out)])
     folder, begin = out / "latest", 0.0
@@ -80,7 +80,8 @@ def saved_frames(folder: Path) -> tuple[int, float]:
     """Read all files of a killed run.
 
     Returns:
-        The number of saved frames, and the wall time of the run until they were saved, in seconds.
+        The number of saved frames, and the wall time of the run until these frames were saved, in
+        seconds.
     """
     read_trajectory(folder / ONLINE)
     if not (folder / MAP).exists():

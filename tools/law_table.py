@@ -12,9 +12,9 @@ TABLE = Path(__file__).parents[1] / "docs" / "howto" / "laws.csv"
 
 
 def table() -> str:
-    """A CSV table with a row for each kind of perturbation.
+    """Return a CSV table with a row for each kind of perturbation.
 
-    It includes the weakest and the strongest value that ``vslam stress`` tries.
+    The columns include the weakest and the strongest value that ``vslam stress`` tries.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -35,7 +35,7 @@ def main() -> None:
 
 
 def tables(report: LoopsJson) -> dict[str, list[Row]]:
-    """The rows of every table, by the name of the table.
+    """Return the rows of all tables by the name of the table.
 
     A table has no rows if the report has no results for it.
     """
@@ -60,7 +60,7 @@ def _share(value: float | None) -> str:
 
 
 def _wide(cells: Iterable[Score], columns: Callable[[Score], Row]) -> list[Row]:
-    """Make a row for each set of images and condition. Each detector has its own columns."""
+    """Make a row for each set of images and each condition. Each detector has its own columns."""
     rows: dict[tuple[str, str], Row] = {}
     for cell in cells:
         row = rows.setdefault(

@@ -4,11 +4,11 @@
 
 DATA is a folder in KITTI's format. The table is in milliseconds. The run has only one thread, so
 that the CPU clock of this thread measures every stage. If a stage calls another stage, the time
-counts only for the inner stage. The total is that of the process, from the start of Python to the
-last written file.
+counts only for the inner stage. The total is the CPU time of the process, from the start of Python
+until the last file is written.
 
-Run the script twice, so that the kernels are loaded from Numba's cache the second time. The time to
-load a kernel counts for the first stage that calls it.
+Run the script twice. In the second run, the kernels are loaded from Numba's cache. The time to load
+a kernel counts for the first stage that calls the kernel.
 """
 
 from __future__ import annotations
@@ -68,7 +68,10 @@ STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
 
 
 class StageClock:
-    """Measures the CPU seconds of this thread by stage, without the time of inner stages."""
+    """Measures the CPU time of this thread in each stage, in seconds.
+
+    If a stage calls another stage, the time counts only for the inner stage.
+    """
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
@@ -98,7 +101,7 @@ class StageClock:
 
 
 def table(seconds: dict[str, float], frames: int) -> str:
-    """A Markdown table with the milliseconds per frame and the share of each stage."""
+    """Return a Markdown table with the milliseconds per frame and the share of each stage."""
     whole = time.process_time()
     rows = [(stage, seconds[stage]) for stage, _ in STAGES]
     rows += [("imports and the rest of the start", whole - sum(s for _, s in rows))]

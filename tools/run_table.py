@@ -26,9 +26,9 @@ def main() -> None:
 
 
 def row_of(run: RunEntry) -> dict[str, object]:
-    """The cells of a run: its drive, its system, the two seeds, and the measures.
+    """Return the row of a run: its drive, its system, two seeds, and its measures.
 
-    The seeds are those of the perturbation and of the town.
+    One seed is that of the perturbation, and the other is that of the rendered town.
     """
     measures = {
         name: "" if run.measures[name] is None else f"{run.measures[name]:.{decimals}f}"

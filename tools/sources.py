@@ -1,7 +1,7 @@
 """Compare the numbers on pages with the CSV files from which they come.
 
 A table in Markdown names its source in a comment before it. Each line of the comment describes one
-row of the table. The last line describes all further rows, too::
+row of the table. The last line also describes all further rows::
 
     <!-- from: docs/x.csv | drive=$1, light=clean | | ate_m (system=ours) | found; missed -->
 
@@ -11,14 +11,14 @@ The fields of a line, separated by ``|``, are:
 - A filter that selects a row of the file. ``$1`` stands for the text of the first cell of the
   table's row. If a part of this text is in backticks, ``$1`` stands for that part. ``$0`` stands
   for the head of the column.
-- A field for each further cell of the table's row. It lists the columns of the file whose values
-  the cell must show, rounded as in the cell. The last field also applies to all further cells. A
-  cell with an empty field is not compared. A filter in parentheses applies to the columns before
-  it. ``mean x``, ``median x`` and ``sum x`` stand for the mean, median and sum of column x over all
-  selected rows.
+- A field for each further cell of the table's row. The field lists columns of the file. The cell
+  must show the values of these columns, rounded as in the cell. The last field also applies to all
+  further cells. If a field is empty, its cell is not compared. A filter in parentheses applies to
+  the columns that precede it in the field. ``mean x``, ``median x`` and ``sum x`` stand for the
+  mean, median and sum of column x over all selected rows.
 
-The line ``-`` skips a row. A comment may also stand before a paragraph. It then names columns whose
-values the paragraph must mention.
+A line that contains only ``-`` skips a row. A comment may also stand before a paragraph. Such a
+comment names columns whose values the paragraph must mention.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ OVER_ROWS = {"mean": mean, "median": median, "sum": sum}
 
 
 def lines_of(comment: str) -> list[str]:
-    """The lines of a source comment."""
+    """Return the lines of a comment that names the source of a table."""
     return [line.strip() for line in comment.strip().splitlines()]
 
 
 def files_of(comment: str) -> set[str]:
-    """The CSV files that a source comment names."""
+    """Return the CSV files that a comment names as sources of a table."""
     return {line.partition("|")[0].strip() for line in lines_of(comment)} - {"-"}
 
 
 def untraced(text: str) -> tuple[int, int]:
-    """The number of tables without a source, and the number of all tables.
+    """Count the tables on a page that name no source, and all tables on the page.
 
     Only tables that contain decimal numbers need a source.
     """
@@ -57,7 +57,7 @@ def untraced(text: str) -> tuple[int, int]:
 
 
 def compare(text: str, root: Path) -> Iterator[str]:
-    """Yield a sentence for each value on a page that differs from its source."""
+    """Compare a page with its sources. Yield a sentence for each value that differs."""
     for found in COMMENT.finditer(text):
         lines, after = lines_of(found[1]), text[found.end() :].partition("\n\n")[0]
         try:
@@ -118,7 +118,7 @@ def _is_rounded(shown: str, value: float) -> bool:
 
 
 def _values(path: Path, filters: str, column: str, row: list[str]) -> list[float | str]:
-    """The numbers and texts of the CSV file that a cell must show.
+    """Return the numbers and texts of the CSV file that a cell of a table must show.
 
     Args:
         row: the head of the column of the cell, followed by all cells of the row.
@@ -143,7 +143,7 @@ def _values(path: Path, filters: str, column: str, row: list[str]) -> list[float
 
 
 def _wanted(filters: str, row: list[str]) -> dict[str, str]:
-    """The filter as values by column, with ``$1`` replaced by the text of ``row[1]``."""
+    """Return a filter as values by column. ``$1`` is replaced by the text of ``row[1]``."""
 
     def text(found: re.Match[str]) -> str:
         cell = row[int(found[1])]

@@ -54,7 +54,7 @@ The other numbers of the method are constants in the code. They are mathematical
 
 
 class Row(NamedTuple):
-    """One threshold: its dotted name, its default, its meaning with the unit, and its source."""
+    """One threshold: its dotted name, its default, its meaning and unit, and its source."""
 
     name: str
     default: str
@@ -63,7 +63,7 @@ class Row(NamedTuple):
 
 
 def descriptions(model: type[BaseModel]) -> dict[str, str]:
-    """The docstring below each field of a class, as one line; empty if there is no docstring."""
+    """Return the docstring below each field of a class as one line. It is empty if missing."""
     (definition,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
     assert isinstance(definition, ast.ClassDef)
     found = {}
@@ -77,7 +77,7 @@ def descriptions(model: type[BaseModel]) -> dict[str, str]:
 
 
 def rows(config: Config, section: str) -> list[Row]:
-    """The thresholds of one section.
+    """Return the thresholds in one section of the configuration.
 
     Raises:
         ValueError: a docstring is missing or does not end with a source.
@@ -94,7 +94,7 @@ def rows(config: Config, section: str) -> list[Row]:
 
 
 def page(config: Config) -> str:
-    """The page for a configuration, with the docstring and a table for each section."""
+    """Return the page for a configuration. Each section has its docstring and a table."""
     lines = [HEAD]
     for section in type(config).model_fields:
         title, _, rest = (type(getattr(config, section)).__doc__ or "").partition("\n\n")

@@ -1,11 +1,12 @@
 """Build the wheel, install it into a clean environment and run it from another folder.
 
-The script finds errors that the tests cannot find: files that are missing in the wheel,
-dependencies that only the development environment has, and imports that work only in the checkout.
-It runs the first frames of a rendered drive, whose ground truth is exact.
+The script finds errors that the tests cannot find. Examples are files that are missing in the
+wheel, dependencies that only the development environment has, and imports that work only in the
+checkout. The script runs vslam on the first frames of a rendered drive, whose ground truth is
+exact.
 
-Each Python that ``--python`` names gets its own environment. With ``--runners``, the wheel is also
-started by pipx and uvx, if they are installed.
+For each Python that ``--python`` names, a separate environment is made. With ``--runners``, the
+wheel is also started using pipx and uvx, if they are installed.
 
 usage: python tools/wheel_test.py [--python python3.12 ...] [--runners]
 """
@@ -28,7 +29,7 @@ MAX_ATE_M = 0.02
 
 
 def run(*command: str | Path, cwd: Path, **environment: str) -> str:
-    """Run a command and return its output. If the command fails, print its output and exit."""
+    """Run a command and return its output. If the command fails, print the output and exit."""
     start = time.perf_counter()
     done = subprocess.run(
         list(map(str, command)), cwd=cwd, capture_output=True, text=True,
@@ -42,7 +43,7 @@ def run(*command: str | Path, cwd: Path, **environment: str) -> str:
 
 
 def check_run(folder: Path) -> None:
-    """Check that all files exist, that no frame is lost, and that the ATE is small."""
+    """Check a run: all files exist, no frame is lost, and the ATE is small."""
     wanted = (
         "report.json report.md report.html config.json map.npz recording.rrd "
         "trajectory_kitti.txt trajectory.tum keyframes.tum"
@@ -57,7 +58,7 @@ def check_run(folder: Path) -> None:
 
 
 def try_environment(python: str, wheel: Path, scratch: Path) -> None:
-    """Install the wheel for a Python version, and run it outside of the checkout."""
+    """Install the wheel for a Python version, and run vslam outside of the checkout."""
     run(python, "-m", "venv", scratch / "env", cwd=scratch)
     binaries = scratch / "env" / "bin"
     pip = binaries / "pip"
@@ -80,7 +81,7 @@ def try_environment(python: str, wheel: Path, scratch: Path) -> None:
 
 
 def try_runners(wheel: Path, scratch: Path) -> None:
-    """Start vslam by ``pipx run`` and ``uvx``, which install the wheel into their own folders."""
+    """Start vslam using ``pipx run`` and ``uvx``. They install the wheel into their own folders."""
     constraints = str(ROOT / "constraints.txt")
     commands = {
         "uvx": ["--no-python-downloads", "--from", wheel, "vslam", "--version"],

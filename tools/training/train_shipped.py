@@ -67,12 +67,12 @@ _VIEW_ARGUMENTS = "05 --seed 41 --pairs 160 --lateral=-3.2:-3.2 --heading 30:30"
 
 
 def _towns(first: int, last: int) -> tuple[str, ...]:
-    """Names of the towns with seeds in a range."""
+    """Return the names of the rendered towns whose seeds are in a range."""
     return tuple(name for name in _renderings() if first <= int(name[-2:]) <= last)
 
 
 def _renderings(pairs: int = 220) -> dict[str, list[str]]:
-    """The arguments of ``vslam synth`` for each folder of pairs, without ``--out``."""
+    """Return the arguments of ``vslam synth`` for each folder of pairs, without ``--out``."""
     found: dict[str, list[str]] = {}
     for first, lateral, heading, towns in _TOWNS:
         for seed, town in enumerate(towns.split(), first):
@@ -87,7 +87,7 @@ def _renderings(pairs: int = 220) -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of the training.
+    """One stage of training the shipped weights.
 
     Attributes:
         name: name of the folder and, by default, of the settings file.
@@ -95,7 +95,7 @@ class Stage:
         pairs: names of the folders of rendered pairs.
         threads: number of threads of ``vslam train``; None for the default.
         network: name of the network.
-        other_settings: name of the settings file; empty if it is ``name``.
+        other_settings: name of the settings file. Empty if the name of the stage is used.
         epochs: number of epochs; None for the number in the settings.
     """
 
@@ -115,7 +115,7 @@ class Stage:
         return out / self.name / f"{self.network}.safetensors"
 
     def finished(self, out: Path) -> bool:
-        """Whether training has finished. The model card then exists, because it is written last."""
+        """Return whether this stage is finished. It is if the model card, the last file, exists."""
         card = self.weights(out).with_suffix(".json")
         return card.exists() and bool(json.loads(card.read_text())["finished"])
 
@@ -150,7 +150,7 @@ PAPER = (
 
 
 def main() -> None:
-    """Parse the command line and run the parts that are not finished."""
+    """Parse the command line, and run the parts of the training that are not finished."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--kitti", type=Path, required=True, help="folder with sequences/")
     parser.add_argument(

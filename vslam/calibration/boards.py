@@ -1,7 +1,7 @@
-"""Calibration boards: their geometry, the detection of their corners, and their recognition.
+"""Calibration boards: describes them, detects their corners, and recognises unknown boards.
 
-Recognition finds out which board the images show, for an error message if it is not the expected
-board.
+Boards are recognised only for error messages. If the images do not show the expected board, the
+message tells which board they show.
 
 A board lies in the plane z = 0 of its frame. The frame of a checkerboard or ChArUco board has x to
 the right, y down and z away from the viewer. The frame of an AprilGrid is that of Kalibr, with x to
@@ -62,13 +62,13 @@ class Board:
 
     Attributes:
         kind: the pattern.
-        columns, rows: numbers of inner corners of a checkerboard, of squares of a ChArUco board, or
-            of tags of an AprilGrid.
+        columns, rows: size of the board. It is the number of inner corners for a checkerboard, of
+            squares for a ChArUco board, and of tags for an AprilGrid.
         square: side of a square in metres. For an AprilGrid, it is the distance from one tag to the
             next.
         marker: side of the black marker or tag in metres; 0 for a checkerboard.
-        dictionary: dictionary of a ChArUco board's markers: OpenCV's name without ``DICT_``, in
-            capitals.
+        dictionary: dictionary of the markers of a ChArUco board. It is OpenCV's name in capitals,
+            without ``DICT_``.
 
     Raises:
         InputError: a size is impossible, or the dictionary is unknown or has too few markers.
@@ -115,7 +115,8 @@ class View:
 
     Attributes:
         name: name of the image, for messages.
-        ids: ``(N,)`` int64 numbers of the corners, which are rows of `board_points`.
+        ids: ``(N,)`` int64 numbers of the corners. Corner ``i`` has its position in row ``i`` of
+            the array that `board_points` returns.
         xy: ``(N, 2)`` float64 positions of the corners in pixels.
     """
 
@@ -125,7 +126,7 @@ class View:
 
 
 def read_board(path: Path) -> Board:
-    """Read a target file of Kalibr: an ``aprilgrid`` or a ``checkerboard``.
+    """Read a Kalibr target file that describes an ``aprilgrid`` or a ``checkerboard``.
 
     Raises:
         InputError: the file describes another kind of board, a key is missing, or a size is
@@ -153,7 +154,7 @@ def read_board(path: Path) -> Board:
 
 
 def board_points(board: Board) -> Array:
-    """``(N, 3)`` float64 positions of the corners in the frame of the board, in metres."""
+    """Return the ``(N, 3)`` float64 positions of the corners in the board's frame, in metres."""
     first = 1 if board.kind == "charuco" else 0  # a ChArUco board's origin is its outer corner
     x, y = np.meshgrid(np.arange(first, board.columns), np.arange(first, board.rows))
     points = np.stack([x, y, np.zeros(x.shape)], axis=-1).reshape(-1, 3) * board.square
@@ -172,11 +173,11 @@ def find_corners(board: Board, image: Image, name: str = "") -> View | None:
 
 
 def same_order(board: Board, left: View, right: View) -> View:
-    """Number the corners of the right view like those of the left view.
+    """Renumber the corners in the right image so that they correspond to those in the left image.
 
-    Some checkerboards look the same upside down, so that their corners may be numbered from either
-    end. With the correct numbering, the offsets between corresponding corners of the two images
-    vary least.
+    Some checkerboards look the same upside down. Their corners may therefore be numbered from
+    either end. The function chooses the numbering for which the offsets between corresponding
+    corners of the two images vary least.
     """
     if board.kind != "checkerboard":
         return right
@@ -187,7 +188,7 @@ def same_order(board: Board, left: View, right: View) -> View:
 
 
 def other_board(board: Board, images: Sequence[Image]) -> str:
-    """Text for an error message that names the board in ``images`` and the options for it.
+    """Return a text that names the board in ``images`` and its options, for an error message.
 
     The text is empty if the images show ``board``, or if no board is recognised.
     """
@@ -223,7 +224,7 @@ def _checkerboard(board: Board, image: Image) -> tuple[NDArray[np.int64], Array]
 
 
 def _reduced(image: Image) -> tuple[Image, float]:
-    """Reduce an image to a size at which a checkerboard is found quickly.
+    """Reduce an image to a size at which OpenCV finds a checkerboard quickly.
 
     Returns:
         The reduced image, and the factor by which it was reduced.
@@ -266,7 +267,7 @@ def _aprilgrid(board: Board, image: Image) -> tuple[NDArray[np.int64], Array] | 
 def _find_tags(
     image: Image, dictionary: str, border: int, most: int | None = None
 ) -> tuple[NDArray[np.int64], Array]:
-    """Find tags of a dictionary in an image.
+    """Find markers or AprilTags of a dictionary in an image.
 
     Args:
         border: number of black bits around a tag.
@@ -292,9 +293,9 @@ def _dictionary(name: str) -> Any:
 
 
 def _refined(board: Board, image: Image, view: View) -> View | None:
-    """Refine the corners to the intersections of their edges, and drop those that move far.
+    """Refine corners to the intersections of the edges around them. Drop corners that move far.
 
-    The window around a corner is so small that it contains no other edges.
+    The window around a corner is chosen so small that it contains no other edges.
     """
     share = {  # half width of the window as a fraction of the distance between neighbouring corners
         "checkerboard": 0.3,
@@ -314,7 +315,10 @@ def _refined(board: Board, image: Image, view: View) -> View | None:
 
 
 def _recognised_checkerboard(images: Sequence[Image]) -> Board | None:
-    """The checkerboard that at least two images show. Its squares are assumed to be 0.1 m wide."""
+    """Recognise a checkerboard that at least two images show.
+
+    Its squares are assumed to be 0.1 m wide.
+    """
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
     sizes: Counter[tuple[int, int]] = Counter()
     for image in images:
@@ -325,7 +329,7 @@ def _recognised_checkerboard(images: Sequence[Image]) -> Board | None:
 
 
 def _recognised_tags(images: Sequence[Image]) -> Board | None:
-    """The ChArUco board or AprilGrid in the image with the most tags.
+    """Recognise a ChArUco board or AprilGrid, using the image that shows the most tags.
 
     Its squares are assumed to be 0.1 m wide.
     """
@@ -350,9 +354,9 @@ def _recognised_tags(images: Sequence[Image]) -> Board | None:
 def _layout(
     kind: Kind, first: int, columns: int, family: str, numbers: NDArray[np.int64], xy: Array
 ) -> tuple[int, Board | None]:
-    """Fit a board of a given number of columns to tags.
+    """Fit a board with a given number of columns to the tags in an image.
 
-    Tag 0 is in column ``first`` of the first row.
+    It is assumed that tag 0 is in column ``first`` of the first row.
 
     Returns:
         The number of tags that fit, and the board; 0 and None if too few tags fit.

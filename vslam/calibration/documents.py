@@ -1,4 +1,4 @@
-"""YAML of calibration files, with typed access to its values.
+"""Reads the YAML of calibration files, and gives typed access to its values.
 
 OpenCV's dialect is accepted: the header ``%YAML:1.0``, ``!!opencv-matrix``, and brackets directly
 after a colon. Scalars are read as text and converted on access. This is necessary because OpenCV
@@ -26,11 +26,11 @@ _NO_SPACE = re.compile(r"^(\s*[\w.]+):(?=\[)", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Document:
-    """A mapping in a YAML file.
+    """A mapping (keys and values) in a YAML file.
 
     Attributes:
         source: name of the file and of the section in it, for error messages.
-        values: text, lists and mappings by key.
+        values: the values by key. A value is text, a list or a mapping.
     """
 
     source: str
@@ -40,33 +40,36 @@ class Document:
         return key in self.values
 
     def section(self, key: str) -> Document:
-        """The mapping at a key."""
+        """Return the mapping that is the value of a key."""
         values = self._value(key)
         if not isinstance(values, Mapping):
             raise InputError(f"{self.source}: {key} must be a section with keys of its own.")
         return Document(f"{self.source}: {key}", values)
 
     def text(self, key: str) -> str:
-        """The value at a key, which must be a scalar, as text."""
+        """Return the value of a key, which must be a scalar, as text."""
         value = self._value(key)
         if not isinstance(value, str):
             raise InputError(f"{self.source}: {key} must be one word.")
         return value
 
     def number(self, key: str) -> float:
-        """The number at a key."""
+        """Return the number that is the value of a key."""
         return self._numbers(key, "one number", 1)[0]
 
     def numbers(self, key: str, *counts: int) -> tuple[float, ...]:
-        """The numbers at a key, as a flat tuple.
+        """Return the numbers that are the value of a key, as a flat tuple.
 
-        If ``counts`` are given, the number of values must be one of them.
+        If ``counts`` are given, the number of numbers must be one of ``counts``.
         """
         wanted = " or ".join(map(str, counts))
         return self._numbers(key, f"{wanted} numbers" if counts else "numbers", *counts)
 
     def matrix(self, key: str, rows: int, columns: int) -> Array:
-        """The ``(rows, columns)`` matrix at a key, written row by row, nested or flat."""
+        """Return the ``(rows, columns)`` matrix at a key.
+
+        The value may be a list of rows, or a flat list of the numbers row by row.
+        """
         found = self._numbers(key, f"{rows}x{columns} numbers", rows * columns)
         return np.array(found).reshape(rows, columns)
 
@@ -136,10 +139,11 @@ def read_document(path: Path) -> Document:
 
 
 def _flat(value: object) -> list[str]:
-    """Flatten nested lists of text.
+    """Flatten nested lists of text to a single list.
 
     Nested YAML aliases can expand a few lines into gigabytes, or form a cycle. Therefore, a list
-    with more items than any matrix is replaced by the text "no number", which the caller rejects.
+    that has more items than any matrix is replaced by the text "no number". The caller rejects this
+    text.
     """
     found: list[str] = []
     waiting = [value]

@@ -49,8 +49,8 @@ _LONGEST_DELAY_S = 0.1  # longest delay between the two images of a pair
 def read_own(documents: Sequence[Document], size: Size | None) -> Calibration:
     """Read vslam's own format.
 
-    Its keys are ``left``, ``right``, ``T_left_right`` or ``baseline``, ``right_delay``,
-    ``depth_scale`` and ``virtual_baseline``.
+    The keys of this format are ``left``, ``right``, ``T_left_right`` or ``baseline``,
+    ``right_delay``, ``depth_scale`` and ``virtual_baseline``.
     """
     (document,) = documents
     _refuse_unknown(document, _OWN_KEYS)
@@ -75,7 +75,7 @@ def read_own(documents: Sequence[Document], size: Size | None) -> Calibration:
 
 
 def _right_delay(document: Document) -> float:
-    """Delay of the right image after the left image in seconds; 0 if the file has none."""
+    """Read the delay of the right image after the left image in seconds; 0 if it is missing."""
     if "right_delay" not in document:
         return 0.0
     delay = document.number("right_delay")
@@ -89,10 +89,10 @@ def _right_delay(document: Document) -> float:
 
 
 def _refuse_contradictions(document: Document) -> None:
-    """Reject keys that contradict each other.
+    """Reject a file of vslam's own format whose keys contradict each other.
 
-    A stereo pair must have exactly one transformation and no keys of depth. A single camera must
-    not have keys of a pair.
+    A stereo pair must have either ``T_left_right`` or ``baseline``, and no keys for depth. A single
+    camera must not have keys for a stereo pair.
     """
     of_pair, of_depth = ([k for k in keys if k in document] for keys in (_PAIR_KEYS, _DEPTH_KEYS))
     if {"T_left_right", "baseline"} <= set(of_pair):
@@ -115,7 +115,7 @@ def _refuse_contradictions(document: Document) -> None:
 def read_kalibr(documents: Sequence[Document], size: Size | None) -> Calibration:
     """Read Kalibr's ``camchain.yaml``.
 
-    ``cam0`` is the left camera. If there is ``cam1``, it is the right camera.
+    ``cam0`` is the left camera, and ``cam1`` is the right camera. ``cam1`` may be missing.
     """
     (document,) = documents
     sections = [document.section(key) for key in ("cam0", "cam1") if key in document]
@@ -145,7 +145,8 @@ def read_euroc(documents: Sequence[Document], size: Size | None) -> Calibration:
 def read_ros(documents: Sequence[Document], size: Size | None) -> Calibration:
     """Read ROS's ``camera_info`` of one or two cameras.
 
-    The file may be a printed message, or a file that ``camera_calibration`` wrote.
+    The file may contain a printed message. It may also be a file that ROS's package
+    ``camera_calibration`` wrote.
     """
     found = [_ros_names(document) for document in documents]
     models = [_matrix_camera(d, d.source, "K", "D", _lens(d, "none"), size) for d in found]
@@ -167,8 +168,8 @@ def read_opencv(documents: Sequence[Document], size: Size | None) -> Calibration
     """Read the files that OpenCV's samples write.
 
     The key of a single camera is ``camera_matrix``. The keys of a stereo pair are ``M1 D1 M2 D2 R
-    T``, in one file or in two. The names ``K1``, or ``cameraMatrix1`` and ``distCoeffs1`` as in
-    OpenCV's manual, are also accepted.
+    T``, which may be in one file or in two files. The key ``K1``, and the keys ``cameraMatrix1``
+    and ``distCoeffs1`` of OpenCV's manual, are also accepted.
     """
     source = _sources(documents)
     document = Document(source, {k: v for each in documents for k, v in each.values.items()})
@@ -235,7 +236,7 @@ def _own_camera(document: Document, size: Size | None) -> CameraModel:
 
 
 def _named_camera(document: Document, distortion: str, size: Size | None) -> CameraModel:
-    """Read a camera of Kalibr's or EuRoC's files, which name the camera and distortion models."""
+    """Read a camera from a Kalibr or EuRoC file, which names the camera and distortion models."""
     if (kind := document.text("camera_model")) != "pinhole":
         raise InputError(
             f"{document.source}: camera_model {kind} is unknown; known is pinhole, with one of "
@@ -290,7 +291,7 @@ def _orbslam2_unrectified(document: Document, size: Size | None) -> Calibration:
 
 
 def _ros_names(document: Document) -> Document:
-    """Rename the keys of a ``camera_calibration`` file to those of a printed message."""
+    """Rename the keys of a ``camera_calibration`` file to those of a printed ``camera_info``."""
     names = {
         "camera_matrix": "K",
         "distortion_coefficients": "D",
@@ -308,9 +309,9 @@ def _ros_names(document: Document) -> Document:
 
 
 def _lens(document: Document, unnamed: str = "") -> Lens:
-    """The lens of the distortion model that a file names.
+    """Return the kind of lens (pinhole or fisheye) of the distortion model that a file names.
 
-    If the file names no model, the model ``unnamed`` is used.
+    If the file names no distortion model, the model ``unnamed`` is used.
     """
     word = document.text("distortion_model") or unnamed
     if word not in _LENSES:
@@ -322,7 +323,10 @@ def _lens(document: Document, unnamed: str = "") -> Lens:
 
 
 def _size_of(document: Document, size: Size | None, *keys: str) -> Size:
-    """Width and height at one or two keys. If the file has no such key, ``size`` is returned."""
+    """Read the width and height of the images, which are at one or two keys.
+
+    If the file has no such key, ``size`` is returned.
+    """
     if keys[0] not in document and size is not None:
         return size
     width, height = document.numbers(keys[0], 2) if len(keys) == 1 else map(document.number, keys)
@@ -381,7 +385,7 @@ def _pair(source: str, left: CameraModel, right: CameraModel, T_left_right: Arra
 
 
 def _unrectified(R_left: Array, R_right: Array, P: Array, source: str) -> Array:
-    """Compute ``T_left_right`` of the cameras before rectification.
+    """Compute ``T_left_right`` of the unrectified cameras from the matrices of the rectification.
 
     Args:
         R_left: ``(3, 3)`` rotation of the left camera into the rectified frame.

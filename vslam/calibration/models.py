@@ -1,8 +1,8 @@
 """Camera models: pinhole with radial-tangential distortion, and equidistant (Kannala-Brandt).
 
-In the camera frame, x points right, y down and z forward. The centre of the upper left pixel is
-(0, 0). The formulas are those of OpenCV's documentation of ``calib3d`` (radial-tangential) and of
-``fisheye`` (equidistant; Kannala and Brandt, PAMI 2006, equation 6).
+In the camera frame, x points right, y down and z forward. The centre of the upper left pixel is (0,
+0). The formulas are those of OpenCV's documentation: ``calib3d`` for radial-tangential distortion,
+and ``fisheye`` for equidistant distortion (Kannala and Brandt, PAMI 2006, equation 6).
 """
 
 from __future__ import annotations
@@ -24,15 +24,16 @@ _SOLVED_PX = 1e-3  # largest distance between a pixel and the projection of its 
 
 @dataclass(frozen=True)
 class CameraModel:
-    """The intrinsic parameters of one camera, which map rays to pixels.
+    """The intrinsic parameters of one camera.
 
     Attributes:
         fx, fy: focal lengths in pixels.
         cx, cy: principal point in pixels.
         width, height: image size in pixels.
         lens: ``pinhole`` or ``fisheye`` (equidistant).
-        distortion: coefficients in OpenCV's order. A pinhole has none, or ``k1 k2 p1 p2``, which
-            may be followed by ``k3``, or by ``k3 k4 k5 k6``. A fisheye has ``k1 k2 k3 k4``.
+        distortion: coefficients in OpenCV's order. A pinhole camera has no coefficients, or ``k1 k2
+            p1 p2``, or ``k1 k2 p1 p2 k3``, or ``k1 k2 p1 p2 k3 k4 k5 k6``. A fisheye camera has
+            ``k1 k2 k3 k4``.
     """
 
     fx: float
@@ -46,7 +47,7 @@ class CameraModel:
 
     @property
     def undistorted(self) -> bool:
-        """Whether the camera is a pinhole without distortion."""
+        """Whether the camera is a pinhole camera without distortion."""
         return self.lens == "pinhole" and not any(self.distortion)
 
 
@@ -57,10 +58,10 @@ class Calibration:
     Attributes:
         left: the left camera, or the only camera.
         right: the right camera; None for a single camera.
-        T_left_right: ``(4, 4)`` float64. It maps points from the right camera's frame to the left
-            camera's frame. None if there is no right camera.
+        T_left_right: ``(4, 4)`` float64. It maps points from the frame of the right camera to the
+            frame of the left camera. None if there is no right camera.
         depth_scale: depth image units per metre; None if the file has none.
-        virtual_baseline: baseline in metres with which depth is converted to disparity; None if the
+        virtual_baseline: baseline in metres that is used to convert depth to disparity; None if the
             file has none.
         right_delay: delay of the right image after the left image, in seconds.
         source: the file or files from which the calibration was read, for error messages.
@@ -75,15 +76,15 @@ class Calibration:
     source: str = field(default="the calibration", compare=False)
 
     def left_alone(self) -> Calibration:
-        """The left camera without the right one."""
+        """Return the calibration of the left camera without the right camera."""
         return replace(self, right=None, T_left_right=None, right_delay=0.0)
 
 
 def project(model: CameraModel, rays: Array) -> Array:
     """Project ``(N, 3)`` points in the camera frame to ``(N, 2)`` float64 pixels.
 
-    The result is NaN for points that have no projection. These are points behind a pinhole camera,
-    and points on the negative z axis of a fisheye camera.
+    The result is NaN for points that have no projection. A pinhole camera cannot project points
+    behind it. A fisheye camera cannot project points on the negative z axis.
     """
     x, y, z = rays.T
     if model.lens == "fisheye":
@@ -100,11 +101,13 @@ def project(model: CameraModel, rays: Array) -> Array:
 
 
 def unproject(model: CameraModel, xy: Array) -> Array:
-    """Viewing rays of ``(N, 2)`` pixels, as ``(N, 3)`` float64 unit vectors in the camera frame.
+    """Compute the viewing rays of ``(N, 2)`` pixels.
+
+    Returns ``(N, 3)`` float64 unit vectors in the camera frame.
 
     The ray of a pixel is NaN if the distortion cannot be inverted there. This happens if Newton's
-    method does not converge. It also happens if the distortion folds the image between the
-    principal point and the pixel.
+    method does not converge. It also happens if the distortion is not monotonic between the
+    principal point and the pixel, so that the image is folded there.
     """
     plane = (xy - (model.cx, model.cy)) / (model.fx, model.fy)
     if model.lens == "fisheye":
@@ -166,7 +169,7 @@ def _undistorted(distortion: tuple[float, ...], wanted: Array) -> Array:
 
 
 def _bent(distortion: tuple[float, ...], angle: Array) -> Array:
-    """Distance of a ray's pixel from the principal point, in focal lengths.
+    """Return how far from the principal point a ray is projected, in focal lengths.
 
     Args:
         angle: angle between the ray and the optical axis in radians.
@@ -189,9 +192,12 @@ def _unbent(distortion: tuple[float, ...], radius: Array) -> Array:
 
 
 def _folds(reach: list[Array]) -> NDArray[np.bool_]:
-    """Whether the distance from the principal point decreases anywhere towards larger angles.
+    """Return whether the projected distances of rays decrease anywhere towards larger angles.
+
+    The distortion then folds the image.
 
     Args:
-        reach: distances from the principal point for increasing angles to the optical axis.
+        reach: distances from the principal point at which rays are projected. The angles of the
+            rays to the optical axis increase.
     """
     return np.any(~(np.diff(reach, axis=0) >= 0.0), axis=0)

@@ -1,9 +1,9 @@
-"""Rectification: warping images to those of an undistorted pinhole camera or aligned stereo pair.
+"""Warps images to those of an undistorted pinhole camera or of an aligned stereo pair.
 
-The x axis of the rectified pair is the baseline. Its viewing direction is as close as possible to
-the mean direction of the two cameras. The rectified images show the largest rectangle that both
-original images cover. They have no black pixels, because features on a black border would not move
-with the scene.
+The x axis of the rectified pair is the baseline. The viewing direction of the rectified pair is as
+close as possible to the mean viewing direction of the two cameras. The rectified images show the
+largest rectangle that both original images cover. The rectified images have no black border,
+because features on such a border would not move with the scene.
 
 OpenCV's functions are not used for this, because they can leave black corners.
 ``cv2.stereoRectify`` estimates the rectangle from a 9x9 grid, and ``cv2.fisheye.stereoRectify``
@@ -42,14 +42,15 @@ class Rectification:
         camera: the rectified camera or pair.
         R_left_rectified: ``(3, 3)`` float64. It maps directions from the frame of the rectified
             left camera to the frame of the original left camera. Both frames have the same origin.
-        left: rectifies a left image, ``(H, W)`` uint8 of the calibrated size, by bilinear
-            interpolation. The result has the size of the left camera's images. An image that needs
-            no rectification is returned unchanged.
-        right: the same for a right image. Without a right camera, images are returned unchanged.
-        left_depth: the same for a depth image of any type, by nearest neighbour. It is valid only
-            if rectification does not rotate the camera, because depth is measured along the
-            camera's axis.
-        identity: whether images are returned unchanged.
+        left: function that rectifies a left image, ``(H, W)`` uint8 of the calibrated size, by
+            bilinear interpolation. The result has the size of the left camera's images. An image
+            that needs no rectification is returned unchanged.
+        right: function that does the same for a right image. If there is no right camera, the
+            function returns images unchanged.
+        left_depth: function that rectifies a depth image of any type by nearest-neighbour
+            interpolation. The result is valid only if rectification does not rotate the camera,
+            because depth is measured along the camera's axis.
+        identity: whether the functions return all images unchanged.
     """
 
     camera: Camera
@@ -61,11 +62,13 @@ class Rectification:
 
 
 def rectify(calibration: Calibration) -> Rectification:
-    """Compute the rectification. Its functions may be called from several threads.
+    """Compute the rectification of a camera or a stereo pair.
+
+    The functions of the result may be called from several threads.
 
     Raises:
-        InputError: the cameras are not side by side, they look in different directions, they are
-            swapped, or a distortion cannot be inverted within the image.
+        InputError: the two cameras are not side by side, look in different directions or are
+            swapped. Also if a distortion cannot be inverted within the image.
     """
     left, right, source = calibration.left, calibration.right, calibration.source
     if right is None or calibration.T_left_right is None:
@@ -124,7 +127,7 @@ def _is_rectified(
 
 
 def _between(R_left_right: Array, centre: Array, source: str) -> Array:
-    """Compute ``R_left_rectified``.
+    """Compute ``R_left_rectified``, the rotation from the rectified to the original left camera.
 
     The x axis of the rectified frame is along the baseline. The z axis is as close as possible to
     the mean viewing direction of the two cameras.
@@ -164,9 +167,9 @@ def _between(R_left_right: Array, centre: Array, source: str) -> Array:
 
 
 def _common_view(source: str, cameras: list[tuple[CameraModel, Array]], baseline: float) -> Camera:
-    """The pinhole camera with the widest view that all images cover.
+    """Return the pinhole camera with the widest field of view that all original images cover.
 
-    Its image size is that of the left camera.
+    The pinhole camera has the image size of the left camera.
     """
     bounds = np.array([_inner_rectangle(model, R, source) for model, R in cameras])
     (x0, y0), (x1, y1) = bounds[:, 0].max(axis=0), bounds[:, 1].min(axis=0)
@@ -187,11 +190,11 @@ def _common_view(source: str, cameras: list[tuple[CameraModel, Array]], baseline
 
 
 def _inner_rectangle(model: CameraModel, R_own_rectified: Array, source: str) -> Array:
-    """The rectangle on the plane z = 1 of the rectified camera that the image covers.
+    """Find a rectangle, on the plane z = 1 of the rectified camera, that the image fully covers.
 
-    Each side of the rectangle touches a border of the image, at the border pixel nearest to the
-    centre. The distortion polynomial of a wide lens may fold the corners of the image. Therefore,
-    pixels that cannot be unprojected are ignored.
+    Each side of the rectangle touches a border of the image at the border pixel that is nearest to
+    the centre. Pixels that cannot be unprojected are ignored, because the distortion polynomial of
+    a wide lens may fold the corners of the image.
 
     Returns:
         ``[[x0, y0], [x1, y1]]``, two opposite corners of the rectangle.
@@ -210,7 +213,10 @@ def _inner_rectangle(model: CameraModel, R_own_rectified: Array, source: str) ->
 
 
 def _check_view(model: CameraModel, R_own_rectified: Array, camera: Camera, source: str) -> None:
-    """Reject a rectified view if the original image shows a part of it twice or not at all."""
+    """Reject a rectified camera if the original image shows its view twice or not at all.
+
+    This applies to every part of the view.
+    """
     xy = np.concatenate(_borders(camera.width, camera.height))
     rays = camera.backproject(xy, np.ones(len(xy))) @ R_own_rectified.T
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -220,7 +226,7 @@ def _check_view(model: CameraModel, R_own_rectified: Array, camera: Camera, sour
 
 
 def _borders(width: int, height: int) -> tuple[Array, ...]:
-    """``(N, 2)`` pixels of the left, upper, right and lower border of an image."""
+    """Return the ``(N, 2)`` pixels on the left, upper, right and lower border of an image."""
     across, down = np.arange(float(width)), np.arange(float(height))
     top, left = np.zeros(width), np.zeros(height)
     return (
@@ -239,7 +245,10 @@ def _folded(source: str) -> InputError:
 
 
 def _maps(model: CameraModel, R_own_rectified: Array, camera: Camera) -> NDArray[np.float32]:
-    """``(H, W, 2)`` float32 position of each rectified pixel in the original image, in pixels."""
+    """Compute where each rectified pixel lies in the original image.
+
+    Returns ``(H, W, 2)`` float32 positions in pixels.
+    """
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     rays = np.stack(
         [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1
@@ -249,9 +258,9 @@ def _maps(model: CameraModel, R_own_rectified: Array, camera: Camera) -> NDArray
 
 
 def _linear(maps: NDArray[np.float32]) -> Callable[[Image], Image]:
-    """Make a function that interpolates bilinearly with a resolution of 1/32 pixel.
+    """Make a function that warps an image bilinearly, with a resolution of 1/32 pixel.
 
-    This fixed-point interpolation is three times as fast as interpolation in floating point.
+    The interpolation uses fixed-point numbers, which is three times as fast as floating point.
     """
     import cv2
 

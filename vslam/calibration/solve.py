@@ -1,7 +1,8 @@
-"""Estimation of one or two cameras, and of the transformation between them, from views of a board.
+"""Estimates one camera, or two cameras and their transformation, from views of a board.
 
-OpenCV estimates the cameras. This module selects views, drops those that do not fit, and measures
-residuals with vslam's own camera models.
+OpenCV estimates the cameras. This module selects views, drops views that do not fit, and measures
+residuals using vslam's own camera models. A *view* contains the corners of the board that one image
+shows.
 """
 
 from __future__ import annotations
@@ -34,15 +35,16 @@ _SAME_VIEW = 0.02  # in image sizes; if the outline moves less, the board is at 
 
 @dataclass(frozen=True)
 class CameraFit:
-    """A camera, estimated from V views.
+    """A camera that was estimated from V views of a board.
 
     Attributes:
         model: the camera.
         views: the V views.
-        residuals: for each view, the ``(N, 2)`` float64 corners in the image minus the projected
-            corners of the board, in pixels.
+        residuals: ``(N, 2)`` float64 residuals of the N corners in each view, in pixels. A residual
+            is the position of a corner in the image minus the projected corner of the board.
         T_camera_board: ``(V, 4, 4)`` float64 pose of the board in each view.
-        dropped: names of views that do not fit, with their RMS errors in pixels.
+        dropped: names of the views that were dropped because they do not fit, with their RMS errors
+            in pixels.
     """
 
     model: CameraModel
@@ -53,20 +55,21 @@ class CameraFit:
 
     @property
     def errors(self) -> Array:
-        """``(V,)`` float64 RMS error of each view in pixels."""
+        """``(V,)`` float64 RMS errors of the views in pixels."""
         return np.array([rms(residuals) for residuals in self.residuals])
 
 
 @dataclass(frozen=True)
 class PairFit:
-    """The transformation between two cameras, estimated from P pairs of views.
+    """The transformation between two cameras, which was estimated from P pairs of views.
 
     Attributes:
         T_left_right: ``(4, 4)`` float64. It maps points from the right camera's frame to the left
             camera's frame.
-        errors: ``(P,)`` float64 RMS distance between the corners in the right image and the corners
-            predicted from the left image, for each pair, in pixels.
-        dropped: names of pairs that do not fit, with their errors.
+        errors: ``(P,)`` float64 RMS errors of the pairs in pixels. The error of a corner is its
+            distance in the right image from the position that is predicted from the left image.
+        dropped: names of the pairs that were dropped because they do not fit, with their RMS errors
+            in pixels.
     """
 
     T_left_right: Array
@@ -76,9 +79,9 @@ class PairFit:
 
 @dataclass(frozen=True)
 class Estimate:
-    """One camera, or the two cameras of a stereo pair and the transformation between them.
+    """The estimate of one camera, or of two cameras and the transformation between them.
 
-    The left camera is the first one.
+    The first camera is the left camera.
     """
 
     cameras: tuple[CameraFit, ...]
@@ -94,19 +97,20 @@ class Estimate:
 
 
 def rms(residuals: Array) -> float:
-    """Root mean square of the lengths of ``(N, 2)`` residuals."""
+    """Return the root mean square of the lengths of ``(N, 2)`` residuals."""
     return float(np.sqrt((residuals**2).sum(axis=1).mean()))
 
 
 def estimate(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], lens: Lens) -> Estimate:
-    """Estimate one camera, or a stereo pair if there are two ``sizes``.
+    """Estimate one camera, or a stereo pair if ``sizes`` has two entries.
 
     Args:
         board: the board that the images show.
-        frames: the view in every image, or the two views in every pair of images. The corners of
-            the two views must have the same numbers (`vslam.calibration.boards.same_order`).
+        frames: one view of the board for each image, or two views for each pair of images. In the
+            two views of a pair, a corner must have the same number
+            (`vslam.calibration.boards.same_order`).
         sizes: width and height of each camera's images.
-        lens: kind of lens.
+        lens: kind of lens, ``pinhole`` or ``fisheye``.
 
     Raises:
         InputError: a camera does not see the board, or `fit_camera` or `fit_pair` fails.
@@ -135,8 +139,9 @@ def diverse(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], n: int
     """Select at most ``n`` frames in which the positions of the board differ most.
 
     The frames are selected one after the other (farthest-point selection). The next frame is always
-    the one in which the outline of the board differs most from that in all selected frames. If the
-    board is at rest, only one frame is selected. Frames without the board are left out.
+    the one in which the outline of the board differs most from the outlines in all frames that are
+    already selected. If the board is at rest, only one frame is selected. Frames without the board
+    are left out.
     """
     frames = [views for views in frames if any(views)]
     outlines = np.array(
@@ -151,10 +156,10 @@ def diverse(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], n: int
 
 
 def _outline(board: Board, view: View | None, size: Size) -> Array:
-    """The four corners of the board's outline, as ``(8,)`` coordinates in image sizes.
+    """Return the four corners of the board's outline, as ``(8,)`` multiples of the image size.
 
-    They are computed by a homography, because some of them may be out of view. They are clipped to
-    half an image size beyond the image.
+    The corners of the outline are computed by a homography, because some of them may be out of
+    view. They are clipped to half an image size beyond the image.
     """
     points = board_points(board)[:, :2]
     H = None if view is None else cv2.findHomography(points[view.ids], view.xy)[0]
@@ -165,7 +170,7 @@ def _outline(board: Board, view: View | None, size: Size) -> Array:
 
 
 def fit_camera(board: Board, views: Sequence[View], size: Size, lens: Lens) -> CameraFit:
-    """Estimate a camera.
+    """Estimate a camera from views of a board.
 
     The distortion of a pinhole camera has the coefficients ``k1 k2 p1 p2``, and that of a fisheye
     camera ``k1 k2 k3 k4``. Views whose error exceeds three times the median are dropped, and the
@@ -225,9 +230,9 @@ def fit_camera(board: Board, views: Sequence[View], size: Size, lens: Lens) -> C
 
 
 def fit_pair(board: Board, left: CameraFit, right: CameraFit) -> PairFit:
-    """Estimate the transformation between two cameras from their views with the same name.
+    """Estimate the transformation between two cameras from pairs of views with the same name.
 
-    Pairs with large errors are dropped, as `fit_camera` drops views.
+    Pairs with large errors are dropped in the same way as `fit_camera` drops views.
 
     Raises:
         InputError: fewer than three pairs remain.
@@ -271,9 +276,9 @@ def fit_pair(board: Board, left: CameraFit, right: CameraFit) -> PairFit:
 def _without_outliers(
     names: Sequence[str], fit: Callable[[Sequence[int]], _Fit], found_in: str, fix: str
 ) -> _Fit:
-    """Fit all views, and repeat the fit without the views whose error is large.
+    """Fit all views. Then drop the views with large errors, and repeat the fit.
 
-    The fit is repeated until no error is large.
+    This is repeated until no error is large.
 
     Raises:
         InputError: too few views remain. ``found_in`` and ``fix`` are parts of the message.

@@ -1,4 +1,4 @@
-"""Readers of data sets, which provide calibrated frames with time stamps.
+"""Readers of data sets. Each reader provides calibrated frames with time stamps.
 
 Each reader checks its input once, before it provides the frames.
 """
@@ -36,16 +36,18 @@ def open_sequence(
     Args:
         dataset: one of `DATASETS`, or the name of a data set that a plug-in reads.
         root: folder of the data set. It is ignored for rendered towns, which are rendered into the
-            user's cache on first use.
+            user's cache when they are first used.
         name: name of the sequence. None opens sequence 00 of KITTI or of the rendered towns. For
             EuRoC and TUM, None opens the only sequence in ``root``.
         start: index of the first frame to read.
         every: read only every ``every``-th frame.
         max_frames: largest number of frames to read; None reads all.
         monocular: read only the left camera.
-        calib: calibration files (docs/howto/cameras.md), which replace the data set's own.
+        calib: calibration files (docs/howto/cameras.md), which are used instead of the calibration
+            in the data set.
         depth_scale: depth image units per metre, for RGB-D data only.
-        on_render: called with the number of frames rendered so far and the total number.
+        on_render: called after each rendered frame, with the number of frames that are rendered so
+            far and the total number.
 
     Raises:
         InputError: the data set is unknown, its plug-in is broken, or the reader rejects the data.

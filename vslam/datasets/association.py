@@ -1,7 +1,7 @@
-"""Association by time.
+"""Associates images and poses by their times.
 
-This module pairs images that were taken at nearly the same time, and interpolates the ground truth
-at the times of frames.
+`associate` pairs images that were taken at nearly the same time. `poses_at` interpolates the ground
+truth at the times of the frames.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ _FEW, _MANY = 0.01, 0.1
 def associate(
     first: NDArray[np.float64], second: NDArray[np.float64], max_difference: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pair times that are less than ``max_difference`` apart.
+    """Pair the times of two lists that are less than ``max_difference`` apart.
 
     The closest pairs are formed first, and each time is used at most once.
 
     Args:
         first: ``(N,)`` seconds, increasing.
         second: ``(M,)`` seconds, increasing.
-        max_difference: seconds.
+        max_difference: upper limit of the difference between the times of a pair, in seconds.
 
     Returns:
-        The indices of the P pairs: ``(P,)`` increasing indices into ``first``, and ``(P,)`` indices
-        into ``second``.
+        Two arrays that describe the P pairs: ``(P,)`` increasing indices into ``first``, and
+        ``(P,)`` indices into ``second``.
     """
     low = np.searchsorted(second, first - max_difference, side="right")
     high = np.searchsorted(second, first + max_difference, side="left")
@@ -59,19 +59,20 @@ def associate(
 
 @dataclass
 class Pairing:
-    """Counts of the images that a reader pairs by time, and of the images that it leaves out.
+    """Counts how many images a reader pairs by time, and how many images it leaves out.
 
-    The reader of a stream counts the images while it reads them. Readers do not log the warnings.
-    The summary and the report of a run, ``vslam doctor`` and ``vslam calibrate`` show them.
+    The reader of a stream counts the images while it reads them. Readers do not log the warnings of
+    this class. Instead, the summary and the report of a run, ``vslam doctor`` and ``vslam
+    calibrate`` show them.
 
     Attributes:
-        source: file or folder that messages name.
-        partner: what each image is paired with, such as ``depth image``.
+        source: name of the file or folder, for messages.
+        partner: name of the images with which the images are paired, such as ``depth image``.
         within_s: largest difference between the times of a pair, in seconds.
         fix: what the user can do if images are left out.
         n_pairs: number of pairs.
         left_out: times of the images without a partner, in seconds.
-        seconds: times of all possible partners, in seconds.
+        seconds: times of all images that can be partners, in seconds.
     """
 
     source: Path
@@ -103,11 +104,11 @@ class Pairing:
 
     @property
     def is_poor(self) -> bool:
-        """Whether more than a tenth of the images are left out, so that tracking suffers."""
+        """Whether so many images are left out (more than a tenth) that tracking suffers."""
         return len(self.left_out) > _MANY * (len(self.left_out) + self.n_pairs)
 
     def warnings(self) -> list[str]:
-        """A warning if more than a hundredth of the images are left out, otherwise an empty list.
+        """One warning if more than a hundredth of the images are left out, otherwise none.
 
         The warning states how many images are left out, the reason, and what the user can do.
         """
@@ -123,7 +124,7 @@ class Pairing:
         Args:
             times: ``(N,)`` times of the images, in seconds.
             paired: ``(P,)`` indices of the images that have a partner.
-            seconds: ``(M,)`` times of the possible partners, in seconds.
+            seconds: ``(M,)`` times of the images that can be partners, in seconds.
         """
         self.n_pairs = len(paired)
         self.left_out = np.delete(times, paired).tolist()
@@ -136,10 +137,10 @@ class Pairing:
         self.seconds.clear()
 
     def _gaps(self) -> NDArray[np.float64]:
-        """Time between each image that is left out and the nearest possible partner, in seconds.
+        """Return the time between each left-out image and the nearest possible partner, in seconds.
 
-        The nearest possible partner may be paired with another image. The time is infinite if there
-        are no possible partners.
+        The nearest possible partner may be paired with a different image. The time difference is
+        infinite if there are no possible partners.
         """
         times = np.array(self.left_out)
         if not self.seconds:
@@ -153,16 +154,18 @@ class Pairing:
 def poses_at(
     source: Path, measured: Trajectory, times: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """Interpolate poses at given times: positions linearly, rotations by slerp.
+    """Interpolate the poses of the ground truth at given times.
+
+    Positions are interpolated linearly. Rotations are interpolated by slerp.
 
     Args:
-        source: file of the ground truth, for the log.
+        source: name of the ground-truth file, for the log.
         times: ``(N,)`` seconds.
 
     Returns:
-        ``(N, 4, 4)`` float64 ``T_wc``. Poses are NaN before the first measurement, after the last
-        one, and in gaps longer than 0.15 s. If no time has a pose, a warning is logged and None is
-        returned.
+        ``(N, 4, 4)`` float64 ``T_wc``. A pose is NaN if its time is before the first measurement,
+        after the last one, or in a gap longer than 0.15 s. If no time has a pose, the function logs
+        a warning and returns None.
     """
     from scipy.spatial.transform import Rotation, Slerp
 

@@ -1,4 +1,4 @@
-"""ROS 1 bags, ROS 2 bags and MCAP files, read by the library rosbags.
+"""Reads ROS 1 bags, ROS 2 bags and MCAP files, using the library rosbags.
 
 Images are ``sensor_msgs/Image`` or ``CompressedImage`` messages. Their time stamps are taken from
 the message headers.
@@ -64,8 +64,8 @@ class BagSource(RawSource):
 
     Attributes:
         path: the bag's file or folder.
-        topics: the topic of the left images. If right images or depth are used, their topic is
-            second.
+        topics: the topic of the left images. If right images or depth images are used, their topic
+            is the second entry.
     """
 
     path: Path
@@ -84,15 +84,16 @@ def open_bag(
     Args:
         path: ``.bag``, ``.mcap`` or ``.db3``, or the folder of a ROS 2 bag.
         topics: the topic of the left images, followed by the topic of the right images or of the
-            depth. If empty, the bag must have exactly as many image topics as the sensor needs. The
-            left images are then those of the first topic in alphabetical order.
-        sensor: ``stereo``, ``rgbd`` or ``mono``. With ``mono``, only the first topic is read. None
-            chooses the sensor by the content of the topics.
+            depth images. If ``topics`` is empty, the bag must have exactly as many image topics as
+            the sensor needs. In this case, the first topic in alphabetical order contains the left
+            images.
+        sensor: ``stereo``, ``rgbd`` or ``mono``. With ``mono``, only the first topic is read. If it
+            is None, the sensor is derived from the content of the topics.
         depth_scale: depth image units per metre; None derives it from the encoding.
 
     Raises:
         InputError: rosbags is not installed, the bag is missing or truncated, topics are missing,
-            the images have no time stamps, they cannot be decoded, or they form no pairs.
+            or the images have no time stamps, cannot be decoded or form no pairs.
     """
     path = Path(path)
     if not path.exists():
@@ -184,11 +185,11 @@ def find_calibration(source: BagSource) -> Calibration | None:
     """Read the calibration from the ``camera_info`` topics that belong to the image topics.
 
     Returns:
-        The calibration. None if a ``camera_info`` topic is missing, or if its focal length is 0
-        because the camera is not calibrated.
+        The calibration. None if a ``camera_info`` topic is missing. Also None if a focal length is
+        0, which means that the camera is not calibrated.
 
     Raises:
-        InputError: a ``camera_info`` cannot be read, or is not a valid calibration.
+        InputError: a ``camera_info`` message cannot be read, or is not a valid calibration.
     """
     path = source.path
     documents = []
@@ -270,9 +271,9 @@ def _opened(path: Path) -> Iterator[Bag]:
 
 
 def _check_metadata(file: Path) -> None:
-    """Reject a large metadata file.
+    """Reject a metadata file that is so large that rosbags would need too much time and memory.
 
-    For each byte of the file, rosbags needs 30 us and 300 bytes of memory.
+    rosbags needs 30 us and 300 bytes of memory for each byte of the file.
 
     Raises:
         ValueError: the file is too large.
@@ -282,10 +283,10 @@ def _check_metadata(file: Path) -> None:
 
 
 def _messages(bag: Bag, path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, Message]]:
-    """Yield the messages of these topics, each with its topic, in the recorded order.
+    """Yield each message of the given topics together with its topic, in the recorded order.
 
     Raises:
-        BrokenSourceError: after the last good message of a damaged bag.
+        BrokenSourceError: the bag is damaged. The messages before the damage are yielded first.
     """
     connections = [c for c in bag.connections if c.topic in topics]
     try:
@@ -308,10 +309,10 @@ def _tolerance(depth: bool) -> int:
 def _synchronised(
     messages: Iterator[tuple[str, Message]], topics: tuple[str, ...], pairing: Pairing
 ) -> Iterator[tuple[Message, ...]]:
-    """Yield one message of each topic at a time, paired by their time stamps.
+    """Pair the messages of the topics by their time stamps, and yield one pair after the other.
 
-    Messages with and without a partner are counted in ``pairing``. A message is paired only when no
-    later message of the other topic can be nearer in time.
+    Messages with and without a partner are counted in ``pairing``. A message is paired only when it
+    is certain that no later message of the other topic is nearer in time.
     """
     pairing.restart()
     if len(topics) == 1:
@@ -352,7 +353,7 @@ def _synchronised(
 def _choose_topics(
     path: Path, bag: Bag, topics: tuple[str, ...], sensor: str | None
 ) -> tuple[tuple[str, ...], bool]:
-    """The topics to read, and whether the second one contains depth."""
+    """Return the topics to read, and whether the second one contains depth."""
     there = sorted({c.topic for c in bag.connections if c.msgtype in IMAGE_TYPES})
     listed = f"image topics are {', '.join(there)}" if there else "there are no image topics"
     for topic in topics:
@@ -387,7 +388,7 @@ def _choose_topics(
 
 
 def _count(bag: Bag, topics: tuple[str, ...]) -> int | None:
-    """The approximate number of frames; None if the bag does not state it."""
+    """Return the approximate number of frames; None if the bag does not state it."""
     try:
         n = min(bag.topics[topic].msgcount for topic in topics)
     except TypeError:

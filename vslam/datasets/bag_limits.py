@@ -1,7 +1,8 @@
-"""Limits on the decompressed size of bags, because rosbags itself sets none.
+"""Limits the decompressed size of bags, because rosbags itself sets no limit.
 
-A few kilobytes can decompress to gigabytes. rosbags looks up its decompression functions in tables
-of its modules. This module replaces the entries of these tables by functions that stop at a limit.
+Without a limit, a few kilobytes could decompress to gigabytes. rosbags looks up its decompression
+functions in tables. This module replaces the functions in these tables with functions that stop at
+a limit.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class _Decompressor(Protocol):
 def limit_bags() -> None:
     """Make rosbags reject chunks, messages and files that exceed the limits.
 
-    Only the first call has an effect.
+    Only the first call of this function has an effect.
     """
     import lz4.frame
     from rosbags.rosbag1 import reader as ros1
@@ -69,7 +70,7 @@ def limit_bags() -> None:
 
 
 def unpack(make: Callable[[], _Decompressor], data: bytes, most: int) -> bytes:
-    """Decompress one or more concatenated compressed frames, to at most ``most`` bytes.
+    """Decompress data that consists of one or more compressed frames, to at most ``most`` bytes.
 
     Raises:
         ValueError: the result exceeds ``most`` bytes, or the data is truncated.
@@ -93,7 +94,7 @@ def _limited(make: Callable[[], _Decompressor]) -> Callable[[bytes], bytes]:
 
 
 def _limited_by_size(make: Callable[[], _Decompressor]) -> Callable[[bytes, int], bytes]:
-    """Limit the decompression of a chunk to the size that the bag states, and to `MOST_BYTES`."""
+    """Decompress a chunk to at most the size that the bag states, and to at most `MOST_BYTES`."""
     return lambda data, size: unpack(make, data, min(size, MOST_BYTES))
 
 

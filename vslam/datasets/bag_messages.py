@@ -1,7 +1,8 @@
-"""Images, calibrations and GPS fixes from ROS messages.
+"""Reads images, calibrations and GPS fixes from ROS messages.
 
-The fields are defined by ROS in ``sensor_msgs/Image``, ``CompressedImage``, ``CameraInfo`` and
-``NavSatFix``, and the image encodings in ``sensor_msgs/image_encodings.hpp``.
+ROS defines the fields of these messages in ``sensor_msgs/Image``, ``CompressedImage``,
+``CameraInfo`` and ``NavSatFix``. It defines the image encodings in
+``sensor_msgs/image_encodings.hpp``.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ _ALIASES = {"8UC1": "mono8", "16UC1": "mono16", "8UC3": "bgr8", "8UC4": "bgra8"}
 
 
 def stamp_of(message: Message) -> int:
-    """Time stamp of the message header in nanoseconds; 0 if the driver did not set it."""
+    """Return the time stamp in the header of a message in nanoseconds; 0 if it is not set."""
     stamp = message.header.stamp
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
@@ -64,7 +65,7 @@ def nav_sat_fix(message: Message) -> tuple[float, ...]:
 def grey_of(message: Message) -> Image:
     """Decode an ``Image`` or ``CompressedImage`` to ``(H, W)`` uint8 grey values.
 
-    Of 16-bit values, the upper eight bits are kept.
+    Only the upper eight bits of 16-bit values are kept.
 
     Raises:
         ValueError: the image cannot be decoded. The message of the error states the reason.
@@ -75,7 +76,7 @@ def grey_of(message: Message) -> Image:
 def colour_of(message: Message) -> NDArray[np.uint8]:
     """Decode an image to ``(H, W, 3)`` uint8 red, green, blue.
 
-    A grey image is decoded to ``(H, W)``, as by `grey_of`.
+    A grey image is decoded to ``(H, W)`` uint8 grey values.
 
     Raises:
         ValueError: as `grey_of`.
@@ -84,7 +85,7 @@ def colour_of(message: Message) -> NDArray[np.uint8]:
 
 
 def _decoded(message: Message, wanted: str) -> NDArray[np.uint8]:
-    """Decode an image to ``GRAY`` or ``RGB``; a grey image stays grey."""
+    """Decode an image to grey values or RGB. A grey image stays grey if ``RGB`` is requested."""
     import cv2
 
     from vslam.datasets.png import decode_with_opencv
@@ -114,7 +115,7 @@ def _decoded(message: Message, wanted: str) -> NDArray[np.uint8]:
 
 
 def is_depth(message: Message, topic: str) -> bool:
-    """Whether an image message contains depth.
+    """Return whether an image message contains depth.
 
     A 16-bit image counts as depth only if the name of its topic contains ``depth``.
     """
@@ -127,12 +128,12 @@ def is_depth(message: Message, topic: str) -> bool:
 def depth_of(message: Message, scale: float | None) -> DepthImage:
     """Decode a depth image to ``(H, W)`` float32 metres, 0 where the depth is unknown.
 
-    The message is an ``Image``, or a ``CompressedImage`` that image_transport's plug-in
-    ``compressed_depth`` made.
+    The message is an ``Image``, or a ``CompressedImage`` that was written by the plug-in
+    ``compressed_depth`` of image_transport.
 
     Args:
-        scale: image units per metre. None follows REP 118, which defines 1000 for 16-bit images and
-            1 for 32-bit images.
+        scale: image units per metre. None uses the units that REP 118 defines: 1000 for 16-bit
+            images and 1 for 32-bit images.
 
     Raises:
         ValueError: as `grey_of`.
@@ -151,8 +152,8 @@ def _compressed_depth(message: Message, scale: float | None) -> DepthImage:
     """Decode an image of ``compressed_depth_image_transport``.
 
     The PNG file in the message holds the values of a 16-bit depth image. For a 32-bit depth image,
-    it holds the quantised inverse depth. The two parameters of this quantisation are in the header
-    (``ConfigHeader``).
+    it holds the quantised inverse depth. The header of the message (``ConfigHeader``) contains the
+    two parameters of this quantisation.
     """
     import cv2
 
@@ -181,7 +182,7 @@ def _metres(image: NDArray[Any], scale: float | None) -> DepthImage:
 
 
 def _pixels(message: Message, channels: int, bits: int, kind: str = "u") -> NDArray[Any]:
-    """The pixels of an image without the padding of its rows."""
+    """Return the pixels of an image without the padding of its rows."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.asarray(message.data, np.uint8)
     row = width * channels * bits // 8
@@ -198,12 +199,13 @@ def _pixels(message: Message, channels: int, bits: int, kind: str = "u") -> NDAr
 def camera_info(message: Message, source: str, rectified: bool) -> Document | None:
     """Convert a ``CameraInfo`` to the input of `vslam.calibration.formats.read_ros`.
 
-    Returns None if the camera is not calibrated. ROS defines that K is then all zero.
+    Returns None if the camera is not calibrated. ROS defines that all entries of K are zero in this
+    case.
 
     Args:
         source: bag and topic, for error messages.
-        rectified: whether the images are rectified. If they are, the projection matrix P describes
-            them.
+        rectified: whether the images are rectified. The projection matrix P describes rectified
+            images.
     """
     # The fields are K, D, R and P in ROS 1 and k, d, r and p in ROS 2.
     K, D, R, P = (

@@ -1,4 +1,4 @@
-"""Live depth cameras. The packages of their makers deliver the images and the calibration."""
+"""Live depth cameras, whose images and calibration are read using the packages of their makers."""
 
 from __future__ import annotations
 
@@ -23,13 +23,14 @@ TIMEOUT_S = 10
 
 @dataclass(frozen=True)
 class Grabbed:
-    """The images that a device took at one time, copied out of its buffers.
+    """The images that a device took at one time. They are copies of the buffers of the device.
 
     Attributes:
         timestamp: seconds.
-        left: left image, ``(H, W)`` uint8; or colour image, ``(H, W, 3)`` uint8 red, green, blue.
-        second: right image, ``(H, W)`` uint8; or depth image, ``(H, W)`` uint16; or None if only
-            the left camera is used.
+        left: left image, ``(H, W)`` uint8. For RGB-D, it is the colour image, ``(H, W, 3)`` uint8
+            red, green, blue.
+        second: right image, ``(H, W)`` uint8. For RGB-D, it is the depth image, ``(H, W)`` uint16.
+            None if only the left camera is used.
     """
 
     timestamp: float
@@ -42,13 +43,13 @@ class DepthCamera:
     """A device that delivers images.
 
     Attributes:
-        dataset: kind of source.
-        name: serial number.
+        dataset: kind of source, for example ``realsense``.
+        name: serial number of the device.
         calibration: calibration of the delivered images, read from the device. If it has a
             ``depth_scale``, the second image contains the depth of the pixels of the first image.
-        grab: waits for the next images and returns them. Returns None after a timeout, or if the
-            device was unplugged.
-        stop: stops the device.
+        grab: function that waits for the next images and returns them. It returns None after a
+            timeout, or if the device was unplugged.
+        stop: function that stops the device.
     """
 
     dataset: str

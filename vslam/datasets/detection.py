@@ -1,4 +1,4 @@
-"""Detect the kind of a source from its files."""
+"""Detects the kind of a source (a data set, folder, video, bag or camera) from its files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 
 
 def _within(folder: Path) -> tuple[Path, ...]:
-    """A folder and its subfolders, which may be the folders of sequences."""
+    """Return a folder and its subfolders, which may be the folders of sequences."""
     return (folder, *(path for path in folder.glob("*") if path.is_dir()))
 
 
@@ -53,7 +53,7 @@ _KINDS: tuple[tuple[str, str, Callable[[Path], bool]], ...] = (
 
 
 def detect_dataset(data: str) -> str:
-    """Detect the value of ``--dataset`` for a folder, a file, a device number or a URL.
+    """Detect which value of ``--dataset`` applies to a folder, a file, a device number or a URL.
 
     Raises:
         InputError: there is no such file or folder, or its kind is not recognised.
@@ -93,7 +93,10 @@ def _kind_of(path: Path) -> str | None:
 
 
 def _nearest(path: Path) -> str:
-    """A hint for an error message if the user named the parent or a subfolder of a data set."""
+    """Return a hint for an error message about a folder that is not a data set.
+
+    The text is empty unless the folder is the parent or a subfolder of a data set.
+    """
     if path.resolve().name == "sequences":
         return f", but {path.resolve().parent} looks like kitti (name that folder)"
     for inside in sorted(path.glob("*")):

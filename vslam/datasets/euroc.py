@@ -1,4 +1,4 @@
-"""EuRoC MAV data, and other data in the same layout (ASL) [Burri et al., IJRR 2016].
+"""Reads EuRoC MAV data and other data in its ASL layout [Burri et al., IJRR 2016].
 
 FOLDER/mav0/cam0/data.csv                  times (ns) and file names of the left camera's images
 FOLDER/mav0/cam0/sensor.yaml               calibration of the left camera
@@ -47,8 +47,8 @@ def open_euroc(
     """Open a sequence. Its images are rectified when they are read.
 
     A frame consists of a left image and the right image that is nearest in time. Left images
-    without a right image within 5 ms are skipped. The ground truth is interpolated at the times of
-    the frames by `vslam.datasets.association.poses_at`.
+    without a right image within 5 ms are skipped. `vslam.datasets.association.poses_at`
+    interpolates the ground truth at the times of the frames.
 
     Args:
         root: folder of the sequence, or a folder that contains several sequences.
@@ -58,7 +58,7 @@ def open_euroc(
         every: read only every ``every``-th pair.
         max_frames: largest number of pairs to read; None reads all.
         monocular: read only the left camera.
-        calib: calibration files, which replace the cameras' ``sensor.yaml``.
+        calib: calibration files, which are used instead of the cameras' ``sensor.yaml``.
 
     Raises:
         InputError: data is missing or malformed, no images form a pair, or the calibration is
@@ -93,7 +93,7 @@ def open_raw_euroc(
 
 
 def is_euroc(root: Path) -> bool:
-    """Whether a folder contains the left camera of a sequence in this layout."""
+    """Return whether a folder contains the left camera of a sequence in this layout."""
     return any((base / "cam0" / "data.csv").is_file() for base in (root / "mav0", root))
 
 
@@ -126,7 +126,7 @@ def _select(
 
 
 def _find(root: Path, name: str | None) -> tuple[Path, str]:
-    """The folder that contains ``cam0``, and the name of the sequence."""
+    """Return the folder that contains ``cam0``, and the name of the sequence."""
     if root.resolve().name == "mav0":  # the parent folder has the name of the sequence
         root = root.resolve().parent
     folder = find_sequence(root, name, is_euroc)
@@ -140,7 +140,7 @@ def _find(root: Path, name: str | None) -> tuple[Path, str]:
 
 
 def _read_list(camera: Path) -> tuple[list[int], list[str]]:
-    """The times (ns, increasing) and the file names of a camera's images."""
+    """Read the times (ns, increasing) and the file names of the images of a camera."""
 
     def parsed(line: str) -> tuple[int, str]:
         stamp, _, name = map(str.strip, line.partition(","))
@@ -207,7 +207,10 @@ def _read_ground_truth(base: Path, stamps: NDArray[np.int64]) -> NDArray[np.floa
 
 
 def _read_states(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """``(N,)`` times (ns), and ``(N, 7)`` positions (m) and quaternions (w first)."""
+    """Read the ground truth: ``(N,)`` times in ns, and ``(N, 7)`` positions (m) and quaternions.
+
+    The scalar part w of a quaternion is its first number.
+    """
     times, rows = [], []
     for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
         if not line.strip() or line.startswith("#"):

@@ -1,4 +1,4 @@
-"""GPS fixes that were recorded during a drive, and their local east-north-up (ENU) frame.
+"""Reads GPS fixes of a drive, and converts them to a local east-north-up (ENU) frame.
 
 Fixes are read from a CSV file, from the folder ``oxts`` of KITTI raw (Geiger et al., IJRR 2013), or
 from the ``sensor_msgs/NavSatFix`` messages of a ROS bag.
@@ -40,7 +40,7 @@ class Fixes:
     """M GPS fixes in the order of their times.
 
     Attributes:
-        times: ``(M,)`` seconds, by the same clock as the images.
+        times: ``(M,)`` times of the fixes in seconds, by the same clock as the images.
         geodetic: ``(M, 3)`` latitude and longitude in degrees and altitude in metres.
         sigma: ``(M, 3)`` standard deviations east, north and up, in metres.
         antenna: ``(3,)`` position of the antenna in the frame of the left camera (x right, y down,
@@ -56,11 +56,11 @@ class Fixes:
         return len(self.times)
 
     def between(self, first: float, last: float) -> Fixes:
-        """The fixes between two times in seconds, both included."""
+        """Return the fixes between two times in seconds, both included."""
         return self.select((self.times >= first) & (self.times <= last))
 
     def select(self, chosen: NDArray[np.bool_]) -> Fixes:
-        """The fixes for which the ``(M,)`` bool array ``chosen`` is True."""
+        """Return the fixes at which the ``(M,)`` bool array ``chosen`` is True."""
         return replace(
             self,
             times=self.times[chosen],
@@ -75,9 +75,10 @@ def read_fixes(path: Path, antenna: Sequence[float] | None = None) -> Fixes:
     Args:
         path: a CSV file, the folder ``oxts`` of KITTI raw, or a bag. The first line of a CSV file
             names its columns: ``time`` (s), ``latitude`` and ``longitude`` (degrees), ``altitude``
-            (m) and optionally ``sigma`` (m). The times of KITTI raw are counted from the first fix.
+            (m) and optionally ``sigma`` (m). For KITTI raw, times are counted from the first fix.
         antenna: position of the antenna as in `Fixes`. If None, it is read from the calibration of
-            KITTI raw. If there is no such calibration, the antenna is assumed to be at the camera.
+            KITTI raw. If there is no such calibration, the function assumes that the antenna is at
+            the camera.
 
     Raises:
         InputError: pymap3d is not installed, the file is missing or malformed, it contains no fix
@@ -117,7 +118,7 @@ def read_fixes(path: Path, antenna: Sequence[float] | None = None) -> Fixes:
 def require_overlap(fixes: Fixes, source: Source, path: Path) -> None:
     """Check that at least one fix was recorded while the images were taken.
 
-    The time of the last image of a stream is unknown, and is taken to be infinite.
+    The time of the last image of a stream is unknown. It is treated as infinite.
 
     Raises:
         InputError: the source is a live camera, or no fix was recorded while its images were taken.
@@ -144,7 +145,7 @@ def to_enu(geodetic: NDArray[np.float64], datum: NDArray[np.float64]) -> NDArray
 
     Args:
         geodetic: ``(N, 3)`` latitude and longitude (degrees) and altitude (m).
-        datum: ``(3,)`` latitude, longitude and altitude of the origin.
+        datum: ``(3,)`` latitude (degrees), longitude (degrees) and altitude (m) of the origin.
 
     Returns:
         ``(N, 3)`` metres east, north and up.
@@ -155,14 +156,20 @@ def to_enu(geodetic: NDArray[np.float64], datum: NDArray[np.float64]) -> NDArray
 
 
 def to_geodetic(enu: NDArray[np.float64], datum: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Convert metres east, north and up to WGS84 coordinates. This is the inverse of `to_enu`."""
+    """Convert metres east, north and up of a datum to WGS84 coordinates.
+
+    This is the inverse of `to_enu`.
+    """
     from pymap3d import enu2geodetic
 
     return np.column_stack(enu2geodetic(*enu.T, *datum))
 
 
 def _read_csv(path: Path) -> NDArray[np.float64]:
-    """``(M, 7)`` rows as `vslam.datasets.bag.read_fixes_of_bag` returns them."""
+    """Read M fixes from a CSV file.
+
+    Returns ``(M, 7)`` float64 in the format of `vslam.datasets.bag.read_fixes_of_bag`.
+    """
     try:
         lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -202,7 +209,11 @@ def _read_csv(path: Path) -> NDArray[np.float64]:
 
 
 def _read_oxts(folder: Path) -> NDArray[np.float64]:
-    """Rows as `_read_csv` returns them. As in KITTI odometry, the first packet has the time 0."""
+    """Read M fixes from the folder ``oxts`` of KITTI raw.
+
+    Returns ``(M, 7)`` float64 in the format of `vslam.datasets.bag.read_fixes_of_bag`. The first
+    fix has the time 0, as in KITTI odometry.
+    """
     files = sorted((folder / "data").glob("*.txt"))
     if not files:
         raise InputError(f"--gps {folder}: no data/*.txt; name the folder oxts of KITTI raw.")
@@ -225,11 +236,12 @@ def _read_oxts(folder: Path) -> NDArray[np.float64]:
 
 
 def _antenna_of_kitti(folder: Path) -> Sequence[float] | None:
-    """Position of the inertial unit in the frame of the left grey camera.
+    """Read the position of the inertial unit in the frame of the left grey camera of KITTI raw.
 
-    OXTS packets refer to this position. It is read from the calibration in the folder of a day of
-    KITTI raw. None if there is no calibration. The rotation by which the images were rectified is
-    ignored, because it is less than a degree.
+    The fixes of KITTI raw are the positions of the inertial unit. The position is read from the
+    calibration in the folder of the day on which the drive was recorded. Returns None if there is
+    no calibration. The rotation by which the images were rectified is ignored, because it is less
+    than a degree.
     """
     paths = [folder / name for name in ("calib_imu_to_velo.txt", "calib_velo_to_cam.txt")]
     if not all(path.is_file() for path in paths):

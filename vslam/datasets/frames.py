@@ -1,7 +1,7 @@
-"""Sources of frames, which readers open and from which runs take their images.
+"""Sources of frames. A reader opens a source, and a run takes its images from the source.
 
-Every source yields its frames in the order of their times. Image files can also be read in any
-order. A video, a bag or a camera is a stream, whose frames can only be read in order.
+Every source yields its frames in the order of their times. The frames of image files can also be
+read in any order. A video, a bag or a camera is a *stream*: its frames can only be read in order.
 
 A reader returns a `RawSource` if the images still have to be rectified (by
 `vslam.datasets.rectified`), and a `Source` if they are rectified already.
@@ -39,23 +39,25 @@ class TimedFrame:
 
     Attributes:
         timestamp: seconds.
-        read: decodes and returns the left and the second image. It can be called in any thread. The
-            left image is ``(H, W)`` uint8. The second one is the right image, ``(H, W)`` uint8; or
-            the depth of the left image's pixels, ``(H, W)`` float32 metres, 0 where unknown; or
-            None for a monocular source. The argument is a map function (`vslam.camera.ImageMap`),
-            which may decode both images in parallel. Raises UnreadableImageError if a file is
-            damaged or its size differs from the calibration.
-        sides: two functions. The first one decodes only the left image, the second one only the
-            right image. They raise the same errors as ``read``. None if both images can only be
-            decoded together, or if there is no right image.
-        file: file of the left image. None if the image has no file of its own, or if it has to be
-            rectified.
-        colour: decodes the left image in colour, ``(H, W, 3)`` uint8 red, green, blue, or
-            ``(H, W)`` if the image is grey. Raises the same errors as ``read``. None if the source
-            has no colours.
+        read: function that decodes and returns the left and the second image. It can be called in
+            any thread. The left image is ``(H, W)`` uint8. For stereo, the second image is the
+            right image, ``(H, W)`` uint8. For RGB-D, it is the depth of the left image's pixels,
+            ``(H, W)`` float32 metres, which is 0 where the depth is unknown. For a monocular
+            source, it is None. The argument is a map function (`vslam.camera.ImageMap`), which may
+            decode both images in parallel. The function raises UnreadableImageError if a file is
+            damaged or if its image size differs from the calibration.
+        sides: two functions, of which the first decodes only the left image and the second decodes
+            only the right image. Both functions raise the same errors as ``read``. ``sides`` is
+            None if both images can only be decoded together, or if there is no right image.
+        file: file of the left image. None if the image has no file of its own, or if the image has
+            to be rectified.
+        colour: function that decodes the left image in colour, ``(H, W, 3)`` uint8 red, green,
+            blue. A grey image is ``(H, W)``. The function raises the same errors as ``read``.
+            ``colour`` is None if the source has no colours.
         name: file name of the left image; None if the image has no file of its own.
-        mask: reads the mask of the left image, ``(H, W)`` uint8, which is 0 at pixels to ignore.
-            Raises UnreadableImageError. None if all pixels are used.
+        mask: function that reads the mask of the left image, ``(H, W)`` uint8. The mask is 0 at the
+            pixels to ignore. The function raises UnreadableImageError if the mask cannot be read.
+            ``mask`` is None if all pixels are used.
     """
 
     timestamp: float
@@ -69,7 +71,7 @@ class TimedFrame:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Frames:
-    """The attributes that `Source` and `RawSource` share; see `Source`."""
+    """The attributes that `Source` and `RawSource` share. `Source` describes them."""
 
     dataset: str
     name: str
@@ -92,25 +94,25 @@ class _Frames:
 
     @property
     def seekable(self) -> bool:
-        """Whether the frames are stored and can be read in any order."""
+        """Whether the frames are stored, so that they can be read in any order."""
         return self.play is None
 
     def frames(self) -> Iterator[TimedFrame]:
         """Yield all frames in order.
 
-        Each call starts from the first frame, unless the source is live. Only the images of the
-        current frame are held in memory.
+        Each call starts from the first frame, unless frames arrive in real time from a camera. Only
+        the images of the current frame are held in memory.
 
         Raises:
-            BrokenSourceError: a file is truncated or a device was unplugged. The frames before the
-                fault are yielded first.
+            BrokenSourceError: a file is truncated or a device was unplugged. The frames before this
+                point are yielded first.
             InputError: the stream ends before the first selected frame.
         """
         return iter(self.stored) if self.play is None else self.play()
 
     @cached_property
     def timestamps(self) -> NDArray[np.float64]:
-        """``(N,)`` float64 seconds, strictly increasing.
+        """``(N,)`` float64 times of the frames in seconds, strictly increasing.
 
         Raises:
             TypeError: the source cannot seek.
@@ -143,17 +145,19 @@ class Source(_Frames):
         dataset: kind of source, for example ``kitti`` or ``video``.
         name: name of the sequence, file or device.
         camera: calibration. ``camera.sensor`` tells which images each frame has.
-        stored: N frames that can be read in any order; empty for a stream. See `stored_frames`.
-        play: yields the frames of a stream; None if the frames are stored.
-        n_expected: number of frames. It is approximate for a stream, and None if unknown.
-        live: whether frames arrive in real time, as from a camera, and are lost if they are not
-            read in time.
+        stored: N frames that can be read in any order; empty for a stream. `stored_frames` makes
+            them.
+        play: function that yields the frames of a stream; None if the frames are stored.
+        n_expected: number of frames. For a stream, it is approximate. None if it is unknown.
+        live: whether frames arrive in real time, as from a camera. Such frames are lost if they are
+            not read in time.
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames without a pose. None if there
             is no ground truth.
-        pairing: numbers of images with and without a second image of the same time. For a stream,
-            it counts only the images that have been read. None if images are not paired by time.
-        rectify_mask: rectifies an ``(H, W)`` uint8 mask of the original left images. None if vslam
-            does not rectify the images.
+        pairing: how many images have a second image of the same time, and how many images are left
+            out because they have none. For a stream, only the images that have been read so far are
+            counted. None if images are not paired by time.
+        rectify_mask: function that rectifies an ``(H, W)`` uint8 mask of the original left images.
+            None if vslam does not rectify the images.
 
     Raises:
         InputError: the times of stored frames do not increase.
@@ -174,7 +178,7 @@ class RawSource(_Frames):
         sizes: width and height of each camera's images. It has only one entry if the second image
             contains depth.
         depth: whether the second image contains the depth of the first image's pixels.
-        ground_truth: poses of the left camera as it was before rectification.
+        ground_truth: poses of the left camera before rectification.
     """
 
     sizes: tuple[Size, ...]
@@ -187,17 +191,18 @@ _AnySource = TypeVar("_AnySource", Source, RawSource)
 def stored_frames(
     timestamps: NDArray[np.float64], read: Callable[[int, ImageMap], Images]
 ) -> tuple[TimedFrame, ...]:
-    """Make stored frames from a function that reads the images of a given frame.
+    """Make the stored frames of a source from a function that reads images by frame index.
 
     Args:
         timestamps: ``(N,)`` float64 seconds, increasing.
-        read: decodes the images of the frame with the given index, as ``TimedFrame.read`` does.
+        read: function that decodes the images of the frame with a given index. Apart from the
+            index, it is like ``TimedFrame.read``.
     """
     return tuple(TimedFrame(time, partial(read, k)) for k, time in enumerate(timestamps.tolist()))
 
 
 def decoded(sides: Several[Callable[[], Image | DepthImage]], image_map: ImageMap = map) -> Images:
-    """Decode the images of a frame, with one function per image."""
+    """Decode the images of a frame. One function per image is given."""
     left, *second = image_map(_call, sides)
     return np.asarray(left, np.uint8), second[0] if second else None
 
@@ -248,7 +253,7 @@ def _play_selected(source: Source | RawSource, chosen: slice) -> Iterator[TimedF
 
 
 def _increasing(frames: Iterator[TimedFrame], name: str) -> Iterator[TimedFrame]:
-    """Yield the frames, but skip those that are not later than the frame before.
+    """Yield the frames, but skip each frame that is not later than the previous frame.
 
     A warning is logged for each skipped frame.
     """
@@ -267,10 +272,10 @@ def _increasing(frames: Iterator[TimedFrame], name: str) -> Iterator[TimedFrame]
 
 
 def frames_at(source: Source, indices: Several[int]) -> Iterator[TimedFrame]:
-    """Yield the frames with these increasing indices.
+    """Yield the frames of a source that have the given indices, which must increase.
 
-    A stream is read up to the last of these frames. Fewer frames are yielded if the source ends
-    earlier.
+    A stream is read only up to the last of these frames. If the source ends earlier, fewer frames
+    are yielded.
     """
     if source.seekable:
         yield from (source.stored[k] for k in indices if k < len(source))
@@ -283,8 +288,8 @@ def frames_at(source: Source, indices: Several[int]) -> Iterator[TimedFrame]:
 def first_frames(source: Source) -> Source:
     """Load the first frames of a stream into memory, so that they can be read in any order.
 
-    A source that can seek is returned unchanged. If a frame cannot be decoded, its
-    UnreadableImageError is raised later, whenever the frame is read.
+    A source that can seek is returned unchanged. If a frame cannot be decoded, this function does
+    not raise an error. The UnreadableImageError is raised whenever the frame is read.
 
     Raises:
         InputError: the stream has no frames.
@@ -304,7 +309,7 @@ def first_frames(source: Source) -> Source:
 
 
 def _preloaded(frame: TimedFrame) -> TimedFrame:
-    """Decode a frame now, and keep its images in memory, or the error that decoding raised."""
+    """Decode a frame now, and keep its images in memory. If decoding fails, keep the error."""
     images: Images | UnreadableImageError
     try:
         images = frame.read(map)

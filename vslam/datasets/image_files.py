@@ -1,4 +1,4 @@
-"""Functions that the readers of image files share: they find files, and decode images and depth."""
+"""Functions that find image files, and that decode images and depth. Several readers use them."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ def checked_files(
     This function checks that no file is empty, and decodes the images of the first frame.
 
     Args:
-        dataset: kind of source.
+        dataset: kind of source, for example ``kitti``.
         name: name of the sequence.
         timestamps: ``(N,)`` float64 seconds.
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of the left camera; None without ground truth.
-        sides: the list of the N left images. A second list may contain the N right images or the N
-            depth images.
+        sides: one or two lists of N files. The first list contains the left images. The second list
+            contains the right images or the depth images.
         depth_scale: depth image units per metre; None if there are no depth images.
-        pairing: see `vslam.datasets.frames.Source`.
+        pairing: numbers of paired images and of left-out images, if the images were paired by time.
 
     Raises:
-        UnreadableImageError: a file is empty, the first frame cannot be decoded, or its depth does
-            not have 16 bits or the size of the image.
+        UnreadableImageError: a file is empty, the first frame cannot be decoded, or the first depth
+            image does not have 16 bits or differs from the image in size.
     """
     for path in (path for side in sides for path in side):
         check_not_empty(path)
@@ -88,7 +88,7 @@ def checked_files(
 
 
 def image_size(path: Path) -> Size:
-    """Width and height of an image file.
+    """Return the width and height of an image file.
 
     Raises:
         UnreadableImageError: the file is missing or damaged.
@@ -98,7 +98,7 @@ def image_size(path: Path) -> Size:
 
 
 def list_images(folder: Path) -> dict[str, Path]:
-    """Image files of a folder by stem, sorted by name; empty if there is no such folder.
+    """List the image files of a folder by stem, sorted by name; empty if there is no such folder.
 
     Raises:
         InputError: a file name is not UTF-8.
@@ -112,7 +112,7 @@ def list_images(folder: Path) -> dict[str, Path]:
 
 
 def is_image(path: Path) -> bool:
-    """Whether a file has the suffix of an image format."""
+    """Return whether a file has the suffix of an image format."""
     return path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
 
 
@@ -124,10 +124,10 @@ def read_image_list(
     Lines that begin with # are comments.
 
     Args:
-        parsed: returns the time and the file name in a line. It raises ValueError if the line is
-            malformed.
+        parsed: function that returns the time and the file name in a line. It must raise ValueError
+            if the line is malformed.
         time: description of the time for error messages, such as "a time in seconds".
-        instead: what the user can do without the file, for error messages. It may be empty.
+        instead: what the user can do if the file is missing, for error messages. It may be empty.
 
     Raises:
         InputError: the file is missing, empty or malformed, or the times do not increase.
@@ -162,17 +162,17 @@ def read_image_list(
 
 
 def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bool]) -> Path | None:
-    """Find the folder of a sequence, which is ``root`` or a subfolder of it.
+    """Find the folder of a sequence. It is either ``root`` or a subfolder of ``root``.
 
     Returns None if there is no sequence.
 
     Args:
         name: name of the sequence's folder. None finds ``root`` itself or, if it is not a sequence,
             the only sequence in it.
-        is_sequence: returns whether a folder contains a sequence.
+        is_sequence: function that tells whether a folder contains a sequence.
 
     Raises:
-        InputError: no sequence has this name, or there are several and ``name`` is None.
+        InputError: no sequence has this name, or there are several sequences and ``name`` is None.
     """
     if name is not None and is_sequence(root / name):
         return root / name
@@ -196,7 +196,7 @@ def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bo
 def select_frames(
     source: Path, n: int, start: int, every: int, max_frames: int | None
 ) -> NDArray[np.int64]:
-    """Indices of the frames that ``start``, ``every`` and ``max_frames`` select.
+    """Return the indices of the frames that ``start``, ``every`` and ``max_frames`` select.
 
     Args:
         source: folder of the frames, for error messages.
@@ -232,8 +232,8 @@ def check_not_empty(path: Path) -> None:
 def read_grey(path: Path) -> Image:
     """Decode an image file to ``(H, W)`` uint8.
 
-    Colours are converted to grey as defined by ITU-R BT.601. Of 16-bit values, the upper eight bits
-    are kept.
+    Colours are converted to grey as defined by ITU-R BT.601. Only the upper eight bits of 16-bit
+    values are kept.
 
     Raises:
         UnreadableImageError: the file is missing, damaged or larger than `MOST_PIXELS`.
@@ -264,7 +264,7 @@ def read_colour(path: Path) -> NDArray[np.uint8]:
     """Decode an image file to ``(H, W, 3)`` uint8 red, green, blue, or ``(H, W)`` if it is grey.
 
     Raises:
-        UnreadableImageError: as `read_grey`.
+        UnreadableImageError: the file is missing, damaged or larger than `MOST_PIXELS`.
     """
     import cv2
 
@@ -278,7 +278,7 @@ def read_colour(path: Path) -> NDArray[np.uint8]:
 
 
 def _read_grey_of(size: Size, path: Path) -> Image:
-    """Decode an image as `read_grey`, and check that it has the size of the first one."""
+    """Decode an image using `read_grey`, and check that it has the same size as the first image."""
     image = read_grey(path)
     if image.shape != size[::-1]:
         raise UnreadableImageError(
@@ -290,15 +290,15 @@ def _read_grey_of(size: Size, path: Path) -> Image:
 
 
 def size_text(shape: tuple[int, ...]) -> str:
-    """A shape ``(H, W)`` as the text ``WxH``."""
+    """Format a shape ``(H, W)`` as the text ``WxH``."""
     return f"{shape[1]}x{shape[0]}"
 
 
 def with_depth(camera: Camera, calibration: Calibration) -> Camera:
-    """The camera for RGB-D images, with a virtual baseline.
+    """Return a camera for RGB-D images, which has a virtual baseline.
 
-    The baseline is that of the calibration. If the calibration has none, the baseline of a Kinect
-    is used.
+    The virtual baseline is taken from the calibration. If the calibration has no virtual baseline,
+    the baseline of a Kinect is used.
     """
     baseline = calibration.virtual_baseline or _VIRTUAL_BASELINE
     return replace(camera, baseline=baseline, depth=True)

@@ -1,19 +1,20 @@
-"""Folders of images: one folder for a single camera, two for a stereo pair or images with depth.
+"""Reads one folder of images, or two folders for stereo pairs or for images with depth.
 
 The two folders of a pair have a common parent folder and are named as in `PAIRS` or `DEPTH_PAIRS`.
 Otherwise, the second folder is given by ``--right`` or ``--depth``.
 
-Images with the same name belong together. If the two folders have no name in common but the same
-number of images, their images are matched in order. If the names of images and depth images are
-times, they are paired by time, and the times of a pair are less than 20 ms apart.
+Images with the same name form a pair. If the two folders have no name in common but the same number
+of images, their images are paired in order. If the names of images and depth images are times, the
+images are paired by time. The times of a pair are then less than 20 ms apart.
 
 The times of the images are taken from the first of these sources that exists:
 
 1. ``--fps``.
 2. ``times.txt`` or ``timestamps.txt`` in the folder of the images or in its parent. Each line
    contains the time of one image in seconds.
-3. File names that are times since 1970. A name with a decimal point is in seconds. The magnitude
-   of an integer tells whether it is in s, ms, us or ns. Smaller integers are frame numbers.
+3. File names that are times since 1970. A name with a decimal point is in seconds. The magnitude of
+   an integer tells whether its unit is s, ms, us or ns. Integers that are too small to be such a
+   time are treated as frame numbers.
 4. ``DateTimeOriginal`` with ``SubSecTimeOriginal`` in the EXIF data of the images.
 """
 
@@ -59,7 +60,7 @@ _UNITS = ((1e17, 10**9), (1e14, 10**6), (1e11, 10**3), (1e9, 1))
 
 
 def has_images(folder: Path) -> bool:
-    """Whether a folder contains images, or a pair of folders with images."""
+    """Return whether a folder contains images, or a pair of folders with images."""
     inside = (folder / left for left, _ in PAIRS + DEPTH_PAIRS)
     return any(list_images(place) for place in (folder, *inside))
 
@@ -75,7 +76,7 @@ class ImageFolders:
             left camera. The second list has the images of the right camera, or the depth images.
         depth: whether the second list has depth images.
         size: width and height of the first image.
-        pairing: see `vslam.datasets.frames.Source`.
+        pairing: numbers of paired images and of left-out images, if the images were paired by time.
     """
 
     name: str
@@ -89,7 +90,7 @@ class ImageFolders:
         """Make a source of the images.
 
         Args:
-            depth_scale: depth image units per metre; needed only for depth images.
+            depth_scale: depth image units per metre. It is needed only for depth images.
 
         Raises:
             InputError: there are depth images but no scale.
@@ -123,7 +124,7 @@ def open_images(
         folder: folder of the images, or the folder that contains both folders of a pair.
         right: folder of the right images. If it is given, ``folder`` contains the left images.
         depth: folder of the depth images. If it is given, ``folder`` contains the images.
-        fps: frames per second, which replace the images' time stamps.
+        fps: frames per second. If it is given, the time stamps of the images are not used.
         start: index of the first frame to read.
         every: read only every ``every``-th frame.
         max_frames: largest number of frames to read; None reads all.
@@ -157,7 +158,7 @@ def open_images(
 def _find_sides(
     folder: Path, right: Path | None, depth: Path | None, sensor: str | None
 ) -> tuple[list[Path], bool]:
-    """The folders of the first and second images, and whether the second images are depth."""
+    """Find the folders of the first and second images, and whether the second images are depth."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; name a folder of images with --data.")
     if right is not None and depth is not None:
@@ -185,9 +186,9 @@ def _find_sides(
 
 
 def _near_miss(folder: Path) -> str:
-    """A hint for an error message if only one folder of a pair exists or was named.
+    """Return a hint for an error message about a folder without images.
 
-    The text is empty if neither is the case.
+    The text is empty unless only one folder of a pair exists, or the user named only one of them.
     """
     above = folder.resolve().parent
     for names in PAIRS + DEPTH_PAIRS:
@@ -201,10 +202,10 @@ def _near_miss(folder: Path) -> str:
 
 
 def _sorted_images(folder: Path) -> dict[str, Path]:
-    """Images of a folder by stem.
+    """List the images of a folder by stem, in the order in which they were taken.
 
-    They are sorted by time if all names are times. Otherwise they are sorted by the numbers in
-    their names, so that 2 comes before 10.
+    If all names are times, the images are sorted by time. Otherwise, they are sorted by the numbers
+    in their names, so that 2 comes before 10.
     """
     images = list_images(folder)
     if not images:
@@ -222,7 +223,7 @@ def _sorted_images(folder: Path) -> dict[str, Path]:
 def _matched(
     sides: list[dict[str, Path]], folders: list[Path], *, by_time: bool
 ) -> tuple[list[list[Path]], Pairing | None]:
-    """The files of each folder, in the order of the pairs that they form."""
+    """Pair the files of two folders. Return the files of each folder in the order of the pairs."""
     first, *rest = sides
     for other in rest:
         if first.keys() == other.keys():
@@ -294,7 +295,7 @@ def _times_of_file(path: Path, n: int) -> NDArray[np.float64]:
 
 
 def _time_of_name(path: Path) -> float | None:
-    """Seconds since 1970; None if the name is not a time."""
+    """Read the time in a file name as seconds since 1970; None if the name is not a time."""
     if re.fullmatch(r"\d+\.\d+", path.stem):
         return float(path.stem)
     if path.stem.isdecimal():
@@ -306,7 +307,10 @@ def _time_of_name(path: Path) -> float | None:
 
 
 def _time_of_exif(path: Path) -> float | None:
-    """Seconds since 1970 by the camera's clock; None if the EXIF data have no time."""
+    """Read the time of an image from its EXIF data; None if they contain no time.
+
+    The time is in seconds since 1970 by the camera's clock.
+    """
     from PIL import Image as PillowImage
 
     try:

@@ -1,4 +1,4 @@
-"""Grey stereo sequences of KITTI odometry [Geiger et al., CVPR 2012].
+"""Reads grey stereo sequences of KITTI odometry [Geiger et al., CVPR 2012].
 
 root/sequences/NN/image_0/000000.png   rectified images of the left camera
 root/sequences/NN/image_1/000000.png   rectified images of the right camera
@@ -38,11 +38,11 @@ def open_kitti(
     monocular: bool = False,
     calib: Several[Path | str] = (),
 ) -> Source:
-    """Open a sequence. Only the selected frames must be complete.
+    """Open a sequence of KITTI odometry. Only the selected frames must have all their images.
 
     The k-th row of ``times.txt`` and of the poses belongs to the k-th image. If a file has more
-    rows than there are images, the number in the file name of an image selects its row. Therefore,
-    an excerpt of a sequence works with the files of the whole sequence.
+    rows than there are images, the row of an image is the number in its file name. Therefore, an
+    excerpt of a sequence can be used with the files of the whole sequence.
 
     Args:
         root: folder that contains ``sequences`` and, optionally, ``poses``. As in KITTI's archives,
@@ -52,8 +52,8 @@ def open_kitti(
         every: read only every ``every``-th frame.
         max_frames: largest number of frames to read; None reads all.
         monocular: read only the left camera. The right camera's images need not exist.
-        calib: calibration files, which replace ``calib.txt``. With them, the images are rectified
-            when they are read.
+        calib: calibration files, which are used instead of ``calib.txt``. If they are given, the
+            images are rectified when they are read.
 
     Raises:
         InputError: data is missing, an image has no partner, or the calibration, the times or the
@@ -96,7 +96,7 @@ def open_kitti(
 
 
 def list_kitti(root: Path | str) -> list[tuple[str, int, int]]:
-    """List the name, the number of left images and the number of right images of each sequence.
+    """List all sequences with their names and their numbers of left and right images.
 
     Raises:
         InputError: ``root`` holds no KITTI data.
@@ -187,7 +187,7 @@ def _by_number(stem: str) -> tuple[int, str]:
 def _check_frames(
     folder: Path, sides: list[dict[str, Path]], stems: list[str]
 ) -> list[tuple[Path, ...]]:
-    """The files of each camera that have these stems.
+    """List the image files of the given frames for each camera. Frames are given by the file stem.
 
     Raises:
         InputError: a camera has no images, or an image of a frame is missing.
@@ -225,7 +225,7 @@ def _read_times(path: Path) -> NDArray[np.float64]:
 
 
 def _row_numbers(path: Path, stems: list[str], n_rows: int) -> NDArray[np.int64]:
-    """``(N,)`` index of the row of ``times.txt`` or of the poses for each image."""
+    """For each of N images, return the index of its row in ``times.txt`` or in the poses."""
     fix = "take the file of this sequence from KITTI's archives"
     if n_rows < len(stems):
         raise InputError(f"{path}: only {n_rows} rows for {len(stems)} images; {fix}.")

@@ -1,7 +1,7 @@
-"""Masks of the left images of a source. A mask selects the pixels that are used.
+"""Adds masks to the left images of a source. A mask selects the pixels that are used.
 
-As in COLMAP and OpenCV, a mask is black (0) at pixels to ignore and white (255) elsewhere. It has
-the size of the original images and is rectified together with them.
+As in COLMAP and OpenCV, a mask is black (0) at the pixels to ignore and white (255) at all other
+pixels. A mask has the size of the original images and is rectified together with them.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ def with_masks(source: Source, path: Path, *, start: int = 0, every: int = 1) ->
     """Add masks to the frames of a source.
 
     Args:
-        path: one mask for all images, or a folder with a mask for each image. For the image
-            ``7.jpg``, the mask may be named ``7.png`` (with any suffix) or ``7.jpg.png``. For a
-            video or bag, the name of a mask is the number of its frame.
+        path: one mask for all images, or a folder with a mask for each image. The mask of the image
+            ``7.jpg`` may be named ``7.png``, ``7.jpg.png``, or ``7`` with a different suffix. For a
+            video or bag, a mask is named after the number of its frame.
         start: index of the first frame that was selected from the source.
         every: step with which the frames were selected.
 

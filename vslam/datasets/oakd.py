@@ -1,7 +1,7 @@
-"""OAK-D cameras, read by depthai (version 3).
+"""Reads OAK-D cameras, using depthai (version 3).
 
-A stereo pair consists of the two grey images. The device undistorts them, and vslam rectifies them
-with the device's calibration.
+A stereo pair consists of the two grey images. The device undistorts the images. Then, vslam
+rectifies them using the calibration of the device.
 
 An RGB-D frame consists of the colour image and the depth. The device computes the depth by stereo
 matching, and registers it to the colour image.
@@ -27,7 +27,7 @@ def open_oakd(serial: str, sensor: str | None) -> DepthCamera:
     """Open a camera and read its calibration.
 
     Args:
-        serial: serial number of the device. If empty, the first device that is found is used.
+        serial: serial number of the device. If it is empty, the first device that is found is used.
         sensor: ``stereo``, ``rgbd`` or ``mono``; None means ``stereo``.
 
     Raises:
@@ -72,7 +72,7 @@ def open_oakd(serial: str, sensor: str | None) -> DepthCamera:
 
 
 def _queue(dai: Any, pipeline: Any, sensor: str) -> Any:
-    """Make a queue of synchronised images ``left`` and ``second``, which keeps the newest ones."""
+    """Make a queue of synchronised images ``left`` and ``second``. It keeps the newest images."""
     create, node, socket = pipeline.create, dai.node, dai.CameraBoardSocket
 
     def output(side: Any, kind: Any = None, *, undistorted: bool = False) -> Any:
@@ -118,7 +118,7 @@ def _calibration(dai: Any, device: Any, images: Any, sensor: str) -> Calibration
 
 
 def _model(image: Any, source: str) -> CameraModel:
-    """The camera model of an image that the device has undistorted."""
+    """Return the camera model of an image that the device has undistorted."""
     transformation = image.getTransformation()
     if any(transformation.getDistortionCoefficients()):
         raise InputError(

@@ -1,6 +1,6 @@
-"""Sources that are read by plug-ins, that is, by readers in other Python packages.
+"""Opens sources using plug-ins, which are readers in other Python packages.
 
-Their frames are checked in the same way as those of vslam's own sources.
+The frames of a plug-in are checked in the same way as the frames of vslam's own sources.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ def open_plugin(
     max_frames: int | None,
     monocular: bool,
 ) -> Source:
-    """Let a plug-in open a source, and select frames of it.
+    """Let a plug-in open a source, and select frames of the source.
 
-    The plug-in may fail later, when a frame is read. If the source can seek, this frame is skipped.
-    If the source is a stream, the stream ends.
+    A plug-in may also fail later, when a frame is read. If the frames can be read in any order,
+    only this frame is skipped. If the source is a stream, the stream ends.
 
     Raises:
         InputError: the plug-in rejects its input, fails, or returns no valid `Source`.
-        UnreadableImageError: the first frame of a source that can seek cannot be read.
+        UnreadableImageError: the first frame cannot be read. This is not checked for a stream.
     """
     raw = plugin.call(root, name)
     wrong = _wrong_source(raw)
@@ -58,7 +58,7 @@ def open_plugin(
 
 
 def _wrong_source(raw: object) -> str:
-    """Text that says why the object that a plug-in returned is not valid; empty if it is valid."""
+    """Return why the object that a plug-in returned is not a valid source; empty if it is valid."""
     if not isinstance(raw, Source):
         return f"returned {type(raw).__name__}, not vslam.datasets.frames.Source"
     if not isinstance(raw.camera, Camera):
@@ -88,9 +88,9 @@ def _play(plugin: PlugIn, raw: Source, checked: partial[TimedFrame]) -> Iterator
 
 
 def _checked(plugin: PlugIn, root: Path, camera: Camera, frame: TimedFrame, at: str) -> TimedFrame:
-    """Return the same frame, but check its images whenever they are read.
+    """Return a frame with the same images, which are checked whenever they are read.
 
-    Their sizes and types must be those of the camera's images.
+    The images must have the types and sizes that the calibration of the camera demands.
     """
 
     def read(image_map: ImageMap) -> Images:
@@ -110,7 +110,7 @@ def _checked(plugin: PlugIn, root: Path, camera: Camera, frame: TimedFrame, at: 
 
 
 def _wrong_images(left: Image, second: Image | DepthImage | None, camera: Camera) -> str:
-    """Text with the types and shapes of images that do not fit the camera; empty if they fit."""
+    """Describe the types and shapes of images that do not fit the camera; empty if they fit."""
     kinds: list[np.dtype[Any]] = [np.dtype(np.uint8)]
     if not camera.monocular:
         kinds.append(np.dtype(np.float32 if camera.depth else np.uint8))

@@ -1,13 +1,13 @@
-"""Fast decoding of 8-bit grey PNG files without interlacing, as in rectified stereo sequences.
+"""Decodes 8-bit grey PNG files, such as those of rectified stereo sequences, at high speed.
 
-PNG predicts every pixel from its neighbours above and on the left and stores the difference (a
-line filter). OpenCV's decoder spends as much time on undoing these filters as on decompression,
-because every pixel depends on the pixel on its left.
+PNG predicts every pixel from its neighbours above and on the left, and stores only the difference.
+This is called a line filter. OpenCV's decoder needs as much time to undo these filters as to
+decompress the data, because every pixel depends on the pixel on its left.
 
-This decoder decodes blocks of 32 lines at once (a wavefront). Each line is one pixel behind the
-line above it, and a vector register holds one pixel of each line. If no pixel of a block is
-predicted from two or more neighbours, as in all files that OpenCV writes, the block is decoded line
-by line, which is then faster.
+This decoder decodes 32 lines at once as a wavefront: each line is one pixel behind the line above
+it, and a vector register holds one pixel of each line. Some filters predict each pixel from at most
+one neighbour. If a block has only such filters, it is decoded line by line, because this is faster.
+All files that OpenCV writes have only such filters.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ _WIDEST = 1 << 15  # largest number of pixels per line; the buffers need 65 byte
 def decode_png(data: bytes) -> NDArray[np.uint8] | None:
     """Decode a PNG file of 8-bit grey levels to ``(H, W)`` uint8, exactly as libpng does.
 
-    Returns None if the file has another format, is interlaced, or is damaged according to its
-    checksums. The caller can then try another decoder.
+    Returns None if the file has a different format, is interlaced, or is damaged according to its
+    checksums. The caller can then try a different decoder.
     """
     import deflate
 
@@ -54,7 +54,7 @@ def decode_png(data: bytes) -> NDArray[np.uint8] | None:
 
 
 def _contents(data: bytes) -> tuple[tuple[int, int], bytes]:
-    """Height and width, and the compressed image data.
+    """Read the height, the width and the compressed image data of a PNG file.
 
     Raises:
         ValueError, struct.error: the file has another format, or is damaged.
@@ -76,7 +76,7 @@ def _contents(data: bytes) -> tuple[tuple[int, int], bytes]:
 
 
 def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
-    """Yield the kind and the contents of every chunk except the last one.
+    """Yield the kind and the contents of every chunk of a PNG file except the last chunk.
 
     Raises:
         ValueError, struct.error: the file is truncated, or a checksum is wrong.
@@ -102,7 +102,7 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
 
 
 def is_cut_off(data: bytes) -> bool:
-    """Whether a file is a PNG with a chunk whose stated length exceeds the rest of the file.
+    """Return whether a PNG file ends before the stated end of one of its chunks.
 
     libpng would allocate the stated length, up to 2 GB, before it reads the chunk.
     """
@@ -118,9 +118,9 @@ def is_cut_off(data: bytes) -> bool:
 
 
 def decode_with_opencv(data: bytes, flags: int) -> NDArray[Any] | None:
-    """Decode a file of any format by ``cv2.imdecode``.
+    """Decode a file of any format using ``cv2.imdecode``.
 
-    Returns None if the file cannot be decoded, or if it is a truncated PNG file (`is_cut_off`).
+    Returns None if the file cannot be decoded, or if `is_cut_off` finds that it is truncated.
 
     Raises:
         cv2.error: the image is too large, or the file is empty.
@@ -143,7 +143,7 @@ def unfilter(lines, image):
         image: ``(H, W)`` uint8, output.
 
     Returns:
-        Whether all filters are known.
+        False if a line has an unknown filter, otherwise True.
     """
     height, width = image.shape
     n = np.uintp(width)
@@ -185,7 +185,7 @@ def unfilter(lines, image):
 
 @inner_kernel
 def largest_filter(lines):
-    """The largest filter number of these lines."""
+    """Return the largest number of a filter that the lines use."""
     largest = np.uint8(0)
     for y in range(len(lines)):
         largest = max(largest, lines[y, 0])
@@ -194,7 +194,7 @@ def largest_filter(lines):
 
 @inner_kernel
 def add_prediction(line, line_above, out, is_first):
-    """Decode a line with filter None, Sub or Up."""
+    """Decode a line that has the filter None, Sub or Up."""
     n, one = np.uintp(len(out)), np.uintp(1)
     if line[0] == 1:
         value = np.uint8(0)
@@ -211,7 +211,7 @@ def add_prediction(line, line_above, out, is_first):
 
 @inline
 def choose_filter(number, lane, left, above, corner, is_average):
-    """Set the masks of a lane for a filter of the PNG specification, section 9.2.
+    """Set the masks of one line of a block for its filter (PNG specification, section 9.2).
 
     The masks select which neighbours Paeth's predictor uses, because the filters Sub and Up are
     special cases of it. If the pixels above are set to zero, the predictor is the left pixel (Sub).
@@ -229,7 +229,7 @@ def choose_filter(number, lane, left, above, corner, is_average):
 
 @inner_kernel
 def advance(coded, decoded, left, above, corner, is_average, steps):
-    """Decode a block of lines. Each step decodes one pixel of every line, see `unfilter`."""
+    """Decode a block of lines. Each step decodes one pixel of every line (see `unfilter`)."""
     lanes, row, one = np.uintp(LANES), np.uintp(LANES + 1), np.uintp(1)
     for step in range(np.uintp(steps)):
         before = decoded[step * row : (step + one) * row]  # two steps ago

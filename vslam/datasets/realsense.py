@@ -1,4 +1,4 @@
-"""RealSense cameras of the D400 series, read by pyrealsense2.
+"""Reads RealSense cameras of the D400 series, using pyrealsense2.
 
 An RGB-D frame consists of the colour image and the depth that the device measures with its pattern
 projector. librealsense registers the depth to the colour image.
@@ -24,7 +24,7 @@ def open_realsense(serial: str, sensor: str | None) -> DepthCamera:
     """Open a camera and read its calibration.
 
     Args:
-        serial: serial number of the device. If empty, the first device that is found is used.
+        serial: serial number of the device. If it is empty, the first device that is found is used.
         sensor: ``stereo``, ``rgbd`` or ``mono``; None means ``rgbd``.
 
     Raises:
@@ -119,11 +119,11 @@ def _calibration(rs: Any, profile: Any, depth_sensor: Any, sensor: str, serial: 
 
 
 def _model(rs: Any, intrinsics: Any, source: str) -> CameraModel:
-    """The camera model of a stream.
+    """Return the camera model of a stream.
 
     Both Brown-Conrady models of librealsense are treated as OpenCV's distortion model. The model
-    named "inverse" differs from it by second-order terms, which amount to 0.01 px for the lens of a
-    D455.
+    named "inverse" differs from OpenCV's model by second-order terms. They amount to 0.01 px for
+    the lens of a D455.
     """
     i = intrinsics
     known = rs.distortion.brown_conrady, rs.distortion.inverse_brown_conrady

@@ -1,4 +1,4 @@
-"""Rectification of the images of a source when they are decoded."""
+"""Rectifies the images of a source when they are decoded."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _MISSING = {(1, 0): "column", (0, 1): "row", (1, 1): "column and row"}
 
 
 def rectified(raw: RawSource, calibration: Calibration) -> Source:
-    """Rectify the images of a source when they are read.
+    """Make a source whose images are rectified when they are read.
 
     The rectification maps are computed once. Images that are already rectified stay unchanged.
 
@@ -99,7 +99,7 @@ def _rectified_frame(rectification: Rectification, frame: TimedFrame) -> TimedFr
 
 
 def _read(rectification: Rectification, frame: TimedFrame, image_map: ImageMap) -> Images:
-    """Read and rectify the images of a frame. Depth is taken from the nearest pixel."""
+    """Read and rectify the images of a frame. For depth, the value of the nearest pixel is used."""
     left, second = frame.read(image_map)
     sides: list[Callable[[], Image | DepthImage]] = [partial(rectification.left, left)]
     if second is not None and rectification.camera.depth:

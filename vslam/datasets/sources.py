@@ -23,21 +23,21 @@ SOURCES = ("images", "video", "bag", *LIVE)
 
 
 class SourceOptions(BaseModel):
-    """The options that select and describe a source of frames.
+    """Options that select a source of frames and tell how to read it.
 
     Attributes:
-        data: folder, file, device number or URL. For a depth camera, it is the serial number, or
-            empty to use the first camera that is found. It is ignored for rendered towns.
+        data: folder, file, device number or URL. For a depth camera, it is the serial number. If it
+            is empty, the first camera that is found is used. It is ignored for rendered towns.
         dataset: one of `vslam.datasets.DATASETS` or of `SOURCES`, or the name of a data set that a
             plug-in reads. None detects the data set from ``data``.
         seq: name of the sequence of a data set, see `vslam.datasets.open_sequence`.
         calib: calibration files, see `vslam.calibration.files.read_calibration`.
         right: folder of the right images.
         depth: folder of the depth images.
-        fps: frames per second, which replace the source's time stamps.
+        fps: frames per second. If it is given, the time stamps of the source are not used.
         side_by_side: whether each frame contains the left and the right image side by side.
         topics: for a bag, the topic of the left images, or two topics separated by a comma. The
-            second topic is that of the right images or of the depth.
+            second topic contains the right images or the depth images.
         depth_scale: depth image units per metre.
         sensor: ``stereo``, ``rgbd`` or ``mono``. With ``mono``, only the left images are read. None
             reads all images of the source.
@@ -83,10 +83,11 @@ def open_source(
 ) -> Source:
     """Open a data set, or images of any camera.
 
-    Images of a camera are rectified with the user's calibration.
+    Images of a camera are rectified using the user's calibration.
 
     Args:
-        on_render: see `vslam.datasets.open_sequence`.
+        on_render: called after each rendered frame, with the number of frames that are rendered so
+            far and the total number.
 
     Raises:
         InputError: an option does not apply to this source, the source does not have the images of

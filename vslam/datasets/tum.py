@@ -1,4 +1,4 @@
-"""TUM's RGB-D sequences, and all data in their layout [Sturm et al., IROS 2012].
+"""Reads TUM's RGB-D sequences and other data in the same layout [Sturm et al., IROS 2012].
 
 FOLDER/rgb.txt             a time in seconds and the file of a colour image on each line
 FOLDER/depth.txt           the same for the depth images
@@ -61,9 +61,9 @@ def open_tum(
 ) -> Source:
     """Open a sequence. Its images are undistorted when they are read.
 
-    A frame consists of a colour image and a depth image that are less than 20 ms apart. They are
-    paired by `vslam.datasets.association.associate`, in the same way as by TUM's ``associate.py``.
-    The ground truth is interpolated by `vslam.datasets.association.poses_at`.
+    A frame consists of a colour image and a depth image that are less than 20 ms apart.
+    `vslam.datasets.association.associate` pairs them in the same way as TUM's ``associate.py``.
+    `vslam.datasets.association.poses_at` interpolates the ground truth.
 
     Args:
         root: folder of the sequence, or a folder that contains several sequences.
@@ -73,9 +73,10 @@ def open_tum(
         every: read only every ``every``-th pair.
         max_frames: largest number of pairs to read; None reads all.
         monocular: read only the colour images. Depth images need not exist.
-        calib: calibration file, which replaces that of the folder and those of TUM's cameras.
-        depth_scale: depth image units per metre. None uses the value of the calibration or, if it
-            has none, 5000.
+        calib: calibration file. If it is given, neither the calibration in the folder nor that of
+            one of TUM's cameras is used.
+        depth_scale: depth image units per metre. If it is None, the value in the calibration is
+            used. If there is no such value, 5000 is used.
 
     Raises:
         InputError: data is missing or malformed, no images form a pair, or the calibration or the
@@ -126,12 +127,12 @@ def open_tum(
 
 
 def is_tum(folder: Path) -> bool:
-    """Whether a folder contains a sequence in this layout."""
+    """Return whether a folder contains a sequence in this layout."""
     return (folder / "rgb.txt").is_file()
 
 
 def _read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
-    """The times (s, increasing) and the files of the images in a list."""
+    """Read the times (s, increasing) and the files of images from ``rgb.txt`` or ``depth.txt``."""
 
     def parsed(line: str) -> tuple[float, str]:
         time, _, name = line.strip().partition(" ")

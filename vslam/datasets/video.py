@@ -1,7 +1,7 @@
-"""Video files and live cameras, read by OpenCV.
+"""Reads video files and live cameras, using OpenCV.
 
-Each frame is one monocular image, or a stereo pair side by side. The time stamp of a live camera's
-frame is the time of the machine's monotonic clock when the frame arrives.
+Each frame is either one monocular image, or a stereo pair side by side. A frame of a live camera
+gets the time at which it arrives, by the monotonic clock of the machine.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def open_capture(source: str | int, *parameters: int) -> Capture | None:
     """Open a file, URL or device; None if OpenCV cannot open it.
 
     Args:
-        parameters: properties of the capture, each followed by its value.
+        parameters: properties of OpenCV's capture, each followed by its value.
     """
     import cv2
 
@@ -58,7 +58,7 @@ def open_capture(source: str | int, *parameters: int) -> Capture | None:
 
 
 def sizes_of(image: NDArray[np.uint8], side_by_side: bool, monocular: bool) -> tuple[Size, ...]:
-    """Width and height of each image that `read_sides` returns."""
+    """Return the width and height of each image that `read_sides` returns."""
     height, width = image.shape[:2]
     if not side_by_side:
         return ((width, height),)
@@ -82,10 +82,10 @@ def read_sides(
 
 
 def left_in_colour(image: NDArray[np.uint8], side_by_side: bool) -> NDArray[np.uint8]:
-    """The left image of a frame: ``(H, W, 3)`` uint8 red, green, blue, or ``(H, W)`` grey.
+    """Return the left image of a frame: ``(H, W, 3)`` uint8 red, green, blue, or ``(H, W)`` grey.
 
     Args:
-        image: as for `read_sides`.
+        image: ``(H, W, 3)`` uint8 blue, green, red, or ``(H, W)`` grey.
     """
     import cv2
 
@@ -114,7 +114,7 @@ def open_video(
     """Open a video and decode its first frames.
 
     Args:
-        fps: frames per second, which override the file's time stamps; None uses the time stamps.
+        fps: frames per second. If it is given, the time stamps in the file are not used.
         side_by_side: whether each frame contains the left and the right image side by side.
         monocular: read only the left images.
 
@@ -167,7 +167,7 @@ def open_video(
 
 
 def _check_sides(source: str, side_by_side: bool, monocular: bool) -> None:
-    """Reject stereo without images side by side, because each frame of a video is one image."""
+    """Reject stereo if ``side_by_side`` is not set, because each frame of a video is one image."""
     if not side_by_side and not monocular:
         raise InputError(
             f"{source} has one image per frame; use --side-by-side if each frame holds both "

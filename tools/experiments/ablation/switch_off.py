@@ -4,8 +4,8 @@ python tools/experiments/ablation/switch_off.py --source "--dataset synthetic --
     --perturb none,noise --out FOLDER
 
 Each ``--source`` contains the options of ``vslam bench`` that choose drives. The runs are kept in
-the output folder, so that the same command resumes an interrupted experiment. The table
-``ablation.csv`` in the folder has a row for each part, data set and perturbation.
+the output folder. Therefore, the same command resumes an interrupted experiment. The table
+``ablation.csv`` in this folder has a row for each part, data set and perturbation.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from vslam.lab.overview.schema import OverviewJson
 
 
 class Variant(NamedTuple):
-    """One part of the method, and how to run without it.
+    """One part of the method, and how vslam is run without this part.
 
     ``thresholds`` are the values of ``--config`` that switch the part off. ``detector`` is the loop
-    detector of the run. ``reference`` is the variant with which the run is compared.
+    detector that is used. ``reference`` is the variant with which the runs are compared.
     """
 
     piece: str
@@ -71,7 +71,7 @@ Measures = dict[str, float | None]
 def run(
     variant: Variant, source: str, perturb: str, arguments: list[str], out: Path
 ) -> dict[Drive, Measures]:
-    """Measure a variant on the drives of a source. Finished runs in the folder are kept."""
+    """Run a variant on the drives of a source. Runs that are already finished are not repeated."""
     command = ["vslam", "bench", *shlex.split(source), *arguments]
     if variant.thresholds:
         command += ["--config", variant.thresholds]
@@ -81,7 +81,7 @@ def run(
     report = OverviewJson.model_validate_json((out / "report.json").read_bytes())
 
     def applied(perturbs: str) -> str:
-        """The perturbation of the images. Changes of the town, such as moving cars, are removed."""
+        """Return the perturbation without changes of the town, such as moving cars."""
         for one in perturb.split(","):
             if one != "none" and perturbs.endswith(one.replace("+", ",")):
                 return one
@@ -99,11 +99,12 @@ def row_of(
     runs: dict[Drive, Measures],
     reference: dict[Drive, Measures],
 ) -> dict[str, object]:
-    """Make a row of the table.
+    """Make the row of the table for a part, a data set and a perturbation.
 
-    It has the errors without the part divided by the errors with it, and the numbers of loops.
+    The row has the error without the part divided by the error with the part, and the numbers of
+    loops.
 
-    ``condition`` is the data set and the ``--perturb`` of the drives of this row.
+    ``condition`` contains the data set and the ``--perturb`` of the drives in this row.
     """
     drives = [drive for drive in runs if condition == (drive[0], drive[2])]
 

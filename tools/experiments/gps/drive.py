@@ -3,14 +3,15 @@
     python tools/experiments/gps/drive.py RUN [RUN ...] --seeds 5
 
 The script simulates a GPS receiver along the ground truth of finished runs. The receiver gives one
-fix per second. The fixes have white noise, a bias that follows a random walk, gaps, and jumps by
-20 m that last ten seconds. The script prints the RMSE of these positions, as a mean over the seeds:
+fix per second. The fixes have white noise, a bias that follows a random walk, gaps, and jumps by 20
+m that last ten seconds. The script prints the RMSE of several positions. Each RMSE is a mean over
+the seeds. The positions are:
 
-- the run without GPS, after the alignment for its sensor;
-- the fixes;
-- the fixes interpolated at the times of the frames, with and without SE3 alignment;
-- the run with GPS, with and without SE3 alignment;
-- with ``--antenna``, the run with GPS if the antenna is assumed to be at the camera.
+- those of the run without GPS, after the alignment for its sensor;
+- those of the fixes;
+- those of the fixes, interpolated at the times of the frames, with and without SE3 alignment;
+- those of the run with GPS, with and without SE3 alignment;
+- with ``--antenna``, those of a run with GPS for which the antenna is assumed to be at the camera.
 
 Finally, it prints the median CPU time that was needed to add the fixes after the drive.
 """
@@ -69,7 +70,7 @@ def main() -> None:
 
 
 def measure(run: Path, options: argparse.Namespace) -> None:
-    """Print the rows of a run. The values are means over the seeds."""
+    """Measure a run with every seed, and print the means over the seeds."""
     visual = read_trajectory(run / "trajectory.tum")
     truth = read_trajectory(run / "ground_truth_kitti.txt", visual.timestamps)
     truth = Trajectory(truth.timestamps, truth.T_wc.copy())
@@ -115,7 +116,7 @@ def measure(run: Path, options: argparse.Namespace) -> None:
 
 
 def errors(positions: NDArray[np.float64], truth: Trajectory) -> tuple[float, float]:
-    """RMSE of ``(N, 3)`` positions in metres, with and without SE3 alignment."""
+    """Compute the RMSE of ``(N, 3)`` positions in metres, with and without SE3 alignment."""
     T_wc = truth.T_wc.copy()
     T_wc[:, :3, 3] = positions
     aligned = evaluate_trajectory(Trajectory(truth.timestamps, T_wc), truth, "se3").ate_rmse_m
@@ -126,7 +127,7 @@ def errors(positions: NDArray[np.float64], truth: Trajectory) -> tuple[float, fl
 def antenna_at(
     times: NDArray[np.float64], truth: Trajectory, antenna: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """``(M, 3)`` true positions of the antenna at ``(M,)`` times.
+    """Compute the ``(M, 3)`` true positions of the antenna at ``(M,)`` times.
 
     ``antenna`` is the position of the antenna in the camera frame.
     """
@@ -137,7 +138,10 @@ def antenna_at(
 def simulated(
     truth: Trajectory, options: argparse.Namespace, seed: int
 ) -> tuple[Fixes, NDArray[np.bool_]]:
-    """Simulate fixes along the ground truth. Returns them, and whether each fix lies in a jump."""
+    """Simulate GPS fixes along the ground truth.
+
+    Returns the fixes, and for each fix whether it lies in a simulated jump.
+    """
     rng = np.random.default_rng(seed)
     first, last = truth.timestamps[[0, -1]]
     times = np.arange(first, last, 1.0 / options.hertz)

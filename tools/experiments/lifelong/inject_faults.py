@@ -1,7 +1,7 @@
-r"""Make every part of a run fail once, and record the run's messages and results.
+r"""Makes each part of a run fail once, and records the messages and results of the run.
 
-tests/faults.py defines the faults and the points at which they are injected. It also judges the
-outcomes.
+tests/faults.py defines the faults and the points of a run at which they are injected. It also
+decides whether an outcome is correct.
 
     python tools/experiments/lifelong/inject_faults.py --out docs/research/lifelong/faults.csv
 """
@@ -27,7 +27,7 @@ from faults import FAULTS, POINTS, Row, inject, load_everything, run_in_fork, wr
 def inject_all(
     work: Path, points: Collection[str], faults: Collection[str], seed: int, *, once: bool
 ) -> list[Row]:
-    """Inject faults at some points and print the outcome of each.
+    """Inject faults at the given points of a run, and print the outcome of each fault.
 
     Args:
         work: an empty folder.

@@ -1,14 +1,15 @@
-"""Localise single images, under changes of light, in a map made by day, and count successes.
+"""Localise single images in a map that was made by day, under changes in lighting.
 
     python tools/experiments/light/day_night.py DATASET SEQ[=MAP_FRAMES] ... --out TABLE.csv
 
 The map is made from the first MAP_FRAMES frames and saved. Then each later left image is localised
-in the map, without using the other images. If MAP_FRAMES is not given, the map is made from the
-whole drive. In this case, all images of the drive except its keyframes are localised.
+in the map, without using other images. The script counts how many poses are right. If MAP_FRAMES is
+not given, the map is made from the whole drive. In this case, all images of the drive except its
+keyframes are localised.
 
 A pose counts as right if it is within 2 m and 15 degrees of the ground truth. These limits are
 those of AirSLAM's experiment on the reuse of maps (Xu et al., T-RO 2025, section VII-D). Poses are
-compared relative to the nearest frame of the map, so that the drift of the map does not count.
+compared relative to the nearest frame of the map. Therefore, drift of the map has no influence.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ LAWS = ("none", "dark:4", "dark:8", "dark:10", "dark:12", "brightness:1.5")
 
 @dataclass(frozen=True)
 class Day:
-    """A saved map.
+    """A saved map, which was made from a drive by day.
 
     Attributes:
         path: file of the map.
@@ -60,7 +61,7 @@ class Day:
 
 @dataclass(frozen=True)
 class WholeMap:
-    """Implements ``MapAccess`` for a map that does not change."""
+    """Gives access to a map that does not change (an implementation of ``MapAccess``)."""
 
     map: Map
     is_merged: bool = True
@@ -70,7 +71,7 @@ class WholeMap:
 
 
 def map_of(source: Source, n_frames: int, detector: str, path: Path) -> Day:
-    """Make a map from the first frames and save it."""
+    """Make a map from the first frames of a drive, and save the map."""
     slam = Slam(source.camera, detector=detector)
     for frame in islice(source.frames(), n_frames):
         slam.step(*frame.read(map), frame.timestamp)
@@ -82,13 +83,13 @@ def map_of(source: Source, n_frames: int, detector: str, path: Path) -> Day:
 
 
 class Localiser:
-    """Searches a saved map for single images."""
+    """Finds the poses of single images in a saved map."""
 
     def __init__(self, day: Day, detector: str, candidates: int) -> None:
-        """Load the map.
+        """Load the map in which images are localised.
 
-        ``candidates`` is the number of keyframes with which an image is compared. It applies to ORB
-        and to learned descriptors.
+        ``candidates`` is the number of keyframes with which an image is compared. It is the same
+        for ORB and for learned descriptors.
         """
         config = as_config(
             {
@@ -104,7 +105,11 @@ class Localiser:
         self._relocaliser = Relocaliser(slam.context, places.locate, recognise)
 
     def pose(self, image: Image) -> Matrix | None:
-        """``(4, 4)`` pose ``T_wc`` in the world frame of the map; None if localisation fails."""
+        """Localise an image.
+
+        Returns the ``(4, 4)`` pose ``T_wc`` in the world frame of the map, or None if localisation
+        fails.
+        """
         extracted = FrameImages(image, lambda: None, self._context).extracted
         frame = Frame.of(extracted, self._context.camera, image=image)
         lost = Found(TrackingState.LOST)
@@ -113,10 +118,10 @@ class Localiser:
 
 
 def is_right(T_wc: Matrix, k: int, day: Day, truth: Matrix) -> bool:
-    """Whether a pose is near enough to the ground truth.
+    """Return whether a pose is within 2 m and 15 degrees of the ground truth.
 
     Args:
-        T_wc: ``(4, 4)`` pose in the world frame of the map.
+        T_wc: ``(4, 4)`` pose of the image in the world frame of the map.
         k: index of the frame to which the image belongs.
         truth: ``(N, 4, 4)`` true poses of all frames.
     """
@@ -128,7 +133,7 @@ def is_right(T_wc: Matrix, k: int, day: Day, truth: Matrix) -> bool:
 
 
 def rows_of(source: Source, n_map: int | None, options: argparse.Namespace) -> Iterator[list]:
-    """Yield a row for each detector, number of candidates and perturbation."""
+    """Yield a row of the table for each detector, number of candidates and perturbation."""
     n = len(source.timestamps)
     for detector in options.detectors:
         with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""Write a table that shows which runs of ``vslam bench`` fail by AirSLAM's rules.
+"""Write a table that shows which runs of ``vslam bench`` fail according to AirSLAM's rules.
 
 vslam bench ... --perturb none,dark:1,dark:2 --out FOLDER
 python tools/experiments/light/ladder.py FOLDER TABLE.csv
@@ -16,7 +16,7 @@ from vslam.report.schema import ReportJson
 
 
 def rows_of(folder: Path) -> list[list[object]]:
-    """A row for each run, sorted by sequence, system, strength of the law and seed."""
+    """Return a row of the table for each run, sorted by sequence, system, strength and seed."""
     rows: list[list[object]] = []
     for path in folder.glob("*/report.json"):
         try:

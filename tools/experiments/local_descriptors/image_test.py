@@ -1,18 +1,19 @@
-"""Compare two tests of whether two images show the same place, on photographs of places.
+"""Compare two tests that decide whether two images show the same place, on photographs.
 
     python tools/experiments/local_descriptors/image_test.py PHOTOS multiview webcams
 
-PHOTOS is a folder of sets of photographs, with the images in SET/PLACE/. Every image is a query. It
-is paired with a right image and with two wrong images. The similarity of images is that of the
-capsule network.
+PHOTOS is a folder of sets of photographs, with the images in SET/PLACE/. Every image is a query.
+Each query is paired with a right image and with two wrong images. Similarities are computed using
+the capsule network.
 
-- The right image is the most similar image of the same place. The view of a webcam never changes.
-  Therefore, the right image of a webcam was taken at another hour, and the query is warped.
+- The right image is the most similar image of the same place. The viewpoint of a webcam never
+  changes. Therefore, for a webcam, the right image is one that was taken at a different hour, and
+  the query is warped.
 - The wrong images are the two most similar images of other places.
 
 The script prints the share of right pairs and the share of wrong pairs that pass each test. Both
-tests count the matches of coarse cells that fit one homography. In the test by share, the matches
-must cover 18 % of the image. In the test by number, there must be 90 matches.
+tests match the cells of a coarse grid and use the matches that fit one homography. The test by
+share requires that these matches cover 18 % of the image. The test by number requires 90 matches.
 """
 
 from __future__ import annotations
@@ -51,11 +52,12 @@ def main() -> None:
 
 
 def measure(folder: Path, of_place: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Test the pairs of a set.
+    """Apply both tests to all pairs of a set of photographs.
 
     Returns:
-        ``(N, 2)`` bool for the right pairs, and the same for the wrong pairs: whether a pair passes
-        the test by share, and whether it passes the test by number.
+        Two ``(N, 2)`` bool arrays, the first for the right pairs and the second for the wrong
+        pairs. The first column tells whether a pair passes the test by share, and the second column
+        whether it passes the test by number.
     """
     gallery, places = [], []
     for place in sorted(path for path in folder.iterdir() if path.is_dir()):

@@ -3,8 +3,9 @@
     python tools/experiments/masks/hood.py --data TOWNS --seq kitti07 --rows 0.2 0.35
 
 A hood with a random texture is painted over the lower part of the images of a stereo drive. The
-hood stays in place while the street moves. The script prints the lost frames, the inliers and the
-ATE of the drive without the hood, with the hood, and with the hood and a mask.
+hood stays in place in the image while the street moves. The script runs the drive without the hood,
+with the hood, and with the hood and a mask. For each run, it prints the lost frames, the inliers
+and the ATE.
 """
 
 from __future__ import annotations
@@ -63,10 +64,10 @@ def main() -> None:
 
 
 def draw_hood(height: int, width: int, rows: float) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Draw the ``(H, W)`` texture of a hood, and its mask (0 on the hood, 255 elsewhere).
+    """Draw the ``(H, W)`` texture of a car hood, and its mask (0 on the hood, 255 elsewhere).
 
-    The upper edge of the hood is an arc. In the middle column of the image, the hood covers the
-    share ``rows`` of all rows.
+    The upper edge of the hood is an arc. ``rows`` is the share of the rows that the hood covers in
+    the middle column of the image.
     """
     texture = np.random.default_rng(0).integers(20, 230, (height // 4, width // 4), dtype=np.uint8)
     texture = cv2.resize(cv2.GaussianBlur(texture, (0, 0), 1.0), (width, height))

@@ -2,9 +2,9 @@
 
     python tools/experiments/uncertainty/costs.py --data "$KITTI_ROOT" --seq 06 --frames 51
 
-The script runs a stereo drive alternately without a mask and with a mask that hides nothing. Apart
-from the mask, both runs do the same work. The script prints the medians of the CPU times. It fails
-if the trajectories of any two runs differ.
+The script runs a stereo drive alternately without a mask and with a mask that hides nothing.
+Therefore, both kinds of run do the same work apart from the mask. The script prints the medians of
+the CPU times. It fails if the trajectories of any two runs differ.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def main() -> None:
 
 
 def run(options: argparse.Namespace, mask: Path | None) -> RunOutcome:
-    """Run the drive with one thread and without loop detection."""
+    """Run a stereo drive with one thread and without loop detection."""
     given = RunOptions(
         data=options.data, dataset="kitti", seq=options.seq, max_frames=options.frames, mask=mask,
         detector="none",
@@ -78,7 +78,7 @@ def run(options: argparse.Namespace, mask: Path | None) -> RunOutcome:
 
 
 def timed(function: Callable[..., Any], times: list[float]) -> Callable[..., Any]:
-    """Wrap a function, so that the CPU seconds of each call are appended to ``times``."""
+    """Wrap a function so that the CPU time of each call, in seconds, is appended to ``times``."""
 
     def called(*args: Any, **more: Any) -> Any:
         start = time.thread_time()

@@ -4,9 +4,10 @@
 
 DATA is a folder in KITTI's format with exact ground truth, for example with rendered drives. Every
 drive is run under every perturbation. The script prints the normalised estimation error squared
-(NEES; Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, 2001, 5.4) of the
-motion over 1 s and over 10 s. The NEES is divided by the six degrees of freedom. Its mean is 1 if
-the covariances are consistent, and larger if they are too small.
+(NEES) of the motion over 1 s and over 10 s. The NEES is defined by Bar-Shalom et al., Estimation
+with Applications to Tracking and Navigation, 2001, section 5.4. The script divides the NEES by the
+six degrees of freedom. The mean is then 1 if the covariances are consistent, and larger than 1 if
+the covariances are too small.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ EVERY = 7  # frames between the starts of intervals; overlapping intervals have 
 
 
 def results_of(source: Source, law: str, seed: int) -> list[TrackResult]:
-    """The result of tracking for every frame."""
+    """Run a drive and return the result of tracking for every frame."""
     slam = Slam(source.camera)
     perturbation = parse_perturbation(law, seed).bound_to(source)
     results = []
@@ -42,7 +43,7 @@ def results_of(source: Source, law: str, seed: int) -> list[TrackResult]:
 
 
 def mean_nees(results: list[TrackResult], truth: Trajectory, interval_s: float) -> float:
-    """Mean NEES per degree of freedom of the motion over an interval."""
+    """Compute the mean NEES, per degree of freedom, of the motion over an interval of time."""
     return float(motion_errors(results, truth, interval_s).nees[SKIPPED::EVERY].mean())
 
 

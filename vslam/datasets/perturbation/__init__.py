@@ -1,9 +1,9 @@
 """Seeded perturbations of a sequence: light, weather, glass, sensor and stereo rig.
 
-A law is one kind of perturbation, for example fog. Its strength has a unit, which
-``docs/howto/stress.md`` lists. In this table, v is a grey value, s the strength, t the time in
-seconds since the first frame, k the index of the frame, and n a standard normal random number. The
-default strength of a law without a unit is 1.
+A *law* is one kind of perturbation, for example fog. The strength of a law has a unit.
+``docs/howto/stress.md`` lists all units. In this table, v is a grey value, s the strength, t the
+time in seconds since the first frame, k the index of the frame, and n a standard normal random
+number. The default strength of a law without a unit is 1.
 
 ============  ======================================================================================
 brightness    v exp(g(t)) + b(t). g and b are Ornstein-Uhlenbeck processes with a time constant of
@@ -58,17 +58,17 @@ black_right   % of the seconds in which the right image is black.
 black_left    % of the seconds in which the left image is black.
 ============  ======================================================================================
 
-Each law rounds and clips its result to 8 bits.
+Each law rounds its result and clips it to 8 bits.
 
 The laws at the end of the table, beginning with stereo_gain, change the image of one camera. All
 other laws change both images in the same way. However, noise, night, shot, impulse, dirt and drops
 on the glass are drawn for each camera separately.
 
 Each law draws from its own random stream, so that it does not depend on other laws. The effect of a
-law on frame k depends only on the seed, on k and on the time of frame k. It does not depend on the
-order in which frames are read. Random processes are defined on a fixed grid in time, so that
-dropped frames do not change the light. They are extended when frames arrive, so that a stream may
-be endless. Laws of plug-ins (docs/howto/plugins.md) must follow the same rules.
+law on frame k depends only on the seed, on k and on the time of frame k. Therefore, frames may be
+read in any order. Random processes are defined on a fixed grid in time, so that dropped frames do
+not change the light. The processes are extended when frames arrive, so that a stream may be
+endless. Laws of plug-ins (docs/howto/plugins.md) must follow the same rules.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Dense depth of an image by semi-global matching, for perturbations that depend on distance."""
+"""Computes the dense depth of an image, for perturbations that depend on distance."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ _NEAREST_M = 3.0  # nearest depth in the search range
 def dense_depths(
     camera: Camera, left: Image, second: Image | DepthImage | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Estimate the depth of all pixels.
+    """Estimate the depth of all pixels of a frame.
 
-    If the second image is a right image, it is matched with the left one (SGBM; Hirschmueller,
-    PAMI 2008).
+    If the second image is a right image, the two images are matched using semi-global matching
+    (SGBM; Hirschmueller, PAMI 2008).
 
     Args:
         camera: calibration of the images.
         left: ``(H, W)`` uint8.
-        second: right image, ``(H, W)`` uint8; or the depth of the left image's pixels, ``(H, W)``
-            float32 metres, 0 where unknown.
+        second: right image, ``(H, W)`` uint8. For RGB-D, it is the depth of the left image's
+            pixels, ``(H, W)`` float32 metres, 0 where unknown.
 
     Returns:
-        ``(H, W)`` depth along z of the left image's pixels in metres, and the same for the right
-        image, or None if there is no right image. The depth is infinite where it is very large or
-        unknown, for example in the sky.
+        Two ``(H, W)`` arrays of depth along z in metres, for the pixels of the left and of the
+        right image. The second array is None if there is no right image. The depth is infinite
+        where it is very large or unknown, for example in the sky.
     """
     if second is not None and second.dtype != np.uint8:
         depth = np.asarray(second, np.float32)
@@ -44,7 +44,7 @@ def dense_depths(
 def disparity(
     camera: Camera, image: Image, other: Image, *, mirrored: bool = False
 ) -> NDArray[np.float32]:
-    """Disparities of the pixels of ``image``.
+    """Compute the disparities of the pixels of ``image``.
 
     Args:
         image: ``(H, W)`` uint8, the left image of a pair, or the right image if ``mirrored``.
@@ -82,10 +82,10 @@ def disparity(
 
 
 def _filled(found: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Fill pixels without a match from the two nearest matches in their row.
+    """Fill each pixel without a match, using the two nearest matches in its row.
 
-    They get the smaller one of both disparities, because occluded pixels belong to the background
-    (rule of Geiger et al., CVPR 2012).
+    The pixel gets the smaller one of both disparities, because occluded pixels belong to the
+    background. This is the rule of Geiger et al., CVPR 2012.
     """
     known = found > 0
     columns = np.broadcast_to(np.arange(found.shape[1]), found.shape)

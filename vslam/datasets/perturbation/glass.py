@@ -57,7 +57,7 @@ def _vignetting(stops: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 
 def _dirt(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
-    """Cover the image with blobs, which differ between the cameras but stay the same all drive."""
+    """Cover the image with blobs of dirt. They differ between the cameras but do not move."""
     opacity = [_blobs(percent / 100.0, [*stream, side], scene) for side in range(2)]
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:
@@ -80,9 +80,9 @@ def _blobs(share: float, seed: list[int], scene: Scene) -> NDArray[np.float32]:
 
 
 def _flare(greys: float, stream: RandomStream, scene: Scene) -> PairLaw:
-    """Add the glare of a sun that stays at one place in the image.
+    """Add the glare of a sun that does not move in the image.
 
-    The place is the same in both cameras, because the sun is far away.
+    The sun is at the same place in both cameras, because it is far away.
     """
     camera = scene.camera
     rng = np.random.default_rng(stream)
@@ -104,7 +104,7 @@ def _flare(greys: float, stream: RandomStream, scene: Scene) -> PairLaw:
 def _cosine_to(
     sun: NDArray[np.float64], x: NDArray[np.float32], y: NDArray[np.float32], scene: Scene
 ) -> NDArray[np.float64]:
-    """Cosine of the angle between the viewing rays of pixels and that of the pixel ``sun``."""
+    """Return the cosine of the angle between the viewing rays of all pixels and of ``sun``."""
     camera = scene.camera
     ray = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)])
     to_sun = np.array([(sun[0] - camera.cx) / camera.fx, (sun[1] - camera.cy) / camera.fy, 1.0])

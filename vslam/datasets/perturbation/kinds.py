@@ -38,9 +38,9 @@ class Pair:
         index: index of the frame.
         t: seconds since the first frame.
         left: left image, ``(H, W)`` uint8.
-        second: right image, ``(H, W)`` uint8; or depth image, ``(H, W)`` float32 metres; or None
-            for a monocular source.
-        clean: both images before any law changed them.
+        second: right image, ``(H, W)`` uint8. For RGB-D, it is the depth image, ``(H, W)`` float32
+            metres. None for a monocular source.
+        clean: both images before any perturbation.
     """
 
     index: int
@@ -62,13 +62,14 @@ PairLaw = Callable[[Pair], Pair]
 
 @dataclass(frozen=True)
 class Scene:
-    """The data of a source that a law may use in addition to the images of a frame.
+    """The data of a source that a perturbation may use in addition to the images of a frame.
 
     Attributes:
         camera: calibration of the source.
         times: ``(N,)`` seconds since the first frame; None if the source cannot seek.
         T_wc: ``(N, 4, 4)`` true camera poses, NaN where unknown; None if there are none.
-        read: reads the images of the frame with the given index; None if the source cannot seek.
+        read: function that reads the images of the frame with a given index. None if the source
+            cannot seek.
     """
 
     camera: Camera
@@ -78,7 +79,7 @@ class Scene:
 
     @classmethod
     def of(cls, source: Source) -> Scene:
-        """The scene of a source."""
+        """Collect the data of a source that perturbations may use."""
         if not source.seekable:
             return cls(source.camera)
         times = source.timestamps
@@ -95,7 +96,7 @@ _UNMET: dict[Need, str] = {
 
 
 def check_need(law: str, need: Need, scene: Scene) -> None:
-    """Check that the source has the data that a law needs.
+    """Check that a source has the data that a law (kind of perturbation) needs.
 
     Raises:
         InputError: the source does not have this data.
@@ -111,14 +112,14 @@ def check_need(law: str, need: Need, scene: Scene) -> None:
 
 @dataclass(frozen=True)
 class SceneLaw:
-    """A law that must be bound to a scene before it can be applied."""
+    """A perturbation that needs data of the source, so that it must be bound to a scene first."""
 
     name: str
     needs: tuple[Need, ...]
     make: Callable[[Scene], PairLaw]
 
     def bound_to(self, scene: Scene) -> PairLaw:
-        """Bind the law to a scene.
+        """Return the perturbation for the source with the data in a scene.
 
         Raises:
             InputError: the source does not have the data that the law needs.
@@ -133,16 +134,16 @@ class SceneLaw:
 
 @dataclass(frozen=True)
 class LawKind:
-    """A kind of perturbation, which makes laws of any strength and seed.
+    """A kind of perturbation, from which a perturbation of any strength and seed can be made.
 
     Attributes:
-        make: ``(strength, stream) -> Law``. If ``of_scene`` is set, it is
-            ``(strength, stream, scene) -> PairLaw``.
+        make: function that makes the perturbation: ``(strength, stream) -> Law``. If ``of_scene``
+            is set, it is ``(strength, stream, scene) -> PairLaw``.
         unit: unit of the strength.
         default: strength that is used if none is given.
         weakest: weakest strength that ``vslam stress`` tries.
-        strongest: strongest strength that ``vslam stress`` tries. It is the smaller number of the
-            two if a small number has a large effect, for example a short visibility in fog.
+        strongest: strongest strength that ``vslam stress`` tries. It is smaller than ``weakest`` if
+            small numbers have a large effect, such as a short visibility in fog.
         about: a description in a few words.
         least: smallest allowed strength.
         most: largest allowed strength.
@@ -150,8 +151,8 @@ class LawKind:
             difference.
         drawn: whether the effect is random, so that the images depend on the seed.
         needs: data that the source must have.
-        of_scene: whether the law needs the scene.
-        sides: ``both`` if the law changes both images, ``one`` for a fault of the stereo rig.
+        of_scene: whether data of the source are needed in addition to the images of a frame.
+        sides: ``both`` if both images are changed, ``one`` for a fault of the stereo rig.
     """
 
     make: Callable[..., Law | PairLaw]
@@ -169,7 +170,7 @@ class LawKind:
     sides: Literal["both", "one"] = "both"
 
     def law(self, name: str, strength: float, stream: RandomStream) -> PairLaw | SceneLaw:
-        """Make the law of one strength and seed."""
+        """Make the perturbation of a given strength and seed."""
         if not self.of_scene:
             return EachSide(self.make(strength, stream))  # type: ignore[arg-type]
         return SceneLaw(name, self.needs, partial(self.make, strength, stream))  # type: ignore[arg-type]
@@ -177,7 +178,7 @@ class LawKind:
 
 @dataclass(frozen=True)
 class EachSide:
-    """Applies a law for one image to both images. Depth stays unchanged."""
+    """Applies a perturbation of one image to both images of a frame. Depth is not changed."""
 
     law: Law
 

@@ -1,4 +1,4 @@
-"""Parse ``--perturb``, and apply the laws to the frames of a source."""
+"""Parses ``--perturb``, and applies the perturbation to the frames of a source."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ from vslam.errors import DroppedFrameError, InputError, did_you_mean
 
 @dataclass(frozen=True)
 class Perturbation:
-    """Laws that are applied to each frame one after the other.
+    """Laws (kinds of perturbation with a strength) that are applied to each frame in turn.
 
     If there are no laws, the images stay unchanged.
 
     Attributes:
         name: canonical spelling, for example ``none`` or ``brightness:1.5,blur:0.5``.
-        laws: see `vslam.datasets.perturbation`.
+        laws: the laws, in the order in which they are applied. `vslam.datasets.perturbation`
+            describes them.
     """
 
     name: str
@@ -34,7 +35,7 @@ class Perturbation:
     def bound_to(self, source: Source) -> Perturbation:
         """Prepare the perturbation for one source.
 
-        This is needed because some laws use the depth or the poses of the source.
+        This is necessary because some laws use the depth or the poses of the source.
 
         Raises:
             InputError: the source does not have the data that a law needs.
@@ -51,14 +52,15 @@ class Perturbation:
         """Perturb the images of a frame. This method is thread-safe.
 
         Depth images stay unchanged, because depth sensors have their own light source. Fog is the
-        only law for which the left image depends on the second one, because its depth is computed
-        from both images.
+        only law for which the left image depends on the second image, because the depth for fog is
+        computed from both images.
 
         Args:
             index: index of the frame.
             t: seconds since the first frame.
-            left: left image, as in `vslam.datasets.frames.TimedFrame`.
-            second: right image, depth image or None, as in `vslam.datasets.frames.TimedFrame`.
+            left: left image, ``(H, W)`` uint8.
+            second: right image, ``(H, W)`` uint8. For RGB-D, it is the depth image, ``(H, W)``
+                float32 metres. None for a monocular source.
 
         Raises:
             DroppedFrameError: the perturbation drops the frame.
@@ -75,7 +77,7 @@ def parse_perturbation(spec: str, seed: int) -> Perturbation:
     Args:
         spec: one or more laws, each written as ``law[:strength]``, separated by commas. They are
             applied in this order. ``none`` or the empty string means no perturbation.
-        seed: not negative. Equal seeds produce equal images.
+        seed: seed of all random numbers, not negative. Equal seeds produce equal images.
 
     Raises:
         InputError: a law is unknown or repeated, a strength is not a number in the law's range, the
@@ -109,9 +111,9 @@ def parse_perturbation(spec: str, seed: int) -> Perturbation:
 
 
 def perturbed(frames: Iterator[TimedFrame], perturbation: Perturbation) -> Iterator[TimedFrame]:
-    """Yield the same frames, whose images are perturbed when they are read.
+    """Yield the frames of a source. Their images are perturbed when they are read.
 
-    The time of the laws is 0 at the first frame.
+    For the perturbation, time starts with 0 at the first frame.
     """
     first = None
     laws = [law for law in perturbation.laws if isinstance(law, EachSide)]
@@ -158,7 +160,7 @@ def contact_sheet(
     start: int = 0,
     every: int = 1,
 ) -> Image:
-    """Show a perturbation in a grey image with one row for each frame.
+    """Draw a grey image that shows a perturbation, with one row for each frame.
 
     Each row shows the original left image, the perturbed images, and the amplified change of the
     image that changed more.
@@ -182,9 +184,10 @@ def contact_sheet(
 
 
 def sheet_of_laws(sequence: Source, specs: Collection[str], index: int, seed: int) -> Image:
-    """Show several perturbations of one frame in a grey image.
+    """Draw a grey image that shows several perturbations of one frame.
 
-    Each perturbation has a row as in `contact_sheet`. Several rows are arranged in two columns.
+    Each perturbation has a row with the original left image, the perturbed images, and the
+    amplified change. Several rows are arranged in two columns.
 
     Raises:
         InputError: the sequence does not have the data that a law needs.
@@ -203,7 +206,7 @@ def sheet_of_laws(sequence: Source, specs: Collection[str], index: int, seed: in
 
 
 def laws_for(sequence: Source) -> tuple[list[str], dict[str, str]]:
-    """The names of the laws that can be applied to a source, and why the others cannot."""
+    """Return the names of the laws that a source allows, and why it does not allow the others."""
     applicable, reasons = [], {}
     for name in all_laws():
         try:

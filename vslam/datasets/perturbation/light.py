@@ -1,6 +1,6 @@
-"""Perturbations of the light, and of the camera's response to it.
+"""Perturbations of the light, and of the camera's response to light.
 
-The random processes are endless in time. They do not depend on the order in which frames are read.
+The random processes are endless in time and do not depend on the order in which frames are read.
 """
 
 from __future__ import annotations
@@ -37,11 +37,13 @@ _LIT_S = 1.0  # time before the first blackout may begin
 def ou_walk(
     deviation: float, rng: np.random.Generator, jumps: Iterable[float] = ()
 ) -> Iterator[float]:
-    """An endless Ornstein-Uhlenbeck process with a time constant of 2 s, exact on a 10 ms grid.
+    """Generate an endless Ornstein-Uhlenbeck process with a time constant of 2 s.
+
+    The process is exact on a grid of 10 ms.
 
     Args:
         deviation: stationary standard deviation. The process begins in the stationary state.
-        rng: generates one normal number for each step.
+        rng: random generator, from which one normal number is drawn for each step.
         jumps: increasing times in seconds at which the process is redrawn with 1.5 times the
             deviation.
     """
@@ -77,7 +79,7 @@ class Cached:
 
 
 def on_grid(t: float) -> int:
-    """The index of the grid step of a process at time t (seconds)."""
+    """Return the index of the grid step of a process at time t (seconds)."""
     # Without the small offset, rounding errors could move a time on the grid to the previous step.
     return floor(t / STEP_S + 1e-6)
 
@@ -91,10 +93,11 @@ def jump_times(rng: np.random.Generator, per_second: float = _JUMPS_PER_S) -> It
 
 
 def _pointwise(curve: Callable[[int, float], NDArray[np.float64]]) -> Law:
-    """Make a law that maps each grey value by a curve.
+    """Make a perturbation that maps each grey value by a curve.
 
     Args:
-        curve: returns the ``(256,)`` new grey values for the index and the time of a frame.
+        curve: function that returns the ``(256,)`` new grey values, given the index and the time of
+            a frame.
     """
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:
@@ -134,7 +137,7 @@ def _flicker(strength: float, stream: RandomStream) -> Law:
 
 
 def _exposure(seconds: float, stream: RandomStream) -> Law:
-    """Lower and raise the light by 3 stops in turn. The exposure follows with a time constant."""
+    """Lower and raise the light by 3 stops in turn. The exposure follows with a delay."""
 
     def errors() -> Iterator[float]:
         rng = np.random.default_rng(stream)
@@ -182,7 +185,7 @@ def _blackout(period: float, stream: RandomStream) -> Law:
     """Switch the light off once in every period, at a random time.
 
     Two kinds of blackout alternate (``_BLACKOUTS``). After a short blackout, the light increases
-    slowly. After a long blackout, it increases fast.
+    slowly. After a long blackout, the light increases fast.
     """
 
     def curve(frame: int, t: float) -> NDArray[np.float64]:

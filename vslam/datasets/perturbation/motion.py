@@ -1,4 +1,4 @@
-"""Motion blur by the rotation of the camera during the exposure.
+"""Motion blur that the rotation of the camera causes during the exposure.
 
 The functions that compute the velocities of the camera and of the image are also used by other
 perturbations.
@@ -16,7 +16,9 @@ _SHRINK = 2
 
 
 def optical_flow(first: Image, second: Image) -> NDArray[np.float32]:
-    """Optical flow by dense inverse search (Kroeger et al., ECCV 2016) at half size.
+    """Compute the optical flow between two images at half size.
+
+    The method is dense inverse search (Kroeger et al., ECCV 2016).
 
     Returns:
         ``(H, W, 2)`` displacement of each pixel from ``first`` to ``second``, in pixels.
@@ -35,7 +37,7 @@ def optical_flow(first: Image, second: Image) -> NDArray[np.float32]:
 
 
 def neighbours(scene: Scene, frame: int) -> tuple[int, int]:
-    """Indices of the previous and the next frame.
+    """Return the indices of the frames before and after a frame.
 
     If there is no previous or next frame, the frame's own index takes its place.
     """
@@ -44,11 +46,12 @@ def neighbours(scene: Scene, frame: int) -> tuple[int, int]:
 
 
 def image_velocity(scene: Scene, frame: int) -> NDArray[np.float64]:
-    """Velocity with which the camera's rotation moves the image, ``(2,)`` pixels per second.
+    """Return the velocity with which the camera's rotation moves the image centre.
 
-    It is the velocity at the image centre, and is computed from the true rotation if this is known.
-    Otherwise, it is the median optical flow to the next frame, which also contains the flow due to
-    the forward motion.
+    Returns ``(2,)`` pixels per second.
+
+    The velocity is computed from the true rotation if this is known. Otherwise, it is the median
+    optical flow to the next frame. The optical flow also contains the effect of the forward motion.
     """
     assert scene.times is not None
     assert scene.read is not None
@@ -69,7 +72,7 @@ def image_velocity(scene: Scene, frame: int) -> NDArray[np.float64]:
 
 
 def forward_speed(scene: Scene, frame: int) -> float:
-    """Forward speed of the camera in metres per second; 0 if it is unknown."""
+    """Return the forward speed of the camera in metres per second; 0 if it is unknown."""
     if scene.times is None or scene.T_wc is None:
         return 0.0
     previous, following = neighbours(scene, frame)
@@ -81,7 +84,7 @@ def forward_speed(scene: Scene, frame: int) -> float:
 
 
 def line_kernel(shift: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Weights of a centred filter for motion blur along a straight line.
+    """Return the weights of a centred filter for motion blur along a straight line.
 
     Args:
         shift: ``(2,)`` displacement in x and y during the exposure, in pixels.

@@ -1,7 +1,7 @@
 """All laws (kinds of perturbation) by name.
 
-Plug-ins in other Python packages may add laws (docs/howto/plugins.md). Their result is checked for
-every image.
+Plug-ins in other Python packages may add laws (docs/howto/plugins.md). Every image that such a law
+returns is checked.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ _PROBE = (48, 64)  # rows and columns of the image on which a new law is tried
 
 
 def plugin_laws() -> dict[str, Callable[[float, tuple[int, int]], PlugInLaw]]:
-    """The laws that plug-ins in other Python packages define.
+    """Return the laws (kinds of perturbation) that plug-ins in other Python packages define.
 
     Returns:
-        For the name of each law, a function that makes the law from its strength and from a random
-        stream (`RandomStream`).
+        A function for each law by its name. The function makes the law from a strength and from a
+        random stream (`RandomStream`).
     """
     return {name: partial(_make, plugin) for name, plugin in find_plugins(PERTURBATIONS).items()}
 
 
 def _make(plugin: PlugIn, strength: float, stream: tuple[int, int]) -> PlugInLaw:
-    """Make a law and try it on a grey image.
+    """Make a perturbation of a plug-in, and try it on a grey image.
 
     Raises:
         InputError: the plug-in is broken, or does not return a law.
@@ -50,7 +50,7 @@ def _make(plugin: PlugIn, strength: float, stream: tuple[int, int]) -> PlugInLaw
 
 
 def _apply(plugin: PlugIn, law: PlugInLaw, frame: int, t: float, side: int, image: Image) -> Image:
-    """Apply a law to an image.
+    """Apply a perturbation of a plug-in to an image.
 
     Raises:
         UnreadableImageError: the law fails, or does not return an image of the same size. The run
@@ -88,7 +88,10 @@ LAWS: dict[str, LawKind] = {
 
 
 def all_laws() -> dict[str, LawKind]:
-    """vslam's own laws, followed by those of plug-ins, whose strengths are from 0 to 10."""
+    """Return all laws: those of vslam, followed by those of plug-ins.
+
+    The strengths of laws of plug-ins are from 0 to 10.
+    """
     others = {
         name: LawKind(make, "x", 1.0, 0.1, 10.0, "of another package", logarithmic=True)
         for name, make in plugin_laws().items()
@@ -98,7 +101,7 @@ def all_laws() -> dict[str, LawKind]:
 
 
 def law_kind(name: str) -> LawKind:
-    """The law with this name.
+    """Return the law (kind of perturbation) with a given name.
 
     Raises:
         KeyError: there is no such law.

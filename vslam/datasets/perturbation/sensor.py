@@ -1,4 +1,4 @@
-"""Perturbations by the sensor, by compression and by transmission."""
+"""Perturbations that the sensor, compression or transmission cause."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def _drop(percent: float, stream: RandomStream) -> Law:
 def _outage(seconds: float, stream: RandomStream) -> Law:
     """Drop all frames during one outage in every ten seconds.
 
-    The outage has a random time, but does not begin in the first second of the run.
+    The time of each outage is random, but no outage begins in the first second of the run.
     """
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:

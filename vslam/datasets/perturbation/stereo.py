@@ -1,4 +1,4 @@
-"""Perturbations by faults of a stereo rig, which affect only one camera."""
+"""Perturbations that faults of a stereo rig cause. They affect only one camera."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from vslam.datasets.perturbation.motion import neighbours, optical_flow
 
 
 def _of_right(change: Callable[[Pair, Image], Image]) -> PairLaw:
-    """Make a law that changes only the right image."""
+    """Make a perturbation that changes only the right image."""
 
     def law(pair: Pair) -> Pair:
         right = pair.right
@@ -67,7 +67,7 @@ def _baseline(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 
 def _moved(image: Image, shift: NDArray[np.float32]) -> Image:
-    """Shift the pixels of an image.
+    """Shift each pixel of an image.
 
     Args:
         shift: ``(H, W, 2)`` pixels. The new value of a pixel is taken from its position minus its
@@ -84,7 +84,7 @@ def _moved(image: Image, shift: NDArray[np.float32]) -> Image:
 
 
 def _turned(axis: int) -> Callable[[float, RandomStream, Scene], PairLaw]:
-    """Make a law that turns the right camera about its x axis (0) or y axis (1)."""
+    """Make a perturbation that turns the right camera about its x axis (0) or y axis (1)."""
 
     def make(arc_minutes: float, stream: RandomStream, scene: Scene) -> PairLaw:
         from scipy.spatial.transform import Rotation
@@ -109,7 +109,7 @@ def _turned(axis: int) -> Callable[[float, RandomStream, Scene], PairLaw]:
 def _black(
     side: Literal["left", "right"],
 ) -> Callable[[float, RandomStream, Scene], PairLaw]:
-    """Make a law that turns the images of one side black during some seconds."""
+    """Make a perturbation that makes the images of one camera black during some seconds."""
 
     def make(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
         def law(pair: Pair) -> Pair:

@@ -60,18 +60,18 @@ def _fog(visibility_m: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 
 def drops_per_m3(mm_per_h: float) -> tuple[float, float]:
-    """Density of raindrops at a rainfall rate [Marshall and Palmer, J. Meteorology 1948].
+    """Compute the density of raindrops at a rainfall rate [Marshall and Palmer, J. Met. 1948].
 
     Returns:
-        The number of drops larger than 1 mm per cubic metre, and the rate (1/mm) at which the
-        number decays exponentially with the diameter.
+        The number of drops larger than 1 mm per cubic metre. Also the rate (1/mm) at which the
+        number of drops decays exponentially with the diameter.
     """
     rate = 4.1 * mm_per_h**-0.21
     return 8000.0 / rate * exp(-rate * _LEAST_MM), rate
 
 
 def fall_speed(diameter_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Terminal velocity of raindrops in m/s [Atlas et al., Rev. Geophysics 1973]."""
+    """Return the terminal velocity of raindrops in m/s [Atlas et al., Rev. Geophysics 1973]."""
     return 9.65 - 10.3 * np.exp(-0.6 * diameter_mm)
 
 
@@ -93,7 +93,7 @@ def _rain(mm_per_h: float, stream: RandomStream, scene: Scene) -> PairLaw:
 def _streaks(
     mm_per_h: float, rng: np.random.Generator, side: int, frame: int, scene: Scene
 ) -> NDArray[np.float32]:
-    """``(H, W)`` opacity of the drops that fall during the exposure.
+    """Return the ``(H, W)`` opacity of the drops that fall during the exposure.
 
     The opacity is the share of the exposure during which a drop covers a pixel (Garg and Nayar,
     IJCV 2007). Both cameras see the same drops.
@@ -133,7 +133,7 @@ def _streaks(
 
 
 def glass_drops(mm_per_h: float, camera: Camera) -> float:
-    """Mean number of drops on a glass that is 30 mm wide and wiped every 3 s.
+    """Return the mean number of drops on a glass that is 30 mm wide and wiped every 3 s.
 
     All water that falls on the glass is assumed to form drops of 2 mm.
     """
@@ -145,7 +145,7 @@ def glass_drops(mm_per_h: float, camera: Camera) -> float:
 def _drops_on_glass(
     image: Image, mm_per_h: float, rng: np.random.Generator, camera: Camera
 ) -> Image:
-    """Draw drops as lenses, which show the scene smaller, upside down and out of focus."""
+    """Draw drops on the glass as lenses. They show the scene small, upside down and blurred."""
     import cv2
 
     n = rng.poisson(glass_drops(mm_per_h, camera))

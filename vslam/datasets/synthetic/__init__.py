@@ -1,6 +1,6 @@
 """Rendered towns: stereo drives with exact ground truth, in KITTI's format.
 
-They are rendered on this computer, so that nothing has to be downloaded.
+The drives are rendered on this computer, so that nothing has to be downloaded.
 """
 
 from __future__ import annotations
@@ -81,10 +81,11 @@ def open_synthetic(
     """Open a drive on a built-in route. Frames that are not in the cache are rendered first.
 
     Args:
-        name: name of the drive, as for `parse_drive`.
-        variation: variation of the town, which replaces the variation in the name.
-        start, every, max_frames, monocular: as for `open_kitti`.
-        threads, on_frame: as for `render_sequence`.
+        name: name of the drive, for example ``05+change:0.5+seed:1`` (`parse_drive`).
+        variation: variation of the town. If it is given, it is used instead of the variation in the
+            name.
+        start, every, max_frames, monocular: which frames and cameras are read (`open_kitti`).
+        threads, on_frame: threads of the renderer, and a function for progress (`render_sequence`).
 
     Raises:
         InputError: the route or the variation is unknown, or `render_sequence` or `open_kitti`

@@ -1,4 +1,4 @@
-"""Textures of buildings: plaster or brick, windows, doors, shops, signs and stains."""
+"""Paints the textures of buildings: walls, windows, doors, shops, signs and stains."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class FacadeStyle:
     Attributes:
         wall, frame, glass: grey levels of walls, window frames and panes.
         brick: whether the walls are of brick instead of plaster.
-        storey: vertical distance between windows in metres.
+        storey: height of a storey, which is the vertical distance between windows, in metres.
         pitch: horizontal distance between windows in metres.
         window: ``(width, height)`` of a window in metres.
         shutters, balconies, shop, bands: whether the house has these.
@@ -37,7 +37,7 @@ class FacadeStyle:
 
 
 def random_style(rng: Rng, *, town: bool) -> FacadeStyle:
-    """Draw a random style. In a town, houses may have shops, and fewer of them have shutters."""
+    """Draw a random style of a house. Houses in a town may have shops, and fewer have shutters."""
     brick = bool(rng.random() < 0.22)
     low, high = (70, 125) if brick else (185, 238) if rng.random() < 0.6 else (120, 180)
     return FacadeStyle(
@@ -65,7 +65,8 @@ def facade(
         lived: random generator for what residents change, such as blinds, curtains and lights.
         style: style of the house.
         size: width and height in metres.
-        front: whether it is the front, with a door and a shop, or a side with fewer windows.
+        front: whether the side is the front, which has a door and perhaps a shop. Other sides have
+            fewer windows.
 
     Returns:
         ``(H, W)`` albedo, 0 to 255, and ``(H, W)`` brightness of the windows at night, 0 to 1.
@@ -115,7 +116,7 @@ def facade(
 
 
 def _texels(metres: float) -> int:
-    """Number of texels, a power of two, for about 2.5 cm per texel."""
+    """Return a number of texels that is a power of two and gives about 2.5 cm per texel."""
     return int(np.clip(2 ** round(np.log2(metres / 0.025)), 64, 512))
 
 

@@ -23,13 +23,16 @@ _SAMPLED = 5  # number of frames whose checksums are compared in a quick check
 
 
 def frame_files(folder: Path, frame: int, depth: bool) -> list[Path]:
-    """Paths of the left and right image of a frame and, with ``depth``, of its depth image."""
+    """Return the paths of the left and right image of a frame. ``depth`` adds its depth image."""
     names = ("image_0", "image_1", *(("depth_0",) if depth else ()))
     return [folder / name / f"{frame:06d}.png" for name in names]
 
 
 def checksum(paths: Collection[Path]) -> str:
-    """The first 64 bits of the SHA-256 of the concatenated files, as a hexadecimal number."""
+    """Compute a checksum of several files as a hexadecimal number.
+
+    It is the first 64 bits of the SHA-256 digest of the concatenated files.
+    """
     digest = hashlib.sha256()
     for path in paths:
         digest.update(path.read_bytes())
@@ -37,7 +40,7 @@ def checksum(paths: Collection[Path]) -> str:
 
 
 def size(paths: Collection[Path]) -> int:
-    """Total size of the files in bytes; -1 if one is missing."""
+    """Return the total size of the files in bytes; -1 if a file is missing."""
     try:
         return sum(path.stat().st_size for path in paths)
     except FileNotFoundError:
@@ -45,12 +48,13 @@ def size(paths: Collection[Path]) -> int:
 
 
 def damaged_frames(folder: Path, manifest: dict[str, Any], *, thorough: bool) -> list[int]:
-    """Frames whose files differ from the manifest of a complete sequence.
+    """Return the frames whose files differ from the manifest of a complete sequence.
 
     Args:
         folder: folder of the sequence.
         manifest: the ``checksums`` and ``sizes`` of the files of each frame.
-        thorough: compare all checksums. Otherwise, all sizes and a few checksums are compared.
+        thorough: whether all checksums are compared. Otherwise, all sizes and a few checksums are
+            compared.
     """
     sums, depth = manifest["checksums"], bool(manifest["depth"])
     sizes = manifest.get("sizes") or [None] * len(sums)
@@ -110,7 +114,7 @@ def check_disk(cache: Path, frames: int, depth: bool) -> None:
 
 @contextmanager
 def writing(cache: Path) -> Iterator[None]:
-    """Convert errors of the file system to an `InputError`."""
+    """Convert errors of the file system in the ``with`` block to an `InputError`."""
     try:
         yield
     except OSError as error:

@@ -50,7 +50,7 @@ class FisheyeRig:
 
 
 def fisheye_rig(camera: Camera) -> FisheyeRig:
-    """The fisheye pair that replaces a rectified pair."""
+    """Return a fisheye pair at the positions of the cameras of a rectified pair."""
     models, rotations = [], []
     for scale, (dx, dy), distortion, turn in _SIDES:
         focal = scale * camera.fx
@@ -65,9 +65,10 @@ def fisheye_rig(camera: Camera) -> FisheyeRig:
 
 
 def wide_camera(camera: Camera) -> Camera:
-    """The rectified pair that is rendered.
+    """Return the rectified pinhole pair that is rendered for a fisheye pair.
 
-    It has the same focal length, and the smallest images that cover the view of the fisheye pair.
+    The pinhole pair has the same focal length as the given pair. Its images are the smallest ones
+    that cover the view of the fisheye pair.
     """
     rig = fisheye_rig(camera)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
@@ -95,14 +96,15 @@ def render_fisheye(
     interrupted rendering.
 
     Args:
-        route, variation, until, threads, on_frame: as for `render_sequence`.
+        route, variation, until, threads, on_frame: what is rendered and how (`render_sequence`).
         folder: output folder, to which ``mav0``, ``camchain.yaml`` and ``pinhole`` are written.
 
     Returns:
         ``folder``.
 
     Raises:
-        InputError: as `render_sequence`.
+        InputError: the folder cannot be written, the disk is too small, or another process is
+            rendering the sequence.
     """
     rig = fisheye_rig(route.camera)
     wide = replace(route, camera=wide_camera(route.camera))
@@ -135,7 +137,7 @@ def render_fisheye(
 
 
 def _seen_at(model: CameraModel, R_own_rectified: Array, camera: Camera) -> NDArray[np.float32]:
-    """The pixel of the pinhole camera that has the same viewing direction as each fisheye pixel.
+    """For each fisheye pixel, find the pinhole pixel with the same viewing direction.
 
     Returns:
         ``(H, W, 2)`` float32 coordinates in the image of the rectified pinhole camera, in pixels.

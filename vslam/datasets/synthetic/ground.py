@@ -1,4 +1,4 @@
-"""The ground of a town, which is a mesh over the terrain with a separate texture for each tile."""
+"""Makes the ground of a town: a mesh over the terrain, with a texture for each tile."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def make_ground(
 
 
 def _tile(x: float, z: float, terrain: Terrain, texture: int, fine: int) -> Surfaces:
-    """Make two triangles for each cell of the terrain in a tile."""
+    """Make the surfaces of a tile: two triangles for each cell of the terrain."""
     cells = 2
     step = TILE / cells
     origin, s, t, uv = [], [], [], []
@@ -199,7 +199,7 @@ def _road_marks(rng: Rng, roads: Roads, style: RoadStyle) -> NDArray[np.float64]
 
 @kernel
 def _hash(a, b):
-    """A pseudo-random number in [0, 1) from a pair of integers."""
+    """Return a pseudo-random number in [0, 1) from a pair of integers."""
     h = (np.uint64(a) * np.uint64(0x9E3779B97F4A7C15)) ^ (
         np.uint64(b) * np.uint64(0xC2B2AE3D27D4EB4F)
     )

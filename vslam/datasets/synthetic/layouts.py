@@ -36,15 +36,16 @@ def render_rgbd(
     are as uncertain as with stereo.
 
     Args:
-        route, variation, threads, on_frame: as for `render_sequence`.
+        route, variation, threads, on_frame: what is rendered and how (`render_sequence`).
         out: output folder.
-        until: write only the frames before this one.
+        until: number of the frame before which rendering ends.
 
     Returns:
         ``out``.
 
     Raises:
-        InputError: as `render_sequence`.
+        InputError: the folder cannot be written, the disk is too small, or another process is
+            rendering the sequence.
     """
     root = render_sequence(
         route,

@@ -1,4 +1,4 @@
-"""Labelled pairs of rendered images, with which loop detectors are trained."""
+"""Renders labelled pairs of images, which are used to train loop detectors."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ class Moves:
     """Ranges (lowest, highest) of the random motion of the second view of a pair.
 
     Attributes:
-        lateral: metres to the right. At -3.2, the camera is on the other lane.
-        heading: degrees of rotation, to either side.
+        lateral: lateral shift to the right in metres. At -3.2, the camera is on the other lane.
+        heading: rotation to either side in degrees.
     """
 
     lateral: tuple[float, float] = (-1.4, 1.4)
@@ -79,7 +79,8 @@ def render_pairs(
 
     ``folder/pairs.csv`` has one row per pair, with these columns:
 
-    - the two image files, whether they show the same place (1 or 0), and the kind of the pair;
+    - the two image files, whether the images show the same place (1 or 0), and the kind of the
+      pair;
     - for each image, the frame at which it is taken, and the frame whose light and objects it
       shows;
     - the distance between the two frames (m);
@@ -165,7 +166,7 @@ def _view(
 
 
 def _other_passes(T_wc: Float) -> list[NDArray[np.int64]]:
-    """For each frame, the frames of other passes that have a similar position and heading."""
+    """For each frame, find the frames of other passes with a similar position and heading."""
     xz, ahead = T_wc[:, [0, 2], 3], T_wc[:, :3, 2]
     again = []
     for k, near in enumerate(cKDTree(xz).query_ball_point(xz, _TOGETHER)):
@@ -176,7 +177,7 @@ def _other_passes(T_wc: Float) -> list[NDArray[np.int64]]:
 
 
 def _different(T_wc: Float, others: Float) -> NDArray[np.bool_]:
-    """Which poses are at a different place than the pose ``T_wc``, and not in the same street.
+    """Return which poses are at a different place than ``T_wc``, and not in the same street.
 
     Args:
         others: ``(N, 4, 4)`` poses.
@@ -194,10 +195,10 @@ def _different(T_wc: Float, others: Float) -> NDArray[np.bool_]:
 
 
 def _look_alikes(route: Route, town: Town, passes: Passes, threads: int) -> NDArray[np.int64]:
-    """``(P, 2)`` pairs of frames that show different but similar places.
+    """Return ``(P, 2)`` pairs of frames that show different places that look similar.
 
     There are several pairs for each place. The similarity of two places is the correlation of their
-    small, blurred and normalised images.
+    images, which are made small, blurred and normalised.
     """
     chosen = np.unique(np.linspace(0, len(route.T_wc) - 1, _PLACES).astype(int))
     c = route.camera

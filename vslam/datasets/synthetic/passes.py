@@ -1,4 +1,4 @@
-"""The state of a town at each frame: static objects, moving objects, and light."""
+"""Computes the state of a town at each frame: static objects, moving objects, and light."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Passes:
         self._pools = lamp_pools(town.lamps)
 
     def at(self, frame: int) -> Moment:
-        """The town at a frame of the route."""
+        """Return the scene of the town at a frame of the route."""
         number = int(np.searchsorted(self._starts, frame, side="right")) - 1
         light, night = self._light(frame, number)
         standing = self._standing(frame)
@@ -57,7 +57,7 @@ class Passes:
         return Moment(surfaces, shadows, light, night, self._pools if night > 0 else NO_LAMPS)
 
     def _standing(self, frame: int) -> Surfaces:
-        """The surfaces of the ground and of all things that do not move."""
+        """Return the surfaces of the ground and of all things that do not move."""
         surfaces, when = self._town.surfaces, self._town.when
         if not when.any():
             return surfaces
@@ -66,7 +66,7 @@ class Passes:
         return surfaces.select((surfaces.thing < 0) | present[surfaces.thing])
 
     def _light(self, frame: int, number: int) -> tuple[Light, float]:
-        """The light at a frame of pass ``number``, and how dark it is (0 by day to 1 at night).
+        """Return the light at a frame of pass ``number``, and the darkness (0 by day, 1 at night).
 
         The sun does not move during a pass. Between two passes, it moves while a cloud hides it.
         Night falls slowly during the whole drive.
@@ -97,9 +97,9 @@ class Passes:
         return light, night
 
     def _cars(self, frame: int) -> list[Surfaces]:
-        """The moving cars.
+        """Return the surfaces of the moving cars at a frame.
 
-        The first car drives ahead of the camera. The others approach on the other lane.
+        The first car drives ahead of the camera. The other cars approach on the other lane.
         """
         T_wc = self._route.T_wc
         here, cars = T_wc[frame], []
@@ -122,7 +122,7 @@ class Passes:
 
 
 def _switch_frames(place: NDArray[np.float64], cameras: NDArray[np.float64]) -> NDArray[np.int64]:
-    """``(T,)`` frame at which the camera leaves each place for the first time.
+    """For each of T places, return the frame at which the camera leaves it for the first time.
 
     It is the largest int64 if the camera never reaches the place, or never leaves it.
     """
@@ -138,7 +138,7 @@ def _switch_frames(place: NDArray[np.float64], cameras: NDArray[np.float64]) -> 
 
 
 def pass_starts(T_wc: NDArray[np.float64]) -> list[int]:
-    """The first frame of each pass of a drive.
+    """Return the first frame of each pass of a drive.
 
     A pass begins at frame 0 and whenever the camera returns to an earlier street.
 

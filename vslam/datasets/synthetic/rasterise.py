@@ -1,4 +1,4 @@
-"""Projection, culling and z-buffer. They determine which surface each sample of an image sees."""
+"""Determines which surface each sample of an image sees (projection, culling and z-buffer)."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ CALIBRATIONS = tuple(_CAMERAS)
 
 @dataclass(frozen=True)
 class Route:
-    """The path of the camera in a town, with its roads and its terrain.
+    """The path of the camera in a town, with the roads and the terrain of the town.
 
     Attributes:
         name: for example ``demo``.
@@ -171,7 +171,7 @@ def built_in_route(name: str) -> Route:
 
 
 def _straight(start: Float, direction: Float, metres: Float) -> Float:
-    """``(K, 2)`` points on a ray, at the ``(K,)`` distances ``metres`` from its start."""
+    """Return the ``(K, 2)`` points on a ray at the ``(K,)`` distances ``metres`` from its start."""
     return start + np.outer(metres, direction) / np.linalg.norm(direction)
 
 
@@ -285,7 +285,10 @@ def _headings(line: Float) -> Float:
 
 
 def _drive(path: Float, speed: float) -> Float:
-    """``(N, 2)`` camera positions at 10 Hz along a ``(K, 2)`` path. The camera slows in bends."""
+    """Drive along a ``(K, 2)`` path, more slowly in bends.
+
+    Returns ``(N, 2)`` camera positions at 10 Hz.
+    """
     along = np.cumsum(np.r_[0, np.linalg.norm(np.diff(path, axis=0), axis=1)])
     keep = np.r_[True, np.diff(along) > 1e-9]
     along, path = along[keep], path[keep]
@@ -300,7 +303,7 @@ def _drive(path: Float, speed: float) -> Float:
 
 
 def _poses(xz: Float, terrain: Terrain) -> Float:
-    """``(N, 4, 4)`` camera poses whose heading and pitch follow the path and sway slightly."""
+    """Make ``(N, 4, 4)`` camera poses along a path. Heading and pitch sway slightly."""
     up = terrain.height(xz)
     smooth = _smooth(np.column_stack([xz, up]), 7)
     step = np.gradient(smooth, axis=0)
@@ -322,7 +325,7 @@ def _poses(xz: Float, terrain: Terrain) -> Float:
 
 
 def _waves(xz: Float, seed: int) -> Float:
-    """``(N,)`` heights of hills with amplitude 1 at ``(N, 2)`` positions."""
+    """Return ``(N,)`` heights of hills with amplitude 1 at ``(N, 2)`` positions."""
     rng = np.random.default_rng(seed)
     total = np.zeros(len(xz))
     for k in range(4):
@@ -343,7 +346,7 @@ def _terrain(xz: Float, height: Callable[[Float], Float]) -> Terrain:
 
 
 def _heights_of(xz: Float, up: Float) -> Callable[[Float], Float]:
-    """Make a smooth function of the height, which averages the heights of several passes.
+    """Make a smooth function of the height that averages the heights of several passes.
 
     Args:
         xz: ``(N, 2)`` positions.

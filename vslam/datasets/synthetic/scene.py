@@ -1,6 +1,7 @@
-"""The data types of the renderer's kernels.
+"""Data types for the kernels of the renderer.
 
-They describe flat textured surfaces, their textures with mipmaps, the light and the camera.
+The data types describe flat textured surfaces, their textures with mipmaps, the light and the
+camera.
 """
 
 from __future__ import annotations
@@ -56,18 +57,18 @@ class Surfaces(NamedTuple):
     thing: NDArray[np.int32]
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Surfaces:
-        """The surfaces that ``rows``, a mask or an array of indices, selects."""
+        """Return some of the surfaces. ``rows`` is a mask or an array of indices."""
         return Surfaces._make(np.ascontiguousarray(column[rows]) for column in self)
 
     def moved(self, R: Float, t: Float) -> Surfaces:
-        """The surfaces rotated by ``R``, ``(3, 3)``, and then translated by ``t``, ``(3,)``."""
+        """Rotate the surfaces by ``R``, ``(3, 3)``, and then translate them by ``t``, ``(3,)``."""
         return self._replace(
             origin=self.origin @ R.T + t, edge_s=self.edge_s @ R.T, edge_t=self.edge_t @ R.T
         )
 
 
 def join(parts: list[Surfaces]) -> Surfaces:
-    """Join one or more parts, in their order."""
+    """Join one or more sets of surfaces in the given order."""
     if len(parts) == 1:
         return parts[0]
     return Surfaces(*map(np.concatenate, zip(*parts, strict=True)))
@@ -145,7 +146,7 @@ class AtlasBuilder:
         self._alpha: list[list[NDArray[np.uint8]] | None] = []
 
     def add(self, grey: NDArray[np.floating], alpha: NDArray[np.floating] | None = None) -> int:
-        """Add a texture.
+        """Add a texture to the atlas.
 
         Args:
             grey: ``(H, W)`` albedo, 0 to 255. H and W are powers of two. Row 0 is at v = 0.

@@ -1,4 +1,4 @@
-"""Shading of pixels, with trilinear textures, sun, shadows, lamps, haze and sky."""
+"""Shades pixels with trilinear textures, sun, shadows, lamps, haze and sky."""
 
 from __future__ import annotations
 
@@ -52,7 +52,8 @@ class _PixelRun(NamedTuple):
 class _RowBuffers(NamedTuple):
     """Working memory for one row of W pixels.
 
-    ``total`` is the radiance so far, (W,) f8. ``nearest`` is the largest 1/z so far, (W,) f8.
+    ``total`` is the sum of the radiance so far, (W,) f8. ``nearest`` is the largest 1/z so far,
+    (W,) f8.
 
     The other arrays describe the current run. ``texel`` is (6, W) f8. Its rows are the depth, s, t,
     half the distance of two texture samples in s, the same in t, and the albedo. ``size`` is the
@@ -89,7 +90,9 @@ def _bilinear(texels, at, log_w, log_h, level, u, v):
 
 @inline
 def _log2(bits):
-    """The integer part and the fraction of the binary logarithm of a float32, given its bits.
+    """Return the integer part and the fraction of the binary logarithm of a float32.
+
+    The float32 is given by its bits.
 
     The fraction is interpolated linearly between powers of two.
     """
@@ -126,9 +129,9 @@ def _trilinear(texels, offset, number, log_w, log_h, bits, u, v):
 
 @inline
 def _sky(atlas, number, light, x, y, z, bits):
-    """Grey level of the sky in the world direction ``(x, y, z)``, with the glare around the sun.
+    """Return the grey level of the sky in the world direction ``(x, y, z)``, with sun glare.
 
-    ``bits`` are those of `_trilinear`.
+    ``bits`` are the bits of a float32: the number of texels of level 0 per pixel.
     """
     texels, offset, log_size = atlas.texels, atlas.offset, atlas.log_size
     log_w, log_h = log_size[number, 0], log_size[number, 1]
@@ -144,7 +147,7 @@ def _sky(atlas, number, light, x, y, z, bits):
 
 @inline
 def _lit(shadow, frame, light, slope, x, y, z):
-    """Fraction of the sunlight that reaches a world point. Shadows have soft edges."""
+    """Return the fraction of the sunlight at a world point. Shadows have soft edges."""
     up = -y
     a = (x - light.sun_x * slope * up - frame[0]) / frame[2] - 0.5
     b = (z - light.sun_z * slope * up - frame[1]) / frame[2] - 0.5
@@ -170,7 +173,7 @@ def _lit(shadow, frame, light, slope, x, y, z):
 
 @inline
 def _pool(pools, frame, x, z):
-    """Light of the street lamps at a world point. It is 1 under a lamp."""
+    """Return the light of the street lamps at a world point. It is 1 under a lamp."""
     a = (x - frame[0]) / frame[2]
     b = (z - frame[1]) / frame[2]
     c, r = math.floor(a), math.floor(b)
@@ -189,7 +192,7 @@ def _pool(pools, frame, x, z):
 def shade(visible, band, atlas, sky, light, shadows, pools, camera, view):
     """Shade the rows of a view that belong to a band of samples.
 
-    Neighbouring pixels that see only one and the same surface are shaded together (a run). Other
+    Neighbouring pixels that all see the same single surface are shaded together (a run). Other
     pixels are shaded once for each surface that they see.
 
     Args:
@@ -285,7 +288,7 @@ def _kinds(seen, row, column, samples, number, weight, shift_u, shift_v):
 
 @inline
 def _alike(seen, row, column, samples, first):
-    """Whether all samples of a pixel see the surface ``first``."""
+    """Return whether all samples of a pixel see the surface ``first``."""
     alike = True
     for a in range(samples):
         for b in range(samples):

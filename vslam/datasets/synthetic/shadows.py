@@ -1,4 +1,4 @@
-"""Shadows of the sun, and the light of street lamps."""
+"""Computes shadows of the sun, and the light of street lamps."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _POOL_CELL, _POOL_REACH = 0.5, 16.0  # m
 
 
 class ShadowMap(NamedTuple):
-    """The highest occluder on each sun ray.
+    """A shadow map, which stores the highest occluder on each sun ray.
 
     A sun ray belongs to the cell where it meets the height 0.
 
@@ -33,7 +33,7 @@ class ShadowMap(NamedTuple):
 
 
 class LampPools(NamedTuple):
-    """Light of the street lamps.
+    """The light of street lamps on the ground plane.
 
     It does not depend on the height, because the cone of a lamp is approximated by a cylinder.
 
@@ -50,7 +50,7 @@ NO_LAMPS = LampPools(np.zeros((1, 1), np.float32), np.array([0.0, 0.0, 1.0]))
 
 
 def lamp_pools(lamps: NDArray[np.float64]) -> LampPools:
-    """The light of street lamps at ``(L, 2)`` positions (x, z)."""
+    """Return the light of street lamps at ``(L, 2)`` positions (x, z)."""
     if len(lamps) == 0:
         return NO_LAMPS
     low = np.floor(lamps.min(axis=0) - _POOL_REACH)

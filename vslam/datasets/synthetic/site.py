@@ -1,4 +1,4 @@
-"""A town under construction, to which many functions add objects, and its textures."""
+"""A town under construction and its textures. Many functions add objects to the town."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class Variation:
 
 @dataclass(frozen=True)
 class Site:
-    """The town so far, and everything that is needed to add objects to it.
+    """A town under construction, with everything that is needed to add objects to it.
 
     In this package, objects are called things.
 
@@ -152,11 +152,11 @@ class Site:
 
     @property
     def next_thing(self) -> int:
-        """The number of the next thing, for ``Surfaces.thing``."""
+        """The number of the next object, for ``Surfaces.thing``."""
         return len(self.place)
 
     def stand(self, model: Surfaces, xz: Float, heading: float, when: int = ALWAYS) -> None:
-        """Place a model on the ground as the next thing. Its ``thing`` must be `next_thing`."""
+        """Place a model on the ground as the next object. Its ``thing`` must be `next_thing`."""
         up = float(self.route.terrain.height(xz[None])[0])
         self.parts.append(model.moved(solids.turn(heading), np.array([xz[0], -up, xz[1]])))
         self.place.append(xz)

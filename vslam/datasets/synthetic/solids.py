@@ -20,7 +20,10 @@ Vector = tuple[float, ...] | NDArray[np.float64]
 
 
 def turn(heading: float) -> NDArray[np.float64]:
-    """``(3, 3)`` rotation of the z axis to a heading, in radians from +z towards +x."""
+    """Return the ``(3, 3)`` rotation of the z axis to a heading.
+
+    The heading is in radians from +z towards +x.
+    """
     c, s = np.cos(heading), np.sin(heading)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 

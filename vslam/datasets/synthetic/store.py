@@ -67,14 +67,14 @@ class Stored:
 
 
 def cache_folder() -> Path:
-    """The folder of rendered sequences, which is in ``$VSLAM_CACHE`` or in the user's cache."""
+    """Return the folder of rendered sequences, in ``$VSLAM_CACHE`` or in the user's cache."""
     from platformdirs import user_cache_path
 
     return Path(os.environ.get("VSLAM_CACHE") or user_cache_path("vslam")) / "synthetic"
 
 
 def folder_name(variation: Variation) -> str:
-    """The name of the folder that all sequences of one variation share."""
+    """Return the name of the folder that all sequences of one variation share."""
     name = f"v{VERSION}-seed{variation.seed}"
     name += "-aliased" if variation.aliased else ""
     name += f"-moving{variation.moving}" if variation.moving else ""
@@ -82,7 +82,7 @@ def folder_name(variation: Variation) -> str:
 
 
 def list_stored(cache: Path) -> list[Stored]:
-    """All sequences in a cache folder. Some of them may be incomplete."""
+    """List all rendered sequences in a cache folder. Some of them may be incomplete."""
     found = []
     for record in sorted(cache.glob(f"*/sequences/*/{_RECORD}")):
         folder, root = record.parent, record.parents[2]
@@ -98,7 +98,7 @@ def _folder_size(folder: Path) -> int:
 
 
 def place_folder(cache: Path) -> Path:
-    """The folder of the images that the benchmark of loop detectors renders."""
+    """Return the folder of the images that the benchmark of loop detectors renders."""
     return cache / f"v{VERSION}-places"
 
 
@@ -138,10 +138,11 @@ def render_sequence(
     Args:
         route: route to render.
         variation: variation of the town.
-        cache: folder of the rendered sequences, see `cache_folder`.
+        cache: folder of the rendered sequences (`cache_folder`).
         depth: whether to write ``depth_0``, too. It contains the depth of the left camera in
             centimetres, as 16-bit PNG files.
-        until: render only the frames before this one. A later call can continue from there.
+        until: number of the frame before which rendering ends. A later call can continue from
+            there.
         verify: compare the checksums of all frames. Otherwise, all file sizes and a few checksums
             are compared.
         threads: number of frames that are rendered in parallel. The images do not depend on it.
@@ -193,7 +194,7 @@ def render_sequence(
 
 
 def _matching_record(folder: Path, wanted: dict[str, Any], camera: Camera) -> dict[str, Any] | None:
-    """The manifest of a folder if it describes the wanted sequence, otherwise None."""
+    """Read the manifest of a folder. None if it does not describe the wanted sequence."""
     found = _read_record(folder)
     if found is None or any(found.get(key) != value for key, value in wanted.items()):
         return None
@@ -223,7 +224,7 @@ def render_frames(
     """Render frames of a route into the folder of a sequence.
 
     Args:
-        depth, threads: as for `render_sequence`.
+        depth, threads: whether depth is written, and how many frames are rendered in parallel.
         on_frame: called with the number of finished frames and ``total``.
         total: number of frames of the sequence. Frames that are not rendered count as finished.
         monocular: render only the left images.
@@ -279,7 +280,7 @@ def _read_record(folder: Path) -> dict[str, Any] | None:
 
 
 def calibration_text(camera: Camera) -> str:
-    """The text of KITTI's ``calib.txt``. The colour cameras P2 and P3 equal the grey cameras."""
+    """Return the text of KITTI's ``calib.txt``. The colour cameras equal the grey cameras."""
     lines = []
     for side in range(4):
         shift = -camera.bf if side % 2 else 0.0

@@ -1,4 +1,4 @@
-"""Trees, parked cars, hedges, signs and rails beside the road."""
+"""Adds trees, parked cars, hedges, signs and rails beside the road."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _KERB = (0.15, 0.12)  # width and height of kerb stones, m
 
 
 def plant(site: Site, xz: Float, height: float) -> None:
-    """Plant a tree at the ``(2,)`` position (x, z) if there is room."""
+    """Plant a tree at the ``(2,)`` position (x, z) if there is enough space."""
     rng = np.random.default_rng([site.variation.seed, 7, site.next_thing])
     if not site.plan.claim(rectangle(xz, 0.0, 1.6, 1.6), road=site.style.lane + 1.0):
         return
@@ -38,7 +38,7 @@ def plant(site: Site, xz: Float, height: float) -> None:
 
 
 def _pruned(site: Site, model: Surfaces, xz: Float) -> Surfaces | None:
-    """Remove the twigs that are too near to a camera from a model.
+    """Remove from a model of a tree the twigs that are too near to a camera.
 
     Returns None if 30 % or more of the twigs are too near.
     """
@@ -74,7 +74,7 @@ def lay_kerbs(site: Site) -> None:
 
 
 def _on_ground(site: Site, xz: Float, height: float) -> Float:
-    """``(N, 3)`` points at a height above the ground, at ``(N, 2)`` positions (x, z)."""
+    """Return ``(N, 3)`` points above the ground at ``(N, 2)`` positions (x, z)."""
     up = site.route.terrain.height(xz) + height
     return np.stack([xz[:, 0], -up, xz[:, 1]], axis=1)
 

@@ -1,4 +1,4 @@
-"""The roads and the terrain, which a route and its town share, and the plan of the town."""
+"""The roads and the terrain that a route and its town share, and the plan of the town."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Terrain:
     up: Float
 
     def height(self, xz: Float) -> Float:
-        """Height of the ground above y = 0.
+        """Return the height of the ground above y = 0.
 
         Outside of the grid, the height is that of the nearest point of the grid.
 
@@ -124,7 +124,7 @@ def roads_of(lines: list[Float], *, same_road: float = 3.0) -> Roads:
 
 
 def rectangle(middle: Float, heading: float, width: float, depth: float) -> Float:
-    """``(4, 2)`` corners (x, z) of a rectangle, whose width is measured across the heading."""
+    """Return the ``(4, 2)`` corners (x, z) of a rectangle. Its width is across the heading."""
     ahead = np.array([np.sin(heading), np.cos(heading)])
     right = np.array([np.cos(heading), -np.sin(heading)])
     a, b = 0.5 * width * right, 0.5 * depth * ahead
@@ -191,7 +191,7 @@ class Plan:
         return True
 
     def _near_camera(self, corners: Float) -> bool:
-        """Whether a camera position is nearer than `CLEARANCE` to a convex polygon."""
+        """Return whether a camera position is nearer than `CLEARANCE` to a convex polygon."""
         middle = corners.mean(axis=0)
         reach = np.linalg.norm(corners - middle, axis=1).max() + CLEARANCE
         polygon = corners.astype(np.float32)[:, None]
@@ -201,14 +201,17 @@ class Plan:
         )
 
     def road_distance(self, xz: Float) -> NDArray[np.float32]:
-        """``(N,)`` distances from ``(N, 2)`` positions to the middle of the nearest road, in m."""
+        """Return the distance of ``(N, 2)`` positions from the middle of the nearest road.
+
+        Returns ``(N,)`` metres.
+        """
         c, r = self._cell(xz).T
         return self._road[r, c]
 
     def open_ray(self, start: Float, heading: float, reach: float) -> Float | None:
-        """``(K, 2)`` positions along a line of sight, with a distance of one metre.
+        """Return the ``(K, 2)`` positions along a line of sight, one metre apart.
 
-        None if a tall object blocks the line of sight.
+        Returns None if a tall object blocks the line of sight.
         """
         distance = np.arange(2.0, reach, 1.0)[:, None]
         line = start + distance * np.array([np.sin(heading), np.cos(heading)])

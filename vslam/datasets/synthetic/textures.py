@@ -1,4 +1,4 @@
-"""Procedural textures of plants, fences, walls, signs and sky.
+"""Paints procedural textures of plants, fences, walls, signs and sky.
 
 The values are albedos from 0 to 255. The first row is the top of the texture.
 """
@@ -20,7 +20,7 @@ _LETTERS = np.array(list("ABCDEFGHIKLMNOPRSTUVWZ0123456789"))
 
 
 def noise(rng: Rng, height: int, width: int, cell: float, octaves: int = 4) -> Grey:
-    """Tileable band-limited noise with zero mean and unit variance.
+    """Make tileable band-limited noise with zero mean and unit variance.
 
     Args:
         cell: cell size of the coarsest grid in texels. Each octave has half the cell size and 0.7
@@ -50,12 +50,12 @@ def _stretch(grid: Grey, height: int, width: int) -> Grey:
 
 
 def detail(rng: Rng, contrast: float, cell: float = 8.0, size: int = 256) -> Grey:
-    """A fine texture with mean 128, which multiplies another texture (`scene.Surfaces.detail`)."""
+    """Make a fine texture with mean 128, by which a coarse texture is multiplied."""
     return np.clip(128.0 * (1.0 + contrast * noise(rng, size, size, cell, 4)), 8, 255)
 
 
 def letters(rng: Rng, low: int = 3, high: int = 9) -> str:
-    """A random word."""
+    """Return a random word."""
     return "".join(rng.choice(_LETTERS, int(rng.integers(low, high))))
 
 
@@ -76,7 +76,7 @@ def write(image: Grey, rng: Rng, text: str, box: tuple[int, int, int, int], grey
 
 
 def sign(rng: Rng, size: int = 128) -> tuple[Grey, Grey]:
-    """A round, triangular or square sign. Its alpha is symmetric."""
+    """Make the texture of a round, triangular or square sign. Its alpha is symmetric."""
     grey = np.full((size, size), float(rng.uniform(190, 235)), np.float32)
     alpha = np.zeros((size, size), np.float32)
     middle, rim = (size // 2, size // 2), float(rng.uniform(40, 90))
@@ -108,7 +108,7 @@ def sign(rng: Rng, size: int = 128) -> tuple[Grey, Grey]:
 
 
 def foliage(rng: Rng, size: int = 256, density: float = 1.0) -> tuple[Grey, Grey]:
-    """A twig with leaves, and its alpha. The leaves are sparser towards the border."""
+    """Make the texture of a twig with leaves, and its alpha. Leaves are sparser at the border."""
     grey = np.full((size, size), 28.0, np.float32)
     alpha = np.zeros((size, size), np.float32)
     for _ in range(10):
@@ -121,7 +121,7 @@ def foliage(rng: Rng, size: int = 256, density: float = 1.0) -> tuple[Grey, Grey
 
 
 def hedge(rng: Rng) -> tuple[Grey, Grey]:
-    """A clipped hedge with dense leaves and an uneven upper edge, and its alpha."""
+    """Make the texture of a dense clipped hedge with an uneven upper edge, and its alpha."""
     width, height = 512, 128
     grey = np.full((height, width), 20.0, np.float32)
     alpha = np.zeros((height, width), np.float32)
@@ -156,13 +156,13 @@ def _leaves(rng: Rng, grey: Grey, alpha: Grey, count: int, *, radial: bool) -> N
 
 
 def bark(rng: Rng, size: int = 128) -> Grey:
-    """Furrowed bark, stretched along the trunk."""
+    """Make the texture of furrowed bark, which is stretched along the trunk."""
     tall = cv2.resize(noise(rng, size // 8, size, 10.0, 3), (size, size))
     return np.clip(62 + 17 * tall + 9 * noise(rng, size, size, 12.0, 3), 10, 160)
 
 
 def fence(rng: Rng) -> tuple[Grey, Grey]:
-    """A fence of pickets or bars, 4 m long, and its alpha."""
+    """Make the texture of a fence of pickets or bars, 4 m long, and its alpha."""
     height, width = 64, 256
     grey = np.full((height, width), float(rng.uniform(50, 190)), np.float32)
     grey += 12 * noise(rng, height, width, 16.0)
@@ -178,7 +178,7 @@ def fence(rng: Rng) -> tuple[Grey, Grey]:
 
 
 def garden_wall(rng: Rng) -> Grey:
-    """A wall of coursed stone or plaster, 4 m by 1 m."""
+    """Make the texture of a wall of coursed stone or plaster, 4 m by 1 m."""
     height, width = 128, 512
     grey = np.full((height, width), float(rng.uniform(80, 170)), np.float32)
     if rng.random() < 0.6:
@@ -196,7 +196,7 @@ def garden_wall(rng: Rng) -> Grey:
 
 
 def poster(rng: Rng, size: int = 128) -> Grey:
-    """A poster with rectangles, circles and words."""
+    """Make the texture of a poster with rectangles, circles and words."""
     image = np.full((size, size), float(rng.uniform(120, 235)), np.float32)
     for _ in range(int(rng.integers(3, 7))):
         x0, y0 = rng.integers(0, size - 20, 2)
@@ -214,7 +214,7 @@ def poster(rng: Rng, size: int = 128) -> Grey:
 
 
 def sky(rng: Rng) -> Grey:
-    """A panorama of clouds over distant trees.
+    """Make a panorama of clouds over distant trees.
 
     u corresponds to the heading. v decreases with the elevation.
     """

@@ -1,4 +1,4 @@
-"""Construction of a town along a route.
+"""Builds a town along a route.
 
 The town depends only on the route and on the variation.
 """
@@ -167,7 +167,7 @@ def _house(site: Site, xz: Float, heading: float, size: tuple[float, float, floa
 def _try_house(
     site: Site, front: Float, heading: float, size: tuple[float, float, float], clear: float
 ) -> bool:
-    """Build a house if its ground is free. Returns whether it was built."""
+    """Build a house if its ground is free. Return whether the house was built."""
     ahead = np.array([np.sin(heading), np.cos(heading)])
     middle = front + 0.5 * size[2] * ahead
     if not site.plan.claim(rectangle(middle, heading, size[0], size[2]), road=clear, tall=True):

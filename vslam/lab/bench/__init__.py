@@ -1,4 +1,4 @@
-"""Benchmarks: a grid of sequences, perturbations, detectors and seeds.
+"""Benchmarks: run vslam on a grid of sequences, perturbations, detectors and seeds.
 
-A *cell* of the grid is one run. Each run has its own process.
+A *cell* of the grid is one run of vslam. Each run has its own process.
 """

@@ -1,7 +1,8 @@
-"""Run the cells of a benchmark on a Dask cluster, whose workers send the results back.
+"""Runs the cells of a benchmark (one run each) on a Dask cluster.
 
-If a worker dies, the scheduler gives its cells to another worker. The workers need vslam with the
-extra ``cluster``. They need the data under the same path as on this machine.
+The workers send the results back to this machine. If a worker dies, the scheduler gives its cells
+to a different worker. The workers need vslam with the extra ``cluster``. They also need the data
+under the same path as on this machine.
 """
 
 from __future__ import annotations
@@ -23,9 +24,12 @@ _POLL_S = 2.0  # time between checks of the stop event; each check is a request 
 def run_on_cluster(
     cells: Collection[Cell], options: RunOptions, scheduler: str, out: Path
 ) -> Generator[CellOutcome, None, None]:
-    """Run cells on the workers of a scheduler, and publish and yield each outcome when it arrives.
+    """Run the cells of a benchmark on the workers of a Dask scheduler.
 
-    A worker runs as many cells at a time as it has threads. Closing the generator stops the cells.
+    When the outcome of a cell arrives, it is written to the benchmark's folder and yielded.
+
+    A worker runs as many cells at a time as it has threads. If the generator is closed, the running
+    cells are stopped.
 
     Raises:
         InputError: Dask is not installed, or no scheduler answers.
@@ -64,7 +68,7 @@ def run_on_cluster(
 
 
 def _require_certificates(scheduler: str) -> None:
-    """Reject a TLS address if Dask has no certificates, because Dask's client would never close."""
+    """Reject a TLS address if Dask has no certificates. Its client would otherwise never close."""
     from distributed.security import Security
 
     if not scheduler.startswith("tls://"):
@@ -81,7 +85,7 @@ def _require_certificates(scheduler: str) -> None:
 
 
 def _run_on_worker(cell: Cell, options: RunOptions, stop: str) -> CellOutcome:
-    """Run a cell on this worker, and kill it when the benchmark sets the event named ``stop``."""
+    """Run a cell on this worker. Kill it when the benchmark sets the event named ``stop``."""
     from distributed import Event
 
     event = Event(stop)

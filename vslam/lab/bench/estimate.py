@@ -1,4 +1,4 @@
-"""Estimate the time and disk space that a grid needs, before it starts and while it runs."""
+"""Estimates how much time and disk space a benchmark needs, before it starts and while it runs."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ _CELL_BYTES, _FRAME_BYTES, _SCRATCH_FRAME_BYTES = 100_000, 1_000, 45_000
 
 @dataclass(frozen=True)
 class Estimate:
-    """Time and disk space that a grid needs.
+    """How much time and disk space the cells of a benchmark need.
 
     Attributes:
-        seconds: wall time if all jobs are always busy.
-        kept: bytes of the files that are kept.
-        scratch: bytes of the files that are deleted after each run.
-        basis: what the estimated time is based on, in words.
+        seconds: wall time in seconds. It is assumed that as many cells run at the same time as the
+            user requested.
+        kept: size of the files that are kept, in bytes.
+        scratch: size of the files that are deleted after each run, in bytes.
+        basis: text that says on what the estimated time is based.
     """
 
     seconds: float
@@ -42,15 +43,16 @@ def estimate(
     frames: Mapping[str, int],
     jobs: int,
 ) -> Estimate:
-    """Estimate the time and space that the missing cells need from those of the finished cells.
+    """Estimate how much time and disk space the missing cells of a benchmark need.
 
-    If a cell with the same detector is finished, its time per frame is used.
+    The estimate is based on the finished cells. If a cell with the same detector is finished, its
+    time per frame is used.
 
     Args:
-        missing: cells that have not run yet.
+        missing: cells (one run each) that have not run yet.
         finished: finished cells and their reports.
         frames: number of frames of each sequence.
-        jobs: number of cells that run at a time.
+        jobs: number of cells that run at the same time.
     """
     frame_s: dict[str, list[float]] = {}  # for each detector, seconds per frame of finished cells
     starts: list[float] = []
@@ -79,7 +81,7 @@ def estimate(
 
 
 def check_disk(needed: Estimate, out: Path) -> None:
-    """Check that the disk has enough free space for a grid.
+    """Check that the disk has enough free space for the cells of a benchmark.
 
     Raises:
         InputError: the free space is too small.
@@ -93,7 +95,7 @@ def check_disk(needed: Estimate, out: Path) -> None:
 
 
 def duration(seconds: float) -> str:
-    """A duration as a text: ``2 h 05 min``, ``7 min`` or ``40 s``."""
+    """Format a duration as a text such as ``2 h 05 min``, ``7 min`` or ``40 s``."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
@@ -101,7 +103,7 @@ def duration(seconds: float) -> str:
 
 
 def size(n_bytes: float) -> str:
-    """A size in MB or GB, as a text."""
+    """Format a number of bytes as a text in MB or GB."""
     return f"{n_bytes / 1e6:.0f} MB" if n_bytes < 1e9 else f"{n_bytes / 1e9:.1f} GB"
 
 

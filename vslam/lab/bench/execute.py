@@ -1,7 +1,7 @@
-"""Run each cell in its own process and publish its results as one complete folder.
+"""Runs each cell of a benchmark in its own process, and writes its results into a folder.
 
-A cell is finished when its folder exists. Therefore, a killed benchmark loses only the cells that
-were running.
+The folder of a cell appears only when its results are complete. A cell is finished if its folder
+exists. Therefore, if a benchmark is killed, only the cells that were running are lost.
 
 The result files of a cell have a few MB. They are passed to this module in memory, even if the cell
 ran on another machine. Only this module writes to the folder of the benchmark.
@@ -32,14 +32,16 @@ _PARTS, _FAILED = ".parts", "failed"
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options that all cells share.
+    """Options that all cells of a benchmark share.
 
     Attributes:
         data: root of the data set on the machine that runs the cell; None for rendered towns.
-        config: thresholds, as the text of a ``config.json``.
-        threads: number of threads of each run. It does not change the result.
-        command: program that accepts the arguments of ``vslam``; None for vslam itself.
-        others: programs of other systems, by ``Cell.detector``. They accept the same arguments.
+        config: thresholds, as the text of a file ``config.json``.
+        threads: number of threads of each run. It does not change the results of the runs.
+        command: program that is run instead of ``vslam`` and accepts the same arguments; None for
+            vslam itself.
+        others: programs of other SLAM systems, by ``Cell.detector``. The programs accept the same
+            arguments as ``vslam``.
         scratch: folder to which runs write; None for the machine's temporary folder.
         source: arguments of ``vslam run`` that describe how to read the data.
     """
@@ -55,7 +57,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Finished:
-    """A complete run, with its files by path. Paths are relative to ``folder``."""
+    """A complete run of a cell, with its files by path. The paths are relative to ``folder``."""
 
     cell: Cell
     folder: str
@@ -64,7 +66,7 @@ class Finished:
 
 @dataclass(frozen=True)
 class Failed:
-    """A run without results, with the reason in one line and the whole output of the run."""
+    """A cell whose run gave no results, with the reason in one line and the whole output."""
 
     cell: Cell
     message: str
@@ -77,10 +79,11 @@ CellOutcome = Finished | Failed
 def run_cell(
     cell: Cell, options: RunOptions, stopped: Callable[[], bool] = lambda: False
 ) -> CellOutcome:
-    """Run one cell in a temporary folder and return its files.
+    """Run one cell of a benchmark (a single run) in a temporary folder. Return its files.
 
     Args:
-        stopped: called repeatedly; the run is killed when it returns True.
+        stopped: function that is called repeatedly. The run is killed when the function returns
+            True.
     """
     if options.scratch is not None:
         options.scratch.mkdir(parents=True, exist_ok=True)
@@ -108,12 +111,13 @@ def run_cell(
 def run_here(
     cells: Collection[Cell], options: RunOptions, jobs: int, out: Path
 ) -> Generator[CellOutcome, None, None]:
-    """Run cells on this machine, and publish and yield each outcome when it ends.
+    """Run the cells of a benchmark on this machine, ``jobs`` cells at a time.
 
-    ``jobs`` cells run at a time. Closing the generator kills the runs.
+    When a cell ends, its outcome is written to the benchmark's folder and yielded. If the generator
+    is closed, the running cells are killed.
 
-    The cells are started from threads, which is sufficient because each thread only waits for a
-    process. The threads also publish the outcomes, so that a cell that ends while the caller is
+    The cells are started from threads. Threads are sufficient, because each thread only waits for a
+    process. The threads also write the outcomes. Therefore, a cell that ends while the caller is
     interrupted is not lost.
 
     Raises:
@@ -141,14 +145,14 @@ def run_here(
 
 
 def finished_cells(cells: Collection[Cell], out: Path, config: str) -> list[Cell]:
-    """The cells whose results are already in ``out``."""
+    """Return the cells of a benchmark whose results are already in the folder ``out``."""
     return [cell for cell in cells if is_finished(cell, out / cell.name, config)]
 
 
 def publish(outcome: CellOutcome, out: Path) -> None:
-    """Write the results of a finished cell into ``out``, completely or not at all.
+    """Write the results of a cell into the folder ``out``, either completely or not at all.
 
-    For a failed cell, the log is written instead.
+    If the cell failed, only its log is written.
 
     Raises:
         ResultsError: the folder cannot be written.
@@ -183,14 +187,14 @@ def publish(outcome: CellOutcome, out: Path) -> None:
 
 
 def prepare(out: Path, data: str) -> None:
-    """Create the folder of a benchmark, and remove the files that killed benchmarks left there.
+    """Create the folder of a benchmark, and remove files that a killed benchmark left there.
 
     Args:
         data: text that identifies the data. All results in a folder must come from the same data,
-            because sequences of other data may have the same names.
+            because sequences of different data may have the same names.
 
     Raises:
-        InputError: the folder cannot be written, or it contains runs on other data.
+        InputError: the folder cannot be written, or it contains runs on different data.
     """
     import psutil
 
@@ -213,7 +217,7 @@ def prepare(out: Path, data: str) -> None:
 
 
 def scratch_folder(out: Path) -> Path:
-    """The folder to which the unfinished cells of this process write."""
+    """Return the folder to which the unfinished cells of this process write."""
     return out / _PARTS / str(os.getpid())
 
 
@@ -225,7 +229,7 @@ def tidy(out: Path) -> None:
 
 
 def _call(command: list[str], log: Path, stopped: Callable[[], bool]) -> int:
-    """Run a command, and return its exit code. The command is killed if ``stopped`` returns True.
+    """Run a command and return its exit code. If ``stopped`` returns True, kill the command.
 
     The command runs in its own session, so that Ctrl-C reaches only this process. Its standard
     input is a pipe that closes when this process dies (:mod:`vslam.cli.child`).

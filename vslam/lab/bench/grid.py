@@ -1,4 +1,4 @@
-"""The cells of a benchmark, and the folders of their results."""
+"""Makes the cells of a benchmark (one run each), and names the folders of their results."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from vslam.report.schema import ReportJson
 
 @dataclass(frozen=True, order=True)
 class Cell:
-    """One run of the grid.
+    """One run in a benchmark's grid of sequences, perturbations, detectors and seeds.
 
-    Apart from the images, its attributes determine the result of the run.
+    The attributes and the images determine the result of the run.
 
     Attributes:
         dataset: value of ``--dataset``.
         sequence: name of the sequence.
         perturb: perturbation in canonical spelling, e.g. ``none`` or ``brightness:1.5,blur:0.5``.
-        detector: loop detector, or the name of another system.
+        detector: name of a loop detector of vslam, or of a different SLAM system.
         seed: seed of the perturbation.
         max_frames: number of frames, counted from the first frame; None for all frames.
         weights: weight file of a learned detector; None for the shipped weights. The file must have
@@ -52,7 +52,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Name of the folder for the results of this cell. No two cells have the same name."""
+        """Name of the folder for the results of this run. No two cells have the same name."""
         light = self.perturb.replace(":", "").replace(",", "+")
         parts = [self.dataset, self.sequence, light, self.detector, f"seed{self.seed}"]
         parts += [f"{self.max_frames}frames"] if self.max_frames else []
@@ -62,7 +62,7 @@ class Cell:
         return "-".join(re.sub(r"[^A-Za-z0-9.+-]+", "_", part) for part in parts)
 
     def arguments(self) -> list[str]:
-        """Arguments of ``vslam run``."""
+        """Return the arguments of ``vslam run`` for this cell."""
         words = ["--dataset", self.dataset, "--perturb", self.perturb]
         words += ["--detector", self.detector, "--seed", str(self.seed)]
         words += [] if self.dataset in SOURCES else ["--seq", self.sequence]
@@ -73,7 +73,7 @@ class Cell:
 
 
 def parse_sequences(text: str) -> list[str]:
-    """Parse names and ranges of sequences.
+    """Parse a text with names and ranges of sequences.
 
     For example, ``00-02,05,demo`` gives ``00 01 02 05 demo``. Repetitions are removed.
 
@@ -96,9 +96,11 @@ def parse_sequences(text: str) -> list[str]:
 
 
 def parse_perturbations(text: str) -> list[str]:
-    """Parse ``none,brightness:2+blur`` into ``none`` and ``brightness:2,blur:1``.
+    """Parse perturbations, such as ``none,brightness:2+blur``.
 
-    A comma separates the entries of the grid. ``+`` joins perturbations that are applied together.
+    The result for this example is ``none`` and ``brightness:2,blur:1``. In the input, a comma
+    separates the perturbations of different runs. ``+`` joins perturbations that are applied
+    together in one run.
 
     Raises:
         InputError: one of the entries is not a valid perturbation.
@@ -120,17 +122,19 @@ def make_grid(
     thresholds: str = "",
     repeated: Collection[str] = (),
 ) -> list[Cell]:
-    """Make all cells of a grid.
+    """Make all cells (runs) of a benchmark.
 
-    Every sequence first runs with the first seed, then with the next seed. In this order, the
-    results of an interrupted benchmark are most useful. A perturbation that is not random gets only
-    one run. Its repetitions would be identical, and a statistical test would count them as
-    independent samples.
+    The cells are in this order: all sequences with the first seed, then all sequences with the
+    second seed, and so on. In this order, the results of an interrupted benchmark are most useful.
+    A perturbation that is not random gets only one run. Repeated runs would be identical, and a
+    statistical test would count them as independent samples.
 
     Args:
         runs: number of seeds.
-        weights: weight files by detector, for detectors that do not use the shipped weights.
-        repeated: systems that are not deterministic, so that they run with every seed.
+        weights: weight files by the name of the detector. Detectors without an entry use the
+            shipped weights.
+        repeated: systems that run with every seed even if the perturbation is not random, because
+            they are not deterministic.
     """
     paths = {name: str(path) for name, path in (weights or {}).items()}
     digests = {name: _digest(path) for name, path in (weights or {}).items()}
@@ -156,7 +160,7 @@ def make_grid(
 
 
 def thresholds_digest(config: str) -> str:
-    """Digest of the thresholds that differ from the defaults; empty if there are none.
+    """Return a digest of the thresholds that differ from the defaults; empty if there are none.
 
     Args:
         config: the text of a ``config.json``.
@@ -177,13 +181,13 @@ def _digest(path: Path) -> str:
 
 
 def draws(perturb: str) -> bool:
-    """Whether a perturbation is random, so that the images depend on the seed."""
+    """Return whether a perturbation is random. If it is, the images depend on the seed."""
     laws = {law.partition(":")[0] for law in perturb.split(",")} - {"none"}
     return any(law_kind(law).drawn for law in laws)
 
 
 def read_report(folder: Path) -> ReportJson | None:
-    """The report in a run folder; None if it is missing or has another schema."""
+    """Read the report in the folder of a run; None if it is missing or has a different schema."""
     try:
         return ReportJson.read(folder / "report.json")
     except InputError:
@@ -191,16 +195,16 @@ def read_report(folder: Path) -> ReportJson | None:
 
 
 def tracked_nothing(folder: Path) -> bool:
-    """Whether a run folder contains the report of a run that was lost in every frame."""
+    """Return whether tracking was lost in every frame, according to the report in a run folder."""
     report = read_report(folder)
     return report is not None and report.lost_frames + report.dropped_frames == report.frames
 
 
 def is_finished(cell: Cell, folder: Path, config: str) -> bool:
-    """Whether ``folder`` contains a complete run of exactly this cell.
+    """Return whether ``folder`` contains a complete run of exactly this cell of a benchmark.
 
     Args:
-        config: the thresholds, as in ``config.json`` of a run.
+        config: thresholds, as the text of a file ``config.json``.
     """
     report = read_report(folder)
     if report is None or report.interrupted is not None:

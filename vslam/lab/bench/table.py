@@ -1,4 +1,4 @@
-"""The table that the terminal shows while a grid runs."""
+"""The table that the terminal shows while a benchmark runs."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from vslam.report.schema import ReportJson
 
 
 class GridProgress:
-    """The finished, failed and missing cells of a grid.
+    """The finished, failed and missing cells (runs) of a benchmark.
 
     Attributes:
-        cells: the whole grid.
+        cells: all cells of the benchmark.
         reports: reports of the finished cells, in the order in which the cells ended.
-        failed: for each failed cell, the reason in one line.
+        failed: for each failed cell, one line that says why it failed.
     """
 
     def __init__(
@@ -44,11 +44,11 @@ class GridProgress:
 
     @property
     def missing(self) -> list[Cell]:
-        """Cells that are neither finished nor failed."""
+        """Cells of the benchmark that have neither finished nor failed."""
         return [c for c in self.cells if c not in self.reports and c not in self.failed]
 
     def add(self, outcome: CellOutcome) -> str:
-        """Add a published cell and return a line about it."""
+        """Add a cell that has ended, and return a line of text about it."""
         cell = outcome.cell
         if isinstance(outcome, Failed):
             self.failed[cell] = outcome.message
@@ -60,9 +60,10 @@ class GridProgress:
         return f"{len(self.reports) + len(self.failed)}/{len(self.cells)} {cell.name}: {result}"
 
     def table(self) -> Table:
-        """A table with a row for each sequence and perturbation, and a column for each detector.
+        """Return a table with the median ATE of the finished cells.
 
-        Each entry contains the number of finished cells and their median ATE.
+        There is a row for each sequence and perturbation, and a column for each detector. Each
+        entry contains the number of finished cells and their median ATE.
         """
         detectors = list(dict.fromkeys(cell.detector for cell in self.cells))
         caption = "Each entry gives the number of finished runs and their median ATE.\n"
@@ -94,11 +95,11 @@ class GridProgress:
 
 @contextmanager
 def shown_live(progress: GridProgress, *, shown: bool) -> Iterator[Callable[[str], None]]:
-    """Show the table on stderr, and update it while the grid runs.
+    """Show the table of a benchmark on stderr, and update it while the benchmark runs.
 
-    The context manager yields a function that prints a line if stderr is not a terminal. When the
-    grid is complete, the table is erased, because the results are printed next. If cells are
-    missing or failed, the table stays.
+    The context manager yields a function that prints a line of text if stderr is not a terminal.
+    When the benchmark is complete, the table is erased, because the results are printed next. If
+    cells are missing or have failed, the table stays.
     """
     console = Console(stderr=True, quiet=not shown, highlight=False, soft_wrap=True)
     live = (

@@ -1,1 +1,1 @@
-"""Compare loop detectors on images of places under changes of light, viewpoint and scene."""
+"""Compares loop detectors on images of places with changes in lighting, viewpoint and scene."""

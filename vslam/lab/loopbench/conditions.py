@@ -1,4 +1,8 @@
-"""Conditions: changes of the query images. The gallery images are not changed."""
+"""Conditions of a comparison of loop detectors.
+
+A *condition* is a change of the query images, such as a change in lighting. The gallery images are
+not changed.
+"""
 
 from __future__ import annotations
 
@@ -32,26 +36,26 @@ _APART_S = 10.0
 
 @dataclass(frozen=True)
 class Condition:
-    """A kind of change, and its strength from 0 to 1."""
+    """A kind of change of the query images, and its strength from 0 to 1."""
 
     kind: str
     strength: float = 0.0
 
     @property
     def name(self) -> str:
-        """The name, for example ``none`` or ``viewpoint:0.5``."""
+        """Name of the condition, for example ``none`` or ``viewpoint:0.5``."""
         return self.kind if self.kind == "none" else f"{self.kind}:{self.strength:g}"
 
     @property
     def view(self) -> float:
-        """Strength of the change of viewpoint."""
+        """Strength of the change in viewpoint, from 0 to 1."""
         return {"viewpoint": self.strength, "all": self.strength / 2}.get(self.kind, 0.0)
 
     @property
     def lateral(self) -> tuple[float, float]:
-        """Range of the lateral offset in metres, positive to the right.
+        """Range of the camera's lateral offset in metres, positive to the right.
 
-        There is some offset even without a change of viewpoint, because no two drives follow
+        Even without a change in viewpoint, there is some offset, because no two drives follow
         exactly the same line.
         """
         side = -_OTHER_LANE * self.view
@@ -59,7 +63,7 @@ class Condition:
 
     @property
     def heading(self) -> tuple[float, float]:
-        """Range of the rotation to either side in degrees."""
+        """Range of the camera's rotation to either side in degrees."""
         turn = _TURN * self.view
         return (turn, turn) if self.view else (0.0, 3.0)
 
@@ -67,14 +71,14 @@ class Condition:
     def change(self) -> float:
         """Value of ``vslam synth --change`` with which the town is rendered.
 
-        For the condition ``change``, it is 0.5 at strength 0.5, and 0.9 at strength 1.
+        For the condition ``change``, the value is 0.5 at strength 0.5, and 0.9 at strength 1.
         """
         strength = {"change": self.strength, "all": self.strength / 2}.get(self.kind)
         return 0.0 if strength is None else round(0.1 + 0.8 * strength, 3)
 
 
 def parse_conditions(kinds: str, strengths: str) -> list[Condition]:
-    """Make the condition ``none``, followed by every other kind at every strength.
+    """Make the condition ``none``, followed by each given kind of change at each given strength.
 
     Args:
         kinds: names from ``KINDS``, separated by commas.
@@ -102,14 +106,14 @@ def parse_conditions(kinds: str, strengths: str) -> list[Condition]:
 def apply(
     condition: Condition, images: Collection[Image], seed: int, *, rendered: bool
 ) -> list[Image]:
-    """Apply a condition to images. Each image gets its own random change.
+    """Change images according to a condition. Each image gets a different random change.
 
     Args:
-        condition: the condition. ``change`` does not modify the images, because the renderer has
-            already changed the town.
-        images: ``(H, W)`` uint8 each.
+        condition: the condition. ``change`` does not modify the images, because it is applied when
+            the town is rendered.
+        images: the images, each ``(H, W)`` uint8.
         seed: seed of all random changes.
-        rendered: whether the renderer has already changed the viewpoint.
+        rendered: whether the images were already rendered with the change in viewpoint.
     """
     out = list(images)
     if condition.view and not rendered:
@@ -128,7 +132,7 @@ def apply(
 
 
 def turned(image: Image, degrees: float) -> Image:
-    """The image that the camera would see after a rotation to the right about its centre.
+    """Warp an image to what the camera would see after a rotation to the right about its centre.
 
     Pixels outside of the original view are black.
     """
@@ -140,7 +144,10 @@ def turned(image: Image, degrees: float) -> Image:
 
 
 def clipped(image: Image, share: float, bright: bool) -> Image:
-    """Change the exposure so that a share of the pixels becomes white (``bright``) or black."""
+    """Change the exposure of an image so that a given share of its pixels becomes white or black.
+
+    The pixels become white if ``bright`` is set, and otherwise black.
+    """
     grey = np.arange(256.0)
     if bright:
         white = max(float(np.quantile(image, 1.0 - share)), 1.0)
@@ -152,5 +159,5 @@ def clipped(image: Image, share: float, bright: bool) -> Image:
 
 
 def _sign(seed: int, k: int) -> float:
-    """-1 or 1, drawn for image ``k``."""
+    """Draw a sign, -1 or 1, for image ``k``."""
     return float(np.random.default_rng([seed, 30, k]).choice([-1.0, 1.0]))

@@ -1,6 +1,7 @@
-"""Measure CPU time and memory of one detector in a separate process.
+"""Measures the CPU time and the memory of one loop detector in a separate process.
 
-CPU time is measured instead of wall time, because it hardly depends on the load of the machine.
+CPU time is measured instead of wall time, because CPU time hardly depends on the load of the
+machine.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ _REPEATS = 60
 
 
 def cost(name: str, weights: Path | None) -> Cost:
-    """Measure a detector in a new process."""
+    """Measure the CPU time and the memory of a loop detector in a new process."""
     command = [sys.executable, "-m", "vslam.lab.loopbench.cost", name, str(weights or "")]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return Cost.model_validate_json(done.stdout)

@@ -1,4 +1,4 @@
-"""Precision-recall curves, with a figure for each set of images and one figure for all drives."""
+"""Draws precision-recall curves of loop detectors."""
 
 from __future__ import annotations
 
@@ -32,9 +32,10 @@ Line = tuple[str, Curve | DecisionCurve, str, str, str]
 
 
 def draw_curves(report: LoopsJson) -> list[page.Figure]:
-    """Draw a figure for each set of images, and one figure for all drives.
+    """Draw precision-recall curves: one figure for each set of images, and one for all drives.
 
-    The figure of a set of images has one panel per condition.
+    The figure of a set of images has one panel per condition (kind and strength of a change of the
+    images).
     """
     return draw(_drawings(report))
 

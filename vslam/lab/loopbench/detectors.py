@@ -1,4 +1,4 @@
-"""Loop detectors that compute the similarity of query and gallery images, without a map."""
+"""Loop detectors that compute the similarity of images without a map."""
 
 from __future__ import annotations
 
@@ -41,7 +41,8 @@ class DescribedImage:
         xy: ``(N, 2)`` float32 positions of the features in pixels.
         descriptors: ``(N, 32)`` uint8.
         words: ``(N,)`` int32 visual word of each feature.
-        nodes: direct index, which gives the features under each node of the vocabulary.
+        nodes: direct index of the image. It lists the features under each node of the vocabulary
+            tree.
     """
 
     image: Image
@@ -52,7 +53,7 @@ class DescribedImage:
 
 
 def describe(images: list[Image], vocabulary: Vocabulary, threads: int) -> list[DescribedImage]:
-    """Extract the features of all images in the same way as a run."""
+    """Extract the ORB features of images in the same way as a run of vslam."""
     node_of_word = vocabulary.ancestors(_MATCHING_LEVEL)
 
     def one(image: Image) -> DescribedImage:
@@ -67,21 +68,24 @@ def describe(images: list[Image], vocabulary: Vocabulary, threads: int) -> list[
 
 
 class Scorer(Protocol):
-    """A loop detector that compares images and needs no map."""
+    """A loop detector that compares query images with gallery images and needs no map."""
 
     name: str
     probability: bool
     """Whether the scores are probabilities, so that the accuracy at p = 0.5 and 0.9 is defined."""
 
     def store(self, gallery: list[DescribedImage]) -> Any:
-        """Compute the data of the gallery that the detector compares with queries."""
+        """Compute the data of gallery images with which the detector compares query images."""
 
     def scores(self, queries: list[DescribedImage], stored: Any) -> NDArray[np.float64]:
-        """``(Q, G)`` similarities. A higher value means more similar."""
+        """Compute the ``(Q, G)`` similarities of queries and gallery. Higher means more similar."""
 
 
 class BowScorer:
-    """A scorer with the tf-idf weights and L1 score of `vslam.loopclosure.bow.BowDetector`."""
+    """A bag-of-words detector with the weights and the score of a run of vslam.
+
+    The tf-idf weights and the L1 score are those of `vslam.loopclosure.bow.BowDetector`.
+    """
 
     name = "bow"
     probability = False
@@ -102,7 +106,7 @@ class BowScorer:
 
 
 def require_comparable(name: str, weights: Path | None) -> None:
-    """Check that a detector can be compared. This check is made before large packages are imported.
+    """Check that a loop detector can be compared. No large packages are imported for this check.
 
     Raises:
         InputError: the detector is unknown, or there are no weights for it.
@@ -121,16 +125,16 @@ def require_comparable(name: str, weights: Path | None) -> None:
 
 
 def open_scorer(name: str, weights: Path | None, vocabulary: Vocabulary) -> Scorer:
-    """Open ``bow`` or one of the networks.
+    """Open the loop detector ``bow`` or one of the networks.
 
     Raises:
-        InputError: the weights are missing or belong to another network.
+        InputError: the weights are missing or belong to a different network.
     """
     return BowScorer(vocabulary) if name == "bow" else NetworkScorer(name, weights)
 
 
 class NetworkScorer:
-    """A scorer that runs one of ``NETWORKS`` on one thread.
+    """A loop detector that runs one of ``NETWORKS`` on one thread.
 
     Attributes:
         parameters: number of learned parameters.
@@ -144,7 +148,7 @@ class NetworkScorer:
         self.compare = self._network.compare
 
     def store(self, gallery: list[DescribedImage]) -> NDArray[np.float32]:
-        """Descriptors ``(G, D)``."""
+        """Compute the ``(G, D)`` descriptors of G gallery images."""
         return self.embed([one.image for one in gallery])
 
     def scores(
@@ -154,7 +158,7 @@ class NetworkScorer:
         return np.stack([self.compare(one, stored) for one in embedded]).astype(np.float64)
 
     def embed(self, images: list[Image]) -> NDArray[np.float32]:
-        """``(N, D)`` descriptors of ``(H, W)`` uint8 images."""
+        """Compute the ``(N, D)`` descriptors of N images, each ``(H, W)`` uint8."""
         size, fit = self._network.size, SiameseConfig().fit
         return np.stack([self._network.embed(to_size(one, size, fit)) for one in images])
 
@@ -162,7 +166,7 @@ class NetworkScorer:
 class LocalDescriptorCache:
     """Local descriptors of images, which are computed once per image.
 
-    Only the coarse descriptors are kept, see `DescriptorMaps`.
+    Only the coarse descriptors are kept (`DescriptorMaps`).
     """
 
     def __init__(self) -> None:
@@ -170,7 +174,9 @@ class LocalDescriptorCache:
         self._kept: dict[bytes, DescriptorMaps] = {}
 
     def of(self, image: Image) -> DescriptorMaps:
-        """The coarse local descriptors of an ``(H, W)`` grey image.
+        """Return the coarse local descriptors of an ``(H, W)`` grey image.
+
+        They are computed only if they are not in the cache.
 
         Raises:
             InputError: the network cannot be read.
@@ -186,7 +192,7 @@ class LocalDescriptorCache:
 
 
 class DetectorSet:
-    """The detectors of a benchmark. The first one is the baseline of the comparison.
+    """The loop detectors that are compared. The first detector is the baseline.
 
     The features and stored data of the last few galleries are cached, because most conditions share
     a gallery.
@@ -199,7 +205,10 @@ class DetectorSet:
         self._kept: OrderedDict[bytes, tuple[list[DescribedImage], dict[str, Any]]] = OrderedDict()
 
     def gallery(self, images: list[Image]) -> tuple[list[DescribedImage], dict[str, Any]]:
-        """The features of the images, and for each detector by name the data that it stores."""
+        """Return the features of gallery images, and the data that each detector stores for them.
+
+        The stored data are given by the name of the detector.
+        """
         hashed = hashlib.blake2b()
         for image in images:
             hashed.update(f"{image.shape}".encode())

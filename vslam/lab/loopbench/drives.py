@@ -1,4 +1,7 @@
-"""Drives for tests of loop detectors. The images are in the order in which they were taken."""
+"""Opens drives for tests of loop detectors.
+
+A drive has its images in the order in which they were taken.
+"""
 
 from __future__ import annotations
 
@@ -24,17 +27,20 @@ _ORDERED = ("kitti", "fabmap")  # kinds of sources whose images are in driving o
 def open_drives(
     spec: str, cache: Path, *, threads: int, progress_bar: ProgressBar
 ) -> list[ImageSource]:
-    """Open ``drive:ROUTE[seed=101,aliased=1,change=0.5,every=10]``, ``kitti:`` or ``fabmap:``.
+    """Open a drive that is named by a text.
+
+    The text is ``drive:ROUTE[seed=101,aliased=1,change=0.5,every=10]``, ``kitti:DIR`` or
+    ``fabmap:DIR``.
 
     The left images of a built-in route are rendered on first use. With ``every=10``, only every
     tenth frame is rendered.
 
     Args:
         cache: folder of rendered towns.
-        progress_bar: opened while a drive is rendered.
+        progress_bar: progress bar that is opened while a drive is rendered.
 
     Raises:
-        InputError: ``spec`` does not name a drive, its route or an option is unknown, or the data
+        InputError: ``spec`` does not name a drive, the route or an option is unknown, or the data
             is missing or malformed.
     """
     kind = split_spec(spec)[0]
@@ -94,12 +100,12 @@ def render_views(
     """Render the left images of some frames into a folder in KITTI's layout.
 
     Images that exist are not rendered again. The images are identical to those of
-    `render_sequence`. The poses and times of the whole drive are written, too. The file of poses is
-    written last, so that it exists only if all images exist.
+    `render_sequence`. The poses and times of the whole drive are also written. The file of the
+    poses is written last. Therefore, it exists only if all images exist.
 
     Args:
         root: output folder, which must not be used for other routes or variations.
-        frames: frame numbers, ascending.
+        frames: numbers of the frames to render, ascending.
         threads: number of threads of the renderer.
         on_frame: called with the number of finished frames and the number of all frames.
 

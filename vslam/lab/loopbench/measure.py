@@ -1,4 +1,4 @@
-"""Measure loop detectors on test sets, before and after geometric verification."""
+"""Measures loop detectors on test sets, before and after geometric verification."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ def measure(
     detectors: DetectorSet,
     seed: int,
 ) -> tuple[list[Score], list[Gain]]:
-    """Measure all detectors on a set of images.
+    """Measure all loop detectors on a set of images.
 
-    Returns empty lists if the condition cannot be applied to the set.
+    Returns empty lists if the change of the images (the condition) cannot be applied to the set.
     """
     query_set = test_set.query_set(condition, seed)
     if query_set is None:
@@ -122,20 +122,23 @@ def _score(
 def _best_images(
     scores: Matrix, relation: NDArray[np.int8]
 ) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
-    """For each query, the most similar image with a known relation to it, and this relation."""
+    """For each query, find the most similar image whose relation to the query is known.
+
+    Returns the indices of these images, and their relations (same place or another place).
+    """
     best = np.where(relation != UNKNOWN, scores, -np.inf).argmax(1)
     return best, relation[np.arange(len(best)), best]
 
 
 def thinned(curve: PrecisionRecall) -> Curve:
-    """Reduce a curve to fewer points, at equal steps of recall.
+    """Reduce a precision-recall curve to fewer points, at equal steps of recall.
 
     Each step is represented by its point with the best precision. The end of the curve, where every
     pair is accepted, is also kept.
 
-    Equal steps in the number of pairs would not show the curve of a good detector. Such a detector
-    ranks the few true pairs before thousands of false pairs, so that nearly the whole curve would
-    lie within the first step.
+    Equal steps in the number of accepted pairs would not be suitable. A good detector ranks the few
+    true pairs before thousands of false pairs. Nearly the whole curve would then lie within the
+    first step.
     """
     points = drawn_points(curve)
     return Curve(
@@ -145,7 +148,10 @@ def thinned(curve: PrecisionRecall) -> Curve:
 
 
 def drawn_points(curve: PrecisionRecall) -> NDArray[np.int64]:
-    """Indices of the first point of a curve, and of the points nearest to equal steps of recall."""
+    """Select the first point of a curve, and the points that are nearest to equal steps of recall.
+
+    Returns the indices of the points.
+    """
     wanted = np.linspace(0.0, curve.recall[0], _CURVE_POINTS)
     reached = len(curve.recall) - 1 - np.searchsorted(curve.recall[::-1], wanted)
     return np.unique(np.append(reached, 0))
@@ -159,7 +165,10 @@ def _gain(
     found: dict[str, Matrix],
     relation: NDArray[np.int8],
 ) -> Gain:
-    """The difference in average precision (AP), with a bootstrap interval over the queries."""
+    """Compute by how much the average precision (AP) of two detectors differs.
+
+    The result contains a 95 % interval, which is computed by a bootstrap over the queries.
+    """
     known, rng = relation != UNKNOWN, np.random.default_rng(0)
 
     def gain(rows: NDArray[np.integer]) -> float:
@@ -181,7 +190,7 @@ def _gain(
 
 
 class Verification:
-    """Decides by local features whether two images show the same place. Results are cached."""
+    """Decides whether two images show the same place, using local features. Results are cached."""
 
     def __init__(
         self,
@@ -194,7 +203,7 @@ class Verification:
         self._by_learned: dict[tuple[int, int], bool] = {}
 
     def by_orb(self, query: int, image: int) -> bool:
-        """Whether enough ORB matches fit one epipolar geometry."""
+        """Return whether enough ORB matches between two images fit one epipolar geometry."""
         key = query, image
         if key not in self._by_orb:
             inliers = epipolar_inliers(self._queries[query], self._gallery[image])
@@ -202,10 +211,11 @@ class Verification:
         return self._by_orb[key]
 
     def by_learned(self, query: int, image: int) -> bool:
-        """Whether enough similar cells of the two coarse grids roughly fit one homography.
+        """Return whether enough learned descriptors of two images match and fit one homography.
 
-        The number of cells decides, not their share. The share would depend on how much of the
-        images is sky or road.
+        The descriptors are those of the cells of a coarse grid, and the homography is a rough fit.
+        The limit is on the number of matching cells, not on their share, because the share depends
+        on how much of the images is sky or road.
         """
         key = query, image
         if key not in self._by_learned:
@@ -217,7 +227,7 @@ class Verification:
 
 
 def epipolar_inliers(a: DescribedImage, b: DescribedImage) -> int:
-    """Number of ORB matches between two images that fit the best fundamental matrix."""
+    """Count the ORB matches between two images that fit the best fundamental matrix."""
     import cv2
 
     config = VerificationConfig()
@@ -235,19 +245,22 @@ def epipolar_inliers(a: DescribedImage, b: DescribedImage) -> int:
 
 
 def sequence_scores(scores: Matrix) -> Matrix:
-    """Scores of sequences instead of single images, as in SeqSLAM (Milford and Wyeth, ICRA 2012).
+    """Compute the similarity of sequences instead of single images (SeqSLAM).
 
-    A query and its predecessors are compared with a gallery image and its predecessors. Their
-    scores are averaged along straight lines in the matrix of scores that end at this pair. There is
-    one line for each speed. The result is the mean score along the best line.
+    The method is that of Milford and Wyeth, ICRA 2012.
+
+    A query and the images before it are compared with a gallery image and the images before it. In
+    the matrix of scores, several straight lines end at this pair of images, one line for each
+    speed. The scores along each line are averaged. The result is the mean score along the best
+    line.
 
     Args:
         scores: ``(Q, G)`` scores of queries and gallery images, both in driving order. A higher
             score means more similar.
 
     Returns:
-        ``(Q, G)`` mean scores. Where a line leaves the gallery, the mean score of the query
-        replaces the missing score. The lines of the first queries are shorter.
+        ``(Q, G)`` mean scores. If a line leaves the gallery, each missing score is replaced by the
+        mean score of the query. The lines of the first queries are shorter.
     """
     n_queries, n_images = scores.shape
     usual = scores.mean(1)
@@ -263,6 +276,6 @@ def sequence_scores(scores: Matrix) -> Matrix:
 
 
 def log_odds(p: Matrix) -> Matrix:
-    """Log odds of probabilities. The log odds of independent observations can be added."""
+    """Compute the log odds of probabilities. Log odds of independent observations can be added."""
     p = np.clip(p, _LEAST_P, 1.0 - _LEAST_P)
     return np.asarray(np.log(p / (1.0 - p)))

@@ -1,4 +1,4 @@
-"""Measure loop detectors on drives, with one decision per image, before and after verification."""
+"""Measures loop detectors on drives, with one decision per image."""
 
 from __future__ import annotations
 
@@ -24,16 +24,17 @@ def measure_drive(
     *,
     threads: int,
 ) -> list[OnlineScore]:
-    """Measure all detectors on one drive.
+    """Measure all loop detectors on one drive, before and after verification.
 
     Args:
-        drive: images in order.
-        scorers: the detectors.
-        window: the images just before a query, in which no match is searched for.
-        vocabulary: vocabulary of ``bow`` and of the features that verification matches.
+        drive: images in the order in which they were taken.
+        scorers: the loop detectors.
+        window: the images just before a query. They are not searched for a match.
+        vocabulary: vocabulary of the detector ``bow``. It is also used to match features for
+            verification.
 
     Raises:
-        InputError: no image has a true match before the window.
+        InputError: no image has a true match before its window.
         UnreadableImageError: an image is missing or damaged.
     """
     n = len(drive)

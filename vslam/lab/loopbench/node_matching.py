@@ -1,8 +1,8 @@
-"""Match features by the direct index of a vocabulary (Galvez-Lopez and Tardos, T-RO 2012, IV).
+"""Matches features using the direct index of a vocabulary.
 
-Only features whose words lie under the same node of the vocabulary tree are compared. Loop closing
-compares all pairs of descriptors instead. This finds a quarter more matches, but is too slow for
-thousands of image pairs.
+Only features whose words lie under the same node of the vocabulary tree are compared (Galvez-Lopez
+and Tardos, T-RO 2012, section IV). Loop closing compares all pairs of descriptors instead.
+Comparing all pairs finds a quarter more matches, but is too slow for thousands of image pairs.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from vslam.kernels import hamming, kernel
 
 
 class NodeIndex(NamedTuple):
-    """Direct index of an image: its features, sorted by the node under which their words lie.
+    """The features of an image, sorted by the vocabulary node under which their words lie.
 
     Attributes:
         node: ``(N,)`` int32 node of each feature, ascending.
@@ -28,7 +28,7 @@ class NodeIndex(NamedTuple):
 
 
 def index_nodes(node: NDArray[np.int32]) -> NodeIndex:
-    """Make the direct index of an image.
+    """Make the direct index of an image, in which its features are sorted by vocabulary node.
 
     Args:
         node: ``(N,)`` node under which the word of each feature lies.
@@ -49,12 +49,13 @@ def match_by_node(
         node_b, feature_b: direct index of image b.
         descriptors_b: ``(N, 4)`` uint64 descriptors of all features of image b.
         max_distance: largest Hamming distance in bits.
-        ratio: largest ratio of the best distance to the second best distance under the node. 1
-            disables this test.
+        ratio: largest ratio of the distance of the best match to that of the second best match
+            under the same node. 1 disables this test.
 
     Returns:
-        ``(M,)`` int32 index of the matching feature of image b for each feature of image a, or -1.
-        A feature of image b is matched at most once, with the closest feature of image a.
+        ``(M,)`` int32. For each feature of image a, it contains the index of the matching feature
+        of image b, or -1 if there is no match. A feature of image b is matched at most once, with
+        the closest feature of image a.
     """
     matches = np.full(len(descriptors_a), -1, np.int32)
     distances = np.full(len(descriptors_a), 257, np.int64)

@@ -1,4 +1,4 @@
-"""The report of a comparison of loop detectors as Markdown, HTML and JSON."""
+"""Writes the report of a comparison of loop detectors as Markdown, HTML and JSON."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ _ABOUT_DECISIONS = (
 
 
 def write_report(report: LoopsJson, out: Path) -> None:
-    """Write ``loops.json``, ``loops.md`` and ``loops.html`` into ``out``.
+    """Write the report as ``loops.json``, ``loops.md`` and ``loops.html`` into the folder ``out``.
 
     Raises:
         ResultsError: a file cannot be written.
@@ -74,7 +74,7 @@ def write_report(report: LoopsJson, out: Path) -> None:
 
 
 def loops_page(report: LoopsJson) -> Page:
-    """The page of a comparison."""
+    """Make the page of a comparison of loop detectors."""
     return Page(
         title(report),
         (f"vslam {report.versions.get('vslam', '')}", f"{report.created:%Y-%m-%d %H:%M %Z}"),
@@ -88,15 +88,15 @@ def loops_page(report: LoopsJson) -> Page:
 
 
 def title(report: LoopsJson) -> str:
-    """One line that says what was compared."""
+    """Return one line that says what was compared."""
     return f"Loop detectors: {', '.join(_detectors(report))}"
 
 
 def words(report: LoopsJson) -> list[str]:
-    """Sentences that summarise the comparison.
+    """Return sentences that summarise a comparison of loop detectors.
 
-    They compare each detector with the first one under each condition, and name the best detector
-    on each drive.
+    The sentences compare each detector with the first detector under each condition. They also name
+    the best detector on each drive.
     """
     sentences = _online_words(report.online)
     for first, second in dict.fromkeys((g.first, g.second) for g in report.gains):
@@ -117,7 +117,7 @@ def words(report: LoopsJson) -> list[str]:
 
 
 def tables(report: LoopsJson) -> list[Section]:
-    """Every table of the report."""
+    """Return all tables of the report of a comparison of loop detectors."""
     if not report.cells:
         return _online_tables(report.online)
     names = _detectors(report)
@@ -210,7 +210,7 @@ def _retrieval_table(
 
 
 def _online_tables(scores: Iterable[OnlineScore]) -> list[Section]:
-    """Tables with recall at 100 % precision, the largest F1 score, and counts."""
+    """Return the tables for drives: recall at 100 % precision, the largest F1 score, and counts."""
     head = ("drive", "images", "with a match", "window", "verified by")
     texts = ("drive", "window", "verified by")
 
@@ -237,11 +237,11 @@ def _by_detector(
     about: Callable[[_Scored], tuple[str, ...]],
     shown: Callable[[_Scored], str],
 ) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Head and rows of a table with one column for each detector.
+    """Return the head and the rows of a table that has one column for each detector.
 
     Args:
-        about: returns the first cells of a row.
-        shown: returns the cell for the score of a detector.
+        about: function that returns the first cells of a row.
+        shown: function that returns the cell for the score of a detector.
     """
     rows: dict[tuple[str, ...], dict[str, str]] = {}
     for score in scores:
@@ -251,7 +251,7 @@ def _by_detector(
 
 
 def _online_words(scores: Iterable[OnlineScore]) -> list[str]:
-    """Sentences that name the best detector for each drive and each kind of verification.
+    """Return sentences that name the best detector for each drive and each kind of verification.
 
     The best detector has the highest recall without a wrong match.
     """

@@ -1,4 +1,4 @@
-"""The schema of ``loops.json``. Scripts may rely on it."""
+"""The schema of ``loops.json``, on which scripts may rely."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from vslam.report.schema import Document, Record
 
 
 class Curve(Record):
-    """Precision and recall at selected thresholds, beginning with the lowest threshold."""
+    """A precision-recall curve at selected thresholds, beginning with the lowest threshold."""
 
     precision: list[float]
     recall: list[float]
 
 
 class Verified(Record):
-    """Queries whose most similar gallery image passes verification.
+    """The result of verifying the most similar gallery image of each query.
 
-    - ``right``: share of the queries whose verified image shows the same place. It is a share of
-      the queries whose place is in the gallery.
-    - ``wrong``: number of queries whose verified image shows another place.
+    - ``right``: share of the queries for which the image passes verification and shows the same
+      place. Only queries whose place is in the gallery are counted.
+    - ``wrong``: number of queries for which the image passes verification but shows another place.
     """
 
     right: float
@@ -28,18 +28,22 @@ class Verified(Record):
 
 
 class Score(Record):
-    """One detector on one set of images under one condition.
+    """The figures of one loop detector on one set of images under one condition.
 
-    - ``figures``: figures without verification, see `vslam.loopclosure.precision_recall.summary`.
-    - ``accuracy``: balanced accuracy by threshold on the probability p. None for detectors that
-      compute no probability.
-    - ``accepted``: precision and recall of the pairs with a probability of at least 0.9. None for
-      detectors that compute no probability, and in older files.
+    A *condition* is a change of the query images.
+
+    - ``figures``: figures without verification, as returned by
+      `vslam.loopclosure.precision_recall.summary`.
+    - ``accuracy``: balanced accuracy for several thresholds on the probability p. None for
+      detectors that compute no probability.
+    - ``accepted``: precision and recall if pairs with a probability of at least 0.9 are accepted.
+      None for detectors that compute no probability, and in older files.
     - ``queries``: number of queries whose place is in the gallery.
-    - ``first_right``: share of these queries whose most similar image shows their place.
-    - ``sequence_right``: the same share for scores of sequences. None for images without an order.
-    - ``verified``: results of verification by ``orb``, by ``learned`` local descriptors, and by at
-      least one of them (``both``). Empty without verification.
+    - ``first_right``: share of these queries for which the most similar image shows the same place.
+    - ``sequence_right``: the same share if sequences of images are compared instead of single
+      images. None for images without an order.
+    - ``verified``: results by kind of verification: ORB descriptors (``orb``), learned local
+      descriptors (``learned``), and at least one of the two (``both``). Empty without verification.
     """
 
     data: str
@@ -56,7 +60,10 @@ class Score(Record):
 
 
 class DecisionCurve(Record):
-    """Precision and recall over images, at selected thresholds on the score in ascending order."""
+    """A precision-recall curve over the images of a drive, at selected thresholds.
+
+    The thresholds are in ascending order.
+    """
 
     threshold: list[float]
     precision: list[float]
@@ -64,14 +71,17 @@ class DecisionCurve(Record):
 
 
 class OnlineScore(Record):
-    """One detector on one drive, with one decision per image (`vslam.lab.loopbench.online`).
+    """The figures of one loop detector on one drive, with one decision per image.
 
-    - ``window``: the images just before a query, in which no match is searched for.
-    - ``verified_by``: ``nothing``, ``orb``, ``learned`` local descriptors, or ``both`` if one of
-      the two is sufficient.
-    - ``answerable``: number of images that have a true match before the window.
+    `vslam.lab.loopbench.online` defines the figures.
+
+    - ``window``: the images just before a query, which are not searched for a match.
+    - ``verified_by``: kind of verification. It is ``nothing``, ``orb``, ``learned`` (local
+      descriptors), or ``both``, which means that one of the two is sufficient.
+    - ``answerable``: number of images that have a true match before their window.
     - ``right``: number of matches that are marked as the same place, at the lowest threshold.
-    - ``near``: number of matches that are near the place but not marked, at the lowest threshold.
+    - ``near``: number of matches that were taken near the place but are not marked as the same
+      place, at the lowest threshold.
     - ``far``: number of matches that show another place, at the lowest threshold.
     - Figures whose names end in ``_far`` leave out near matches. The other figures count near
       matches as wrong.
@@ -96,7 +106,7 @@ class OnlineScore(Record):
 
 
 class Gain(Record):
-    """Average precision (AP) of ``second`` minus that of ``first``.
+    """Difference between the average precision (AP) of two detectors: ``second`` minus ``first``.
 
     The 95 % interval is computed by a bootstrap over the queries.
     """
@@ -111,11 +121,11 @@ class Gain(Record):
 
 
 class Cost(Record):
-    """Median costs of one detector in a separate process with one thread.
+    """Median costs of one loop detector, measured in a separate process with one thread.
 
-    - ``image_ms``: time per image. It does not include the ORB features, which tracking extracts
-      anyway.
-    - ``query_ms``: time per query, by number of keyframes.
+    - ``image_ms``: CPU time per image in milliseconds. The extraction of ORB features is not
+      included, because tracking needs these features in any case.
+    - ``query_ms``: CPU time per query in milliseconds, by number of keyframes.
     """
 
     detector: str
@@ -127,10 +137,11 @@ class Cost(Record):
 
 
 class LoopsJson(Document):
-    """The results of ``vslam loops bench``.
+    """The results of ``vslam loops bench``, as in ``loops.json``.
 
-    ``kind`` distinguishes this file from reports of runs. The protocol ``retrieval`` writes
-    ``cells``, ``gains`` and ``costs``. The protocol ``online`` writes ``online``.
+    ``kind`` distinguishes this file from reports of runs. With the protocol ``retrieval``, the
+    results are in ``cells``, ``gains`` and ``costs``. With the protocol ``online``, they are in
+    ``online``.
     """
 
     kind: Literal["loops"] = "loops"

@@ -1,4 +1,4 @@
-"""Image sets for tests of loop detectors: rendered towns, and collections with ground truth."""
+"""Opens image sets for tests of loop detectors: rendered towns, and collections of images."""
 
 from __future__ import annotations
 
@@ -27,13 +27,14 @@ _GAP = 50  # number of images just before a query of a drive in which no match i
 
 @dataclass(frozen=True)
 class QuerySet:
-    """Query images, the gallery in which their places are searched for, and the ground truth.
+    """Query images, gallery images in which their places are searched for, and the ground truth.
 
     Attributes:
-        queries: Q images to which the condition was applied, each ``(H, W)`` uint8.
-        gallery: G unchanged images.
-        relation: ``(Q, G)`` int8. 1 means the same place, and -1 means another place. Pairs with 0
-            are unknown and are left out.
+        queries: Q images, each ``(H, W)`` uint8. They are already changed according to the
+            condition.
+        gallery: G images without changes, each ``(H, W)`` uint8.
+        relation: ``(Q, G)`` int8. 1 means that a query and a gallery image show the same place, and
+            -1 means another place. Pairs with 0 are unknown and are left out.
         in_order: whether the queries and the gallery are in the order of a drive.
     """
 
@@ -45,12 +46,13 @@ class QuerySet:
 
 @dataclass(frozen=True)
 class TestSet:
-    """One set of images.
+    """One set of images for tests of loop detectors.
 
     Attributes:
         title: title in the report.
-        query_set: function of ``(condition, seed)`` that returns the images under the condition, or
-            None if the condition cannot be applied to the set.
+        query_set: function of ``(condition, seed)`` that changes the query images according to the
+            condition and returns all images. It returns None if the condition cannot be applied to
+            the set.
     """
 
     __test__ = False  # pytest must not collect this class because of its name
@@ -60,14 +62,16 @@ class TestSet:
 
 
 def open_set(spec: str, cache: Path, *, threads: int, progress_bar: ProgressBar) -> list[TestSet]:
-    """Open ``town:ROUTE[seed=101,aliased=1,places=150]`` or a source of ``vslam train``.
+    """Open a set of images that is named by a text.
+
+    The text is ``town:ROUTE[seed=101,aliased=1,places=150]``, or a source of ``vslam train``.
 
     A town is rendered into ``cache`` when it is first needed. It is rendered once for each
-    viewpoint and change.
+    combination of viewpoint and change of the town.
 
     Args:
         cache: folder of rendered towns.
-        progress_bar: opened while a town is rendered.
+        progress_bar: progress bar that is opened while a town is rendered.
 
     Raises:
         InputError: the kind, route or an option is unknown, or the data is missing or malformed.
@@ -82,9 +86,9 @@ def open_set(spec: str, cache: Path, *, threads: int, progress_bar: ProgressBar)
 
 
 def rendered_route(spec: str, defaults: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Parse the route and the options of ``KIND:ROUTE[options]``.
+    """Parse the route and the options of a text ``KIND:ROUTE[options]``, which names a town.
 
-    Missing options have their default values.
+    Options that are not given have their default values.
 
     Raises:
         InputError: the route or an option is unknown, or an option is not a number.

@@ -1,1 +1,1 @@
-"""A report of many runs, with medians, comparisons of systems, trajectories and error curves."""
+"""Makes a report of many runs: medians, comparisons of systems, trajectories and error curves."""

@@ -1,4 +1,4 @@
-"""Find finished runs of vslam and of other systems on the disk, and read their figures."""
+"""Finds finished runs of vslam and of other SLAM systems on the disk, and reads their results."""
 
 from __future__ import annotations
 
@@ -28,8 +28,9 @@ class Found:
     """The finished runs, in order, and notes on runs that were left out.
 
     Attributes:
-        estimate: the trajectory file of each run, by the ``source`` of the run.
-        truth: for each (dataset, place), the folder of a run that contains the ground truth.
+        estimate: the file of the estimated trajectory of each run, by ``RunEntry.source``.
+        truth: for each pair of data set and sequence, the folder of a run that contains the ground
+            truth.
     """
 
     runs: list[RunEntry]
@@ -39,14 +40,15 @@ class Found:
 
 
 def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
-    """Read every run below ``folders``, and evaluate ``trajectories`` on the same sequences.
+    """Read every run below ``folders``, and evaluate the trajectories of other systems.
 
-    Interrupted runs are left out, as are reports that this version cannot read. A note is added for
-    each of them.
+    ``trajectories`` contains the trajectories of other systems, which are evaluated on the same
+    sequences as the runs. Interrupted runs and reports that this version cannot read are left out.
+    The result has a note for each of them.
 
     Raises:
         InputError: a folder is missing, no folder contains a finished run, a trajectory cannot be
-            read, or it is ambiguous to which sequence a trajectory belongs.
+            read, or more than one sequence could belong to a trajectory.
     """
     found = Found([], [])
     for folder in run_folders(folders):
@@ -82,9 +84,9 @@ def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
 
 
 def read_aligned(found: Found, run: RunEntry) -> tuple[Trajectory, Trajectory | None]:
-    """The trajectory of a run, aligned to its ground truth, and the ground truth.
+    """Read the trajectory of a run, align it to the ground truth, and return both.
 
-    The ground truth is None if it is missing.
+    If there is no ground truth, None is returned in its place.
 
     Raises:
         InputError: a file is missing or malformed.
@@ -104,7 +106,7 @@ def read_aligned(found: Found, run: RunEntry) -> tuple[Trajectory, Trajectory | 
 
 
 def run_folders(folders: Collection[Path]) -> list[Path]:
-    """Folders at any depth that contain a ``report.json``, except hidden folders.
+    """Find the folders that contain a ``report.json``, at any depth. Hidden folders are skipped.
 
     Raises:
         InputError: a folder does not exist.
@@ -134,7 +136,7 @@ def _read(folder: Path, notes: list[str]) -> ReportJson | None:
 
 
 def _is_overview(path: Path) -> bool:
-    """Whether a ``report.json`` is a report of many runs instead of one run."""
+    """Return whether a ``report.json`` is a report of many runs and not of a single run."""
     try:
         OverviewJson.read(path)
     except InputError:
@@ -145,7 +147,7 @@ def _is_overview(path: Path) -> bool:
 def _compared_entry(
     entry: RunEntry, report: ReportJson, other: DetectorFigures, folder: Path
 ) -> RunEntry:
-    """The entry of a detector that a run compared with its own detector (``--compare``)."""
+    """Make the entry of a detector that a run compared with its own detector (``--compare``)."""
     return entry.model_copy(
         update={
             "system": other.detector + entry.system.removeprefix(report.detector),
@@ -198,10 +200,11 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
 
 
 def _settings(report: ReportJson, folder: Path) -> dict[str, Any]:
-    """The settings of a run.
+    """Return the settings of a run, which distinguish it from other runs of the same system.
 
-    They are the thresholds and options that differ from the defaults, and the version of the
-    method. Only runs of vslam have a ``run.json`` and settings. Runs of other systems have neither.
+    The settings are the thresholds and options that differ from the defaults, and the version of
+    the method. A folder without a ``run.json`` contains a run of another system, which has no
+    settings.
     """
     if not (folder / "run.json").exists():
         return {}
@@ -216,7 +219,10 @@ def _settings(report: ReportJson, folder: Path) -> dict[str, Any]:
 
 
 def _name_by_settings(found: Found) -> None:
-    """Treat each combination of settings as a system, whose name lists the settings that differ."""
+    """Treat each combination of settings as a separate system. Its name lists these settings.
+
+    Settings that all runs share are not listed.
+    """
     first = found.runs[0].settings
     shared = {
         name: value
@@ -234,7 +240,7 @@ def _name_by_settings(found: Found) -> None:
 
 
 def without_settings(system: str) -> str:
-    """The name of a system, without the settings in brackets."""
+    """Return the name of a system without the settings that follow it in brackets."""
     return re.sub(r" \(.*\)", "", system)
 
 
@@ -296,10 +302,11 @@ def _add_external(text: str, found: Found) -> None:
 
 
 def _alignment_of_external(system: str, drive: Drive, found: Found) -> str:
-    """The alignment with which the trajectory of another system is evaluated.
+    """Return the alignment (se3 or sim3) with which another system's trajectory is evaluated.
 
     It is the alignment of vslam's runs on the same sequence. If only some of these runs are
-    monocular, the name of the system decides: sim3 if it ends in ``, mono``, otherwise se3.
+    monocular, the name of the other system decides. The alignment is sim3 if the name ends in ``,
+    mono``, and se3 otherwise.
     """
     there = {run.alignment for run in found.runs if run.drive.place == drive.place}
     if len(there) == 1:

@@ -1,4 +1,4 @@
-"""The figures of a report of many runs: errors by sequence, error curves and trajectories."""
+"""Draws the figures of a report of many runs: errors, error curves and trajectories."""
 
 from __future__ import annotations
 
@@ -45,7 +45,10 @@ Looks = Mapping[str, tuple[str, Any]]  # colour and dashes of each system
 
 
 def draw_overview(report: OverviewJson, found: Found) -> list[page.Figure]:
-    """Draw all figures for which there is data, in the order of the report."""
+    """Draw all figures of a report of many runs, in the order of the report.
+
+    A figure is left out if there is no data for it.
+    """
     looks = {
         name: (_COLORS[k % len(_COLORS)], _DASHES[k % len(_DASHES)])
         for k, name in enumerate(systems(report.rows))
@@ -59,7 +62,7 @@ def draw_overview(report: OverviewJson, found: Found) -> list[page.Figure]:
 
 
 def _errors(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
-    """Draw the ATE of each sequence, with a figure for each perturbation."""
+    """Draw the ATE of each sequence. There is one figure for each perturbation."""
     for perturb in dict.fromkeys(row.drive.perturb for row in rows):
         known = [r for r in rows if r.drive.perturb == perturb and r.measures["ate_rmse_m"]]
         places = list(dict.fromkeys((row.drive.dataset, row.drive.place) for row in known))
@@ -89,7 +92,7 @@ def _errors(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
 def _curves(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
     """Draw the ATE and the number of loops against the strength of a perturbation.
 
-    There is a figure for each kind of perturbation and sequence.
+    There is one figure for each combination of a kind of perturbation and a sequence.
     """
     laws = {
         law.partition(":")[0]: None
@@ -149,9 +152,9 @@ def _curve(
 
 
 def _paths(report: OverviewJson, found: Found, looks: Looks) -> Iterator[Drawing]:
-    """Draw a trajectory of each system, with a figure for each drive.
+    """Draw one trajectory of each system for each drive. There is one figure for each drive.
 
-    The trajectory is that of the run with the median ATE.
+    The trajectory is taken from the run that has the median ATE.
     """
     for drive in dict.fromkeys(row.drive for row in report.rows):
         figure, axes = new_figure(

@@ -1,4 +1,4 @@
-"""Write the report of many runs, as a page and as a CSV table."""
+"""Writes the report of many runs, as a page and as a CSV table."""
 
 from __future__ import annotations
 
@@ -47,18 +47,21 @@ def write_overview(
     out: Path,
     baseline: str | None = None,
 ) -> OverviewJson:
-    """Collect finished runs, and write ``report.{html,md,json}`` and ``table.csv`` into ``out``.
+    """Collect finished runs, and write a report of them into the folder ``out``.
+
+    The files are ``report.html``, ``report.md``, ``report.json`` and ``table.csv``.
 
     Args:
         runs: folders that contain runs at any depth.
-        trajectories: trajectories of other systems, ``NAME[@SEQUENCE[@PERTURB]]=FILE``.
+        trajectories: trajectories of other systems, each as a text
+            ``NAME[@SEQUENCE[@PERTURB]]=FILE``.
         out: output folder, which is created if it does not exist.
         baseline: the system with which the other systems are compared; None for the simplest
             system.
 
     Raises:
         InputError: there is no finished run, there is no run of the baseline, a trajectory cannot
-            be read, or it is ambiguous to which sequence a trajectory belongs.
+            be read, or more than one sequence could belong to a trajectory.
         ResultsError: a file cannot be written.
     """
     found = collect(runs, trajectories)
@@ -90,7 +93,7 @@ def overview_page(report: OverviewJson, figures: Collection[Figure]) -> Page:
 
 
 def title(report: OverviewJson) -> str:
-    """One line with the systems and the number of runs."""
+    """Return one line with the names of the systems and the number of runs."""
     places = len({(row.drive.dataset, row.drive.place) for row in report.rows})
     return (
         f"{', '.join(report.systems)}: {counted(len(report.runs), 'run')} on "
@@ -99,7 +102,10 @@ def title(report: OverviewJson) -> str:
 
 
 def render_csv(report: OverviewJson) -> str:
-    """The rows as CSV, with the median, the smallest and the largest value of each measure."""
+    """Write the rows of the report as CSV.
+
+    Each row has the median, the smallest and the largest value of each measure.
+    """
     names = [name for name, *_ in MEASURES]
     head = ["dataset", "sequence", "excerpt", "perturb", "system", "alignment", "runs", "frames"]
     lines: list[list[object]] = [
@@ -117,9 +123,10 @@ def render_csv(report: OverviewJson) -> str:
 
 
 def _results(report: OverviewJson) -> list[Section]:
-    """The tables of results.
+    """Return the tables with the results of all systems on all drives.
 
-    There are several tables with the same rows, because one table would be too wide.
+    The results are divided into several tables with the same rows, because one table would be too
+    wide.
     """
     texts = ("sequence", "perturbation", "system")
 

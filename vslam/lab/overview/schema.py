@@ -1,4 +1,4 @@
-"""The schema of the ``report.json`` of many runs. Scripts may rely on it."""
+"""The schema of the ``report.json`` of many runs, on which scripts may rely."""
 
 from __future__ import annotations
 
@@ -29,10 +29,11 @@ ALL = "all"  # value of ``Comparison.perturb`` for a comparison over all perturb
 
 
 class Drive(Record):
-    """The images on which systems are compared.
+    """The images of a drive, on which systems are compared.
 
-    They are those of a sequence or of an excerpt of it, with a perturbation. ``excerpt`` is empty
-    for a whole sequence. Runs with different seeds have the same drive.
+    They are the images of a sequence or of an excerpt of a sequence, with a perturbation.
+    ``excerpt`` is empty for a whole sequence. Runs that differ only in their seed have the same
+    drive.
     """
 
     dataset: str
@@ -42,25 +43,25 @@ class Drive(Record):
 
     @property
     def place(self) -> str:
-        """The sequence without its perturbation."""
+        """The sequence or excerpt, without the perturbation."""
         return f"{self.sequence}, {self.excerpt}" if self.excerpt else self.sequence
 
 
 class RunEntry(Record):
-    """One run.
+    """One run of a system on a drive, with its results.
 
-    - ``system``: the name of the loop detector or of another system. The settings that not all runs
-      share follow the name of a loop detector in brackets.
+    - ``system``: the name of vslam's loop detector or of another SLAM system. After the name of a
+      loop detector, brackets contain the settings that not all runs share.
     - ``settings``: thresholds and options that differ from the defaults, and the version of the
       method.
     - ``seed``: seed of the perturbation; None for other systems.
-    - ``town``: seed of a rendered town. The same route in another town counts as the same drive
-      with another seed.
+    - ``town``: seed of a rendered town. The same route in a different town counts as the same drive
+      with a different seed.
     - ``alignment``: the transformation that is fitted before errors are computed. It is ``se3``, or
       ``sim3`` for a monocular run, whose scale is arbitrary.
-    - ``measures``: values by the names in ``MEASURES``; None if unknown.
-    - ``source``: the folder of the run. For another system or a detector of ``--compare``, it is
-      the trajectory file.
+    - ``measures``: values by the names in ``MEASURES``. A value is None if it is unknown.
+    - ``source``: the folder of the run. For another system, or for a detector that ``--compare``
+      added to a run, it is the trajectory file.
     """
 
     drive: Drive
@@ -76,7 +77,7 @@ class RunEntry(Record):
 
 
 class Spread(Record):
-    """Median, smallest and largest value over the ``n`` runs that have a value."""
+    """Median, smallest and largest value of a measure over the ``n`` runs that have a value."""
 
     n: int
     median: float
@@ -85,7 +86,10 @@ class Spread(Record):
 
 
 class Row(Record):
-    """All runs of one system on one drive. A measure is None if no run has a value for it."""
+    """A summary of all runs of one system on one drive.
+
+    A measure is None if no run has a value for it.
+    """
 
     drive: Drive
     system: str
@@ -96,7 +100,7 @@ class Row(Record):
 
 
 class Pair(Record):
-    """Medians of two systems on one drive. ``difference`` is the second minus the first median."""
+    """Median errors of two systems on one drive. ``difference`` is the second minus the first."""
 
     drive: Drive
     first: float
@@ -105,13 +109,13 @@ class Pair(Record):
 
 
 class Comparison(Record):
-    """Two systems under one perturbation, paired by sequence.
+    """A comparison of the errors of two systems under one perturbation, paired by sequence.
 
-    - ``perturb``: the perturbation, or ``all`` for a comparison over all perturbations. In the
-      latter case, each sequence counts once, with its mean over the perturbations under which both
-      systems have run.
-    - ``p_value``: p-value of the two-sided Wilcoxon signed-rank test on the differences that are
-      not ties; None if there are too few differences.
+    - ``perturb``: the perturbation, or ``all`` for a comparison over all perturbations. With
+      ``all``, each sequence counts once. Its error is the mean over the perturbations under which
+      both systems have run.
+    - ``p_value``: p-value of the two-sided Wilcoxon signed-rank test. Differences that are ties are
+      left out of the test. None if there are too few differences.
     - ``winner``: the system with significantly smaller errors; None if there is no such system.
     - ``words``: the result in sentences.
     """
@@ -131,10 +135,10 @@ class Comparison(Record):
 
 
 class OverviewJson(Document):
-    """A report of many runs.
+    """The ``report.json`` of many runs.
 
-    ``kind`` distinguishes this file from the ``report.json`` of one run. ``systems`` lists the
-    baseline first, followed by the systems that are compared with it.
+    ``kind`` distinguishes this file from the ``report.json`` of a single run. ``systems`` begins
+    with the baseline. The other systems are compared with the baseline.
     """
 
     kind: Literal["overview"] = "overview"

@@ -1,12 +1,12 @@
 """The web server of ``vslam report --serve``, which lists all runs in some folders.
 
-The server can only be reached from this machine. A request names a report by its number. A path
-from a request is never opened. Requests for another host name are rejected, so that a web site
-cannot read reports through the user's browser (DNS rebinding).
+The server can only be reached from this machine. A request names a report by its number. The server
+never opens a path that comes from a request. Requests for a different host name are rejected.
+Otherwise, a web site could read reports through the user's browser (DNS rebinding).
 
-A report may come from an untrusted person and contain any script. Therefore, it is sandboxed: its
-scripts run in their own origin, and cannot access other reports or the network. A ``report.html``
-or ``report.json`` that is a symbolic link is not read.
+A report may come from an untrusted person and contain any script. Therefore, every report is
+sandboxed: the scripts of a report run in their own origin and cannot access other reports or the
+network. The server does not read a ``report.html`` or ``report.json`` that is a symbolic link.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _REPORT = re.compile("/run/([0-9]{1,9})")
 
 
 def list_runs(folders: Collection[Path]) -> list[tuple[Path, ReportJson]]:
-    """The folders of all runs and their reports, newest first.
+    """Find the folders of all runs and read their reports. The newest run comes first.
 
     Reports that cannot be read are left out.
 
@@ -59,12 +59,14 @@ def list_runs(folders: Collection[Path]) -> list[tuple[Path, ReportJson]]:
 
 
 def _is_own(path: Path) -> bool:
-    """Whether a path in a resolved folder is a file, but not a symbolic link."""
+    """Return whether a path in a resolved folder is a file and not a symbolic link."""
     return path.is_file() and path.resolve() == path
 
 
 def make_server(folders: Sequence[Path], port: int = 0) -> http.server.ThreadingHTTPServer:
-    """Make a server on the loopback interface. Its method ``serve_forever`` starts it.
+    """Make a server on the loopback interface that shows all runs in some folders.
+
+    The method ``serve_forever`` of the server starts it.
 
     The folders are read again whenever the list of runs is requested.
 
@@ -107,9 +109,10 @@ def make_server(folders: Sequence[Path], port: int = 0) -> http.server.Threading
 
 
 class _Pages:
-    """The pages of the server.
+    """The pages that the server shows.
 
-    The number of a report is its index in ``_known``. It never changes while the server runs.
+    A report is requested by its number, which is its index in ``_known``. The number of a report
+    never changes while the server runs.
     """
 
     def __init__(self, folders: Sequence[Path]) -> None:
@@ -119,7 +122,7 @@ class _Pages:
         self._list()
 
     def answer(self, request: str) -> tuple[int, str]:
-        """The HTTP status and the page for a requested path with its query."""
+        """Return the HTTP status and the page for a request. The path includes the query."""
         try:
             url = urlsplit(request)
             if url.path == "/":

@@ -1,8 +1,9 @@
-"""Summarize runs in rows and compare systems.
+"""Summarizes many runs, and compares systems.
 
 On each drive, a system is represented by the median of its runs. Two systems are compared under
-each perturbation, and over all perturbations. A comparison pairs the systems by *sequence*. Runs on
-the same sequence are not independent, so that counting each run would overstate the evidence.
+each perturbation, and over all perturbations. A comparison pairs the systems by *sequence*. It does
+not count each run, because runs on the same sequence are not independent. Counting them would
+overstate the evidence.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _KNOWN = ("none", "bow", *NETWORKS, "both")
 
 
 class Shown(NamedTuple):
-    """How an error is printed. Its value is multiplied by ``scale`` to get it in ``unit``."""
+    """How an error is printed. The error times ``scale`` is the printed value in ``unit``."""
 
     title: str
     unit: str
@@ -43,7 +44,7 @@ class Shown(NamedTuple):
     decimals: int
 
     def text(self, value: float, sign: str = "") -> str:
-        """The value as text without its unit. ``sign`` is ``+`` for differences."""
+        """Format a value without its unit. For differences, ``sign`` is ``+``."""
         return f"{self.scale * value:{sign}.{self.decimals}f}"
 
 
@@ -52,7 +53,7 @@ ROTATION = {"rpe_deg": Shown("RPE", "°", 1.0, 3)}
 
 
 def summarize(found: Found, baseline: str | None = None) -> OverviewJson:
-    """Compute the content of the report from the runs.
+    """Compute the content of the report of many runs from the runs.
 
     Args:
         found: the runs.
@@ -90,7 +91,7 @@ def summarize(found: Found, baseline: str | None = None) -> OverviewJson:
 
 
 def _unlike_towns(runs: Iterable[RunEntry]) -> Iterator[str]:
-    """Notes on the drives on which the systems ran in different rendered towns."""
+    """Yield a note for each drive on which the systems ran in different rendered towns."""
     towns: dict[Drive, dict[str, set[int]]] = {}
     for run in runs:
         if run.town is not None:
@@ -104,11 +105,11 @@ def _unlike_towns(runs: Iterable[RunEntry]) -> Iterator[str]:
 
 
 def systems(runs: Iterable[RunEntry | Row], baseline: str | None = None) -> list[str]:
-    """Names of the systems in the order of the report.
+    """Return the names of the systems in the order in which the report lists them.
 
-    If a baseline is named, it is the first system. It is followed by the loop detectors, from the
-    simplest to the most elaborate one, and by the other systems in the order of ``runs``. A
-    detector with default settings precedes the same detector with other settings.
+    If a baseline is named, it is the first system. Then come the loop detectors of vslam, from the
+    simplest to the most elaborate one. Last come the other SLAM systems, in the order of ``runs``.
+    A detector with default settings comes before the same detector with other settings.
     """
     names = dict.fromkeys(run.system for run in runs)
 
@@ -121,12 +122,15 @@ def systems(runs: Iterable[RunEntry | Row], baseline: str | None = None) -> list
 
 
 def _is_called(system: str, name: str | None) -> bool:
-    """Whether a name denotes a system. It may omit the settings and the suffix ``, mono``."""
+    """Return whether a name that the user gave denotes a system.
+
+    The name may omit the settings of the system and the suffix ``, mono``.
+    """
     return name in {one.removesuffix(MONOCULAR) for one in (system, without_settings(system))}
 
 
 def make_rows(runs: list[RunEntry]) -> list[Row]:
-    """Make a row for each drive and system, in the order of the names of the sequences."""
+    """Summarize the runs in one row for each drive and system, sorted by the sequence's name."""
     groups: dict[tuple[Drive, str], list[RunEntry]] = {}
     for run in runs:
         groups.setdefault((run.drive, run.system), []).append(run)
@@ -155,13 +159,14 @@ def make_rows(runs: list[RunEntry]) -> list[Row]:
 def compare(
     rows: list[Row], first: str, second: str, perturb: str, measure: str
 ) -> Comparison | None:
-    """Compare the errors of two systems.
+    """Compare the errors of two systems, paired by sequence.
 
     Args:
         rows: medians of both systems. Rows of other systems are ignored.
-        first, second: names of the systems. Errors after different alignments are not compared.
-        perturb: a perturbation, or `ALL`. With `ALL`, the mean of each sequence over the
-            perturbations under which both systems have run is compared.
+        first, second: names of the systems. Errors that were computed after different alignments
+            are not compared.
+        perturb: a perturbation, or `ALL`. With `ALL`, the mean error of each sequence is compared.
+            The mean is over the perturbations under which both systems have run.
         measure: ``ate_rmse_m`` or ``rpe_m``. Smaller values are better.
 
     Returns:
@@ -208,15 +213,15 @@ def compare(
 
 
 def is_tie(difference: float, measure: str) -> bool:
-    """Whether two errors differ by at most half a unit of the last digit that is printed."""
+    """Return whether two errors differ by at most half a unit of the last digit that is printed."""
     shown = COMPARED[measure]
     return shown.scale * abs(difference) <= 0.5 * 10.0**-shown.decimals
 
 
 def strengths(drives: Iterable[Drive], law: str) -> dict[Drive, float]:
-    """The strength of a perturbation in each drive that has only this perturbation.
+    """Return the strength of a perturbation in each drive.
 
-    The strength is 0 for unperturbed drives.
+    Drives with other perturbations are left out. The strength is 0 for unperturbed drives.
 
     Args:
         law: name of the perturbation, without strength.
@@ -231,14 +236,14 @@ def strengths(drives: Iterable[Drive], law: str) -> dict[Drive, float]:
 
 
 def least_pairs() -> int:
-    """Least number of pairs with which Wilcoxon's two-sided test can reach ``ALPHA``."""
+    """Return how many pairs Wilcoxon's two-sided test needs at least to reach ``ALPHA``."""
     return math.ceil(1.0 - math.log2(ALPHA))
 
 
 def _wilcoxon(differences: list[float]) -> tuple[float | None, bool]:
-    """The two-sided p-value, and whether the differences tend to be negative.
+    """Run Wilcoxon's test. Return the p-value, and whether the differences tend to be negative.
 
-    The p-value is None if there are too few differences.
+    The test is two-sided. The p-value is None if there are too few differences.
     """
     if len(differences) < least_pairs():
         return None, False
@@ -249,7 +254,7 @@ def _wilcoxon(differences: list[float]) -> tuple[float | None, bool]:
 
 
 def _words(found: Comparison, better: list[Pair], worse: list[Pair]) -> str:
-    """The result of a comparison in sentences."""
+    """Describe the result of a comparison in sentences."""
 
     def named(some: list[Pair]) -> str:
         return ", ".join(pair.drive.place for pair in some)

@@ -1,4 +1,4 @@
-"""Comparison of systems, as tables by sequence and perturbation, and as sentences."""
+"""Shows comparisons of systems as tables (by sequence and perturbation) and as sentences."""
 
 from __future__ import annotations
 
@@ -30,10 +30,11 @@ Rows = dict[str, dict[Key, Row]]
 
 
 def versus(report: OverviewJson) -> list[Section]:
-    """Make the sections that compare systems and name the winner.
+    """Make the sections of the report that compare systems and name the winner.
 
-    Two systems are in the same section if they ran on the same drive and have the same alignment.
-    If no drive has a revisit, the first section explains why loop detectors cannot differ.
+    Two systems are in the same section if they ran on the same drive and if their trajectories are
+    aligned in the same way (se3 or sim3). If no drive revisits a place, the first section explains
+    why loop detectors cannot differ.
     """
     rows: Rows = {name: {} for name in report.systems}
     for row in report.rows:
@@ -52,16 +53,16 @@ def versus(report: OverviewJson) -> list[Section]:
 
 
 def median_text(spread: Spread | None, decimals: int) -> str:
-    """The median as text. The median of counts gets one decimal if it is not an integer."""
+    """Format a median. A median of counts gets one decimal if it is not an integer."""
     if spread is None:
         return "n/a"
     return f"{spread.median:.{1 if decimals == 0 and spread.median % 1 else decimals}f}"
 
 
 def _without_revisits(report: OverviewJson) -> str:
-    """Text that explains why loop detectors hardly differ.
+    """Explain why loop detectors hardly differ on drives that revisit no place.
 
-    It is empty if a drive has a revisit, or if there is no ground truth.
+    The text is empty if a drive revisits a place, or if there is no ground truth.
     """
     judged = [row for row in report.rows if row.measures["loops_found"] is not None]
     names = {row.system for row in judged if row.system == without_settings(row.system)}
@@ -127,11 +128,11 @@ def _cell(row: Row | None, measure: str) -> str:
 
 
 def _points(report: OverviewJson, rows: Rows, names: list[str]) -> Iterator[str]:
-    """Sentences that summarise the comparison.
+    """Yield sentences that summarise the comparison.
 
-    The first sentences give the total numbers of lost frames and loops over the drives that all
-    systems share. The other sentences compare each system with its baseline. The baseline of a
-    system is the first system that ran on one of its drives.
+    The first sentences give the total numbers of lost frames and of loops. These totals are over
+    the drives on which all systems ran. The other sentences compare each system with its baseline.
+    The baseline of a system is the first system that ran on at least one of the same drives.
     """
     shared = set.intersection(*(set(rows[name]) for name in names))
     runs = {

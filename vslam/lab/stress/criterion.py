@@ -1,4 +1,4 @@
-"""The criterion that decides whether a run has failed."""
+"""Decides whether a run of a stress test has failed."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ ABSOLUTE = (
 
 
 def absolute_verdict(report: ReportJson) -> str:
-    """Text that says why a run exceeded the absolute limits; empty if it did not exceed them.
+    """Return why a run exceeded the absolute limits; empty if it did not exceed them.
 
-    The absolute limits (``ABSOLUTE``) do not depend on a run on clean images.
+    The absolute limits (``ABSOLUTE``) do not depend on a run on unperturbed images.
     """
     if report.longest_loss_s is not None and report.longest_loss_s > _LOSS_S:
         return f"lost for {report.longest_loss_s:.0f} s"
@@ -27,13 +27,15 @@ def absolute_verdict(report: ReportJson) -> str:
 
 
 def lost_percent(report: ReportJson) -> float:
-    """Lost frames, in percent of the frames that were not dropped."""
+    """Return the lost frames in percent of the frames that were not dropped."""
     return 100.0 * report.lost_frames / max(1, report.frames - report.dropped_frames)
 
 
 @dataclass(frozen=True)
 class Criterion:
-    """Limits relative to a run of the same system on the unperturbed (clean) images.
+    """The limits beyond which a run has failed.
+
+    The limits are relative to the *clean run*, a run of the same system on the unperturbed images.
 
     Attributes:
         lost_percent: largest allowed percentage of lost frames. Dropped frames are not counted.
@@ -48,7 +50,7 @@ class Criterion:
 
     @property
     def words(self) -> str:
-        """The criterion in one sentence."""
+        """The limits, described in one sentence."""
         return (
             f"A run fails if more than {self.lost_percent:g} % of its frames are lost, if its ATE "
             f"is above {self.ate_least_m:g} m and above {self.ate_factor:g} times the ATE of the "
@@ -57,7 +59,7 @@ class Criterion:
         )
 
     def verdict(self, report: ReportJson, clean: ReportJson) -> str:
-        """Text that says why a run failed; empty if it did not fail."""
+        """Return why a run failed according to these limits; empty if it did not fail."""
         if (lost := lost_percent(report)) > self.lost_percent:
             return f"{lost:.0f} % lost"
         limit = self.ate_limit(clean)
@@ -71,7 +73,7 @@ class Criterion:
         return ""
 
     def ate_limit(self, clean: ReportJson) -> float | None:
-        """Largest allowed ATE in metres; None if the clean run has no ATE."""
+        """Return the largest allowed ATE in metres. None if the run on clean images has no ATE."""
         if clean.ate_rmse_m is None:
             return None
         return max(self.ate_least_m, self.ate_factor * clean.ate_rmse_m)

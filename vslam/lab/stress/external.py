@@ -1,12 +1,13 @@
-"""Run other systems, which read a folder in KITTI's format and write a trajectory.
+"""Runs other SLAM systems, which read a folder in KITTI's format and write a trajectory.
 
-The command of a system is a template with ``{folder}`` and ``{out}``. ``folder`` contains
-``image_0``, ``image_1``, ``calib.txt`` and ``times.txt`` of the perturbed frames. Dropped frames
-are left out. The command writes these files into the folder ``out``:
+The command of a system is a template with the placeholders ``{folder}`` and ``{out}``. The folder
+at ``{folder}`` contains ``image_0``, ``image_1``, ``calib.txt`` and ``times.txt`` of the perturbed
+frames. Dropped frames are left out. The command must write these files into the folder at
+``{out}``:
 
-- ``trajectory.txt`` contains one pose per frame in KITTI's format, or poses with times in TUM's
-  format.
-- ``causal.txt`` (optional) has the same format, with the poses as they were first estimated.
+- ``trajectory.txt`` contains the estimated poses. It has either one pose per frame in KITTI's
+  format, or poses with times in TUM's format.
+- ``causal.txt`` (optional) contains the poses as they were first estimated, in the same format.
 - ``states.txt`` (optional) contains ``OK`` or ``LOST`` for each frame.
 """
 
@@ -38,18 +39,18 @@ _SAME_TIME_S = 1e-3
 
 @dataclass(frozen=True)
 class Poses:
-    """``(N, 4, 4)`` poses ``T_wc`` of the frames of a run, and an ``(N,)`` mask of known poses."""
+    """The ``(N, 4, 4)`` poses ``T_wc`` of N frames, and an ``(N,)`` mask of the known poses."""
 
     T_wc: NDArray[np.float64]
     known: NDArray[np.bool_]
 
     def bridged(self, times: NDArray[np.float64]) -> Trajectory:
-        """The trajectory at the ``(N,)`` times of the frames. Unknown poses are interpolated."""
+        """Return the trajectory of N frames with given times. Unknown poses are interpolated."""
         return bridge_gaps(Trajectory(times, self.T_wc), self.known)
 
 
 def check_template(name: str, template: str) -> None:
-    """Check a command template.
+    """Check the command template of a SLAM system.
 
     Raises:
         InputError: a placeholder is missing or unknown.
@@ -81,7 +82,7 @@ def run_external(
     template: str,
     folder: Path,
 ) -> ReportJson:
-    """Run another system on a perturbed sequence, and write ``report.json`` and trajectories.
+    """Run another SLAM system on a perturbed sequence. Write ``report.json`` and trajectories.
 
     Loops are not evaluated, because other systems do not report them.
 
@@ -110,7 +111,7 @@ def run_external(
 
 
 def export_kitti(sequence: Source, perturbation: Perturbation, folder: Path) -> NDArray[np.int64]:
-    """Write the perturbed frames in KITTI's format. Dropped frames are left out.
+    """Write the perturbed frames of a sequence in KITTI's format, without dropped frames.
 
     Returns:
         The indices of the written frames.
@@ -213,15 +214,15 @@ def _outcome(
 
 
 def read_poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) -> Poses:
-    """Read the poses that a system wrote.
+    """Read the poses that another SLAM system wrote.
 
-    An unknown pose is replaced by the last known pose before it. If there is none, it is replaced
-    by the first known pose.
+    An unknown pose is replaced by the last known pose before it. If there is no known pose before
+    it, the first known pose is used.
 
     Args:
         path: file in KITTI's or TUM's format.
         times: ``(N,)`` seconds of the frames.
-        kept: indices of the frames that the system received.
+        kept: indices of the frames that the system received, which are those that were not dropped.
 
     Raises:
         InputError: the file is malformed.

@@ -1,4 +1,4 @@
-"""Curves of a stress test, with lost frames, ATE and loops against the strength of a law."""
+"""Draws the curves of a stress test: lost frames, ATE and loops against the strength of a law."""
 
 from __future__ import annotations
 
@@ -37,7 +37,10 @@ _PANELS = (
 
 
 def draw_curves(report: StressJson) -> list[page.Figure]:
-    """Draw a figure for each sequence and law. The strongest perturbation is on the right."""
+    """Draw the curves of a stress test, with one figure for each sequence and perturbation.
+
+    The strongest perturbation is on the right.
+    """
     systems = list(dict.fromkeys(entry.system for entry in report.boundaries))
     colors = {name: _COLORS[k % len(_COLORS)] for k, name in enumerate(systems)}
     groups: dict[tuple[str, str], list[BoundaryEntry]] = {}

@@ -1,9 +1,9 @@
 """The preset ``kitti-c``: the corruptions of RoboDepth's KITTI-C that vslam can apply.
 
-KITTI-C (Kong et al., NeurIPS 2023) has 18 corruptions with 5 severities each. Most of them have the
-parameters of ImageNet-C (Hendrycks and Dietterich, ICLR 2019). If vslam's perturbation has the same
-parameter, the strengths in this module are the values of KITTI-C. Otherwise, a note describes the
-difference.
+KITTI-C (Kong et al., NeurIPS 2023) has 18 corruptions with 5 severities each. Most corruptions have
+the parameters of ImageNet-C (Hendrycks and Dietterich, ICLR 2019). If a perturbation of vslam has
+the same parameter as a corruption, its strengths are the values of KITTI-C. Otherwise, a note
+describes the difference.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class Corruption:
     """One corruption of KITTI-C.
 
     Attributes:
-        specs: values of ``--perturb``, weakest first; empty if vslam has no such perturbation.
+        specs: values of ``--perturb``, weakest first. Empty if vslam has no such perturbation.
         note: the difference between vslam's perturbation and the corruption of KITTI-C.
     """
 
@@ -27,7 +27,7 @@ class Corruption:
 
     @property
     def perturbations(self) -> list[str]:
-        """``specs`` in canonical spelling."""
+        """The values of ``--perturb`` in canonical spelling, weakest first."""
         return [parse_perturbation(spec, 0).name for spec in self.specs]
 
 

@@ -55,7 +55,7 @@ Viewer.ViewpointF: 2000.0
 
 
 def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
-    """Track stereo frames, and write ``trajectory.txt``, ``causal.txt`` and ``states.txt``.
+    """Track stereo frames. Write ``trajectory.txt``, ``causal.txt`` and ``states.txt``.
 
     Args:
         vocabulary: vocabulary file of ORB-SLAM3.
@@ -108,7 +108,7 @@ def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
 
 
 def _keep_first_of_each_time(path: Path) -> None:
-    """Remove duplicate times, because ORB-SLAM3 writes some frames twice after a tracking loss."""
+    """Keep only the first pose of each time. After a loss, ORB-SLAM3 writes some frames twice."""
     by_time: dict[float, str] = {}
     for line in path.read_text().splitlines():
         by_time.setdefault(float(line.split()[0]), line)

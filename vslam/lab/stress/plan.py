@@ -1,4 +1,4 @@
-"""The searches of a stress test: which cells run next, and the results so far."""
+"""The searches of a stress test: which runs are next, and the results obtained so far."""
 
 from __future__ import annotations
 
@@ -22,16 +22,17 @@ It returns None if the cell has not run yet.
 
 @dataclass
 class Search:
-    """The search for one law, sequence, system and seed.
+    """The search for the strength of one perturbation at which a system fails on a sequence.
+
+    A *cell* is one run. A *position* is a strength on a scale from 0 (weakest) to 1 (greatest).
 
     Attributes:
-        clean: the cell on clean images.
-        law: name of the law.
+        clean: the run on unperturbed images.
+        law: name of the perturbation, without its strength.
         seed: seed of the perturbation.
         steps: number of bisections.
-        verdicts: verdicts of finished tests, by position. The position is 0 for the weakest and 1
-            for the greatest strength.
-        tested: cells of finished tests, by position.
+        verdicts: for each finished test, by position, why it failed; empty if it did not fail.
+        tested: the runs of the finished tests, by position.
     """
 
     clean: Cell
@@ -42,21 +43,21 @@ class Search:
     tested: dict[float, Cell] = field(default_factory=dict)
 
     def cell(self, position: float) -> Cell:
-        """The cell that tests a position from 0 (weakest strength) to 1 (greatest strength)."""
+        """Return the run that tests a position from 0 (weakest) to 1 (greatest strength)."""
         strength = strength_at(law_kind(self.law), position)
         name = parse_perturbation(f"{self.law}:{strength:g}", self.seed).name
         return replace(self.clean, perturb=name, seed=self.seed)
 
     def position(self) -> float | None:
-        """The next position to test; None if the search has ended."""
+        """Return the next position (0 to 1) to test; None if the search has ended."""
         return next_position({p: bool(v) for p, v in self.verdicts.items()}, self.steps)
 
     def wants(self) -> Cell | None:
-        """The next cell to run; None if the search has ended."""
+        """Return the next run of this search; None if the search has ended."""
         return None if (position := self.position()) is None else self.cell(position)
 
     def advance(self, reports: Reports, criterion: Criterion) -> None:
-        """Judge the tests that have ended. This determines the next position."""
+        """Judge the tests that have ended, and determine which strength is tested next."""
         clean = reports(self.clean)
         if not isinstance(clean, ReportJson):
             return
@@ -70,24 +71,25 @@ class Search:
 
     @property
     def boundary(self) -> Boundary:
-        """The result of the search. The search must have ended."""
+        """The result of the search, which must have ended."""
         return boundary(self.verdicts, law_kind(self.law), self.steps)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The searches and runs of a stress test.
+    """A stress test: the searches to make and the options that they share.
 
     Attributes:
-        clean: the runs of each system on the clean images of each sequence.
-        laws: names of the laws whose boundaries are searched.
-        seeds: number of seeds for each law.
+        clean: the runs of each system on the unperturbed images of each sequence.
+        laws: names of the perturbations to test. For each of them, the strength at which runs fail
+            is searched.
+        seeds: number of seeds for each perturbation.
         steps: number of bisections in each search.
         baseline: the system with which the errors of a preset are compared.
         criterion: criterion that decides whether a run has failed.
-        repeated: systems that are not deterministic, so that they run with every seed.
-        preset: ``kitti-c``, whose fixed severities are tested instead of ``laws``. None if there is
-            no preset.
+        repeated: systems that are not deterministic and therefore run with every seed.
+        preset: ``kitti-c`` or None. With ``kitti-c``, the fixed severities of KITTI-C are tested
+            instead of ``laws``.
     """
 
     clean: list[Cell]
@@ -100,10 +102,10 @@ class Plan:
     preset: str | None = None
 
     def searches(self) -> list[Search]:
-        """All searches.
+        """Return all searches of the stress test.
 
-        A law that is not random is searched with only one seed, unless the system is not
-        deterministic.
+        If a perturbation is not random, there is only one search, with the first seed. A system
+        that is not deterministic is searched with all seeds.
         """
         return [
             Search(clean, law, seed, self.steps)
@@ -114,7 +116,7 @@ class Plan:
         ]
 
     def preset_cells(self) -> list[Cell]:
-        """The runs of the preset; empty if there is no preset."""
+        """Return the runs of the preset; empty if there is no preset."""
         if self.preset is None:
             return []
         specs = [spec for corruption in CORRUPTIONS.values() for spec in corruption.perturbations]
@@ -128,7 +130,7 @@ class Plan:
 
 
 def parse_laws(text: str) -> list[str]:
-    """Parse names of laws, such as ``fog,rain`` or ``all``.
+    """Parse names of perturbations (laws), such as ``fog,rain`` or ``all``.
 
     Raises:
         InputError: a law is unknown, or the text names no law.

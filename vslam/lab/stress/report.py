@@ -1,6 +1,6 @@
-"""Write the report of a stress test.
+"""Writes the report of a stress test.
 
-Its files are ``stress.json``, ``boundaries.csv``, ``boundaries.jpg``, ``report.md`` and
+The report has the files ``stress.json``, ``boundaries.csv``, ``boundaries.jpg``, ``report.md`` and
 ``report.html``.
 """
 
@@ -34,13 +34,13 @@ _NOT_MONOTONE = (
 
 
 def write_report(out: Path, report: StressJson, sequences: Mapping[str, Source]) -> None:
-    """Write all files of the report.
+    """Write all files of the report of a stress test.
 
     Args:
         out: an existing folder.
-        report: the results.
-        sequences: sequences by name, from which example images are drawn. Only the first sequence
-            of the report is needed. Without it, no images are drawn.
+        report: the results of the stress test.
+        sequences: sequences by name. Example images are taken from the first sequence of the
+            report. If this sequence is missing, there are no example images.
 
     Raises:
         ResultsError: a file cannot be written.
@@ -61,7 +61,7 @@ def write_report(out: Path, report: StressJson, sequences: Mapping[str, Source])
 
 
 def render_csv(report: StressJson) -> str:
-    """The results as CSV, with a line for each search."""
+    """Write the results as CSV. Each line contains the result of one search."""
     names = ("dataset", "sequence", "law", "unit", "system", "seed", "holds_to", "fails_at")
     lines: list[list[object]] = [[*names, "reason", "also_failed", "runs"]]
     for entry in report.boundaries:
@@ -72,7 +72,7 @@ def render_csv(report: StressJson) -> str:
 
 
 def title(report: StressJson) -> str:
-    """One line with the systems and the sequences."""
+    """Return one line with the names of the systems and of the sequences."""
     systems = list(dict.fromkeys(entry.system for entry in report.clean))
     places = list(dict.fromkeys(f"{entry.dataset} {entry.sequence}" for entry in report.clean))
     excerpt = f", {counted(report.max_frames, 'frame')}" if report.max_frames else ""
@@ -83,7 +83,7 @@ def title(report: StressJson) -> str:
 def stress_page(
     report: StressJson, figures: Collection[Figure] = (), sheet: Collection[Figure] = ()
 ) -> Page:
-    """Make the page of a stress test, with its curves and with images at the boundaries."""
+    """Make the page of a stress test, with curves and with images at which systems failed."""
     return Page(
         title(report),
         [report.criterion],
@@ -100,15 +100,16 @@ def stress_page(
 
 
 def boundary_sections(report: StressJson) -> list[Section]:
-    """The sections that the command line also prints.
+    """Return the sections of the report that the command line also prints.
 
-    They contain the boundaries of each system, and the errors for each corruption.
+    They contain the strengths at which each system fails, and the errors for each corruption of a
+    preset.
     """
     return [*_boundaries(report), *_preset(report)]
 
 
 def groups(report: StressJson) -> dict[tuple[str, str, str], list[BoundaryEntry]]:
-    """Group searches by sequence, law and system. The searches of a group differ in the seed."""
+    """Group searches by sequence, perturbation and system. A group has one search per seed."""
     found: dict[tuple[str, str, str], list[BoundaryEntry]] = {}
     for entry in report.boundaries:
         found.setdefault((entry.sequence, entry.law, entry.system), []).append(entry)
@@ -116,7 +117,10 @@ def groups(report: StressJson) -> dict[tuple[str, str, str], list[BoundaryEntry]
 
 
 def cell(entries: Collection[BoundaryEntry]) -> str:
-    """The strengths at which the seeds fail, as a text such as ``60 (50-75), 12 % lost``."""
+    """Format the strengths at which runs fail, such as ``60 (50-75), 12 % lost``.
+
+    The range in parentheses is over the seeds.
+    """
     if not entries:
         return ""
     law = law_kind(next(iter(entries)).law)
@@ -227,10 +231,10 @@ def _runs(report: StressJson) -> Table:
 
 
 def _sheet(report: StressJson, sequences: Mapping[str, Source]) -> list[Figure]:
-    """A picture of the middle frame of the first sequence under each law.
+    """Draw the middle frame of the first sequence under each perturbation.
 
-    Each law has the strength at which the first system failed. If the system did not fail, the law
-    has the greatest strength.
+    Each perturbation has the strength at which the first system failed. If this system did not
+    fail, the perturbation has its greatest strength.
     """
     specs: dict[str, str] = {}
     first = next(iter(sequences), None)

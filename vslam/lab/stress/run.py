@@ -1,6 +1,6 @@
-"""Run all searches together, in rounds.
+"""Runs all searches of a stress test together, in rounds.
 
-Each round runs the next cell of every search that has not ended.
+In each round, every search that has not ended runs its next cell. A *cell* is one run.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ RunCells = Callable[[Collection[Cell]], Generator[CellOutcome, None, None]]
 
 
 class Results:
-    """The results of cells: the reports in the folder, and the failures since the command began."""
+    """The results of runs: reports in the folder, and failures since the command began."""
 
     def __init__(self, out: Path, config: str) -> None:
         self._out, self._config = out, config
         self._known: dict[Cell, ReportJson | str] = {}
 
     def __call__(self, cell: Cell) -> ReportJson | str | None:
-        """The report of a cell, the reason why it failed, or None if it has not run."""
+        """Return the report of a cell, or why its run failed; None if it has not run."""
         if cell not in self._known:
             folder = self._out / cell.name
             if not is_finished(cell, folder, self._config):
@@ -37,7 +37,7 @@ class Results:
         return self._known[cell]
 
     def add(self, outcome: CellOutcome) -> None:
-        """Add a cell that has ended."""
+        """Add the outcome of a cell (a run) that has ended."""
         if isinstance(outcome, Failed):
             self._known[outcome.cell] = outcome.message
         else:
@@ -53,9 +53,12 @@ def run_all(
     run: RunCells,
     say: Callable[[str], None] = lambda line: None,
 ) -> None:
-    """Run the clean cells, then the cells of all searches in rounds, then ``others``.
+    """Run all cells (runs) of a stress test.
 
-    Cells that an earlier command has finished are not run again.
+    The runs on unperturbed images are first. Then come the runs of all searches, in rounds, and
+    finally the runs in ``others``.
+
+    A cell that an earlier command has finished is not run again.
     """
     _run(clean, results, run, say)
     while True:
@@ -69,7 +72,10 @@ def run_all(
 
 
 def _wanted(search: Search, results: Results) -> Cell | None:
-    """The next cell of a search; None if the search has ended or its clean run has failed."""
+    """Return the next cell (run) of a search.
+
+    Returns None if the search has ended, or if the run on unperturbed images has failed.
+    """
     return search.wants() if isinstance(results(search.clean), ReportJson) else None
 
 

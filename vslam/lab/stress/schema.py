@@ -1,7 +1,7 @@
 """The schema of ``stress.json``.
 
-The file contains no times and does not name the machine. Therefore, equal runs produce
-byte-identical files.
+The file contains no times and does not name the machine. Therefore, two stress tests with equal
+runs produce byte-identical files.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ from vslam.report.schema import Document, Record
 
 
 class Tested(Record):
-    """One run at one strength.
+    """One run of a stress test, at one strength of a perturbation.
 
     - ``verdict``: why the run failed; empty if it did not fail.
-    - ``absolute``: why it exceeded the limits that do not depend on the clean run; empty if it did
-      not exceed them.
+    - ``absolute``: why the run exceeded the limits that do not depend on the run on unperturbed
+      images; empty if it did not exceed them.
     """
 
     strength: float
@@ -27,7 +27,10 @@ class Tested(Record):
 
 
 class BoundaryEntry(Record):
-    """The result of one search, as in `vslam.lab.stress.search.Boundary`."""
+    """The strength at which a system fails, as found by one search.
+
+    `vslam.lab.stress.search.Boundary` describes the attributes.
+    """
 
     dataset: str
     sequence: str
@@ -43,7 +46,7 @@ class BoundaryEntry(Record):
 
 
 class CleanEntry(Record):
-    """The run of a system on clean images, from which the limits are derived."""
+    """The run of a system on unperturbed images. The limits for failure are derived from it."""
 
     dataset: str
     sequence: str
@@ -57,12 +60,13 @@ class CleanEntry(Record):
 
 
 class CorruptionEntry(Record):
-    """One corruption of a preset, with values by system.
+    """The errors under one corruption of a preset such as ``kitti-c``, by system.
 
-    Values are None if vslam cannot apply the corruption, or if a run has no ATE.
+    A value is None if vslam cannot apply the corruption, or if a run has no ATE.
 
-    - ``ate_sum_m``: the median ATE over the seeds, summed over the severities.
-    - ``error_percent``: this sum in percent of the sum of the baseline.
+    - ``ate_sum_m``: sum of the ATE over the severities. For each severity, the median over the
+      seeds is used.
+    - ``error_percent``: ``ate_sum_m`` in percent of the ``ate_sum_m`` of the baseline.
     - ``lost_percent``: the mean share of lost frames.
     """
 
@@ -76,7 +80,7 @@ class CorruptionEntry(Record):
 
 
 class StressJson(Document):
-    """The results of a stress test."""
+    """The results of a stress test, as in ``stress.json``."""
 
     kind: str = "stress"
     schema_version: int = 1

@@ -1,4 +1,4 @@
-"""Search for the strength at which runs fail, by bisection."""
+"""Finds the strength of a perturbation at which runs fail, using bisection."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Verdict = str
 
 @dataclass(frozen=True)
 class Boundary:
-    """The strength at which a system fails under a law.
+    """The strength of a perturbation at which a system fails.
 
     Attributes:
         holds_to: greatest strength at which a run did not fail, according to the bisection. None if
@@ -31,7 +31,10 @@ class Boundary:
 
 
 def strength_at(kind: LawKind, position: float) -> float:
-    """The strength at a position from 0 (weakest) to 1 (greatest), to three significant digits."""
+    """Return the strength at a position from 0 (weakest) to 1 (greatest strength).
+
+    The strength is rounded to three significant digits.
+    """
     weak, strong = kind.weakest, kind.strongest
     if kind.logarithmic:
         value = weak * (strong / weak) ** position
@@ -41,10 +44,11 @@ def strength_at(kind: LawKind, position: float) -> float:
 
 
 def bracket(failed: Mapping[float, bool], steps: int) -> tuple[float, float, float | None]:
-    """The state of the bisection.
+    """Return the interval in which a system begins to fail, and the next position to test.
 
     Args:
-        failed: for each tested position, whether the run failed.
+        failed: whether the run failed, by tested position. A position is a strength on a scale from
+            0 (weakest) to 1 (greatest).
         steps: number of bisections.
 
     Returns:
@@ -63,12 +67,14 @@ def bracket(failed: Mapping[float, bool], steps: int) -> tuple[float, float, flo
 
 
 def next_position(failed: Mapping[float, bool], steps: int) -> float | None:
-    """The next position to test; None at the end of the search.
+    """Return the position that the bisection tests next; None at the end of the search.
+
+    A position is a strength on a scale from 0 (weakest) to 1 (greatest).
 
     The greatest strength is tested first. If the run fails, the interval is bisected ``steps``
     times. Bisection assumes that a system that does not fail at a strength does not fail at weaker
-    strengths. The last test checks this assumption, at half of the greatest position at which the
-    system did not fail. The arguments are those of `bracket`.
+    strengths. The last test checks this assumption at half of the greatest position at which the
+    system did not fail. `bracket` describes the arguments.
     """
     if 1.0 not in failed:
         return 1.0
@@ -80,7 +86,7 @@ def next_position(failed: Mapping[float, bool], steps: int) -> float | None:
 
 
 def boundary(verdicts: Mapping[float, Verdict], kind: LawKind, steps: int) -> Boundary:
-    """The boundary according to the verdicts of the finished tests, which are given by position."""
+    """Return the strength at which a system fails, given the verdicts of all tests by position."""
     holds, fails, _ = bracket({p: bool(v) for p, v in verdicts.items()}, steps)
     weaker = tuple(
         strength_at(kind, position)

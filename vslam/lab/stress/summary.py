@@ -1,4 +1,4 @@
-"""Compute the figures of the report from finished searches."""
+"""Computes the figures in the report of a stress test from the finished searches."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from vslam.report.schema import ReportJson
 def summarise(
     plan: Plan, searches: Collection[Search], reports: Reports, notes: list[str]
 ) -> StressJson:
-    """Make the report from the searches that have ended.
+    """Make the report of a stress test from the searches that have ended.
 
-    A note is added for each clean run that failed.
+    The report has a note for each run on unperturbed images that failed.
     """
     failed = [(cell, found) for cell in plan.clean if isinstance(found := reports(cell), str)]
     notes = [*notes, *(f"{cell.name} is left out because it fails on clean images: {why}"
@@ -44,7 +44,7 @@ def summarise(
 def clean_entries(
     cells: Collection[Cell], reports: Reports, criterion: Criterion
 ) -> list[CleanEntry]:
-    """The entries of the finished clean runs."""
+    """Return the entries of the finished runs on unperturbed images."""
     return [
         CleanEntry(
             dataset=cell.dataset,
@@ -63,7 +63,7 @@ def clean_entries(
 
 
 def boundary_entry(search: Search, reports: Reports) -> BoundaryEntry:
-    """The result of a search that has ended."""
+    """Return the entry in the report for a search that has ended."""
     found, kind = search.boundary, law_kind(search.law)
     return BoundaryEntry(
         dataset=search.clean.dataset,
@@ -100,9 +100,10 @@ def _tested(strength: float, verdict: str, report: ReportJson | str | None) -> T
 def corruption_entries(
     cells: Collection[Cell], reports: Reports, baseline: str
 ) -> list[CorruptionEntry]:
-    """The errors under each corruption, relative to a baseline.
+    """Compute the errors under each corruption of a preset, relative to a baseline.
 
-    The mean corruption error (mCE; Hendrycks and Dietterich, ICLR 2019) is computed from them.
+    The mean corruption error (mCE; Hendrycks and Dietterich, ICLR 2019) is computed from these
+    errors.
     """
     systems = list(dict.fromkeys(cell.detector for cell in cells))
     return [
@@ -156,9 +157,9 @@ def _corruption(
 
 
 def mean_error(entries: Collection[CorruptionEntry], system: str) -> float | None:
-    """The mean corruption error (mCE) in percent.
+    """Compute the mean corruption error (mCE) in percent.
 
-    It is the mean over the corruptions for which every system has an error.
+    The mean is over the corruptions for which every system has an error.
     """
     complete = (e.error_percent for e in entries if None not in e.error_percent.values())
     values = [value for errors in complete if (value := errors.get(system)) is not None]

@@ -1,5 +1,5 @@
 """Experiments: benchmarks of many runs, stress tests, and comparisons of loop detectors on images.
 
-SLAM does not need this package. Only the command line imports this package.
-tests/test_dependencies.py checks this.
+The SLAM system itself does not need this package. Only the command line imports it.
+``tests/test_dependencies.py`` checks that no other package imports it.
 """

@@ -26,10 +26,11 @@ def run_on_cluster(
 ) -> Generator[CellOutcome, None, None]:
     """Run the cells of a benchmark on the workers of a Dask scheduler.
 
-    When the outcome of a cell arrives, it is written to the benchmark's folder and yielded.
+    When the outcome of a cell (one run) arrives, it is written to the benchmark's folder and
+    yielded.
 
-    A worker runs as many cells at a time as it has threads. If the generator is closed, the running
-    cells are stopped.
+    The number of cells that a worker runs at the same time is the number of its threads. If the
+    generator is closed, the running cells are stopped.
 
     Raises:
         InputError: Dask is not installed, or no scheduler answers.
@@ -68,7 +69,7 @@ def run_on_cluster(
 
 
 def _require_certificates(scheduler: str) -> None:
-    """Reject a TLS address if Dask has no certificates. Its client would otherwise never close."""
+    """Reject a TLS address if Dask has no certificates. Otherwise, its client would never close."""
     from distributed.security import Security
 
     if not scheduler.startswith("tls://"):
@@ -85,7 +86,7 @@ def _require_certificates(scheduler: str) -> None:
 
 
 def _run_on_worker(cell: Cell, options: RunOptions, stop: str) -> CellOutcome:
-    """Run a cell on this worker. Kill it when the benchmark sets the event named ``stop``."""
+    """Run a cell (one run) on this worker. Kill the run when the event named ``stop`` is set."""
     from distributed import Event
 
     event = Event(stop)

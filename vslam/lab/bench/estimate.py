@@ -21,13 +21,13 @@ _CELL_BYTES, _FRAME_BYTES, _SCRATCH_FRAME_BYTES = 100_000, 1_000, 45_000
 
 @dataclass(frozen=True)
 class Estimate:
-    """How much time and disk space the cells of a benchmark need.
+    """An estimate of the time and the disk space that the runs of a benchmark need.
 
     Attributes:
-        seconds: wall time in seconds. It is assumed that as many cells run at the same time as the
-            user requested.
-        kept: size of the files that are kept, in bytes.
-        scratch: size of the files that are deleted after each run, in bytes.
+        seconds: wall time in seconds for all runs together, if the requested number of runs takes
+            place at the same time.
+        kept: size in bytes of the files that are kept.
+        scratch: size in bytes of the files that are deleted after each run.
         basis: text that says on what the estimated time is based.
     """
 
@@ -43,16 +43,16 @@ def estimate(
     frames: Mapping[str, int],
     jobs: int,
 ) -> Estimate:
-    """Estimate how much time and disk space the missing cells of a benchmark need.
+    """Estimate how much time and disk space the missing runs of a benchmark need.
 
-    The estimate is based on the finished cells. If a cell with the same detector is finished, its
+    The estimate is based on the finished runs. If a run with the same detector is finished, its
     time per frame is used.
 
     Args:
-        missing: cells (one run each) that have not run yet.
-        finished: finished cells and their reports.
+        missing: cells of the benchmark's grid (one run each) that have not been run yet.
+        finished: finished cells and the reports of their runs.
         frames: number of frames of each sequence.
-        jobs: number of cells that run at the same time.
+        jobs: number of cells that are run at the same time.
     """
     frame_s: dict[str, list[float]] = {}  # for each detector, seconds per frame of finished cells
     starts: list[float] = []
@@ -81,7 +81,7 @@ def estimate(
 
 
 def check_disk(needed: Estimate, out: Path) -> None:
-    """Check that the disk has enough free space for the cells of a benchmark.
+    """Check that the disk has enough free space for the results of a benchmark.
 
     Raises:
         InputError: the free space is too small.

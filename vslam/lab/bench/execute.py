@@ -1,10 +1,11 @@
 """Runs each cell of a benchmark in its own process, and writes its results into a folder.
 
-The folder of a cell appears only when its results are complete. A cell is finished if its folder
-exists. Therefore, if a benchmark is killed, only the cells that were running are lost.
+A cell is one run of vslam. The folder of a cell appears only when the results of the run are
+complete. A cell is finished if its folder exists. Therefore, if a benchmark is killed, only the
+cells that were running are lost.
 
-The result files of a cell have a few MB. They are passed to this module in memory, even if the cell
-ran on another machine. Only this module writes to the folder of the benchmark.
+The result files of a cell have a size of a few MB. They are passed to this module in memory, even
+if the cell was run on another machine. Only this module writes to the folder of the benchmark.
 """
 
 from __future__ import annotations
@@ -32,17 +33,19 @@ _PARTS, _FAILED = ".parts", "failed"
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options that all cells of a benchmark share.
+    """Options that are the same for all runs of a benchmark.
 
     Attributes:
-        data: root of the data set on the machine that runs the cell; None for rendered towns.
+        data: root folder of the data set on the machine on which vslam is run; None for rendered
+            towns.
         config: thresholds, as the text of a file ``config.json``.
         threads: number of threads of each run. It does not change the results of the runs.
         command: program that is run instead of ``vslam`` and accepts the same arguments; None for
             vslam itself.
-        others: programs of other SLAM systems, by ``Cell.detector``. The programs accept the same
-            arguments as ``vslam``.
-        scratch: folder to which runs write; None for the machine's temporary folder.
+        others: programs of other SLAM systems. The key is the name of the system, as in
+            ``Cell.detector``. The programs accept the same arguments as ``vslam``.
+        scratch: folder to which each run first writes its files; None for the machine's temporary
+            folder.
         source: arguments of ``vslam run`` that describe how to read the data.
     """
 
@@ -57,7 +60,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Finished:
-    """A complete run of a cell, with its files by path. The paths are relative to ``folder``."""
+    """A complete run, with the contents of its files by path. Paths are relative to ``folder``."""
 
     cell: Cell
     folder: str
@@ -66,7 +69,7 @@ class Finished:
 
 @dataclass(frozen=True)
 class Failed:
-    """A cell whose run gave no results, with the reason in one line and the whole output."""
+    """A run that gave no results, with the reason in one line and the whole output of the run."""
 
     cell: Cell
     message: str
@@ -79,11 +82,11 @@ CellOutcome = Finished | Failed
 def run_cell(
     cell: Cell, options: RunOptions, stopped: Callable[[], bool] = lambda: False
 ) -> CellOutcome:
-    """Run one cell of a benchmark (a single run) in a temporary folder. Return its files.
+    """Run one cell of a benchmark (a single run) in a temporary folder, and return its files.
 
     Args:
-        stopped: function that is called repeatedly. The run is killed when the function returns
-            True.
+        stopped: function that is called repeatedly during the run. If the function returns True,
+            the run is killed.
     """
     if options.scratch is not None:
         options.scratch.mkdir(parents=True, exist_ok=True)
@@ -113,12 +116,12 @@ def run_here(
 ) -> Generator[CellOutcome, None, None]:
     """Run the cells of a benchmark on this machine, ``jobs`` cells at a time.
 
-    When a cell ends, its outcome is written to the benchmark's folder and yielded. If the generator
-    is closed, the running cells are killed.
+    A cell is one run. When a cell ends, its outcome is written to the benchmark's folder and
+    yielded. If the generator is closed, the running cells are killed.
 
     The cells are started from threads. Threads are sufficient, because each thread only waits for a
-    process. The threads also write the outcomes. Therefore, a cell that ends while the caller is
-    interrupted is not lost.
+    process. The threads also write the outcomes. Therefore, if a cell ends while the caller is
+    being interrupted, its outcome is not lost.
 
     Raises:
         ResultsError: the results of a cell cannot be written.
@@ -150,9 +153,9 @@ def finished_cells(cells: Collection[Cell], out: Path, config: str) -> list[Cell
 
 
 def publish(outcome: CellOutcome, out: Path) -> None:
-    """Write the results of a cell into the folder ``out``, either completely or not at all.
+    """Write the results of a run into the folder ``out``, either completely or not at all.
 
-    If the cell failed, only its log is written.
+    If the run failed, only its log is written.
 
     Raises:
         ResultsError: the folder cannot be written.
@@ -190,8 +193,8 @@ def prepare(out: Path, data: str) -> None:
     """Create the folder of a benchmark, and remove files that a killed benchmark left there.
 
     Args:
-        data: text that identifies the data. All results in a folder must come from the same data,
-            because sequences of different data may have the same names.
+        data: text that identifies the data set. All results in a folder must come from the same
+            data set, because sequences of different data sets may have the same names.
 
     Raises:
         InputError: the folder cannot be written, or it contains runs on different data.
@@ -217,7 +220,7 @@ def prepare(out: Path, data: str) -> None:
 
 
 def scratch_folder(out: Path) -> Path:
-    """Return the folder to which the unfinished cells of this process write."""
+    """Return the folder to which the unfinished runs of this process write."""
     return out / _PARTS / str(os.getpid())
 
 

@@ -1,4 +1,4 @@
-"""Makes the cells of a benchmark (one run each), and names the folders of their results."""
+"""Lists the runs of a benchmark (the cells of its grid), and names the folder of each run."""
 
 from __future__ import annotations
 
@@ -21,21 +21,22 @@ from vslam.report.schema import ReportJson
 class Cell:
     """One run in a benchmark's grid of sequences, perturbations, detectors and seeds.
 
-    The attributes and the images determine the result of the run.
+    The result of the run depends only on the attributes and on the images.
 
     Attributes:
         dataset: value of ``--dataset``.
         sequence: name of the sequence.
         perturb: perturbation in canonical spelling, e.g. ``none`` or ``brightness:1.5,blur:0.5``.
-        detector: name of a loop detector of vslam, or of a different SLAM system.
+        detector: name of a loop detector of vslam, or name of another SLAM system.
         seed: seed of the perturbation.
         max_frames: number of frames, counted from the first frame; None for all frames.
         weights: weight file of a learned detector; None for the shipped weights. The file must have
             the same path on every worker.
         digest: digest of the weight file.
         sensor: value of ``--sensor``; None to use all images of the data.
-        calib: calibration files.
-        thresholds: digest of the thresholds that differ from the defaults; empty if there are none.
+        calib: paths of the calibration files that are given with ``--calib``.
+        thresholds: digest of the thresholds that differ from the defaults; empty if all thresholds
+            have their default values.
     """
 
     dataset: str
@@ -75,7 +76,7 @@ class Cell:
 def parse_sequences(text: str) -> list[str]:
     """Parse a text with names and ranges of sequences.
 
-    For example, ``00-02,05,demo`` gives ``00 01 02 05 demo``. Repetitions are removed.
+    For example, ``00-02,05,demo`` gives ``00 01 02 05 demo``. Repeated names are removed.
 
     Raises:
         InputError: a range is reversed, or there is no name.
@@ -103,7 +104,7 @@ def parse_perturbations(text: str) -> list[str]:
     together in one run.
 
     Raises:
-        InputError: one of the entries is not a valid perturbation.
+        InputError: a part of the text is not a valid perturbation.
     """
     specs = [part.strip().replace("+", ",") for part in text.split(",")]
     return list(dict.fromkeys(parse_perturbation(spec, 0).name for spec in specs))
@@ -126,15 +127,16 @@ def make_grid(
 
     The cells are in this order: all sequences with the first seed, then all sequences with the
     second seed, and so on. In this order, the results of an interrupted benchmark are most useful.
-    A perturbation that is not random gets only one run. Repeated runs would be identical, and a
-    statistical test would count them as independent samples.
+
+    If a perturbation is not random, it is run with only one seed. Runs with other seeds would be
+    identical, and a statistical test would count them as independent samples.
 
     Args:
         runs: number of seeds.
         weights: weight files by the name of the detector. Detectors without an entry use the
             shipped weights.
-        repeated: systems that run with every seed even if the perturbation is not random, because
-            they are not deterministic.
+        repeated: names of the systems that are not deterministic. They are run with every seed,
+            even if the perturbation is not random.
     """
     paths = {name: str(path) for name, path in (weights or {}).items()}
     digests = {name: _digest(path) for name, path in (weights or {}).items()}
@@ -160,10 +162,10 @@ def make_grid(
 
 
 def thresholds_digest(config: str) -> str:
-    """Return a digest of the thresholds that differ from the defaults; empty if there are none.
+    """Return a digest of the thresholds that differ from the defaults; empty if none differs.
 
     Args:
-        config: the text of a ``config.json``.
+        config: thresholds, as the text of a file ``config.json``.
     """
     changed = changed_thresholds(json.loads(config))
     return _digest_of(json.dumps(changed, sort_keys=True).encode()) if changed else ""
@@ -181,7 +183,7 @@ def _digest(path: Path) -> str:
 
 
 def draws(perturb: str) -> bool:
-    """Return whether a perturbation is random. If it is, the images depend on the seed."""
+    """Return whether a perturbation is random, so that the images depend on the seed."""
     laws = {law.partition(":")[0] for law in perturb.split(",")} - {"none"}
     return any(law_kind(law).drawn for law in laws)
 

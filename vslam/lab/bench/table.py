@@ -19,7 +19,7 @@ from vslam.report.schema import ReportJson
 
 
 class GridProgress:
-    """The finished, failed and missing cells (runs) of a benchmark.
+    """The finished, failed and missing cells of a benchmark's grid. A cell is one run.
 
     Attributes:
         cells: all cells of the benchmark.
@@ -44,11 +44,11 @@ class GridProgress:
 
     @property
     def missing(self) -> list[Cell]:
-        """Cells of the benchmark that have neither finished nor failed."""
+        """Cells of the benchmark (one run each) that have neither finished nor failed."""
         return [c for c in self.cells if c not in self.reports and c not in self.failed]
 
     def add(self, outcome: CellOutcome) -> str:
-        """Add a cell that has ended, and return a line of text about it."""
+        """Add the outcome of a run that has ended, and return a line of text about the run."""
         cell = outcome.cell
         if isinstance(outcome, Failed):
             self.failed[cell] = outcome.message
@@ -60,10 +60,10 @@ class GridProgress:
         return f"{len(self.reports) + len(self.failed)}/{len(self.cells)} {cell.name}: {result}"
 
     def table(self) -> Table:
-        """Return a table with the median ATE of the finished cells.
+        """Return a table with the median ATE of the finished runs.
 
         There is a row for each sequence and perturbation, and a column for each detector. Each
-        entry contains the number of finished cells and their median ATE.
+        entry of the table contains the number of finished runs and the median of their ATE.
         """
         detectors = list(dict.fromkeys(cell.detector for cell in self.cells))
         caption = "Each entry gives the number of finished runs and their median ATE.\n"
@@ -97,9 +97,11 @@ class GridProgress:
 def shown_live(progress: GridProgress, *, shown: bool) -> Iterator[Callable[[str], None]]:
     """Show the table of a benchmark on stderr, and update it while the benchmark runs.
 
-    The context manager yields a function that prints a line of text if stderr is not a terminal.
+    The context manager yields a function that takes a line of text. The function prints the line
+    if stderr is not a terminal.
+
     When the benchmark is complete, the table is erased, because the results are printed next. If
-    cells are missing or have failed, the table stays.
+    runs are missing or have failed, the table stays.
     """
     console = Console(stderr=True, quiet=not shown, highlight=False, soft_wrap=True)
     live = (

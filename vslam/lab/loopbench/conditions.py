@@ -1,7 +1,7 @@
 """Conditions of a comparison of loop detectors.
 
-A *condition* is a change of the query images, such as a change in lighting. The gallery images are
-not changed.
+A *condition* is a change that is applied to the query images, such as a change in lighting. The
+gallery images are not changed.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _APART_S = 10.0
 
 @dataclass(frozen=True)
 class Condition:
-    """A kind of change of the query images, and its strength from 0 to 1."""
+    """A type of change that is applied to the query images, and its strength from 0 to 1."""
 
     kind: str
     strength: float = 0.0
@@ -55,7 +55,7 @@ class Condition:
     def lateral(self) -> tuple[float, float]:
         """Range of the camera's lateral offset in metres, positive to the right.
 
-        Even without a change in viewpoint, there is some offset, because no two drives follow
+        Even without a change in viewpoint, there is a small offset, because no two drives follow
         exactly the same line.
         """
         side = -_OTHER_LANE * self.view
@@ -71,21 +71,24 @@ class Condition:
     def change(self) -> float:
         """Value of ``vslam synth --change`` with which the town is rendered.
 
-        For the condition ``change``, the value is 0.5 at strength 0.5, and 0.9 at strength 1.
+        The condition ``change`` has the value 0.5 at strength 0.5, and the value 0.9 at strength 1.
         """
         strength = {"change": self.strength, "all": self.strength / 2}.get(self.kind)
         return 0.0 if strength is None else round(0.1 + 0.8 * strength, 3)
 
 
 def parse_conditions(kinds: str, strengths: str) -> list[Condition]:
-    """Make the condition ``none``, followed by each given kind of change at each given strength.
+    """List the conditions under which loop detectors are compared.
+
+    The first condition is ``none`` (unchanged images). It is followed by each type of change at
+    each strength.
 
     Args:
-        kinds: names from ``KINDS``, separated by commas.
+        kinds: types of change, as names from ``KINDS`` that are separated by commas.
         strengths: numbers above 0 and up to 1, separated by commas.
 
     Raises:
-        InputError: a kind is unknown, or a strength is outside of that range.
+        InputError: a type of change is unknown, or a strength is out of range.
     """
     names = [name.strip() for name in kinds.split(",") if name.strip()]
     if wrong := [name for name in names if name not in KINDS]:
@@ -106,13 +109,13 @@ def parse_conditions(kinds: str, strengths: str) -> list[Condition]:
 def apply(
     condition: Condition, images: Collection[Image], seed: int, *, rendered: bool
 ) -> list[Image]:
-    """Change images according to a condition. Each image gets a different random change.
+    """Apply the change of a condition to images. The random values differ between the images.
 
     Args:
-        condition: the condition. ``change`` does not modify the images, because it is applied when
-            the town is rendered.
+        condition: type and strength of the change. The type ``change`` has no effect here, because
+            it is applied when the town is rendered.
         images: the images, each ``(H, W)`` uint8.
-        seed: seed of all random changes.
+        seed: seed of all random values.
         rendered: whether the images were already rendered with the change in viewpoint.
     """
     out = list(images)
@@ -132,9 +135,9 @@ def apply(
 
 
 def turned(image: Image, degrees: float) -> Image:
-    """Warp an image to what the camera would see after a rotation to the right about its centre.
+    """Warp an image as if the camera had been rotated to the right about its centre.
 
-    Pixels outside of the original view are black.
+    Pixels that the original image does not show become black.
     """
     import cv2
 
@@ -144,9 +147,9 @@ def turned(image: Image, degrees: float) -> Image:
 
 
 def clipped(image: Image, share: float, bright: bool) -> Image:
-    """Change the exposure of an image so that a given share of its pixels becomes white or black.
+    """Change the exposure of an image so that a given share of its pixels is clipped.
 
-    The pixels become white if ``bright`` is set, and otherwise black.
+    If ``bright`` is set, these pixels become white. Otherwise, they become black.
     """
     grey = np.arange(256.0)
     if bright:

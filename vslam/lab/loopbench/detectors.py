@@ -41,8 +41,8 @@ class DescribedImage:
         xy: ``(N, 2)`` float32 positions of the features in pixels.
         descriptors: ``(N, 32)`` uint8.
         words: ``(N,)`` int32 visual word of each feature.
-        nodes: direct index of the image. It lists the features under each node of the vocabulary
-            tree.
+        nodes: direct index of the image. For each node of the vocabulary tree, it lists the
+            features whose visual words lie under this node.
     """
 
     image: Image
@@ -53,7 +53,7 @@ class DescribedImage:
 
 
 def describe(images: list[Image], vocabulary: Vocabulary, threads: int) -> list[DescribedImage]:
-    """Extract the ORB features of images in the same way as a run of vslam."""
+    """Extract the ORB features of images with the same settings as ``vslam run``."""
     node_of_word = vocabulary.ancestors(_MATCHING_LEVEL)
 
     def one(image: Image) -> DescribedImage:
@@ -68,23 +68,26 @@ def describe(images: list[Image], vocabulary: Vocabulary, threads: int) -> list[
 
 
 class Scorer(Protocol):
-    """A loop detector that compares query images with gallery images and needs no map."""
+    """A loop detector that compares query images with gallery images and does not need a map."""
 
     name: str
     probability: bool
     """Whether the scores are probabilities, so that the accuracy at p = 0.5 and 0.9 is defined."""
 
     def store(self, gallery: list[DescribedImage]) -> Any:
-        """Compute the data of gallery images with which the detector compares query images."""
+        """Compute the data that the detector needs to compare query images with a gallery."""
 
     def scores(self, queries: list[DescribedImage], stored: Any) -> NDArray[np.float64]:
-        """Compute the ``(Q, G)`` similarities of queries and gallery. Higher means more similar."""
+        """Compute the ``(Q, G)`` similarities of Q query images and G gallery images.
+
+        A higher value means that two images are more similar.
+        """
 
 
 class BowScorer:
-    """A bag-of-words detector with the weights and the score of a run of vslam.
+    """A bag-of-words detector that does not need a map.
 
-    The tf-idf weights and the L1 score are those of `vslam.loopclosure.bow.BowDetector`.
+    It uses the same tf-idf weights and the same L1 score as `vslam.loopclosure.bow.BowDetector`.
     """
 
     name = "bow"
@@ -106,7 +109,7 @@ class BowScorer:
 
 
 def require_comparable(name: str, weights: Path | None) -> None:
-    """Check that a loop detector can be compared. No large packages are imported for this check.
+    """Check that a loop detector can be compared, without importing large packages.
 
     Raises:
         InputError: the detector is unknown, or there are no weights for it.
@@ -166,7 +169,7 @@ class NetworkScorer:
 class LocalDescriptorCache:
     """Local descriptors of images, which are computed once per image.
 
-    Only the coarse descriptors are kept (`DescriptorMaps`).
+    Only the coarse descriptors of `DescriptorMaps` are kept in memory.
     """
 
     def __init__(self) -> None:
@@ -174,12 +177,12 @@ class LocalDescriptorCache:
         self._kept: dict[bytes, DescriptorMaps] = {}
 
     def of(self, image: Image) -> DescriptorMaps:
-        """Return the coarse local descriptors of an ``(H, W)`` grey image.
+        """Return the coarse local descriptors of an ``(H, W)`` uint8 grey image.
 
-        They are computed only if they are not in the cache.
+        The descriptors are computed only if they are not in the cache.
 
         Raises:
-            InputError: the network cannot be read.
+            InputError: the local-descriptor network cannot be read.
         """
         digest = hashlib.blake2b(image.tobytes()).digest()
         if digest not in self._kept:
@@ -194,8 +197,9 @@ class LocalDescriptorCache:
 class DetectorSet:
     """The loop detectors that are compared. The first detector is the baseline.
 
-    The features and stored data of the last few galleries are cached, because most conditions share
-    a gallery.
+    Most conditions (changes of the query images) are measured on the same gallery images.
+    Therefore, the features of the last few sets of gallery images are cached, together with the
+    data that each detector stores for them.
     """
 
     def __init__(self, scorers: list[Scorer], vocabulary: Vocabulary, threads: int) -> None:
@@ -207,7 +211,7 @@ class DetectorSet:
     def gallery(self, images: list[Image]) -> tuple[list[DescribedImage], dict[str, Any]]:
         """Return the features of gallery images, and the data that each detector stores for them.
 
-        The stored data are given by the name of the detector.
+        The second result maps the name of each detector to its stored data.
         """
         hashed = hashlib.blake2b()
         for image in images:

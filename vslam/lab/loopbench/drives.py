@@ -1,6 +1,6 @@
 """Opens drives for tests of loop detectors.
 
-A drive has its images in the order in which they were taken.
+The images of a drive are in the order in which they were taken.
 """
 
 from __future__ import annotations
@@ -27,15 +27,14 @@ _ORDERED = ("kitti", "fabmap")  # kinds of sources whose images are in driving o
 def open_drives(
     spec: str, cache: Path, *, threads: int, progress_bar: ProgressBar
 ) -> list[ImageSource]:
-    """Open a drive that is named by a text.
-
-    The text is ``drive:ROUTE[seed=101,aliased=1,change=0.5,every=10]``, ``kitti:DIR`` or
-    ``fabmap:DIR``.
+    """Open a drive for tests of loop detectors.
 
     The left images of a built-in route are rendered on first use. With ``every=10``, only every
     tenth frame is rendered.
 
     Args:
+        spec: ``drive:ROUTE[seed=101,aliased=1,change=0.5,every=10]`` for a built-in route,
+            ``kitti:DIR``, or ``fabmap:DIR``.
         cache: folder of rendered towns.
         progress_bar: progress bar that is opened while a drive is rendered.
 
@@ -99,13 +98,13 @@ def render_views(
 ) -> None:
     """Render the left images of some frames into a folder in KITTI's layout.
 
-    Images that exist are not rendered again. The images are identical to those of
-    `render_sequence`. The poses and times of the whole drive are also written. The file of the
-    poses is written last. Therefore, it exists only if all images exist.
+    Images that already exist are not rendered again. The images are identical to those of
+    `render_sequence`. The poses and times of the whole drive are also written. The file with the
+    poses is written last. Therefore, this file exists only if all images exist.
 
     Args:
         root: output folder, which must not be used for other routes or variations.
-        frames: numbers of the frames to render, ascending.
+        frames: indices of the frames to render, in ascending order.
         threads: number of threads of the renderer.
         on_frame: called with the number of finished frames and the number of all frames.
 

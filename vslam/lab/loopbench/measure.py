@@ -49,9 +49,14 @@ def measure(
     detectors: DetectorSet,
     seed: int,
 ) -> tuple[list[Score], list[Gain]]:
-    """Measure all loop detectors on a set of images.
+    """Evaluate all loop detectors on a set of images under one condition.
 
-    Returns empty lists if the change of the images (the condition) cannot be applied to the set.
+    A condition is a change that is applied to the query images. If it cannot be applied to this
+    set, two empty lists are returned.
+
+    Returns:
+        The scores of all detectors. Also the differences between the first detector and each other
+        detector.
     """
     query_set = test_set.query_set(condition, seed)
     if query_set is None:
@@ -124,17 +129,18 @@ def _best_images(
 ) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
     """For each query, find the most similar image whose relation to the query is known.
 
-    Returns the indices of these images, and their relations (same place or another place).
+    Returns the index of this image for each query, and whether it shows the same place as the
+    query or another place.
     """
     best = np.where(relation != UNKNOWN, scores, -np.inf).argmax(1)
     return best, relation[np.arange(len(best)), best]
 
 
 def thinned(curve: PrecisionRecall) -> Curve:
-    """Reduce a precision-recall curve to fewer points, at equal steps of recall.
+    """Reduce the number of points of a precision-recall curve, using equal intervals of recall.
 
-    Each step is represented by its point with the best precision. The end of the curve, where every
-    pair is accepted, is also kept.
+    In each interval, only the point with the highest precision is kept. The last point of the
+    curve, at which every pair is accepted, is also kept.
 
     Equal steps in the number of accepted pairs would not be suitable. A good detector ranks the few
     true pairs before thousands of false pairs. Nearly the whole curve would then lie within the
@@ -148,9 +154,10 @@ def thinned(curve: PrecisionRecall) -> Curve:
 
 
 def drawn_points(curve: PrecisionRecall) -> NDArray[np.int64]:
-    """Select the first point of a curve, and the points that are nearest to equal steps of recall.
+    """Select the points of a precision-recall curve that are drawn.
 
-    Returns the indices of the points.
+    These are the first point, and the points that are nearest to equal steps of recall. Returns the
+    indices of the points.
     """
     wanted = np.linspace(0.0, curve.recall[0], _CURVE_POINTS)
     reached = len(curve.recall) - 1 - np.searchsorted(curve.recall[::-1], wanted)
@@ -167,7 +174,8 @@ def _gain(
 ) -> Gain:
     """Compute by how much the average precision (AP) of two detectors differs.
 
-    The result contains a 95 % interval, which is computed by a bootstrap over the queries.
+    The result contains a 95 % confidence interval, which is computed by a bootstrap over the
+    queries.
     """
     known, rng = relation != UNKNOWN, np.random.default_rng(0)
 
@@ -190,7 +198,9 @@ def _gain(
 
 
 class Verification:
-    """Decides whether two images show the same place, using local features. Results are cached."""
+    """Decides whether two images show the same place, using local features.
+
+    The decisions are cached."""
 
     def __init__(
         self,
@@ -203,7 +213,7 @@ class Verification:
         self._by_learned: dict[tuple[int, int], bool] = {}
 
     def by_orb(self, query: int, image: int) -> bool:
-        """Return whether enough ORB matches between two images fit one epipolar geometry."""
+        """Return whether enough ORB matches of two images are inliers of one epipolar geometry."""
         key = query, image
         if key not in self._by_orb:
             inliers = epipolar_inliers(self._queries[query], self._gallery[image])
@@ -211,11 +221,13 @@ class Verification:
         return self._by_orb[key]
 
     def by_learned(self, query: int, image: int) -> bool:
-        """Return whether enough learned descriptors of two images match and fit one homography.
+        """Return whether enough learned local descriptors of two images match.
 
-        The descriptors are those of the cells of a coarse grid, and the homography is a rough fit.
-        The limit is on the number of matching cells, not on their share, because the share depends
-        on how much of the images is sky or road.
+        There is one descriptor for each cell of a coarse grid of the image. The matches must also
+        fit one homography, with a large tolerance.
+
+        The limit is on the number of matching cells. A limit on their share would not be suitable,
+        because the share depends on how much of the images is sky or road.
         """
         key = query, image
         if key not in self._by_learned:
@@ -227,7 +239,7 @@ class Verification:
 
 
 def epipolar_inliers(a: DescribedImage, b: DescribedImage) -> int:
-    """Count the ORB matches between two images that fit the best fundamental matrix."""
+    """Count the ORB matches between two images that are inliers of the best fundamental matrix."""
     import cv2
 
     config = VerificationConfig()
@@ -249,18 +261,19 @@ def sequence_scores(scores: Matrix) -> Matrix:
 
     The method is that of Milford and Wyeth, ICRA 2012.
 
-    A query and the images before it are compared with a gallery image and the images before it. In
-    the matrix of scores, several straight lines end at this pair of images, one line for each
-    speed. The scores along each line are averaged. The result is the mean score along the best
-    line.
+    A sequence that ends at a query is compared with a sequence that ends at a gallery image. In the
+    matrix of scores, the two sequences correspond to a straight line that ends at this pair of
+    images. The slope of the line is the ratio of the speeds of the two drives. Several slopes are
+    tried, and the scores along each line are averaged. The result is the highest of these mean
+    scores.
 
     Args:
         scores: ``(Q, G)`` scores of queries and gallery images, both in driving order. A higher
             score means more similar.
 
     Returns:
-        ``(Q, G)`` mean scores. If a line leaves the gallery, each missing score is replaced by the
-        mean score of the query. The lines of the first queries are shorter.
+        ``(Q, G)`` mean scores. If a line extends beyond the gallery, each missing score is replaced
+        with the mean score of the query. The lines of the first queries are shorter.
     """
     n_queries, n_images = scores.shape
     usual = scores.mean(1)

@@ -1,4 +1,4 @@
-"""Measures loop detectors on drives, with one decision per image."""
+"""Evaluates loop detectors on drives. A detector makes one decision for each image of a drive."""
 
 from __future__ import annotations
 
@@ -24,17 +24,18 @@ def measure_drive(
     *,
     threads: int,
 ) -> list[OnlineScore]:
-    """Measure all loop detectors on one drive, before and after verification.
+    """Evaluate all loop detectors on one drive, before and after geometric verification.
 
     Args:
         drive: images in the order in which they were taken.
         scorers: the loop detectors.
-        window: the images just before a query. They are not searched for a match.
+        window: length of the window before a query. The images in this window are not compared with
+            the query.
         vocabulary: vocabulary of the detector ``bow``. It is also used to match features for
             verification.
 
     Raises:
-        InputError: no image has a true match before its window.
+        InputError: no image shows the same place as an image before its window.
         UnreadableImageError: an image is missing or damaged.
     """
     n = len(drive)

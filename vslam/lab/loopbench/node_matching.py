@@ -16,7 +16,9 @@ from vslam.kernels import hamming, kernel
 
 
 class NodeIndex(NamedTuple):
-    """The features of an image, sorted by the vocabulary node under which their words lie.
+    """The features of an image, sorted by node of the vocabulary tree.
+
+    The node of a feature is the one under which the visual word of the feature lies.
 
     Attributes:
         node: ``(N,)`` int32 node of each feature, ascending.
@@ -31,7 +33,8 @@ def index_nodes(node: NDArray[np.int32]) -> NodeIndex:
     """Make the direct index of an image, in which its features are sorted by vocabulary node.
 
     Args:
-        node: ``(N,)`` node under which the word of each feature lies.
+        node: ``(N,)`` node of each feature: the node of the vocabulary tree under which the visual
+            word of the feature lies.
     """
     order = np.argsort(node, kind="stable").astype(np.int32)
     return NodeIndex(node[order], order)
@@ -41,7 +44,10 @@ def index_nodes(node: NDArray[np.int32]) -> NodeIndex:
 def match_by_node(
     node_a, feature_a, descriptors_a, node_b, feature_b, descriptors_b, max_distance, ratio
 ):
-    """Match features of two images whose words lie under the same node of the vocabulary.
+    """Match the features of two images.
+
+    Two features are compared only if their visual words lie under the same node of the vocabulary
+    tree.
 
     Args:
         node_a, feature_a: direct index of image a (`NodeIndex`).
@@ -55,7 +61,7 @@ def match_by_node(
     Returns:
         ``(M,)`` int32. For each feature of image a, it contains the index of the matching feature
         of image b, or -1 if there is no match. A feature of image b is matched at most once, with
-        the closest feature of image a.
+        the feature of image a whose descriptor is most similar.
     """
     matches = np.full(len(descriptors_a), -1, np.int32)
     distances = np.full(len(descriptors_a), 257, np.int64)

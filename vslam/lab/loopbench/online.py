@@ -1,19 +1,22 @@
 """Evaluates loop detectors with one decision per image of a drive, as is usual in the literature.
 
 The images are processed in driving order. Each image is compared with all earlier images, except
-the images in a window just before it. The most similar image is its match. The match is accepted if
-its score reaches a threshold.
+the images in a window just before it. The most similar image is the match of this image. The match
+is accepted if its score reaches a threshold.
 
-The ground truth marks which images show the same place. The figures are defined as follows:
+The ground truth says for each pair of images whether both show the same place. The metrics are
+defined as follows:
 
-- A match is *right* if the ground truth marks it as the same place. Otherwise, it is *wrong*.
-- Precision is right / (right + wrong). Only matches whose score reaches the threshold count.
-- Recall is right / (number of images that have a marked image before the window).
+- A match is *right* if both images show the same place according to the ground truth. Otherwise,
+  the match is *wrong*.
+- Precision is right / (right + wrong). Only matches whose score reaches the threshold are counted.
+- Recall is right / answerable. An image is *answerable* if an image before its window shows the
+  same place.
 
-Recall at 100 % precision is the highest recall that is reached without a wrong match, over all
-thresholds (Cummins and Newman, IJRR 2008; Galvez-Lopez and Tardos, T-RO 2012; Garcia-Fidalgo and
-Ortiz, RA-L 2018; An et al., IROS 2019). If geometric verification rejects a match, the image has no
-match at any threshold.
+Recall at 100 % precision is the highest recall over all thresholds at which no match is wrong
+(Cummins and Newman, IJRR 2008; Galvez-Lopez and Tardos, T-RO 2012; Garcia-Fidalgo and Ortiz, RA-L
+2018; An et al., IROS 2019). If geometric verification rejects a match, the image has no match at
+any threshold.
 """
 
 from __future__ import annotations
@@ -33,8 +36,8 @@ class Window:
     """The images just before a query image, which are not compared with the query.
 
     Attributes:
-        amount: length of the window, as a number of images. If ``timed`` is set, it is in seconds.
-        timed: whether ``amount`` is in seconds.
+        amount: length of the window, in images or in seconds.
+        timed: whether ``amount`` is in seconds. If not, ``amount`` is a number of images.
     """
 
     amount: float
@@ -44,12 +47,14 @@ class Window:
         return f"{self.amount:g} {'s' if self.timed else 'images'}"
 
     def searchable(self, n: int, times: NDArray[np.float64] | None) -> NDArray[np.int64]:
-        """For each image, count the images at the start of the drive that may be searched.
+        """For each image of a drive, count the images before its window.
+
+        These are the images with which the image is compared.
 
         Args:
             n: number of images in the drive.
-            times: ``(n,)`` seconds, ascending. If it is None, one image per second is assumed. This
-                is also the default of DLoopDetector.
+            times: ``(n,)`` times of the images in seconds, ascending. If it is None, one image per
+                second is assumed. This is also the default of DLoopDetector.
 
         Returns:
             ``(n,)`` int64 numbers of images.
@@ -94,19 +99,19 @@ class Decisions:
             raise InputError("loops bench: a score is NaN; check the weights of the detector.")
 
     def only(self, accepted: NDArray[np.bool_]) -> Decisions:
-        """Return the decisions, but remove each match at which the ``(N,)`` mask is False."""
+        """Return the decisions without the matches at which the ``(N,)`` bool mask is False."""
         return Decisions(
             np.where(accepted, self.match, -1), np.where(accepted, self.score, -np.inf)
         )
 
 
 def decide(scores: NDArray[np.float64], searchable: NDArray[np.int64]) -> Decisions:
-    """For each image of a drive, find the most similar image that may be searched.
+    """For each image of a drive, find the most similar image before its window.
 
     Args:
-        scores: ``(N, N)`` similarities of the images. Each row belongs to one query.
-        searchable: ``(N,)`` number of images from the start of the drive that may be searched, for
-            each image (`Window.searchable`).
+        scores: ``(N, N)`` similarities of the images. Each row belongs to one query image.
+        searchable: ``(N,)`` for each image, the number of images before its window
+            (`Window.searchable`).
     """
     match, score = np.full(len(scores), -1, np.int64), np.full(len(scores), -np.inf)
     for k in np.flatnonzero(searchable):
@@ -121,11 +126,12 @@ class Judged:
 
     Attributes:
         score: ``(N,)`` float64 score of the match; -inf if there is no match.
-        right: ``(N,)`` bool, whether the match is marked as the same place.
+        right: ``(N,)`` bool, whether the match shows the same place as the image, according to the
+            ground truth.
         far: ``(N,)`` bool, whether the match shows another place. A match is neither right nor far
-            if it was taken near the place of the query, but not near enough to be marked.
-        answerable: ``(N,)`` bool, whether there is a marked image before the window, so that a
-            right match is possible.
+            if it was taken near the image, but not near enough to count as the same place.
+        answerable: ``(N,)`` bool, whether an image before the window shows the same place, so that
+            a right match is possible.
     """
 
     score: NDArray[np.float64]
@@ -135,7 +141,7 @@ class Judged:
 
     @property
     def near(self) -> NDArray[np.bool_]:
-        """``(N,)`` bool, whether a match was taken near the place but is not marked."""
+        """Whether the match was taken near the image, but not at the same place; ``(N,)`` bool."""
         return np.isfinite(self.score) & ~self.right & ~self.far
 
 
@@ -146,13 +152,13 @@ def judge(
 
     Args:
         decisions: the decisions for N images.
-        relation: ``(N, N)`` int8. 1 means that two images show the same place, -1 means another
-            place, and pairs with 0 are unknown (`vslam.lab.loopbench.sets.QuerySet`).
-        searchable: ``(N,)`` number of images from the start of the drive that may be searched, for
-            each image (`Window.searchable`).
+        relation: ``(N, N)`` int8. For each pair of images, 1 means that both show the same place,
+            -1 means that they show different places, and 0 means that it is unknown.
+        searchable: ``(N,)`` for each image, the number of images before its window
+            (`Window.searchable`).
 
     Raises:
-        InputError: no image has a marked image before its window.
+        InputError: no image shows the same place as an image before its window.
     """
     n = len(relation)
     before = np.arange(n)[None] < searchable[:, None]
@@ -170,12 +176,13 @@ def judge(
 
 
 def decision_curve(judged: Judged, *, near_is_wrong: bool = True) -> PrecisionRecall:
-    """Compute precision and recall over images, using each distinct score as a threshold.
+    """Compute precision and recall for N images, using each distinct score as a threshold.
 
     Args:
-        near_is_wrong: whether a match counts as wrong if it was taken near the place of the query
-            but is not marked as the same place. This is usual in the literature. If False, these
-            matches are left out.
+        judged: the decisions of a loop detector, compared with the ground truth.
+        near_is_wrong: whether near matches count as wrong, as is usual in the literature. A near
+            match was taken near the query, but the ground truth does not mark it as the same place.
+            If False, near matches are left out.
     """
     wrong = judged.far | (judged.near & near_is_wrong)
     counted = judged.right | wrong

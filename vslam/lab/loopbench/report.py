@@ -88,15 +88,15 @@ def loops_page(report: LoopsJson) -> Page:
 
 
 def title(report: LoopsJson) -> str:
-    """Return one line that says what was compared."""
+    """Return a title that names the compared loop detectors."""
     return f"Loop detectors: {', '.join(_detectors(report))}"
 
 
 def words(report: LoopsJson) -> list[str]:
     """Return sentences that summarise a comparison of loop detectors.
 
-    The sentences compare each detector with the first detector under each condition. They also name
-    the best detector on each drive.
+    The sentences compare each detector with the first detector, under each condition (change of the
+    query images). They also name the best detector on each drive.
     """
     sentences = _online_words(report.online)
     for first, second in dict.fromkeys((g.first, g.second) for g in report.gains):
@@ -237,11 +237,13 @@ def _by_detector(
     about: Callable[[_Scored], tuple[str, ...]],
     shown: Callable[[_Scored], str],
 ) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Return the head and the rows of a table that has one column for each detector.
+    """Return the head and the rows of a table that has one column for each loop detector.
 
     Args:
-        about: function that returns the first cells of a row.
-        shown: function that returns the cell for the score of a detector.
+        scores: results of all detectors.
+        head: titles of the first columns.
+        about: function that takes a result and returns the entries of the first columns.
+        shown: function that takes a result and returns the entry in the column of its detector.
     """
     rows: dict[tuple[str, ...], dict[str, str]] = {}
     for score in scores:

@@ -16,11 +16,12 @@ class Curve(Record):
 
 
 class Verified(Record):
-    """The result of verifying the most similar gallery image of each query.
+    """The result of geometric verification of the most similar gallery image of each query.
 
-    - ``right``: share of the queries for which the image passes verification and shows the same
-      place. Only queries whose place is in the gallery are counted.
-    - ``wrong``: number of queries for which the image passes verification but shows another place.
+    - ``right``: share of the queries whose most similar image passes verification and shows the
+      same place. Only queries whose place is in the gallery are counted.
+    - ``wrong``: number of queries whose most similar image passes verification but shows another
+      place.
     """
 
     right: float
@@ -28,22 +29,23 @@ class Verified(Record):
 
 
 class Score(Record):
-    """The figures of one loop detector on one set of images under one condition.
+    """The metrics of one loop detector on one set of images under one condition.
 
-    A *condition* is a change of the query images.
+    A *condition* is a change that is applied to the query images.
 
-    - ``figures``: figures without verification, as returned by
+    - ``figures``: metrics without geometric verification, as returned by
       `vslam.loopclosure.precision_recall.summary`.
-    - ``accuracy``: balanced accuracy for several thresholds on the probability p. None for
-      detectors that compute no probability.
+    - ``accuracy``: balanced accuracy for several thresholds on the probability. None for detectors
+      that compute no probability.
     - ``accepted``: precision and recall if pairs with a probability of at least 0.9 are accepted.
       None for detectors that compute no probability, and in older files.
     - ``queries``: number of queries whose place is in the gallery.
-    - ``first_right``: share of these queries for which the most similar image shows the same place.
+    - ``first_right``: share of these queries whose most similar image shows the same place.
     - ``sequence_right``: the same share if sequences of images are compared instead of single
-      images. None for images without an order.
-    - ``verified``: results by kind of verification: ORB descriptors (``orb``), learned local
-      descriptors (``learned``), and at least one of the two (``both``). Empty without verification.
+      images. None if the images are not in the order of a drive.
+    - ``verified``: results by kind of verification. ``orb`` uses ORB descriptors, and ``learned``
+      uses learned local descriptors. With ``both``, an image is accepted if at least one of these
+      two accepts it. Empty without verification.
     """
 
     data: str
@@ -71,21 +73,27 @@ class DecisionCurve(Record):
 
 
 class OnlineScore(Record):
-    """The figures of one loop detector on one drive, with one decision per image.
+    """The metrics of one loop detector on one drive.
 
-    `vslam.lab.loopbench.online` defines the figures.
+    The detector makes one decision for each image of the drive: it selects the most similar earlier
+    image (the match), or none. `vslam.lab.loopbench.online` defines the metrics.
 
-    - ``window``: the images just before a query, which are not searched for a match.
-    - ``verified_by``: kind of verification. It is ``nothing``, ``orb``, ``learned`` (local
-      descriptors), or ``both``, which means that one of the two is sufficient.
-    - ``answerable``: number of images that have a true match before their window.
-    - ``right``: number of matches that are marked as the same place, at the lowest threshold.
-    - ``near``: number of matches that were taken near the place but are not marked as the same
-      place, at the lowest threshold.
-    - ``far``: number of matches that show another place, at the lowest threshold.
-    - Figures whose names end in ``_far`` leave out near matches. The other figures count near
+    - ``window``: length of the window before an image. The images in this window cannot be its
+      match.
+    - ``verified_by``: how matches are verified. ``nothing`` accepts every match. ``orb`` uses ORB
+      descriptors, and ``learned`` uses learned local descriptors. With ``both``, a match is
+      accepted if at least one of these two accepts it.
+    - ``answerable``: number of images for which an image before the window shows the same place.
+    - ``right``: number of matches that show the same place as the image, according to the ground
+      truth. For this number and for the next two, all verified matches are counted, whatever their
+      score is.
+    - ``near``: number of matches that were taken near the image, but that the ground truth does not
+      mark as the same place.
+    - ``far``: number of matches that show another place.
+    - Metrics whose names end in ``_far`` leave out the near matches. The other metrics count near
       matches as wrong.
-    - ``max_f1_threshold``: threshold with the largest F1 score. None if no image has a match.
+    - ``max_f1_threshold``: threshold on the score at which the F1 score is largest. None if no
+      image has a match.
     """
 
     data: str
@@ -108,7 +116,7 @@ class OnlineScore(Record):
 class Gain(Record):
     """Difference between the average precision (AP) of two detectors: ``second`` minus ``first``.
 
-    The 95 % interval is computed by a bootstrap over the queries.
+    The 95 % confidence interval is computed by a bootstrap over the queries.
     """
 
     data: str
@@ -125,7 +133,8 @@ class Cost(Record):
 
     - ``image_ms``: CPU time per image in milliseconds. The extraction of ORB features is not
       included, because tracking needs these features in any case.
-    - ``query_ms``: CPU time per query in milliseconds, by number of keyframes.
+    - ``query_ms``: CPU time per query in milliseconds. The key is the number of keyframes in the
+      map.
     """
 
     detector: str
@@ -139,9 +148,9 @@ class Cost(Record):
 class LoopsJson(Document):
     """The results of ``vslam loops bench``, as in ``loops.json``.
 
-    ``kind`` distinguishes this file from reports of runs. With the protocol ``retrieval``, the
-    results are in ``cells``, ``gains`` and ``costs``. With the protocol ``online``, they are in
-    ``online``.
+    ``kind`` distinguishes this file from reports of runs. With ``--protocol retrieval``, the
+    results are in ``cells``, ``gains`` and ``costs``. With ``--protocol online``, the results are
+    in ``online``.
     """
 
     kind: Literal["loops"] = "loops"

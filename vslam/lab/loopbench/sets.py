@@ -30,12 +30,13 @@ class QuerySet:
     """Query images, gallery images in which their places are searched for, and the ground truth.
 
     Attributes:
-        queries: Q images, each ``(H, W)`` uint8. They are already changed according to the
-            condition.
-        gallery: G images without changes, each ``(H, W)`` uint8.
+        queries: Q query images, each ``(H, W)`` uint8. The change of the condition has already been
+            applied to them.
+        gallery: G unchanged images, each ``(H, W)`` uint8.
         relation: ``(Q, G)`` int8. 1 means that a query and a gallery image show the same place, and
-            -1 means another place. Pairs with 0 are unknown and are left out.
-        in_order: whether the queries and the gallery are in the order of a drive.
+            -1 means that they show different places. 0 means that this is unknown. Such a pair is
+            left out.
+        in_order: whether the queries and the gallery images are in the order of a drive.
     """
 
     queries: list[Image]
@@ -49,10 +50,10 @@ class TestSet:
     """One set of images for tests of loop detectors.
 
     Attributes:
-        title: title in the report.
-        query_set: function of ``(condition, seed)`` that changes the query images according to the
-            condition and returns all images. It returns None if the condition cannot be applied to
-            the set.
+        title: title of the set in the report.
+        query_set: function of ``(condition, seed)`` that applies the change of a condition to the
+            query images, and returns all images of the set. It returns None if the change cannot be
+            applied to this set.
     """
 
     __test__ = False  # pytest must not collect this class because of its name
@@ -62,14 +63,14 @@ class TestSet:
 
 
 def open_set(spec: str, cache: Path, *, threads: int, progress_bar: ProgressBar) -> list[TestSet]:
-    """Open a set of images that is named by a text.
+    """Open a set of images for tests of loop detectors.
 
-    The text is ``town:ROUTE[seed=101,aliased=1,places=150]``, or a source of ``vslam train``.
-
-    A town is rendered into ``cache`` when it is first needed. It is rendered once for each
-    combination of viewpoint and change of the town.
+    A town is rendered into ``cache`` when its images are first needed. For each change in viewpoint
+    and for each change of the town, the town is rendered separately.
 
     Args:
+        spec: ``town:ROUTE[seed=101,aliased=1,places=150]`` for a rendered town. Otherwise, the
+            name of image data as for ``vslam train``.
         cache: folder of rendered towns.
         progress_bar: progress bar that is opened while a town is rendered.
 
@@ -88,7 +89,7 @@ def open_set(spec: str, cache: Path, *, threads: int, progress_bar: ProgressBar)
 def rendered_route(spec: str, defaults: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """Parse the route and the options of a text ``KIND:ROUTE[options]``, which names a town.
 
-    Options that are not given have their default values.
+    Options that are not given have the values in ``defaults``.
 
     Raises:
         InputError: the route or an option is unknown, or an option is not a number.

@@ -1,1 +1,3 @@
-"""Makes a report of many runs: medians, comparisons of systems, trajectories and error curves."""
+"""Makes a report that summarises many runs.
+
+The report has medians of the errors, comparisons of systems, trajectories and error curves."""

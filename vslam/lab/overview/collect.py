@@ -25,10 +25,11 @@ _OPTIONS = ("weights", "local_weights", "realtime", "map", "localize", "mask")
 
 @dataclass(frozen=True)
 class Found:
-    """The finished runs, in order, and notes on runs that were left out.
+    """The finished runs, in order, and notes on the runs that were left out.
 
     Attributes:
-        estimate: the file of the estimated trajectory of each run, by ``RunEntry.source``.
+        estimate: for each run, the file with the estimated trajectory. The key is
+            ``RunEntry.source``.
         truth: for each pair of data set and sequence, the folder of a run that contains the ground
             truth.
     """
@@ -40,11 +41,13 @@ class Found:
 
 
 def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
-    """Read every run below ``folders``, and evaluate the trajectories of other systems.
+    """Read every run below ``folders``, and evaluate the trajectories of other SLAM systems.
 
-    ``trajectories`` contains the trajectories of other systems, which are evaluated on the same
-    sequences as the runs. Interrupted runs and reports that this version cannot read are left out.
-    The result has a note for each of them.
+    ``trajectories`` contains the trajectories of other systems. They are evaluated on the same
+    sequences as the runs.
+
+    Interrupted runs are left out. Runs whose report this version cannot read are left out, too. The
+    result has a note for each run that was left out.
 
     Raises:
         InputError: a folder is missing, no folder contains a finished run, a trajectory cannot be
@@ -147,7 +150,7 @@ def _is_overview(path: Path) -> bool:
 def _compared_entry(
     entry: RunEntry, report: ReportJson, other: DetectorFigures, folder: Path
 ) -> RunEntry:
-    """Make the entry of a detector that a run compared with its own detector (``--compare``)."""
+    """Make the entry of a detector that was added to a run with ``--compare``."""
     return entry.model_copy(
         update={
             "system": other.detector + entry.system.removeprefix(report.detector),
@@ -203,8 +206,8 @@ def _settings(report: ReportJson, folder: Path) -> dict[str, Any]:
     """Return the settings of a run, which distinguish it from other runs of the same system.
 
     The settings are the thresholds and options that differ from the defaults, and the version of
-    the method. A folder without a ``run.json`` contains a run of another system, which has no
-    settings.
+    vslam's method. If the folder has no ``run.json``, it contains a run of another SLAM system.
+    Such a run has no settings.
     """
     if not (folder / "run.json").exists():
         return {}
@@ -219,9 +222,9 @@ def _settings(report: ReportJson, folder: Path) -> dict[str, Any]:
 
 
 def _name_by_settings(found: Found) -> None:
-    """Treat each combination of settings as a separate system. Its name lists these settings.
+    """Treat runs with different settings as different systems, whose names list the settings.
 
-    Settings that all runs share are not listed.
+    Settings that are the same in all runs are not listed.
     """
     first = found.runs[0].settings
     shared = {
@@ -304,9 +307,9 @@ def _add_external(text: str, found: Found) -> None:
 def _alignment_of_external(system: str, drive: Drive, found: Found) -> str:
     """Return the alignment (se3 or sim3) with which another system's trajectory is evaluated.
 
-    It is the alignment of vslam's runs on the same sequence. If only some of these runs are
-    monocular, the name of the other system decides. The alignment is sim3 if the name ends in ``,
-    mono``, and se3 otherwise.
+    It is the alignment that is used for vslam's runs on the same sequence. If only some of these
+    runs are monocular, the name of the other system decides: the alignment is sim3 if the name ends
+    in ``, mono``, and se3 otherwise.
     """
     there = {run.alignment for run in found.runs if run.drive.place == drive.place}
     if len(there) == 1:

@@ -62,7 +62,7 @@ def draw_overview(report: OverviewJson, found: Found) -> list[page.Figure]:
 
 
 def _errors(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
-    """Draw the ATE of each sequence. There is one figure for each perturbation."""
+    """Draw the ATE of all systems on each sequence. There is one figure for each perturbation."""
     for perturb in dict.fromkeys(row.drive.perturb for row in rows):
         known = [r for r in rows if r.drive.perturb == perturb and r.measures["ate_rmse_m"]]
         places = list(dict.fromkeys((row.drive.dataset, row.drive.place) for row in known))

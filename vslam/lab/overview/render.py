@@ -56,8 +56,8 @@ def write_overview(
         trajectories: trajectories of other systems, each as a text
             ``NAME[@SEQUENCE[@PERTURB]]=FILE``.
         out: output folder, which is created if it does not exist.
-        baseline: the system with which the other systems are compared; None for the simplest
-            system.
+        baseline: name of the system with which the other systems are compared; None for the
+            simplest system.
 
     Raises:
         InputError: there is no finished run, there is no run of the baseline, a trajectory cannot
@@ -102,7 +102,7 @@ def title(report: OverviewJson) -> str:
 
 
 def render_csv(report: OverviewJson) -> str:
-    """Write the rows of the report as CSV.
+    """Format the summary of many runs as CSV, with one row for each drive and system.
 
     Each row has the median, the smallest and the largest value of each measure.
     """

@@ -29,11 +29,10 @@ ALL = "all"  # value of ``Comparison.perturb`` for a comparison over all perturb
 
 
 class Drive(Record):
-    """The images of a drive, on which systems are compared.
+    """A sequence with a perturbation, on which systems are compared.
 
-    They are the images of a sequence or of an excerpt of a sequence, with a perturbation.
-    ``excerpt`` is empty for a whole sequence. Runs that differ only in their seed have the same
-    drive.
+    ``excerpt`` states which part of the sequence is used. It is empty for the whole sequence. Runs
+    that differ only in their seed have the same drive.
     """
 
     dataset: str
@@ -50,18 +49,19 @@ class Drive(Record):
 class RunEntry(Record):
     """One run of a system on a drive, with its results.
 
-    - ``system``: the name of vslam's loop detector or of another SLAM system. After the name of a
-      loop detector, brackets contain the settings that not all runs share.
-    - ``settings``: thresholds and options that differ from the defaults, and the version of the
+    - ``system``: the name of vslam's loop detector or of another SLAM system. If runs of vslam have
+      different settings, the differing settings follow the name in brackets.
+    - ``settings``: thresholds and options that differ from the defaults, and the version of vslam's
       method.
     - ``seed``: seed of the perturbation; None for other systems.
     - ``town``: seed of a rendered town. The same route in a different town counts as the same drive
       with a different seed.
     - ``alignment``: the transformation that is fitted before errors are computed. It is ``se3``, or
       ``sim3`` for a monocular run, whose scale is arbitrary.
-    - ``measures``: values by the names in ``MEASURES``. A value is None if it is unknown.
-    - ``source``: the folder of the run. For another system, or for a detector that ``--compare``
-      added to a run, it is the trajectory file.
+    - ``measures``: results of the run. The keys are the names in ``MEASURES``. A value is None if
+      it is unknown.
+    - ``source``: the folder of the run. For another SLAM system, it is the trajectory file. For a
+      detector that was added to a run with ``--compare``, it is the trajectory file, too.
     """
 
     drive: Drive
@@ -77,7 +77,7 @@ class RunEntry(Record):
 
 
 class Spread(Record):
-    """Median, smallest and largest value of a measure over the ``n`` runs that have a value."""
+    """Median, smallest and largest value of a measure, over the ``n`` runs with a known value."""
 
     n: int
     median: float
@@ -88,7 +88,7 @@ class Spread(Record):
 class Row(Record):
     """A summary of all runs of one system on one drive.
 
-    A measure is None if no run has a value for it.
+    A measure is None if its value is unknown for all runs.
     """
 
     drive: Drive
@@ -112,8 +112,8 @@ class Comparison(Record):
     """A comparison of the errors of two systems under one perturbation, paired by sequence.
 
     - ``perturb``: the perturbation, or ``all`` for a comparison over all perturbations. With
-      ``all``, each sequence counts once. Its error is the mean over the perturbations under which
-      both systems have run.
+      ``all``, each sequence counts once. The error on a sequence is then the mean over the
+      perturbations for which there are runs of both systems.
     - ``p_value``: p-value of the two-sided Wilcoxon signed-rank test. Differences that are ties are
       left out of the test. None if there are too few differences.
     - ``winner``: the system with significantly smaller errors; None if there is no such system.

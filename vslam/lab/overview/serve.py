@@ -1,4 +1,4 @@
-"""The web server of ``vslam report --serve``, which lists all runs in some folders.
+"""The web server of ``vslam report --serve``, which lists all runs in given folders.
 
 The server can only be reached from this machine. A request names a report by its number. The server
 never opens a path that comes from a request. Requests for a different host name are rejected.
@@ -6,7 +6,7 @@ Otherwise, a web site could read reports through the user's browser (DNS rebindi
 
 A report may come from an untrusted person and contain any script. Therefore, every report is
 sandboxed: the scripts of a report run in their own origin and cannot access other reports or the
-network. The server does not read a ``report.html`` or ``report.json`` that is a symbolic link.
+network. If a ``report.html`` or ``report.json`` is a symbolic link, the server does not read it.
 """
 
 from __future__ import annotations
@@ -59,16 +59,15 @@ def list_runs(folders: Collection[Path]) -> list[tuple[Path, ReportJson]]:
 
 
 def _is_own(path: Path) -> bool:
-    """Return whether a path in a resolved folder is a file and not a symbolic link."""
+    """Return whether a path is a regular file. A symbolic link does not count as a file."""
     return path.is_file() and path.resolve() == path
 
 
 def make_server(folders: Sequence[Path], port: int = 0) -> http.server.ThreadingHTTPServer:
-    """Make a server on the loopback interface that shows all runs in some folders.
+    """Make a server on the loopback interface that shows all runs in the given folders.
 
-    The method ``serve_forever`` of the server starts it.
-
-    The folders are read again whenever the list of runs is requested.
+    Call the method ``serve_forever`` to start the server. The folders are read again whenever a
+    browser requests the list of runs.
 
     Args:
         folders: folders that contain runs at any depth.
@@ -111,8 +110,8 @@ def make_server(folders: Sequence[Path], port: int = 0) -> http.server.Threading
 class _Pages:
     """The pages that the server shows.
 
-    A report is requested by its number, which is its index in ``_known``. The number of a report
-    never changes while the server runs.
+    A browser requests a report by its number, which is the index of the report in ``_known``. The
+    number of a report never changes while the server runs.
     """
 
     def __init__(self, folders: Sequence[Path]) -> None:
@@ -122,7 +121,7 @@ class _Pages:
         self._list()
 
     def answer(self, request: str) -> tuple[int, str]:
-        """Return the HTTP status and the page for a request. The path includes the query."""
+        """Return the HTTP status and the page for the path (with query string) of a request."""
         try:
             url = urlsplit(request)
             if url.path == "/":

@@ -1,9 +1,9 @@
 """Summarizes many runs, and compares systems.
 
-On each drive, a system is represented by the median of its runs. Two systems are compared under
-each perturbation, and over all perturbations. A comparison pairs the systems by *sequence*. It does
-not count each run, because runs on the same sequence are not independent. Counting them would
-overstate the evidence.
+For each drive, the median over the runs of a system is used. Two systems are compared under each
+perturbation, and over all perturbations. A comparison pairs the errors of the two systems by
+*sequence*. It does not pair single runs, because runs on the same sequence are not independent.
+Treating them as independent samples would overstate the evidence.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _KNOWN = ("none", "bow", *NETWORKS, "both")
 
 
 class Shown(NamedTuple):
-    """How an error is printed. The error times ``scale`` is the printed value in ``unit``."""
+    """The format of a printed error. The error times ``scale`` is the printed value in ``unit``."""
 
     title: str
     unit: str
@@ -44,7 +44,7 @@ class Shown(NamedTuple):
     decimals: int
 
     def text(self, value: float, sign: str = "") -> str:
-        """Format a value without its unit. For differences, ``sign`` is ``+``."""
+        """Format an error without its unit. Pass ``+`` as ``sign`` to format a difference."""
         return f"{self.scale * value:{sign}.{self.decimals}f}"
 
 
@@ -91,7 +91,7 @@ def summarize(found: Found, baseline: str | None = None) -> OverviewJson:
 
 
 def _unlike_towns(runs: Iterable[RunEntry]) -> Iterator[str]:
-    """Yield a note for each drive on which the systems ran in different rendered towns."""
+    """Yield a note for each drive for which the systems were run in different rendered towns."""
     towns: dict[Drive, dict[str, set[int]]] = {}
     for run in runs:
         if run.town is not None:
@@ -107,9 +107,9 @@ def _unlike_towns(runs: Iterable[RunEntry]) -> Iterator[str]:
 def systems(runs: Iterable[RunEntry | Row], baseline: str | None = None) -> list[str]:
     """Return the names of the systems in the order in which the report lists them.
 
-    If a baseline is named, it is the first system. Then come the loop detectors of vslam, from the
-    simplest to the most elaborate one. Last come the other SLAM systems, in the order of ``runs``.
-    A detector with default settings comes before the same detector with other settings.
+    If a baseline is given, it is the first system. It is followed by the loop detectors of vslam,
+    from the simplest to the most elaborate one. The other SLAM systems are at the end, in the order
+    of ``runs``. A detector with default settings precedes the same detector with other settings.
     """
     names = dict.fromkeys(run.system for run in runs)
 
@@ -122,7 +122,7 @@ def systems(runs: Iterable[RunEntry | Row], baseline: str | None = None) -> list
 
 
 def _is_called(system: str, name: str | None) -> bool:
-    """Return whether a name that the user gave denotes a system.
+    """Return whether a name that was given by the user is the name of a system.
 
     The name may omit the settings of the system and the suffix ``, mono``.
     """
@@ -162,15 +162,16 @@ def compare(
     """Compare the errors of two systems, paired by sequence.
 
     Args:
-        rows: medians of both systems. Rows of other systems are ignored.
+        rows: for each drive and system, the medians over the runs. Rows of other systems than
+            ``first`` and ``second`` are ignored.
         first, second: names of the systems. Errors that were computed after different alignments
             are not compared.
-        perturb: a perturbation, or `ALL`. With `ALL`, the mean error of each sequence is compared.
-            The mean is over the perturbations under which both systems have run.
+        perturb: a perturbation, or `ALL`. With `ALL`, the mean error on each sequence is compared.
+            The mean is over the perturbations for which there are runs of both systems.
         measure: ``ate_rmse_m`` or ``rpe_m``. Smaller values are better.
 
     Returns:
-        The comparison; None if there is no drive on which both systems have run.
+        The comparison; None if there is no drive for which there are runs of both systems.
     """
     medians: dict[str, dict[tuple[Drive, str], float]] = {first: {}, second: {}}
     for row in rows:
@@ -213,17 +214,18 @@ def compare(
 
 
 def is_tie(difference: float, measure: str) -> bool:
-    """Return whether two errors differ by at most half a unit of the last digit that is printed."""
+    """Return whether two errors differ by at most half a unit of the last printed digit."""
     shown = COMPARED[measure]
     return shown.scale * abs(difference) <= 0.5 * 10.0**-shown.decimals
 
 
 def strengths(drives: Iterable[Drive], law: str) -> dict[Drive, float]:
-    """Return the strength of a perturbation in each drive.
+    """Return with which strength each drive was perturbed.
 
     Drives with other perturbations are left out. The strength is 0 for unperturbed drives.
 
     Args:
+        drives: sequences with perturbations.
         law: name of the perturbation, without strength.
     """
     found = {}
@@ -236,14 +238,18 @@ def strengths(drives: Iterable[Drive], law: str) -> dict[Drive, float]:
 
 
 def least_pairs() -> int:
-    """Return how many pairs Wilcoxon's two-sided test needs at least to reach ``ALPHA``."""
+    """Return the smallest number of pairs with which Wilcoxon's test can be significant.
+
+    The test is two-sided, and its significance level is ``ALPHA``.
+    """
     return math.ceil(1.0 - math.log2(ALPHA))
 
 
 def _wilcoxon(differences: list[float]) -> tuple[float | None, bool]:
-    """Run Wilcoxon's test. Return the p-value, and whether the differences tend to be negative.
+    """Perform Wilcoxon's signed-rank test on paired differences.
 
-    The test is two-sided. The p-value is None if there are too few differences.
+    The test is two-sided. Returns the p-value, and whether the differences tend to be negative. The
+    p-value is None if there are too few differences.
     """
     if len(differences) < least_pairs():
         return None, False

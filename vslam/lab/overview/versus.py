@@ -32,9 +32,9 @@ Rows = dict[str, dict[Key, Row]]
 def versus(report: OverviewJson) -> list[Section]:
     """Make the sections of the report that compare systems and name the winner.
 
-    Two systems are in the same section if they ran on the same drive and if their trajectories are
-    aligned in the same way (se3 or sim3). If no drive revisits a place, the first section explains
-    why loop detectors cannot differ.
+    Two systems are in the same section if there are runs of both on the same drive, and if their
+    trajectories are aligned in the same way (se3 or sim3). If no drive revisits a place, the first
+    section explains why the results of loop detectors cannot differ.
     """
     rows: Rows = {name: {} for name in report.systems}
     for row in report.rows:
@@ -53,14 +53,14 @@ def versus(report: OverviewJson) -> list[Section]:
 
 
 def median_text(spread: Spread | None, decimals: int) -> str:
-    """Format a median. A median of counts gets one decimal if it is not an integer."""
+    """Format a median. If a median of counts is not an integer, it gets one decimal."""
     if spread is None:
         return "n/a"
     return f"{spread.median:.{1 if decimals == 0 and spread.median % 1 else decimals}f}"
 
 
 def _without_revisits(report: OverviewJson) -> str:
-    """Explain why loop detectors hardly differ on drives that revisit no place.
+    """Return a text that explains why loop detectors hardly differ if no place is revisited.
 
     The text is empty if a drive revisits a place, or if there is no ground truth.
     """
@@ -128,11 +128,11 @@ def _cell(row: Row | None, measure: str) -> str:
 
 
 def _points(report: OverviewJson, rows: Rows, names: list[str]) -> Iterator[str]:
-    """Yield sentences that summarise the comparison.
+    """Yield sentences that summarise the comparison of systems.
 
-    The first sentences give the total numbers of lost frames and of loops. These totals are over
-    the drives on which all systems ran. The other sentences compare each system with its baseline.
-    The baseline of a system is the first system that ran on at least one of the same drives.
+    The first sentences give the total numbers of lost frames and of loops. Only drives for which
+    there are runs of all systems are counted. The other sentences compare each system with a
+    baseline, which is the first system in the list that has a drive in common with it.
     """
     shared = set.intersection(*(set(rows[name]) for name in names))
     runs = {

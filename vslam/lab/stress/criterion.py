@@ -16,9 +16,9 @@ ABSOLUTE = (
 
 
 def absolute_verdict(report: ReportJson) -> str:
-    """Return why a run exceeded the absolute limits; empty if it did not exceed them.
+    """Return why a run exceeded the absolute limits; an empty text if it did not exceed them.
 
-    The absolute limits (``ABSOLUTE``) do not depend on a run on unperturbed images.
+    The absolute limits (``ABSOLUTE``) do not depend on the result of a run on unperturbed images.
     """
     if report.longest_loss_s is not None and report.longest_loss_s > _LOSS_S:
         return f"lost for {report.longest_loss_s:.0f} s"
@@ -27,19 +27,20 @@ def absolute_verdict(report: ReportJson) -> str:
 
 
 def lost_percent(report: ReportJson) -> float:
-    """Return the lost frames in percent of the frames that were not dropped."""
+    """Return the percentage of lost frames among the frames that were not dropped."""
     return 100.0 * report.lost_frames / max(1, report.frames - report.dropped_frames)
 
 
 @dataclass(frozen=True)
 class Criterion:
-    """The limits beyond which a run has failed.
+    """The limits beyond which a run counts as failed.
 
-    The limits are relative to the *clean run*, a run of the same system on the unperturbed images.
+    Some limits are relative to the *clean run*, which is a run of the same system on the
+    unperturbed images.
 
     Attributes:
         lost_percent: largest allowed percentage of lost frames. Dropped frames are not counted.
-        ate_factor: largest allowed ratio of the ATE to the ATE of the clean run.
+        ate_factor: largest allowed ratio of the run's ATE to the clean run's ATE.
         ate_least_m: ATE in metres that is always allowed, even if the clean run has a very small
             ATE.
     """
@@ -59,7 +60,7 @@ class Criterion:
         )
 
     def verdict(self, report: ReportJson, clean: ReportJson) -> str:
-        """Return why a run failed according to these limits; empty if it did not fail."""
+        """Return why a run failed according to these limits; an empty text if it did not fail."""
         if (lost := lost_percent(report)) > self.lost_percent:
             return f"{lost:.0f} % lost"
         limit = self.ate_limit(clean)
@@ -73,7 +74,7 @@ class Criterion:
         return ""
 
     def ate_limit(self, clean: ReportJson) -> float | None:
-        """Return the largest allowed ATE in metres. None if the run on clean images has no ATE."""
+        """Return the largest allowed ATE in metres; None if the clean run has no ATE."""
         if clean.ate_rmse_m is None:
             return None
         return max(self.ate_least_m, self.ate_factor * clean.ate_rmse_m)

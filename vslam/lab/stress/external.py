@@ -1,4 +1,6 @@
-"""Runs other SLAM systems, which read a folder in KITTI's format and write a trajectory.
+"""Runs other SLAM systems on perturbed images.
+
+Such a system reads a folder in KITTI's format and writes a trajectory.
 
 The command of a system is a template with the placeholders ``{folder}`` and ``{out}``. The folder
 at ``{folder}`` contains ``image_0``, ``image_1``, ``calib.txt`` and ``times.txt`` of the perturbed
@@ -45,7 +47,7 @@ class Poses:
     known: NDArray[np.bool_]
 
     def bridged(self, times: NDArray[np.float64]) -> Trajectory:
-        """Return the trajectory of N frames with given times. Unknown poses are interpolated."""
+        """Return the trajectory of the N frames, in which unknown poses are interpolated."""
         return bridge_gaps(Trajectory(times, self.T_wc), self.known)
 
 
@@ -82,9 +84,10 @@ def run_external(
     template: str,
     folder: Path,
 ) -> ReportJson:
-    """Run another SLAM system on a perturbed sequence. Write ``report.json`` and trajectories.
+    """Run another SLAM system on a perturbed sequence, and evaluate its trajectory.
 
-    Loops are not evaluated, because other systems do not report them.
+    ``report.json`` and the trajectories are written into ``folder``. Loops are not evaluated,
+    because other systems do not report them.
 
     Args:
         template: command of the system, with ``{folder}`` and ``{out}``.
@@ -216,12 +219,12 @@ def _outcome(
 def read_poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) -> Poses:
     """Read the poses that another SLAM system wrote.
 
-    An unknown pose is replaced by the last known pose before it. If there is no known pose before
+    An unknown pose is replaced with the last known pose before it. If there is no known pose before
     it, the first known pose is used.
 
     Args:
         path: file in KITTI's or TUM's format.
-        times: ``(N,)`` seconds of the frames.
+        times: ``(N,)`` times of the frames in seconds.
         kept: indices of the frames that the system received, which are those that were not dropped.
 
     Raises:
@@ -244,7 +247,7 @@ def read_poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) 
 
 
 def _last_known(poses: Poses) -> NDArray[np.float64]:
-    """Replace each unknown pose by the last known pose before it, or by the first known pose."""
+    """Replace each unknown pose with the last known pose before it, or else the first known one."""
     if not poses.known.any():
         return poses.T_wc
     at = np.where(poses.known, np.arange(len(poses.known)), -1)

@@ -1,4 +1,4 @@
-"""Draws the curves of a stress test: lost frames, ATE and loops against the strength of a law."""
+"""Draws curves of a stress test: lost frames, ATE and loops against perturbation strength."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _PANELS = (
 def draw_curves(report: StressJson) -> list[page.Figure]:
     """Draw the curves of a stress test, with one figure for each sequence and perturbation.
 
-    The strongest perturbation is on the right.
+    The strength of the perturbation increases to the right.
     """
     systems = list(dict.fromkeys(entry.system for entry in report.boundaries))
     colors = {name: _COLORS[k % len(_COLORS)] for k, name in enumerate(systems)}

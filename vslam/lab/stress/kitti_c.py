@@ -15,7 +15,7 @@ from vslam.datasets.perturbation import parse_perturbation
 
 @dataclass(frozen=True)
 class Corruption:
-    """One corruption of KITTI-C.
+    """One of the image corruptions that KITTI-C (Kong et al., NeurIPS 2023) defines.
 
     Attributes:
         specs: values of ``--perturb``, weakest first. Empty if vslam has no such perturbation.

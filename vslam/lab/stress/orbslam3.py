@@ -108,7 +108,10 @@ def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
 
 
 def _keep_first_of_each_time(path: Path) -> None:
-    """Keep only the first pose of each time. After a loss, ORB-SLAM3 writes some frames twice."""
+    """Keep only the first pose of each time in a trajectory file.
+
+    After tracking was lost, ORB-SLAM3 writes the poses of some frames twice.
+    """
     by_time: dict[float, str] = {}
     for line in path.read_text().splitlines():
         by_time.setdefault(float(line.split()[0]), line)

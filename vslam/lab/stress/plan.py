@@ -22,17 +22,17 @@ It returns None if the cell has not run yet.
 
 @dataclass
 class Search:
-    """The search for the strength of one perturbation at which a system fails on a sequence.
+    """A search for the perturbation strength at which a system fails on a sequence.
 
     A *cell* is one run. A *position* is a strength on a scale from 0 (weakest) to 1 (greatest).
 
     Attributes:
-        clean: the run on unperturbed images.
+        clean: the run of the same system on the unperturbed images of the sequence.
         law: name of the perturbation, without its strength.
         seed: seed of the perturbation.
         steps: number of bisections.
-        verdicts: for each finished test, by position, why it failed; empty if it did not fail.
-        tested: the runs of the finished tests, by position.
+        verdicts: for each tested position, why the run failed; an empty text if it did not fail.
+        tested: for each tested position, the run.
     """
 
     clean: Cell
@@ -43,21 +43,21 @@ class Search:
     tested: dict[float, Cell] = field(default_factory=dict)
 
     def cell(self, position: float) -> Cell:
-        """Return the run that tests a position from 0 (weakest) to 1 (greatest strength)."""
+        """Return the run that tests a position (0 is the weakest, 1 the greatest strength)."""
         strength = strength_at(law_kind(self.law), position)
         name = parse_perturbation(f"{self.law}:{strength:g}", self.seed).name
         return replace(self.clean, perturb=name, seed=self.seed)
 
     def position(self) -> float | None:
-        """Return the next position (0 to 1) to test; None if the search has ended."""
+        """Return the position (0 to 1) that is tested next; None if the search has ended."""
         return next_position({p: bool(v) for p, v in self.verdicts.items()}, self.steps)
 
     def wants(self) -> Cell | None:
-        """Return the next run of this search; None if the search has ended."""
+        """Return the run that comes next in this search; None if the search has ended."""
         return None if (position := self.position()) is None else self.cell(position)
 
     def advance(self, reports: Reports, criterion: Criterion) -> None:
-        """Judge the tests that have ended, and determine which strength is tested next."""
+        """Judge the runs that have ended, and determine which strength is tested next."""
         clean = reports(self.clean)
         if not isinstance(clean, ReportJson):
             return
@@ -71,23 +71,25 @@ class Search:
 
     @property
     def boundary(self) -> Boundary:
-        """The result of the search, which must have ended."""
+        """The strength at which the system fails. The search must have ended."""
         return boundary(self.verdicts, law_kind(self.law), self.steps)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A stress test: the searches to make and the options that they share.
+    """A stress test: which searches are made, and the options of these searches.
 
     Attributes:
-        clean: the runs of each system on the unperturbed images of each sequence.
-        laws: names of the perturbations to test. For each of them, the strength at which runs fail
-            is searched.
+        clean: the run of each system on the unperturbed images of each sequence.
+        laws: names of the perturbations to test, without strengths. For each perturbation, a search
+            finds the strength at which runs fail.
         seeds: number of seeds for each perturbation.
         steps: number of bisections in each search.
-        baseline: the system with which the errors of a preset are compared.
+        baseline: name of the system with which the errors of other systems are compared, if there
+            is a preset.
         criterion: criterion that decides whether a run has failed.
-        repeated: systems that are not deterministic and therefore run with every seed.
+        repeated: names of the systems that are not deterministic. They are tested with every seed,
+            even if a perturbation is not random.
         preset: ``kitti-c`` or None. With ``kitti-c``, the fixed severities of KITTI-C are tested
             instead of ``laws``.
     """
@@ -104,8 +106,9 @@ class Plan:
     def searches(self) -> list[Search]:
         """Return all searches of the stress test.
 
-        If a perturbation is not random, there is only one search, with the first seed. A system
-        that is not deterministic is searched with all seeds.
+        There is one search for each perturbation, system, sequence and seed. If neither the
+        perturbation nor the system is random, only the first seed is used, because all seeds would
+        give the same result.
         """
         return [
             Search(clean, law, seed, self.steps)
@@ -116,7 +119,7 @@ class Plan:
         ]
 
     def preset_cells(self) -> list[Cell]:
-        """Return the runs of the preset; empty if there is no preset."""
+        """Return the runs that the preset demands; an empty list if there is no preset."""
         if self.preset is None:
             return []
         specs = [spec for corruption in CORRUPTIONS.values() for spec in corruption.perturbations]

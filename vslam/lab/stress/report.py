@@ -40,7 +40,7 @@ def write_report(out: Path, report: StressJson, sequences: Mapping[str, Source])
         out: an existing folder.
         report: the results of the stress test.
         sequences: sequences by name. Example images are taken from the first sequence of the
-            report. If this sequence is missing, there are no example images.
+            report. If ``sequences`` does not contain it, there are no example images.
 
     Raises:
         ResultsError: a file cannot be written.
@@ -83,7 +83,7 @@ def title(report: StressJson) -> str:
 def stress_page(
     report: StressJson, figures: Collection[Figure] = (), sheet: Collection[Figure] = ()
 ) -> Page:
-    """Make the page of a stress test, with curves and with images at which systems failed."""
+    """Make the page of a stress test, with curves and with example images."""
     return Page(
         title(report),
         [report.criterion],
@@ -100,16 +100,19 @@ def stress_page(
 
 
 def boundary_sections(report: StressJson) -> list[Section]:
-    """Return the sections of the report that the command line also prints.
+    """Return the sections of the report that are also printed on the command line.
 
-    They contain the strengths at which each system fails, and the errors for each corruption of a
-    preset.
+    These sections contain the strengths at which each system fails. If there is a preset, they also
+    contain the errors for each corruption of the preset.
     """
     return [*_boundaries(report), *_preset(report)]
 
 
 def groups(report: StressJson) -> dict[tuple[str, str, str], list[BoundaryEntry]]:
-    """Group searches by sequence, perturbation and system. A group has one search per seed."""
+    """Group the searches of a stress test by sequence, perturbation and system.
+
+    A group contains one search for each seed.
+    """
     found: dict[tuple[str, str, str], list[BoundaryEntry]] = {}
     for entry in report.boundaries:
         found.setdefault((entry.sequence, entry.law, entry.system), []).append(entry)
@@ -117,9 +120,9 @@ def groups(report: StressJson) -> dict[tuple[str, str, str], list[BoundaryEntry]
 
 
 def cell(entries: Collection[BoundaryEntry]) -> str:
-    """Format the strengths at which runs fail, such as ``60 (50-75), 12 % lost``.
+    """Format the strengths at which runs fail as a text, such as ``60 (50-75), 12 % lost``.
 
-    The range in parentheses is over the seeds.
+    The range in parentheses contains the strengths of all seeds.
     """
     if not entries:
         return ""
@@ -233,8 +236,8 @@ def _runs(report: StressJson) -> Table:
 def _sheet(report: StressJson, sequences: Mapping[str, Source]) -> list[Figure]:
     """Draw the middle frame of the first sequence under each perturbation.
 
-    Each perturbation has the strength at which the first system failed. If this system did not
-    fail, the perturbation has its greatest strength.
+    The strength is the one at which the first system failed. If this system did not fail, the
+    greatest strength is used.
     """
     specs: dict[str, str] = {}
     first = next(iter(sequences), None)

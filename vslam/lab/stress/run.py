@@ -19,14 +19,14 @@ RunCells = Callable[[Collection[Cell]], Generator[CellOutcome, None, None]]
 
 
 class Results:
-    """The results of runs: reports in the folder, and failures since the command began."""
+    """The results of runs: the reports in the folder, and the failures of this command."""
 
     def __init__(self, out: Path, config: str) -> None:
         self._out, self._config = out, config
         self._known: dict[Cell, ReportJson | str] = {}
 
     def __call__(self, cell: Cell) -> ReportJson | str | None:
-        """Return the report of a cell, or why its run failed; None if it has not run."""
+        """Return the report of a run, or why the run failed; None if the run has not ended."""
         if cell not in self._known:
             folder = self._out / cell.name
             if not is_finished(cell, folder, self._config):
@@ -55,10 +55,10 @@ def run_all(
 ) -> None:
     """Run all cells (runs) of a stress test.
 
-    The runs on unperturbed images are first. Then come the runs of all searches, in rounds, and
-    finally the runs in ``others``.
+    The runs on unperturbed images come first. They are followed by the runs of all searches, in
+    rounds. The runs in ``others`` come last.
 
-    A cell that an earlier command has finished is not run again.
+    If an earlier command has already finished a run, this run is not repeated.
     """
     _run(clean, results, run, say)
     while True:
@@ -74,7 +74,7 @@ def run_all(
 def _wanted(search: Search, results: Results) -> Cell | None:
     """Return the next cell (run) of a search.
 
-    Returns None if the search has ended, or if the run on unperturbed images has failed.
+    Returns None if the search has ended, or if the run on unperturbed images gave no results.
     """
     return search.wants() if isinstance(results(search.clean), ReportJson) else None
 

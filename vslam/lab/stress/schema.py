@@ -13,8 +13,8 @@ class Tested(Record):
     """One run of a stress test, at one strength of a perturbation.
 
     - ``verdict``: why the run failed; empty if it did not fail.
-    - ``absolute``: why the run exceeded the limits that do not depend on the run on unperturbed
-      images; empty if it did not exceed them.
+    - ``absolute``: why the run exceeded the absolute limits; empty if it did not exceed them. The
+      absolute limits do not depend on the result of the run on unperturbed images.
     """
 
     strength: float
@@ -27,7 +27,7 @@ class Tested(Record):
 
 
 class BoundaryEntry(Record):
-    """The strength at which a system fails, as found by one search.
+    """The result of one search: the strength of a perturbation at which a system fails.
 
     `vslam.lab.stress.search.Boundary` describes the attributes.
     """
@@ -46,7 +46,10 @@ class BoundaryEntry(Record):
 
 
 class CleanEntry(Record):
-    """The run of a system on unperturbed images. The limits for failure are derived from it."""
+    """The run of a system on unperturbed images.
+
+    The limits beyond which other runs of this system count as failed are computed from this run.
+    """
 
     dataset: str
     sequence: str
@@ -67,7 +70,7 @@ class CorruptionEntry(Record):
     - ``ate_sum_m``: sum of the ATE over the severities. For each severity, the median over the
       seeds is used.
     - ``error_percent``: ``ate_sum_m`` in percent of the ``ate_sum_m`` of the baseline.
-    - ``lost_percent``: the mean share of lost frames.
+    - ``lost_percent``: the mean percentage of lost frames.
     """
 
     sequence: str

@@ -16,9 +16,9 @@ class Boundary:
     """The strength of a perturbation at which a system fails.
 
     Attributes:
-        holds_to: greatest strength at which a run did not fail, according to the bisection. None if
-            runs failed at every tested strength.
-        fails_at: smallest strength at which a run failed, according to the bisection. None if no
+        holds_to: greatest strength at which the run did not fail, according to the bisection. None
+            if the runs at all tested strengths failed.
+        fails_at: smallest strength at which the run failed, according to the bisection. None if no
             run failed.
         reason: reason for the failure at ``fails_at``.
         also_failed: strengths below ``holds_to`` at which a run also failed.
@@ -47,8 +47,8 @@ def bracket(failed: Mapping[float, bool], steps: int) -> tuple[float, float, flo
     """Return the interval in which a system begins to fail, and the next position to test.
 
     Args:
-        failed: whether the run failed, by tested position. A position is a strength on a scale from
-            0 (weakest) to 1 (greatest).
+        failed: for each tested position, whether the run failed. A position is a strength on a
+            scale from 0 (weakest) to 1 (greatest).
         steps: number of bisections.
 
     Returns:
@@ -72,9 +72,9 @@ def next_position(failed: Mapping[float, bool], steps: int) -> float | None:
     A position is a strength on a scale from 0 (weakest) to 1 (greatest).
 
     The greatest strength is tested first. If the run fails, the interval is bisected ``steps``
-    times. Bisection assumes that a system that does not fail at a strength does not fail at weaker
-    strengths. The last test checks this assumption at half of the greatest position at which the
-    system did not fail. `bracket` describes the arguments.
+    times. Bisection assumes that a system that passes a test also passes tests with a smaller
+    strength. The last test of a search checks this assumption: it takes place at half of the
+    greatest position at which the system did not fail. `bracket` describes the arguments.
     """
     if 1.0 not in failed:
         return 1.0
@@ -86,7 +86,14 @@ def next_position(failed: Mapping[float, bool], steps: int) -> float | None:
 
 
 def boundary(verdicts: Mapping[float, Verdict], kind: LawKind, steps: int) -> Boundary:
-    """Return the strength at which a system fails, given the verdicts of all tests by position."""
+    """Return the strength at which a system fails.
+
+    Args:
+        verdicts: for each tested position, why the run failed; an empty text if it did not fail. A
+            position is a strength on a scale from 0 (weakest) to 1 (greatest).
+        kind: the perturbation.
+        steps: number of bisections.
+    """
     holds, fails, _ = bracket({p: bool(v) for p, v in verdicts.items()}, steps)
     weaker = tuple(
         strength_at(kind, position)

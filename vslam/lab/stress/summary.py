@@ -1,4 +1,4 @@
-"""Computes the figures in the report of a stress test from the finished searches."""
+"""Computes the content of the report of a stress test from the finished searches."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def summarise(
 ) -> StressJson:
     """Make the report of a stress test from the searches that have ended.
 
-    The report has a note for each run on unperturbed images that failed.
+    If a run on unperturbed images failed, the report has a note on it.
     """
     failed = [(cell, found) for cell in plan.clean if isinstance(found := reports(cell), str)]
     notes = [*notes, *(f"{cell.name} is left out because it fails on clean images: {why}"
@@ -44,7 +44,7 @@ def summarise(
 def clean_entries(
     cells: Collection[Cell], reports: Reports, criterion: Criterion
 ) -> list[CleanEntry]:
-    """Return the entries of the finished runs on unperturbed images."""
+    """Return the report's entries for the finished runs on unperturbed images."""
     return [
         CleanEntry(
             dataset=cell.dataset,
@@ -157,9 +157,9 @@ def _corruption(
 
 
 def mean_error(entries: Collection[CorruptionEntry], system: str) -> float | None:
-    """Compute the mean corruption error (mCE) in percent.
+    """Compute the mean corruption error (mCE) of a system in percent.
 
-    The mean is over the corruptions for which every system has an error.
+    The mean is over the corruptions for which the errors of all systems are known.
     """
     complete = (e.error_percent for e in entries if None not in e.error_percent.values())
     values = [value for errors in complete if (value := errors.get(system)) is not None]

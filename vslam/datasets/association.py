@@ -37,7 +37,7 @@ def associate(
     Args:
         first: ``(N,)`` seconds, increasing.
         second: ``(M,)`` seconds, increasing.
-        max_difference: upper limit of the difference between the times of a pair, in seconds.
+        max_difference: upper limit in seconds of the difference between the two times of a pair.
 
     Returns:
         Two arrays that describe the P pairs: ``(P,)`` increasing indices into ``first``, and
@@ -62,17 +62,17 @@ class Pairing:
     """Counts how many images a reader pairs by time, and how many images it leaves out.
 
     The reader of a stream counts the images while it reads them. Readers do not log the warnings of
-    this class. Instead, the summary and the report of a run, ``vslam doctor`` and ``vslam
-    calibrate`` show them.
+    this class. Instead, the warnings are shown in the summary and in the report of a run, and by
+    ``vslam doctor`` and ``vslam calibrate``.
 
     Attributes:
         source: name of the file or folder, for messages.
-        partner: name of the images with which the images are paired, such as ``depth image``.
-        within_s: largest difference between the times of a pair, in seconds.
+        partner: what the second image of a pair is called in messages, such as ``depth image``.
+        within_s: largest difference in seconds between the two times of a pair.
         fix: what the user can do if images are left out.
         n_pairs: number of pairs.
-        left_out: times of the images without a partner, in seconds.
-        seconds: times of all images that can be partners, in seconds.
+        left_out: times in seconds of the images without a partner.
+        seconds: times in seconds of all images that can be partners.
     """
 
     source: Path
@@ -104,7 +104,7 @@ class Pairing:
 
     @property
     def is_poor(self) -> bool:
-        """Whether so many images are left out (more than a tenth) that tracking suffers."""
+        """Whether more than a tenth of the images are left out, so that tracking suffers."""
         return len(self.left_out) > _MANY * (len(self.left_out) + self.n_pairs)
 
     def warnings(self) -> list[str]:
@@ -122,9 +122,9 @@ class Pairing:
         """Count all images of a stored sequence.
 
         Args:
-            times: ``(N,)`` times of the images, in seconds.
+            times: ``(N,)`` times of the images in seconds.
             paired: ``(P,)`` indices of the images that have a partner.
-            seconds: ``(M,)`` times of the images that can be partners, in seconds.
+            seconds: ``(M,)`` times in seconds of the images that can be partners.
         """
         self.n_pairs = len(paired)
         self.left_out = np.delete(times, paired).tolist()

@@ -185,8 +185,8 @@ def find_calibration(source: BagSource) -> Calibration | None:
     """Read the calibration from the ``camera_info`` topics that belong to the image topics.
 
     Returns:
-        The calibration. None if a ``camera_info`` topic is missing. Also None if a focal length is
-        0, which means that the camera is not calibrated.
+        The calibration. The result is None if a ``camera_info`` topic is missing, or if a focal
+        length is 0. A focal length of 0 means that the camera is not calibrated.
 
     Raises:
         InputError: a ``camera_info`` message cannot be read, or is not a valid calibration.
@@ -220,7 +220,7 @@ def read_fixes_of_bag(path: Path) -> NDArray[np.float64]:
 
     Raises:
         InputError: rosbags is not installed, the bag is damaged, it does not have exactly one topic
-            of fixes, no message is a fix, or a fix has no time stamp.
+            of GPS fixes, no message contains a fix, or a fix has no time stamp.
     """
     with _opened(path) as bag:
         topics = sorted({c.topic for c in bag.connections if c.msgtype == _FIX_TYPE})
@@ -309,10 +309,10 @@ def _tolerance(depth: bool) -> int:
 def _synchronised(
     messages: Iterator[tuple[str, Message]], topics: tuple[str, ...], pairing: Pairing
 ) -> Iterator[tuple[Message, ...]]:
-    """Pair the messages of the topics by their time stamps, and yield one pair after the other.
+    """Pair the messages of two topics by their time stamps, and yield one pair after the other.
 
-    Messages with and without a partner are counted in ``pairing``. A message is paired only when it
-    is certain that no later message of the other topic is nearer in time.
+    ``pairing`` counts the messages with and without a partner. A message is paired only when it is
+    certain that no later message of the other topic is nearer in time.
     """
     pairing.restart()
     if len(topics) == 1:

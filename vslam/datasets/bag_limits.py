@@ -1,8 +1,8 @@
 """Limits the decompressed size of bags, because rosbags itself sets no limit.
 
-Without a limit, a few kilobytes could decompress to gigabytes. rosbags looks up its decompression
-functions in tables. This module replaces the functions in these tables with functions that stop at
-a limit.
+Without a limit, a bag of a few kilobytes could decompress to gigabytes. rosbags looks up its
+decompression functions in tables. This module replaces the functions in these tables with
+functions that stop at a limit.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def _limited(make: Callable[[], _Decompressor]) -> Callable[[bytes], bytes]:
 
 
 def _limited_by_size(make: Callable[[], _Decompressor]) -> Callable[[bytes, int], bytes]:
-    """Decompress a chunk to at most the size that the bag states, and to at most `MOST_BYTES`."""
+    """Decompress a chunk. The result must not exceed the size in the bag, nor `MOST_BYTES`."""
     return lambda data, size: unpack(make, data, min(size, MOST_BYTES))
 
 

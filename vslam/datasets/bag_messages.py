@@ -85,7 +85,7 @@ def colour_of(message: Message) -> NDArray[np.uint8]:
 
 
 def _decoded(message: Message, wanted: str) -> NDArray[np.uint8]:
-    """Decode an image to grey values or RGB. A grey image stays grey if ``RGB`` is requested."""
+    """Decode an image to grey values or RGB. If ``RGB`` is requested, a grey image stays grey."""
     import cv2
 
     from vslam.datasets.png import decode_with_opencv
@@ -151,9 +151,9 @@ def depth_of(message: Message, scale: float | None) -> DepthImage:
 def _compressed_depth(message: Message, scale: float | None) -> DepthImage:
     """Decode an image of ``compressed_depth_image_transport``.
 
-    The PNG file in the message holds the values of a 16-bit depth image. For a 32-bit depth image,
-    it holds the quantised inverse depth. The header of the message (``ConfigHeader``) contains the
-    two parameters of this quantisation.
+    The message contains a PNG file. For a 16-bit depth image, the file holds the depth values. For
+    a 32-bit depth image, the file holds the quantised inverse depth. The header of the message
+    (``ConfigHeader``) contains the two parameters of this quantisation.
     """
     import cv2
 
@@ -199,8 +199,8 @@ def _pixels(message: Message, channels: int, bits: int, kind: str = "u") -> NDAr
 def camera_info(message: Message, source: str, rectified: bool) -> Document | None:
     """Convert a ``CameraInfo`` to the input of `vslam.calibration.formats.read_ros`.
 
-    Returns None if the camera is not calibrated. ROS defines that all entries of K are zero in this
-    case.
+    Returns None if the camera is not calibrated. In this case, ROS defines that all entries of the
+    camera matrix K are zero.
 
     Args:
         source: bag and topic, for error messages.

@@ -1,4 +1,4 @@
-"""Live depth cameras, whose images and calibration are read using the packages of their makers."""
+"""Live depth cameras. Images and calibration are read using the manufacturers' packages."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TIMEOUT_S = 10
 
 @dataclass(frozen=True)
 class Grabbed:
-    """The images that a device took at one time. They are copies of the buffers of the device.
+    """The images that a device took at one time, copied from the buffers of the device.
 
     Attributes:
         timestamp: seconds.
@@ -60,7 +60,7 @@ class DepthCamera:
 
 
 def frames_of(device: DepthCamera) -> RawSource:
-    """Make a source from the frames of a device. The frames can be read only once."""
+    """Make a source from the frames that a device delivers. The frames can be read only once."""
     calibration = device.calibration
     models = [model for model in (calibration.left, calibration.right) if model is not None]
     return RawSource(
@@ -74,7 +74,7 @@ def frames_of(device: DepthCamera) -> RawSource:
 
 
 def maker_package(name: str, extra: str) -> Any:
-    """Import the package of a device's maker.
+    """Import the Python package of a device's manufacturer.
 
     Raises:
         InputError: the package, or a library that it needs, is not installed.

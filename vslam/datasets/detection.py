@@ -20,7 +20,7 @@ _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 
 
 def _within(folder: Path) -> tuple[Path, ...]:
-    """Return a folder and its subfolders, which may be the folders of sequences."""
+    """Return a folder and its subfolders. Each of them may be the folder of a sequence."""
     return (folder, *(path for path in folder.glob("*") if path.is_dir()))
 
 

@@ -209,7 +209,7 @@ def _read_ground_truth(base: Path, stamps: NDArray[np.int64]) -> NDArray[np.floa
 def _read_states(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Read the ground truth: ``(N,)`` times in ns, and ``(N, 7)`` positions (m) and quaternions.
 
-    The scalar part w of a quaternion is its first number.
+    The scalar part w of a quaternion comes first.
     """
     times, rows = [], []
     for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):

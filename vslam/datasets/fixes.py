@@ -40,7 +40,8 @@ class Fixes:
     """M GPS fixes in the order of their times.
 
     Attributes:
-        times: ``(M,)`` times of the fixes in seconds, by the same clock as the images.
+        times: ``(M,)`` times of the fixes in seconds, measured by the same clock as the times of
+            the images.
         geodetic: ``(M, 3)`` latitude and longitude in degrees and altitude in metres.
         sigma: ``(M, 3)`` standard deviations east, north and up, in metres.
         antenna: ``(3,)`` position of the antenna in the frame of the left camera (x right, y down,
@@ -56,7 +57,7 @@ class Fixes:
         return len(self.times)
 
     def between(self, first: float, last: float) -> Fixes:
-        """Return the fixes between two times in seconds, both included."""
+        """Return the fixes between two times in seconds. Both times are included."""
         return self.select((self.times >= first) & (self.times <= last))
 
     def select(self, chosen: NDArray[np.bool_]) -> Fixes:
@@ -75,10 +76,11 @@ def read_fixes(path: Path, antenna: Sequence[float] | None = None) -> Fixes:
     Args:
         path: a CSV file, the folder ``oxts`` of KITTI raw, or a bag. The first line of a CSV file
             names its columns: ``time`` (s), ``latitude`` and ``longitude`` (degrees), ``altitude``
-            (m) and optionally ``sigma`` (m). For KITTI raw, times are counted from the first fix.
-        antenna: position of the antenna as in `Fixes`. If None, it is read from the calibration of
-            KITTI raw. If there is no such calibration, the function assumes that the antenna is at
-            the camera.
+            (m) and optionally ``sigma`` (m). For KITTI raw, the time of the first fix is 0.
+        antenna: position of the antenna in the frame of the left camera (x right, y down, z
+            forward), in metres. If it is None, the position is read from the calibration of KITTI
+            raw. If there is no such calibration, the function assumes that the antenna is at the
+            camera.
 
     Raises:
         InputError: pymap3d is not installed, the file is missing or malformed, it contains no fix
@@ -156,9 +158,9 @@ def to_enu(geodetic: NDArray[np.float64], datum: NDArray[np.float64]) -> NDArray
 
 
 def to_geodetic(enu: NDArray[np.float64], datum: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Convert metres east, north and up of a datum to WGS84 coordinates.
+    """Convert coordinates in the east-north-up frame of a datum to WGS84 coordinates.
 
-    This is the inverse of `to_enu`.
+    This function is the inverse of `to_enu`.
     """
     from pymap3d import enu2geodetic
 
@@ -238,10 +240,10 @@ def _read_oxts(folder: Path) -> NDArray[np.float64]:
 def _antenna_of_kitti(folder: Path) -> Sequence[float] | None:
     """Read the position of the inertial unit in the frame of the left grey camera of KITTI raw.
 
-    The fixes of KITTI raw are the positions of the inertial unit. The position is read from the
-    calibration in the folder of the day on which the drive was recorded. Returns None if there is
-    no calibration. The rotation by which the images were rectified is ignored, because it is less
-    than a degree.
+    The fixes of KITTI raw are the positions of the inertial unit. Its position relative to the
+    camera is read from the calibration in the drive's date folder. Returns None if there is no
+    calibration. The rectifying rotation of the camera is ignored, because its angle is less than a
+    degree.
     """
     paths = [folder / name for name in ("calib_imu_to_velo.txt", "calib_velo_to_cam.txt")]
     if not all(path.is_file() for path in paths):

@@ -46,7 +46,7 @@ class TimedFrame:
             source, it is None. The argument is a map function (`vslam.camera.ImageMap`), which may
             decode both images in parallel. The function raises UnreadableImageError if a file is
             damaged or if its image size differs from the calibration.
-        sides: two functions, of which the first decodes only the left image and the second decodes
+        sides: two functions. The first one decodes only the left image, and the second one decodes
             only the right image. Both functions raise the same errors as ``read``. ``sides`` is
             None if both images can only be decoded together, or if there is no right image.
         file: file of the left image. None if the image has no file of its own, or if the image has
@@ -55,9 +55,9 @@ class TimedFrame:
             blue. A grey image is ``(H, W)``. The function raises the same errors as ``read``.
             ``colour`` is None if the source has no colours.
         name: file name of the left image; None if the image has no file of its own.
-        mask: function that reads the mask of the left image, ``(H, W)`` uint8. The mask is 0 at the
-            pixels to ignore. The function raises UnreadableImageError if the mask cannot be read.
-            ``mask`` is None if all pixels are used.
+        mask: function that reads the mask of the left image, ``(H, W)`` uint8. Pixels at which the
+            mask is 0 are not used. The function raises UnreadableImageError if the mask cannot be
+            read. ``mask`` is None if all pixels are used.
     """
 
     timestamp: float
@@ -104,8 +104,8 @@ class _Frames:
         the images of the current frame are held in memory.
 
         Raises:
-            BrokenSourceError: a file is truncated or a device was unplugged. The frames before this
-                point are yielded first.
+            BrokenSourceError: a file is truncated or a device was unplugged. All frames before the
+                damage are yielded first.
             InputError: the stream ends before the first selected frame.
         """
         return iter(self.stored) if self.play is None else self.play()
@@ -145,17 +145,17 @@ class Source(_Frames):
         dataset: kind of source, for example ``kitti`` or ``video``.
         name: name of the sequence, file or device.
         camera: calibration. ``camera.sensor`` tells which images each frame has.
-        stored: N frames that can be read in any order; empty for a stream. `stored_frames` makes
-            them.
+        stored: N frames that can be read in any order; empty for a stream. The function
+            `stored_frames` makes them.
         play: function that yields the frames of a stream; None if the frames are stored.
         n_expected: number of frames. For a stream, it is approximate. None if it is unknown.
         live: whether frames arrive in real time, as from a camera. Such frames are lost if they are
             not read in time.
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames without a pose. None if there
             is no ground truth.
-        pairing: how many images have a second image of the same time, and how many images are left
-            out because they have none. For a stream, only the images that have been read so far are
-            counted. None if images are not paired by time.
+        pairing: how many images were paired with a second image by time, and how many images were
+            left out because they have no partner. For a stream, only the images that have been read
+            so far are counted. None if images are not paired by time.
         rectify_mask: function that rectifies an ``(H, W)`` uint8 mask of the original left images.
             None if vslam does not rectify the images.
 
@@ -172,7 +172,7 @@ class Source(_Frames):
 class RawSource(_Frames):
     """A source of unrectified images.
 
-    The attributes that are not listed here have the same meaning as those of `Source`.
+    Attributes that are not listed here have the same meaning as in `Source`.
 
     Attributes:
         sizes: width and height of each camera's images. It has only one entry if the second image
@@ -195,14 +195,14 @@ def stored_frames(
 
     Args:
         timestamps: ``(N,)`` float64 seconds, increasing.
-        read: function that decodes the images of the frame with a given index. Apart from the
-            index, it is like ``TimedFrame.read``.
+        read: function that decodes the images of a frame. Its first argument is the index of the
+            frame. Its other argument and its results are those of ``TimedFrame.read``.
     """
     return tuple(TimedFrame(time, partial(read, k)) for k, time in enumerate(timestamps.tolist()))
 
 
 def decoded(sides: Several[Callable[[], Image | DepthImage]], image_map: ImageMap = map) -> Images:
-    """Decode the images of a frame. One function per image is given."""
+    """Decode the images of a frame, using one function for each image."""
     left, *second = image_map(_call, sides)
     return np.asarray(left, np.uint8), second[0] if second else None
 
@@ -289,7 +289,7 @@ def first_frames(source: Source) -> Source:
     """Load the first frames of a stream into memory, so that they can be read in any order.
 
     A source that can seek is returned unchanged. If a frame cannot be decoded, this function does
-    not raise an error. The UnreadableImageError is raised whenever the frame is read.
+    not raise an error. Instead, an UnreadableImageError is raised whenever this frame is read.
 
     Raises:
         InputError: the stream has no frames.

@@ -46,11 +46,12 @@ def checked_files(
         sides: one or two lists of N files. The first list contains the left images. The second list
             contains the right images or the depth images.
         depth_scale: depth image units per metre; None if there are no depth images.
-        pairing: numbers of paired images and of left-out images, if the images were paired by time.
+        pairing: numbers of paired images and of left-out images; None if the images were not paired
+            by time.
 
     Raises:
         UnreadableImageError: a file is empty, the first frame cannot be decoded, or the first depth
-            image does not have 16 bits or differs from the image in size.
+            image does not have 16 bits or does not have the size of the first image.
     """
     for path in (path for side in sides for path in side):
         check_not_empty(path)
@@ -98,7 +99,9 @@ def image_size(path: Path) -> Size:
 
 
 def list_images(folder: Path) -> dict[str, Path]:
-    """List the image files of a folder by stem, sorted by name; empty if there is no such folder.
+    """List the image files of a folder, sorted by name. The result maps file stems to files.
+
+    The result is empty if there is no such folder.
 
     Raises:
         InputError: a file name is not UTF-8.
@@ -124,8 +127,8 @@ def read_image_list(
     Lines that begin with # are comments.
 
     Args:
-        parsed: function that returns the time and the file name in a line. It must raise ValueError
-            if the line is malformed.
+        parsed: function that takes a line, and returns the time and the file name of the image. It
+            must raise ValueError if the line is malformed.
         time: description of the time for error messages, such as "a time in seconds".
         instead: what the user can do if the file is missing, for error messages. It may be empty.
 
@@ -278,7 +281,7 @@ def read_colour(path: Path) -> NDArray[np.uint8]:
 
 
 def _read_grey_of(size: Size, path: Path) -> Image:
-    """Decode an image using `read_grey`, and check that it has the same size as the first image."""
+    """Decode an image using `read_grey`, and check that it has the given size."""
     image = read_grey(path)
     if image.shape != size[::-1]:
         raise UnreadableImageError(

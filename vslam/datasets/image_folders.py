@@ -1,4 +1,4 @@
-"""Reads one folder of images, or two folders for stereo pairs or for images with depth.
+"""Reads folders of images: one folder, or two folders for stereo pairs or images with depth.
 
 The two folders of a pair have a common parent folder and are named as in `PAIRS` or `DEPTH_PAIRS`.
 Otherwise, the second folder is given by ``--right`` or ``--depth``.
@@ -60,7 +60,7 @@ _UNITS = ((1e17, 10**9), (1e14, 10**6), (1e11, 10**3), (1e9, 1))
 
 
 def has_images(folder: Path) -> bool:
-    """Return whether a folder contains images, or a pair of folders with images."""
+    """Return whether a folder contains images, or contains a pair of folders with images."""
     inside = (folder / left for left, _ in PAIRS + DEPTH_PAIRS)
     return any(list_images(place) for place in (folder, *inside))
 
@@ -76,7 +76,8 @@ class ImageFolders:
             left camera. The second list has the images of the right camera, or the depth images.
         depth: whether the second list has depth images.
         size: width and height of the first image.
-        pairing: numbers of paired images and of left-out images, if the images were paired by time.
+        pairing: numbers of paired images and of left-out images; None if the images were not paired
+            by time.
     """
 
     name: str
@@ -188,7 +189,8 @@ def _find_sides(
 def _near_miss(folder: Path) -> str:
     """Return a hint for an error message about a folder without images.
 
-    The text is empty unless only one folder of a pair exists, or the user named only one of them.
+    The text is empty unless only one folder of a pair exists, or the user named only one folder of
+    a pair.
     """
     above = folder.resolve().parent
     for names in PAIRS + DEPTH_PAIRS:

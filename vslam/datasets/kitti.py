@@ -38,11 +38,11 @@ def open_kitti(
     monocular: bool = False,
     calib: Several[Path | str] = (),
 ) -> Source:
-    """Open a sequence of KITTI odometry. Only the selected frames must have all their images.
+    """Open a sequence of KITTI odometry. Images may be missing in frames that are not selected.
 
-    The k-th row of ``times.txt`` and of the poses belongs to the k-th image. If a file has more
-    rows than there are images, the row of an image is the number in its file name. Therefore, an
-    excerpt of a sequence can be used with the files of the whole sequence.
+    The k-th row of ``times.txt`` and of the poses belongs to the k-th image. If such a file has
+    more rows than there are images, the number in the file name of an image is the number of its
+    row. Therefore, an excerpt of a sequence can be used with the files of the whole sequence.
 
     Args:
         root: folder that contains ``sequences`` and, optionally, ``poses``. As in KITTI's archives,
@@ -56,8 +56,8 @@ def open_kitti(
             images are rectified when they are read.
 
     Raises:
-        InputError: data is missing, an image has no partner, or the calibration, the times or the
-            poses are unusable.
+        InputError: data is missing, the left or the right image of a frame is missing, or the
+            calibration, the times or the poses are unusable.
         UnreadableImageError: the first pair cannot be decoded.
     """
     base = _find_root(root)
@@ -187,7 +187,7 @@ def _by_number(stem: str) -> tuple[int, str]:
 def _check_frames(
     folder: Path, sides: list[dict[str, Path]], stems: list[str]
 ) -> list[tuple[Path, ...]]:
-    """List the image files of the given frames for each camera. Frames are given by the file stem.
+    """List the image files of the given frames for each camera. A frame is named by its file stem.
 
     Raises:
         InputError: a camera has no images, or an image of a frame is missing.
@@ -225,7 +225,7 @@ def _read_times(path: Path) -> NDArray[np.float64]:
 
 
 def _row_numbers(path: Path, stems: list[str], n_rows: int) -> NDArray[np.int64]:
-    """For each of N images, return the index of its row in ``times.txt`` or in the poses."""
+    """For each image, return the index of its row in ``times.txt`` or in the file of the poses."""
     fix = "take the file of this sequence from KITTI's archives"
     if n_rows < len(stems):
         raise InputError(f"{path}: only {n_rows} rows for {len(stems)} images; {fix}.")

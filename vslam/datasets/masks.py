@@ -1,7 +1,7 @@
 """Adds masks to the left images of a source. A mask selects the pixels that are used.
 
-As in COLMAP and OpenCV, a mask is black (0) at the pixels to ignore and white (255) at all other
-pixels. A mask has the size of the original images and is rectified together with them.
+As in COLMAP and OpenCV, the pixels to ignore are black (0) in the mask. All other pixels are white
+(255). A mask has the size of the original images. It is rectified in the same way as the images.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ def with_masks(source: Source, path: Path, *, start: int = 0, every: int = 1) ->
     Args:
         path: one mask for all images, or a folder with a mask for each image. The mask of the image
             ``7.jpg`` may be named ``7.png``, ``7.jpg.png``, or ``7`` with a different suffix. For a
-            video or bag, a mask is named after the number of its frame.
-        start: index of the first frame that was selected from the source.
+            video or bag, the name of a mask is the number of the frame.
+        start: if ``source`` is a selection of frames, the index of the first selected frame.
         every: step with which the frames were selected.
 
     Raises:

@@ -1,7 +1,7 @@
 """Reads OAK-D cameras, using depthai (version 3).
 
-A stereo pair consists of the two grey images. The device undistorts the images. Then, vslam
-rectifies them using the calibration of the device.
+A stereo pair consists of the two grey images. The device undistorts the images. After that, vslam
+rectifies the images using the calibration of the device.
 
 An RGB-D frame consists of the colour image and the depth. The device computes the depth by stereo
 matching, and registers it to the colour image.
@@ -72,7 +72,7 @@ def open_oakd(serial: str, sensor: str | None) -> DepthCamera:
 
 
 def _queue(dai: Any, pipeline: Any, sensor: str) -> Any:
-    """Make a queue of synchronised images ``left`` and ``second``. It keeps the newest images."""
+    """Make a queue of synchronised images ``left`` and ``second``. It drops the oldest images."""
     create, node, socket = pipeline.create, dai.node, dai.CameraBoardSocket
 
     def output(side: Any, kind: Any = None, *, undistorted: bool = False) -> Any:

@@ -4,10 +4,12 @@ PNG predicts every pixel from its neighbours above and on the left, and stores o
 This is called a line filter. OpenCV's decoder needs as much time to undo these filters as to
 decompress the data, because every pixel depends on the pixel on its left.
 
-This decoder decodes 32 lines at once as a wavefront: each line is one pixel behind the line above
-it, and a vector register holds one pixel of each line. Some filters predict each pixel from at most
-one neighbour. If a block has only such filters, it is decoded line by line, because this is faster.
-All files that OpenCV writes have only such filters.
+This decoder decodes 32 lines at once as a wavefront: in each line, decoding is one pixel behind the
+line above it. A vector register holds one pixel of each line.
+
+Some filters predict each pixel from at most one neighbour. If a block of lines has only such
+filters, it is decoded line by line, because this is faster. All files that OpenCV writes have only
+such filters.
 """
 
 from __future__ import annotations
@@ -135,8 +137,8 @@ def unfilter(lines, image):
     """Undo the line filters of a decompressed image.
 
     The lines are decoded in blocks of `LANES`. Each step decodes one pixel of every line of the
-    block, and each line is one pixel behind the line above it. Therefore, the neighbours that
-    predict a pixel are always decoded in earlier steps.
+    block. In each line, decoding is one pixel behind the line above it. Therefore, the neighbours
+    that predict a pixel have always been decoded in earlier steps.
 
     Args:
         lines: ``(H, W + 1)`` uint8. Each line begins with the number of its filter.
@@ -213,9 +215,9 @@ def add_prediction(line, line_above, out, is_first):
 def choose_filter(number, lane, left, above, corner, is_average):
     """Set the masks of one line of a block for its filter (PNG specification, section 9.2).
 
-    The masks select which neighbours Paeth's predictor uses, because the filters Sub and Up are
-    special cases of it. If the pixels above are set to zero, the predictor is the left pixel (Sub).
-    If the left pixels are set to zero, it is the pixel above (Up).
+    The masks select which neighbours Paeth's predictor uses. The filters Sub and Up are special
+    cases of this predictor. If the pixels above are set to zero, it predicts the left pixel (Sub).
+    If the left pixels are set to zero, it predicts the pixel above (Up).
 
     Returns:
         Whether the filter is known.

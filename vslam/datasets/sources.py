@@ -26,8 +26,9 @@ class SourceOptions(BaseModel):
     """Options that select a source of frames and tell how to read it.
 
     Attributes:
-        data: folder, file, device number or URL. For a depth camera, it is the serial number. If it
-            is empty, the first camera that is found is used. It is ignored for rendered towns.
+        data: folder, file, device number or URL. For a depth camera, it is the serial number; if
+            the serial number is empty, the first camera that is found is used. ``data`` is ignored
+            for rendered towns.
         dataset: one of `vslam.datasets.DATASETS` or of `SOURCES`, or the name of a data set that a
             plug-in reads. None detects the data set from ``data``.
         seq: name of the sequence of a data set, see `vslam.datasets.open_sequence`.
@@ -41,7 +42,7 @@ class SourceOptions(BaseModel):
         depth_scale: depth image units per metre.
         sensor: ``stereo``, ``rgbd`` or ``mono``. With ``mono``, only the left images are read. None
             reads all images of the source.
-        mask: mask of the left images, or folder with a mask for each image, see
+        mask: mask for all left images, or folder with a mask for each left image, see
             `vslam.datasets.masks.with_masks`.
         start: index of the first frame to read.
         every: read only every ``every``-th frame.
@@ -81,9 +82,9 @@ _NOT_MONOCULAR = ("right", "depth", "depth_scale")
 def open_source(
     options: SourceOptions, on_render: Callable[[int, int], None] | None = None
 ) -> Source:
-    """Open a data set, or images of any camera.
+    """Open a data set, or the images of any camera.
 
-    Images of a camera are rectified using the user's calibration.
+    If the images are not rectified, they are rectified using the calibration.
 
     Args:
         on_render: called after each rendered frame, with the number of frames that are rendered so

@@ -73,8 +73,8 @@ def open_tum(
         every: read only every ``every``-th pair.
         max_frames: largest number of pairs to read; None reads all.
         monocular: read only the colour images. Depth images need not exist.
-        calib: calibration file. If it is given, neither the calibration in the folder nor that of
-            one of TUM's cameras is used.
+        calib: calibration file. If it is given, it is used instead of the calibration in the folder
+            and instead of the calibration of TUM's cameras.
         depth_scale: depth image units per metre. If it is None, the value in the calibration is
             used. If there is no such value, 5000 is used.
 
@@ -132,7 +132,7 @@ def is_tum(folder: Path) -> bool:
 
 
 def _read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
-    """Read the times (s, increasing) and the files of images from ``rgb.txt`` or ``depth.txt``."""
+    """Read the times in seconds and the files of images from ``rgb.txt`` or ``depth.txt``."""
 
     def parsed(line: str) -> tuple[float, str]:
         time, _, name = line.strip().partition(" ")

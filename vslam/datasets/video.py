@@ -1,7 +1,7 @@
 """Reads video files and live cameras, using OpenCV.
 
-Each frame is either one monocular image, or a stereo pair side by side. A frame of a live camera
-gets the time at which it arrives, by the monotonic clock of the machine.
+Each frame is either one monocular image, or a stereo pair side by side. The time stamp of a live
+camera's frame is the time at which the frame arrives, by the monotonic clock of the machine.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _MISSING_SHARE = 0.05
 
 
 def open_capture(source: str | int, *parameters: int) -> Capture | None:
-    """Open a file, URL or device; None if OpenCV cannot open it.
+    """Open a video file, URL or camera. Returns None if OpenCV cannot open it.
 
     Args:
         parameters: properties of OpenCV's capture, each followed by its value.
@@ -167,7 +167,7 @@ def open_video(
 
 
 def _check_sides(source: str, side_by_side: bool, monocular: bool) -> None:
-    """Reject stereo if ``side_by_side`` is not set, because each frame of a video is one image."""
+    """Check that ``side_by_side`` is set for stereo, because each frame of a video is one image."""
     if not side_by_side and not monocular:
         raise InputError(
             f"{source} has one image per frame; use --side-by-side if each frame holds both "

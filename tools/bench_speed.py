@@ -10,7 +10,7 @@ alternately, and never at the same time. The first round is not counted. In each
 - with its report,
 - with ``--no-report``,
 - with ``--no-report`` and each detector of ``--also`` instead of ``bow``,
-- in the last round, with ``--realtime``, which takes as long as the drive.
+- in the last round, with ``--realtime``. This run takes as long as the drive.
 
 The beginning of the page and the section "Limits" are written by hand. The script keeps them.
 
@@ -111,7 +111,7 @@ class OrbSlam3(NamedTuple):
 
 
 class Process(NamedTuple):
-    """The output of a finished process, and the resources that the process and its children used.
+    """The output of a finished process, and the resources used by it and by its children.
 
     ``held`` is the memory of the process over time, as pairs (s, MB).
     """
@@ -216,8 +216,8 @@ def reading_ms(case: Case, system: str) -> float:
 def run_vslam(case: Case, folder: Path, *words: str) -> Run:
     """Run vslam on a case. ``words`` are added to its command line.
 
-    With --no-report, vslam gets no ground truth and does not evaluate its trajectory. ORB-SLAM3
-    does not evaluate its trajectory either.
+    With --no-report, vslam gets no ground truth and does not evaluate its trajectory. Therefore,
+    the times can be compared with those of ORB-SLAM3, which does not evaluate its trajectory.
     """
     data = case.data
     if "--no-report" in words:
@@ -246,12 +246,12 @@ def run_orbslam3(case: Case, system: OrbSlam3, folder: Path) -> Run:
 def measure_case(
     case: Case, orbslam3: OrbSlam3 | None, repeats: int, also: list[str], scratch: str
 ) -> dict[str, list[Run]]:
-    """Run all systems on a case.
+    """Run all systems on a case several times.
 
     Each run has its own folder in ``scratch``.
 
     Returns:
-        The runs by the name of the system, without the first round.
+        For each name of a system, its runs. The runs of the first round are left out.
     """
     runs: dict[str, list[Run]] = {FULL: [], ORBSLAM3: [], LEAN: [], LIVE: []}
     words = {FULL: (), LEAN: ("--no-report",), LIVE: ("--no-report", "--realtime")}
@@ -390,7 +390,7 @@ def stages(report: dict[str, Any]) -> str:
 def memory(run: Run) -> str:
     """Return a sentence about the memory per keyframe.
 
-    The memory per keyframe is the growth from the first frame to the peak, divided by the number of
+    It is the growth of the memory use from the first frame to the peak, divided by the number of
     keyframes.
     """
     before = [mb for seconds, mb in run.process.held if seconds <= run.report["startup_s"]]
@@ -408,7 +408,7 @@ def memory(run: Run) -> str:
 def measures(
     case: Case, runs: dict[str, list[Run]], reading: dict[str, float]
 ) -> dict[str, list[dict[str, float]]]:
-    """Return the values of all measures by system. Runs in real time are left out."""
+    """Return the values of all measures for each system. Runs in real time are left out."""
     return {
         s: [figures(run, case, reading[ORBSLAM3 if s == ORBSLAM3 else FULL]) for run in runs[s]]
         for s in runs

@@ -118,7 +118,7 @@ def read_entries(root: Path = ROOT) -> list[Entry]:
 
 
 def read_stamps(folder: Path) -> dict[str, Stamp]:
-    """Read the stamps by file; empty if there is no stamps.json."""
+    """Read the stamp of each file; empty if there is no stamps.json."""
     path = folder / STAMPS
     known = json.loads(path.read_text()) if path.exists() else {}
     return {file: Stamp(**one) for file, one in known.items()}

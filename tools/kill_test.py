@@ -4,9 +4,9 @@
 for the next autosave and kills the run while the autosave is being written. Afterwards, all files
 of the run are read, and the run is resumed.
 
-The table contains the frame at which the run was killed, the number of saved frames, the seconds of
-work that were lost, and the ATE of the whole run. It also tells whether the trajectory is
-byte-identical to that of the undisturbed run.
+The script prints a table. For each run, the table contains the frame at which the run was killed,
+the number of saved frames, the seconds of work that were lost, and the ATE of the whole run. It
+also tells whether the trajectory is byte-identical to the trajectory of an undisturbed run.
 
     python tools/kill_test.py --kills 10 --autosave 4 -- --dataset synthetic --seq demo
 """

@@ -2,13 +2,13 @@
 
     python tools/profile_frame.py DATA SEQ FRAMES [--detector bow] [--report]
 
-DATA is a folder in KITTI's format. The table is in milliseconds. The run has only one thread, so
-that the CPU clock of this thread measures every stage. If a stage calls another stage, the time
-counts only for the inner stage. The total is the CPU time of the process, from the start of Python
-until the last file is written.
+DATA is a folder in KITTI's format. The times in the table are in milliseconds. The run has only one
+thread, so that the CPU clock of this thread measures every stage. If a stage calls another stage,
+the time counts only for the inner stage. The total is the CPU time of the process, from the start
+of Python until the last file is written.
 
-Run the script twice. In the second run, the kernels are loaded from Numba's cache. The time to load
-a kernel counts for the first stage that calls the kernel.
+Run the script twice. In the second run, the kernels are loaded from Numba's cache. The time for
+loading a kernel counts for the first stage that calls the kernel.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class StageClock:
         return call
 
     def measure(self, stage: str, module_name: str, name: str) -> None:
-        """Replace a function in its module or class by a function that is timed."""
+        """Replace a function in its module or class with a function that is timed."""
         owner: Any = importlib.import_module(module_name)
         *classes, last = name.split(".")
         for each in classes:

@@ -28,7 +28,7 @@ def main() -> None:
 def row_of(run: RunEntry) -> dict[str, object]:
     """Return the row of a run: its drive, its system, two seeds, and its measures.
 
-    One seed is that of the perturbation, and the other is that of the rendered town.
+    The two seeds are the seed of the perturbation and the seed of the rendered town.
     """
     measures = {
         name: "" if run.measures[name] is None else f"{run.measures[name]:.{decimals}f}"

@@ -62,8 +62,8 @@ class Board:
 
     Attributes:
         kind: the pattern.
-        columns, rows: size of the board. It is the number of inner corners for a checkerboard, of
-            squares for a ChArUco board, and of tags for an AprilGrid.
+        columns, rows: size of the board, counted in inner corners for a checkerboard, in squares
+            for a ChArUco board, and in tags for an AprilGrid.
         square: side of a square in metres. For an AprilGrid, it is the distance from one tag to the
             next.
         marker: side of the black marker or tag in metres; 0 for a checkerboard.
@@ -293,9 +293,9 @@ def _dictionary(name: str) -> Any:
 
 
 def _refined(board: Board, image: Image, view: View) -> View | None:
-    """Refine corners to the intersections of the edges around them. Drop corners that move far.
+    """Refine each corner to the intersection of the edges around it. Drop corners that move far.
 
-    The window around a corner is chosen so small that it contains no other edges.
+    The window around a corner is small enough that it contains no other edges.
     """
     share = {  # half width of the window as a fraction of the distance between neighbouring corners
         "checkerboard": 0.3,

@@ -40,7 +40,7 @@ class Document:
         return key in self.values
 
     def section(self, key: str) -> Document:
-        """Return the mapping that is the value of a key."""
+        """Return the mapping that is stored under a key."""
         values = self._value(key)
         if not isinstance(values, Mapping):
             raise InputError(f"{self.source}: {key} must be a section with keys of its own.")
@@ -54,19 +54,19 @@ class Document:
         return value
 
     def number(self, key: str) -> float:
-        """Return the number that is the value of a key."""
+        """Return the number that is stored under a key."""
         return self._numbers(key, "one number", 1)[0]
 
     def numbers(self, key: str, *counts: int) -> tuple[float, ...]:
-        """Return the numbers that are the value of a key, as a flat tuple.
+        """Return the numbers that are stored under a key, as a flat tuple.
 
-        If ``counts`` are given, the number of numbers must be one of ``counts``.
+        If ``counts`` are given, the length of the tuple must be one of ``counts``.
         """
         wanted = " or ".join(map(str, counts))
         return self._numbers(key, f"{wanted} numbers" if counts else "numbers", *counts)
 
     def matrix(self, key: str, rows: int, columns: int) -> Array:
-        """Return the ``(rows, columns)`` matrix at a key.
+        """Return the ``(rows, columns)`` matrix that is stored under a key.
 
         The value may be a list of rows, or a flat list of the numbers row by row.
         """
@@ -142,7 +142,7 @@ def _flat(value: object) -> list[str]:
     """Flatten nested lists of text to a single list.
 
     Nested YAML aliases can expand a few lines into gigabytes, or form a cycle. Therefore, a list
-    that has more items than any matrix is replaced by the text "no number". The caller rejects this
+    that has more items than any matrix is replaced with the text "no number". The caller rejects this
     text.
     """
     found: list[str] = []

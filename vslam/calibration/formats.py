@@ -145,8 +145,8 @@ def read_euroc(documents: Sequence[Document], size: Size | None) -> Calibration:
 def read_ros(documents: Sequence[Document], size: Size | None) -> Calibration:
     """Read ROS's ``camera_info`` of one or two cameras.
 
-    The file may contain a printed message. It may also be a file that ROS's package
-    ``camera_calibration`` wrote.
+    The file contains either a printed message, or the output of ROS's package
+    ``camera_calibration``.
     """
     found = [_ros_names(document) for document in documents]
     models = [_matrix_camera(d, d.source, "K", "D", _lens(d, "none"), size) for d in found]
@@ -323,7 +323,7 @@ def _lens(document: Document, unnamed: str = "") -> Lens:
 
 
 def _size_of(document: Document, size: Size | None, *keys: str) -> Size:
-    """Read the width and height of the images, which are at one or two keys.
+    """Read the width and height of the images, which are stored under one or two keys.
 
     If the file has no such key, ``size`` is returned.
     """

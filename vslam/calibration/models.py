@@ -169,7 +169,7 @@ def _undistorted(distortion: tuple[float, ...], wanted: Array) -> Array:
 
 
 def _bent(distortion: tuple[float, ...], angle: Array) -> Array:
-    """Return how far from the principal point a ray is projected, in focal lengths.
+    """Return the distance from the principal point to the projection of a ray, in focal lengths.
 
     Args:
         angle: angle between the ray and the optical axis in radians.
@@ -192,12 +192,13 @@ def _unbent(distortion: tuple[float, ...], radius: Array) -> Array:
 
 
 def _folds(reach: list[Array]) -> NDArray[np.bool_]:
-    """Return whether the projected distances of rays decrease anywhere towards larger angles.
+    """Return whether a distortion folds the image.
 
-    The distortion then folds the image.
+    This is the case if a ray with a larger angle to the optical axis is projected closer to the
+    principal point than a ray with a smaller angle.
 
     Args:
-        reach: distances from the principal point at which rays are projected. The angles of the
-            rays to the optical axis increase.
+        reach: distances from the principal point to the projections of rays. The rays are sorted by
+            increasing angle to the optical axis.
     """
     return np.any(~(np.diff(reach, axis=0) >= 0.0), axis=0)

@@ -45,8 +45,8 @@ class Rectification:
         left: function that rectifies a left image, ``(H, W)`` uint8 of the calibrated size, by
             bilinear interpolation. The result has the size of the left camera's images. An image
             that needs no rectification is returned unchanged.
-        right: function that does the same for a right image. If there is no right camera, the
-            function returns images unchanged.
+        right: function that rectifies a right image in the same way. If there is no right camera,
+            the function returns images unchanged.
         left_depth: function that rectifies a depth image of any type by nearest-neighbour
             interpolation. The result is valid only if rectification does not rotate the camera,
             because depth is measured along the camera's axis.
@@ -68,7 +68,7 @@ def rectify(calibration: Calibration) -> Rectification:
 
     Raises:
         InputError: the two cameras are not side by side, look in different directions or are
-            swapped. Also if a distortion cannot be inverted within the image.
+            swapped, or a distortion cannot be inverted within the image.
     """
     left, right, source = calibration.left, calibration.right, calibration.source
     if right is None or calibration.T_left_right is None:
@@ -96,7 +96,7 @@ def rectify(calibration: Calibration) -> Rectification:
 
 
 def unchanged(image: Pixels) -> Pixels:
-    """Return the image itself."""
+    """Return the given image unchanged."""
     return image
 
 
@@ -192,9 +192,9 @@ def _common_view(source: str, cameras: list[tuple[CameraModel, Array]], baseline
 def _inner_rectangle(model: CameraModel, R_own_rectified: Array, source: str) -> Array:
     """Find a rectangle, on the plane z = 1 of the rectified camera, that the image fully covers.
 
-    Each side of the rectangle touches a border of the image at the border pixel that is nearest to
-    the centre. Pixels that cannot be unprojected are ignored, because the distortion polynomial of
-    a wide lens may fold the corners of the image.
+    Each side of the rectangle touches one border of the image. It touches this border at the pixel
+    that is nearest to the centre. Pixels that cannot be unprojected are ignored, because the
+    distortion polynomial of a wide lens may fold the corners of the image.
 
     Returns:
         ``[[x0, y0], [x1, y1]]``, two opposite corners of the rectangle.
@@ -213,9 +213,9 @@ def _inner_rectangle(model: CameraModel, R_own_rectified: Array, source: str) ->
 
 
 def _check_view(model: CameraModel, R_own_rectified: Array, camera: Camera, source: str) -> None:
-    """Reject a rectified camera if the original image shows its view twice or not at all.
+    """Check that the original image shows every part of the rectified view exactly once.
 
-    This applies to every part of the view.
+    Raises an `InputError` if a part of the view is shown twice or not at all.
     """
     xy = np.concatenate(_borders(camera.width, camera.height))
     rays = camera.backproject(xy, np.ones(len(xy))) @ R_own_rectified.T

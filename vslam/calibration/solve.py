@@ -138,10 +138,10 @@ def estimate(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], lens:
 def diverse(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], n: int) -> list[Frame]:
     """Select at most ``n`` frames in which the positions of the board differ most.
 
-    The frames are selected one after the other (farthest-point selection). The next frame is always
-    the one in which the outline of the board differs most from the outlines in all frames that are
-    already selected. If the board is at rest, only one frame is selected. Frames without the board
-    are left out.
+    The frames are selected one after the other (farthest-point selection). In each step, the frame
+    is selected in which the outline of the board differs most from the outlines in the frames that
+    are already selected. If the board is at rest, only one frame is selected. Frames without the
+    board are left out.
     """
     frames = [views for views in frames if any(views)]
     outlines = np.array(
@@ -172,9 +172,9 @@ def _outline(board: Board, view: View | None, size: Size) -> Array:
 def fit_camera(board: Board, views: Sequence[View], size: Size, lens: Lens) -> CameraFit:
     """Estimate a camera from views of a board.
 
-    The distortion of a pinhole camera has the coefficients ``k1 k2 p1 p2``, and that of a fisheye
-    camera ``k1 k2 k3 k4``. Views whose error exceeds three times the median are dropped, and the
-    estimate is repeated.
+    The distortion of a pinhole camera has the coefficients ``k1 k2 p1 p2``. The distortion of a
+    fisheye camera has the coefficients ``k1 k2 k3 k4``. Views whose error exceeds three times the
+    median are dropped, and the camera is estimated again from the other views.
 
     Raises:
         InputError: the views are too few or too similar, or the corners are not those of this
@@ -276,9 +276,7 @@ def fit_pair(board: Board, left: CameraFit, right: CameraFit) -> PairFit:
 def _without_outliers(
     names: Sequence[str], fit: Callable[[Sequence[int]], _Fit], found_in: str, fix: str
 ) -> _Fit:
-    """Fit all views. Then drop the views with large errors, and repeat the fit.
-
-    This is repeated until no error is large.
+    """Repeat a fit without the views that have large errors, until no error is large.
 
     Raises:
         InputError: too few views remain. ``found_in`` and ``fix`` are parts of the message.

@@ -72,7 +72,7 @@ def open_oakd(serial: str, sensor: str | None) -> DepthCamera:
 
 
 def _queue(dai: Any, pipeline: Any, sensor: str) -> Any:
-    """Make a queue of synchronised images ``left`` and ``second``. It drops the oldest images."""
+    """Make a queue that holds only the newest pair of synchronised images, left and second."""
     create, node, socket = pipeline.create, dai.node, dai.CameraBoardSocket
 
     def output(side: Any, kind: Any = None, *, undistorted: bool = False) -> Any:

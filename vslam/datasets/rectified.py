@@ -99,7 +99,7 @@ def _rectified_frame(rectification: Rectification, frame: TimedFrame) -> TimedFr
 
 
 def _read(rectification: Rectification, frame: TimedFrame, image_map: ImageMap) -> Images:
-    """Read and rectify the images of a frame. Depth images are not interpolated."""
+    """Read and rectify the images of a frame. Depth is taken from the nearest pixel."""
     left, second = frame.read(image_map)
     sides: list[Callable[[], Image | DepthImage]] = [partial(rectification.left, left)]
     if second is not None and rectification.camera.depth:

@@ -84,7 +84,7 @@ def open_source(
 ) -> Source:
     """Open a data set, or the images of any camera.
 
-    If the images are not rectified, they are rectified using the calibration.
+    If the images are not rectified yet, they are rectified using the calibration.
 
     Args:
         on_render: called after each rendered frame, with the number of frames that are rendered so

@@ -3,9 +3,9 @@
     python tools/experiments/gps/drive.py RUN [RUN ...] --seeds 5
 
 The script simulates a GPS receiver along the ground truth of finished runs. The receiver gives one
-fix per second. The fixes have white noise, a bias that follows a random walk, gaps, and jumps by 20
-m that last ten seconds. The script prints the RMSE of several positions. Each RMSE is a mean over
-the seeds. The positions are:
+fix per second. The fixes have white noise and a bias that follows a random walk. They also have
+gaps, and jumps by 20 m that last ten seconds. The script prints the RMSE of the following
+positions, as a mean over the seeds:
 
 - those of the run without GPS, after the alignment for its sensor;
 - those of the fixes;
@@ -70,7 +70,7 @@ def main() -> None:
 
 
 def measure(run: Path, options: argparse.Namespace) -> None:
-    """Measure a run with every seed, and print the means over the seeds."""
+    """Measure the errors of a run with GPS for every seed, and print the means over the seeds."""
     visual = read_trajectory(run / "trajectory.tum")
     truth = read_trajectory(run / "ground_truth_kitti.txt", visual.timestamps)
     truth = Trajectory(truth.timestamps, truth.T_wc.copy())

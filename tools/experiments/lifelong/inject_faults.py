@@ -1,4 +1,4 @@
-r"""Makes each part of a run fail once, and records the messages and results of the run.
+r"""Make each part of vslam fail once during a run, and record the messages and results of the run.
 
 tests/faults.py defines the faults and the points of a run at which they are injected. It also
 decides whether an outcome is correct.
@@ -31,7 +31,7 @@ def inject_all(
 
     Args:
         work: an empty folder.
-        once: inject one random fault per point instead of all faults.
+        once: whether only one random fault is injected at each point, instead of all faults.
     """
     load_everything()
     rows = []

@@ -2,9 +2,9 @@
 
     python tools/experiments/uncertainty/nees.py DATA SEQ[:START[:FRAMES]] ... [--perturb LAW ...]
 
-DATA is a folder in KITTI's format with exact ground truth, for example with rendered drives. Every
-drive is run under every perturbation. The script prints the normalised estimation error squared
-(NEES) of the motion over 1 s and over 10 s. The NEES is defined by Bar-Shalom et al., Estimation
+DATA is a folder in KITTI's format with exact ground truth, for example with rendered drives. vslam
+is run on every drive under every perturbation. The script prints the normalised estimation error
+squared (NEES) of the motion over intervals of 1 s and of 10 s. The NEES is defined by Bar-Shalom et al., Estimation
 with Applications to Tracking and Navigation, 2001, section 5.4. The script divides the NEES by the
 six degrees of freedom. The mean is then 1 if the covariances are consistent, and larger than 1 if
 the covariances are too small.
@@ -31,7 +31,7 @@ EVERY = 7  # frames between the starts of intervals; overlapping intervals have 
 
 
 def results_of(source: Source, law: str, seed: int) -> list[TrackResult]:
-    """Run a drive and return the result of tracking for every frame."""
+    """Run vslam on a drive, and return the result of tracking for every frame."""
     slam = Slam(source.camera)
     perturbation = parse_perturbation(law, seed).bound_to(source)
     results = []
@@ -43,7 +43,10 @@ def results_of(source: Source, law: str, seed: int) -> list[TrackResult]:
 
 
 def mean_nees(results: list[TrackResult], truth: Trajectory, interval_s: float) -> float:
-    """Compute the mean NEES, per degree of freedom, of the motion over an interval of time."""
+    """Compute the mean NEES of the motion over intervals of a given length.
+
+    The NEES is divided by the number of degrees of freedom.
+    """
     return float(motion_errors(results, truth, interval_s).nees[SKIPPED::EVERY].mean())
 
 

@@ -51,7 +51,7 @@ def disparity(
         other: ``(H, W)`` uint8, the other image of the pair.
 
     Returns:
-        ``(H, W)`` float32 pixels; 0 in rows without any match.
+        ``(H, W)`` float32 disparities in pixels. A row without any match has the disparity 0.
     """
     import cv2
 
@@ -82,9 +82,9 @@ def disparity(
 
 
 def _filled(found: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Fill each pixel without a match, using the two nearest matches in its row.
+    """Fill each pixel that has no disparity, using the two nearest disparities in its row.
 
-    The pixel gets the smaller one of both disparities, because occluded pixels belong to the
+    The pixel gets the smaller one of the two disparities, because occluded pixels belong to the
     background. This is the rule of Geiger et al., CVPR 2012.
     """
     known = found > 0

@@ -57,7 +57,7 @@ def _vignetting(stops: float, stream: RandomStream, scene: Scene) -> PairLaw:
 
 
 def _dirt(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
-    """Cover the image with blobs of dirt. They differ between the cameras but do not move."""
+    """Cover the image with blobs of dirt, which differ between the cameras but do not move."""
     opacity = [_blobs(percent / 100.0, [*stream, side], scene) for side in range(2)]
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:

@@ -62,7 +62,7 @@ PairLaw = Callable[[Pair], Pair]
 
 @dataclass(frozen=True)
 class Scene:
-    """The data of a source that a perturbation may use in addition to the images of a frame.
+    """Data of a source that a perturbation may use, in addition to the images of a frame.
 
     Attributes:
         camera: calibration of the source.
@@ -79,7 +79,7 @@ class Scene:
 
     @classmethod
     def of(cls, source: Source) -> Scene:
-        """Collect the data of a source that perturbations may use."""
+        """Return the data of a source that perturbations may use."""
         if not source.seekable:
             return cls(source.camera)
         times = source.timestamps
@@ -112,17 +112,17 @@ def check_need(law: str, need: Need, scene: Scene) -> None:
 
 @dataclass(frozen=True)
 class SceneLaw:
-    """A perturbation that needs data of the source, so that it must be bound to a scene first."""
+    """A perturbation that needs data of the source. It must be bound to a scene before use."""
 
     name: str
     needs: tuple[Need, ...]
     make: Callable[[Scene], PairLaw]
 
     def bound_to(self, scene: Scene) -> PairLaw:
-        """Return the perturbation for the source with the data in a scene.
+        """Return the perturbation for one source, whose data is in a scene.
 
         Raises:
-            InputError: the source does not have the data that the law needs.
+            InputError: the source does not have the data that the perturbation needs.
         """
         for need in self.needs:
             check_need(self.name, need, scene)
@@ -142,8 +142,8 @@ class LawKind:
         unit: unit of the strength.
         default: strength that is used if none is given.
         weakest: weakest strength that ``vslam stress`` tries.
-        strongest: strongest strength that ``vslam stress`` tries. It is smaller than ``weakest`` if
-            small numbers have a large effect, such as a short visibility in fog.
+        strongest: strongest strength that ``vslam stress`` tries. If small numbers have a large
+            effect, as for the visibility in fog, ``strongest`` is smaller than ``weakest``.
         about: a description in a few words.
         least: smallest allowed strength.
         most: largest allowed strength.
@@ -151,7 +151,8 @@ class LawKind:
             difference.
         drawn: whether the effect is random, so that the images depend on the seed.
         needs: data that the source must have.
-        of_scene: whether data of the source are needed in addition to the images of a frame.
+        of_scene: whether the perturbation needs data of the source, in addition to the images of a
+            frame.
         sides: ``both`` if both images are changed, ``one`` for a fault of the stereo rig.
     """
 

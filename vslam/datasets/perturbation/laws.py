@@ -19,7 +19,7 @@ from vslam.errors import DroppedFrameError, InputError, did_you_mean
 
 @dataclass(frozen=True)
 class Perturbation:
-    """Laws (kinds of perturbation with a strength) that are applied to each frame in turn.
+    """A sequence of laws that are applied to each frame. A law is a perturbation of one kind.
 
     If there are no laws, the images stay unchanged.
 
@@ -35,10 +35,10 @@ class Perturbation:
     def bound_to(self, source: Source) -> Perturbation:
         """Prepare the perturbation for one source.
 
-        This is necessary because some laws use the depth or the poses of the source.
+        This is necessary because some perturbations use the depth or the poses of the source.
 
         Raises:
-            InputError: the source does not have the data that a law needs.
+            InputError: the source does not have the data that the perturbation needs.
         """
         if not any(isinstance(law, SceneLaw) for law in self.laws):
             return self
@@ -51,9 +51,9 @@ class Perturbation:
     ) -> tuple[Image, Image | DepthImage | None]:
         """Perturb the images of a frame. This method is thread-safe.
 
-        Depth images stay unchanged, because depth sensors have their own light source. Fog is the
-        only law for which the left image depends on the second image, because the depth for fog is
-        computed from both images.
+        Depth images stay unchanged, because depth sensors have their own light source. The left
+        image usually does not depend on the second image. Fog is an exception, because it uses the
+        depth that is computed from both images.
 
         Args:
             index: index of the frame.
@@ -162,17 +162,19 @@ def contact_sheet(
 ) -> Image:
     """Draw a grey image that shows a perturbation, with one row for each frame.
 
-    Each row shows the original left image, the perturbed images, and the amplified change of the
-    image that changed more.
+    Each row shows the original left image and the perturbed images. It also shows the difference
+    between the original and the perturbed image, multiplied by a factor. For a stereo pair, the
+    image with the larger difference is used.
 
     Args:
         indices: indices of the frames to show.
-        start: index of the first frame of ``sequence`` in the whole sequence.
-        every: step with which the frames of ``sequence`` were selected. The labels show the number
-            of each frame in the whole sequence.
+        start: if ``sequence`` is a selection of frames, the number of its first frame in the data
+            set.
+        every: step with which the frames were selected. The labels show the number of each frame in
+            the data set.
 
     Raises:
-        InputError: the sequence does not have the data that a law needs.
+        InputError: the sequence does not have the data that the perturbation needs.
         UnreadableImageError: one of the frames cannot be read.
     """
     perturbation = perturbation.bound_to(sequence)
@@ -186,11 +188,11 @@ def contact_sheet(
 def sheet_of_laws(sequence: Source, specs: Collection[str], index: int, seed: int) -> Image:
     """Draw a grey image that shows several perturbations of one frame.
 
-    Each perturbation has a row with the original left image, the perturbed images, and the
-    amplified change. Several rows are arranged in two columns.
+    Each perturbation has a row with the original left image, the perturbed images, and their
+    difference multiplied by a factor. Several rows are arranged in two columns.
 
     Raises:
-        InputError: the sequence does not have the data that a law needs.
+        InputError: the sequence does not have the data that a perturbation needs.
         UnreadableImageError: the frame cannot be read.
     """
     rows = [
@@ -206,7 +208,10 @@ def sheet_of_laws(sequence: Source, specs: Collection[str], index: int, seed: in
 
 
 def laws_for(sequence: Source) -> tuple[list[str], dict[str, str]]:
-    """Return the names of the laws that a source allows, and why it does not allow the others."""
+    """Return which laws (kinds of perturbation) can be applied to a source.
+
+    Also returns for each other law why it cannot be applied.
+    """
     applicable, reasons = [], {}
     for name in all_laws():
         try:

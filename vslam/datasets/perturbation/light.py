@@ -1,6 +1,7 @@
 """Perturbations of the light, and of the camera's response to light.
 
-The random processes are endless in time and do not depend on the order in which frames are read.
+The random processes are defined for all times. They do not depend on the order in which frames are
+read.
 """
 
 from __future__ import annotations
@@ -37,9 +38,9 @@ _LIT_S = 1.0  # time before the first blackout may begin
 def ou_walk(
     deviation: float, rng: np.random.Generator, jumps: Iterable[float] = ()
 ) -> Iterator[float]:
-    """Generate an endless Ornstein-Uhlenbeck process with a time constant of 2 s.
+    """Yield the values of an Ornstein-Uhlenbeck process with a time constant of 2 s, without end.
 
-    The process is exact on a grid of 10 ms.
+    Consecutive values are 10 ms apart. The discretisation is exact.
 
     Args:
         deviation: stationary standard deviation. The process begins in the stationary state.
@@ -62,7 +63,7 @@ def ou_walk(
 
 
 class Cached:
-    """Gives access by index to the numbers of an endless iterator.
+    """Gives access by index to the numbers that an endless iterator yields.
 
     The numbers are generated on demand. The class is thread-safe.
     """
@@ -79,13 +80,13 @@ class Cached:
 
 
 def on_grid(t: float) -> int:
-    """Return the index of the grid step of a process at time t (seconds)."""
+    """Return the index of the value of a random process at time t (seconds)."""
     # Without the small offset, rounding errors could move a time on the grid to the previous step.
     return floor(t / STEP_S + 1e-6)
 
 
 def jump_times(rng: np.random.Generator, per_second: float = _JUMPS_PER_S) -> Iterator[float]:
-    """Yield the times of an endless Poisson process, in seconds."""
+    """Yield the times in seconds of the events of a Poisson process, without end."""
     time = 0.0
     while True:
         time += rng.exponential(1.0 / per_second)
@@ -93,11 +94,11 @@ def jump_times(rng: np.random.Generator, per_second: float = _JUMPS_PER_S) -> It
 
 
 def _pointwise(curve: Callable[[int, float], NDArray[np.float64]]) -> Law:
-    """Make a perturbation that maps each grey value by a curve.
+    """Make a perturbation that maps each grey value to a new grey value.
 
     Args:
-        curve: function that returns the ``(256,)`` new grey values, given the index and the time of
-            a frame.
+        curve: function that takes the index and the time of a frame, and returns ``(256,)`` new
+            grey values.
     """
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:
@@ -137,7 +138,7 @@ def _flicker(strength: float, stream: RandomStream) -> Law:
 
 
 def _exposure(seconds: float, stream: RandomStream) -> Law:
-    """Lower and raise the light by 3 stops in turn. The exposure follows with a delay."""
+    """Lower and raise the light by 3 stops in turn. The auto-exposure follows with a delay."""
 
     def errors() -> Iterator[float]:
         rng = np.random.default_rng(stream)

@@ -1,7 +1,7 @@
 """Motion blur that the rotation of the camera causes during the exposure.
 
-The functions that compute the velocities of the camera and of the image are also used by other
-perturbations.
+Other perturbations also use the functions that compute the velocities of the camera and of the
+image.
 """
 
 from __future__ import annotations
@@ -50,8 +50,9 @@ def image_velocity(scene: Scene, frame: int) -> NDArray[np.float64]:
 
     Returns ``(2,)`` pixels per second.
 
-    The velocity is computed from the true rotation if this is known. Otherwise, it is the median
-    optical flow to the next frame. The optical flow also contains the effect of the forward motion.
+    The velocity is computed from the true rotation if the rotation is known. Otherwise, it is
+    computed from the median optical flow to the next frame. The optical flow also contains the
+    effect of the forward motion.
     """
     assert scene.times is not None
     assert scene.read is not None

@@ -1,7 +1,7 @@
 """All laws (kinds of perturbation) by name.
 
-Plug-ins in other Python packages may add laws (docs/howto/plugins.md). Every image that such a law
-returns is checked.
+Plug-ins in other Python packages may add laws (docs/howto/plugins.md). vslam checks every image
+that a law of a plug-in returns.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ def plugin_laws() -> dict[str, Callable[[float, tuple[int, int]], PlugInLaw]]:
     """Return the laws (kinds of perturbation) that plug-ins in other Python packages define.
 
     Returns:
-        A function for each law by its name. The function makes the law from a strength and from a
-        random stream (`RandomStream`).
+        A function for each name of a law. The function takes a strength and a random stream
+        (`RandomStream`), and returns the perturbation.
     """
     return {name: partial(_make, plugin) for name, plugin in find_plugins(PERTURBATIONS).items()}
 
@@ -53,8 +53,8 @@ def _apply(plugin: PlugIn, law: PlugInLaw, frame: int, t: float, side: int, imag
     """Apply a perturbation of a plug-in to an image.
 
     Raises:
-        UnreadableImageError: the law fails, or does not return an image of the same size. The run
-            then skips the frame.
+        UnreadableImageError: the perturbation fails, or does not return an image of the same size.
+            The run then skips the frame.
     """
     view = image.view()
     view.flags.writeable = False
@@ -88,9 +88,9 @@ LAWS: dict[str, LawKind] = {
 
 
 def all_laws() -> dict[str, LawKind]:
-    """Return all laws: those of vslam, followed by those of plug-ins.
+    """Return all laws (kinds of perturbation): those of vslam, followed by those of plug-ins.
 
-    The strengths of laws of plug-ins are from 0 to 10.
+    The strength of a plug-in's law is between 0 and 10.
     """
     others = {
         name: LawKind(make, "x", 1.0, 0.1, 10.0, "of another package", logarithmic=True)

@@ -1,4 +1,4 @@
-"""Perturbations that the sensor, compression or transmission cause."""
+"""Perturbations that are caused by the sensor, by compression or by transmission."""
 
 from __future__ import annotations
 

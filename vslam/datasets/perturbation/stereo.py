@@ -70,8 +70,8 @@ def _moved(image: Image, shift: NDArray[np.float32]) -> Image:
     """Shift each pixel of an image.
 
     Args:
-        shift: ``(H, W, 2)`` pixels. The new value of a pixel is taken from its position minus its
-            shift.
+        shift: ``(H, W, 2)`` displacements in pixels. The new value of a pixel is the value of the
+            image at the position of the pixel minus its displacement.
     """
     import cv2
 
@@ -109,7 +109,7 @@ def _turned(axis: int) -> Callable[[float, RandomStream, Scene], PairLaw]:
 def _black(
     side: Literal["left", "right"],
 ) -> Callable[[float, RandomStream, Scene], PairLaw]:
-    """Make a perturbation that makes the images of one camera black during some seconds."""
+    """Make a perturbation during which the images of one camera are black in some seconds."""
 
     def make(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
         def law(pair: Pair) -> Pair:

@@ -63,8 +63,9 @@ def drops_per_m3(mm_per_h: float) -> tuple[float, float]:
     """Compute the density of raindrops at a rainfall rate [Marshall and Palmer, J. Met. 1948].
 
     Returns:
-        The number of drops larger than 1 mm per cubic metre. Also the rate (1/mm) at which the
-        number of drops decays exponentially with the diameter.
+        Two numbers. The first one is the number of drops larger than 1 mm in a cubic metre of air.
+        The second one is the rate (1/mm) at which the number of drops decays exponentially with the
+        diameter.
     """
     rate = 4.1 * mm_per_h**-0.21
     return 8000.0 / rate * exp(-rate * _LEAST_MM), rate
@@ -145,7 +146,7 @@ def glass_drops(mm_per_h: float, camera: Camera) -> float:
 def _drops_on_glass(
     image: Image, mm_per_h: float, rng: np.random.Generator, camera: Camera
 ) -> Image:
-    """Draw drops on the glass as lenses. They show the scene small, upside down and blurred."""
+    """Draw drops on the glass. Like a lens, each drop shows the scene small and upside down."""
     import cv2
 
     n = rng.poisson(glass_drops(mm_per_h, camera))

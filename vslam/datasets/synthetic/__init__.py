@@ -84,8 +84,9 @@ def open_synthetic(
         name: name of the drive, for example ``05+change:0.5+seed:1`` (`parse_drive`).
         variation: variation of the town. If it is given, it is used instead of the variation in the
             name.
-        start, every, max_frames, monocular: which frames and cameras are read (`open_kitti`).
-        threads, on_frame: threads of the renderer, and a function for progress (`render_sequence`).
+        start, every, max_frames, monocular: which frames and cameras are read, see `open_kitti`.
+        threads, on_frame: number of threads of the renderer, and function that reports progress,
+            see `render_sequence`.
 
     Raises:
         InputError: the route or the variation is unknown, or `render_sequence` or `open_kitti`

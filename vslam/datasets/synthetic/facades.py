@@ -12,7 +12,7 @@ from vslam.datasets.synthetic.textures import Grey, Rng, letters, noise, write
 
 @dataclass(frozen=True)
 class FacadeStyle:
-    """The common properties of the four sides of a house.
+    """Properties that the four sides of a house have in common.
 
     Attributes:
         wall, frame, glass: grey levels of walls, window frames and panes.
@@ -37,7 +37,7 @@ class FacadeStyle:
 
 
 def random_style(rng: Rng, *, town: bool) -> FacadeStyle:
-    """Draw a random style of a house. Houses in a town may have shops, and fewer have shutters."""
+    """Draw a random style of a house. If ``town`` is set, the house may have a shop."""
     brick = bool(rng.random() < 0.22)
     low, high = (70, 125) if brick else (185, 238) if rng.random() < 0.6 else (120, 180)
     return FacadeStyle(
@@ -62,7 +62,8 @@ def facade(
 
     Args:
         rng: random generator for the parts of the building.
-        lived: random generator for what residents change, such as blinds, curtains and lights.
+        lived: random generator for things that residents change, such as blinds, curtains and
+            lights.
         style: style of the house.
         size: width and height in metres.
         front: whether the side is the front, which has a door and perhaps a shop. Other sides have
@@ -134,7 +135,7 @@ def _lay_bricks(rng: Rng, image: Grey, px: float, py: float) -> None:
 
 @dataclass(frozen=True)
 class _Painter:
-    """Draws on ``image`` with coordinates in metres; ``px`` and ``py`` are texels per metre."""
+    """Draws on ``image`` with coordinates in metres, using ``px`` and ``py`` texels per metre."""
 
     rng: Rng
     image: Grey

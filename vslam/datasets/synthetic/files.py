@@ -23,7 +23,7 @@ _SAMPLED = 5  # number of frames whose checksums are compared in a quick check
 
 
 def frame_files(folder: Path, frame: int, depth: bool) -> list[Path]:
-    """Return the paths of the left and right image of a frame. ``depth`` adds its depth image."""
+    """Return the paths of a frame's left and right image, and of its depth image if ``depth``."""
     names = ("image_0", "image_1", *(("depth_0",) if depth else ()))
     return [folder / name / f"{frame:06d}.png" for name in names]
 
@@ -48,7 +48,7 @@ def size(paths: Collection[Path]) -> int:
 
 
 def damaged_frames(folder: Path, manifest: dict[str, Any], *, thorough: bool) -> list[int]:
-    """Return the frames whose files differ from the manifest of a complete sequence.
+    """Return the frames whose files differ from the manifest of a completely rendered sequence.
 
     Args:
         folder: folder of the sequence.
@@ -84,7 +84,7 @@ def write_png(path: Path, image: NDArray[Any], level: int) -> None:
 
 
 def lock_of(folder: Path) -> AbstractContextManager[None]:
-    """Lock the folder of a sequence, so that no other process writes to it.
+    """Lock the folder of a sequence, so that no other process writes to this folder.
 
     Raises:
         InputError: another running process has locked the folder.

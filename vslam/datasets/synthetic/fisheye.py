@@ -96,7 +96,7 @@ def render_fisheye(
     interrupted rendering.
 
     Args:
-        route, variation, until, threads, on_frame: what is rendered and how (`render_sequence`).
+        route, variation, until, threads, on_frame: as for `render_sequence`.
         folder: output folder, to which ``mav0``, ``camchain.yaml`` and ``pinhole`` are written.
 
     Returns:

@@ -27,9 +27,9 @@ class RoadStyle:
     """Cross-section of a road. Distances are in metres from its middle line.
 
     Attributes:
-        lane: distance of the edge of the carriageway.
-        parking: distance of the outer edge of the parking bays.
-        walk: distance of the outer edge of the pavement, where the grass begins.
+        lane: distance to the edge of the carriageway.
+        parking: distance to the outer edge of the parking bays.
+        walk: distance to the outer edge of the pavement, where the grass begins.
         dash: length of a lane mark in metres; 0 for a road without marks.
         gap: length of the gap between two lane marks in metres.
         edge_line: whether there is a solid line at the edge of the carriageway.

@@ -31,12 +31,12 @@ def render_rgbd(
     """Render the missing frames of a route for an RGB-D camera, in TUM's layout.
 
     ``out/stereo`` contains the same drive in KITTI's format. The left image is used as the colour
-    image. Depth is in centimetres and 0 in the sky. It has no maximum range. The virtual baseline
-    in ``calibration.yaml`` is the baseline of the rendered stereo pair. Therefore, distant points
-    are as uncertain as with stereo.
+    image. The depth is in centimetres, without a maximum range. It is 0 in the sky. The virtual
+    baseline in ``calibration.yaml`` is the baseline of the rendered stereo pair. Therefore, the
+    depths of distant points have the same uncertainty as with stereo.
 
     Args:
-        route, variation, threads, on_frame: what is rendered and how (`render_sequence`).
+        route, variation, threads, on_frame: as for `render_sequence`.
         out: output folder.
         until: number of the frame before which rendering ends.
 

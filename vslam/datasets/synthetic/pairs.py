@@ -43,11 +43,12 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Moves:
-    """Ranges (lowest, highest) of the random motion of the second view of a pair.
+    """Ranges (lowest, highest) of the random camera motion between the two images of a pair.
 
     Attributes:
-        lateral: lateral shift to the right in metres. At -3.2, the camera is on the other lane.
-        heading: rotation to either side in degrees.
+        lateral: lateral shift of the second camera to the right in metres. At -3.2, the camera is
+            on the other lane.
+        heading: rotation of the second camera to either side in degrees.
     """
 
     lateral: tuple[float, float] = (-1.4, 1.4)
@@ -69,9 +70,10 @@ def render_pairs(
 
     The kind of a pair tells where its second image is taken:
 
-    - ``shift``: at the same frame.
-    - ``pass``: at another pass through the same place, if the drive has one.
-    - ``alike``: at one of the different places that look most similar in small, blurred images.
+    - ``shift``: at the same frame of the drive.
+    - ``pass``: at the same place, but when the camera returned to it, if the drive has such a
+      revisit.
+    - ``alike``: at a different place that looks similar in small, blurred images.
     - ``random``: at any different place.
 
     The camera of the second image is also moved at random. If all kinds are rendered, half of the
@@ -166,7 +168,10 @@ def _view(
 
 
 def _other_passes(T_wc: Float) -> list[NDArray[np.int64]]:
-    """For each frame, find the frames of other passes with a similar position and heading."""
+    """For each frame of a drive, find the frames at which the camera returned to the same place.
+
+    The camera must have a similar position and heading.
+    """
     xz, ahead = T_wc[:, [0, 2], 3], T_wc[:, :3, 2]
     again = []
     for k, near in enumerate(cKDTree(xz).query_ball_point(xz, _TOGETHER)):
@@ -177,7 +182,7 @@ def _other_passes(T_wc: Float) -> list[NDArray[np.int64]]:
 
 
 def _different(T_wc: Float, others: Float) -> NDArray[np.bool_]:
-    """Return which poses are at a different place than ``T_wc``, and not in the same street.
+    """Return which poses are at a different place than the pose ``T_wc``, in a different street.
 
     Args:
         others: ``(N, 4, 4)`` poses.

@@ -122,9 +122,9 @@ class Passes:
 
 
 def _switch_frames(place: NDArray[np.float64], cameras: NDArray[np.float64]) -> NDArray[np.int64]:
-    """For each of T places, return the frame at which the camera leaves it for the first time.
+    """For each of T places, return the frame at which the camera first leaves the place.
 
-    It is the largest int64 if the camera never reaches the place, or never leaves it.
+    The result is the largest int64 if the camera never reaches the place, or never leaves it.
     """
     switch = np.full(len(place), np.iinfo(np.int64).max)
     for k, xz in enumerate(place):

@@ -1,4 +1,4 @@
-"""Determines which surface each sample of an image sees (projection, culling and z-buffer)."""
+"""Determines which surface is visible at each sample (projection, culling and z-buffer)."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class _AlphaMap(NamedTuple):
 
 @kernel
 def find_visible(surfaces, atlas, camera, light):
-    """Project the surfaces that a camera may see, in order of their distance.
+    """Project the surfaces that may be visible in a camera, and sort them by distance.
 
     Args:
         surfaces: `scene.Surfaces`.
@@ -191,7 +191,10 @@ def _affine(row, at, x, y, z, fx, fy, cx, cy):
 
 @kernel
 def _box(corner, fx, fy, cx, cy):
-    """Bounding box ``u0, u1, v0, v1`` in pixels of a quadrilateral, clipped at the near plane."""
+    """Return a quadrilateral's bounding box ``u0, u1, v0, v1`` in pixels.
+
+    The quadrilateral is clipped at the near plane.
+    """
     u0, u1, v0, v1 = 1e9, -1e9, 1e9, -1e9
     for k in range(4):
         a, b = corner[k], corner[(k + 1) % 4]

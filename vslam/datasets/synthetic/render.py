@@ -5,8 +5,8 @@ Therefore, ``(s, t, 1) / z = [edge_s edge_t origin]^-1 r``. These are three affi
 pixel. It follows that a surface covers a single interval of each image row, and that depth and
 texture coordinates are exact at every pixel.
 
-Visibility is determined on a grid that is twice as fine as the pixels. A pixel is shaded once for
-each surface that its four samples see.
+Visibility is determined at four samples per pixel. If different surfaces are visible at these
+samples, the pixel is shaded once for each of the surfaces.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Light:
 
 @dataclass(frozen=True)
 class Moment:
-    """The scene of one frame. ``night``, from 0 to 1, raises the gain of the sensor."""
+    """The scene of one frame. The darkness ``night``, from 0 to 1, raises the sensor's gain."""
 
     surfaces: Surfaces
     shadows: ShadowMap
@@ -92,8 +92,9 @@ class Moment:
 class RenderedView(NamedTuple):
     """A rendered view.
 
-    ``image`` has the ``(H, W)`` float32 grey levels before the sensor, which may exceed 255.
-    ``depth`` has the ``(H, W)`` float32 depth along z in metres, which is 0 in the sky.
+    ``image`` contains ``(H, W)`` float32 grey levels before the sensor is simulated. They may
+    exceed 255. ``depth`` contains the ``(H, W)`` float32 depth along z in metres, which is 0 in the
+    sky.
     """
 
     image: Float32
@@ -206,7 +207,7 @@ def sensor_image(
 
 
 def _streak(length: float) -> NDArray[np.float32]:
-    """Weights of a box filter, whose length in pixels need not be an integer."""
+    """Return the weights of a box filter. Its length in pixels need not be an integer."""
     half = int(np.ceil(length / 2 + 0.5))
     at = np.arange(-half, half + 1)
     weight = np.clip(length / 2 + 0.5 - np.abs(at), 0, 1)

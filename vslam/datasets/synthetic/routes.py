@@ -32,12 +32,12 @@ class Route:
     """The path of the camera in a town, with the roads and the terrain of the town.
 
     Attributes:
-        name: for example ``demo``.
+        name: name of the route, for example ``demo``.
         about: description in a few words.
         land: ``town``, ``suburb`` or ``motorway``.
         camera: the stereo rig.
-        T_wc: ``(N, 4, 4)`` float64 poses of the left camera in the world frame of the town. In this
-            frame, y = 0 is the height 0 of the terrain.
+        T_wc: ``(N, 4, 4)`` float64 poses of the left camera in the world frame of the town. The
+            heights of the terrain are measured from the plane y = 0 of this frame.
         roads: the roads of the route.
         terrain: the heights of the ground.
     """
@@ -178,8 +178,9 @@ def _straight(start: Float, direction: Float, metres: Float) -> Float:
 def route_of_poses(T_wc: Float, name: str, calibration: str = "00-02") -> Route:
     """Make a route along given poses, for example along KITTI's ground truth.
 
-    The heights of all passes over a place are averaged, because a road has only one height.
-    Headings, pitches and rolls are kept. ``Route.ground_truth`` has the averaged heights.
+    If the camera passes a place several times, its heights there are averaged, because a road has
+    only one height. Headings, pitches and rolls are kept. ``Route.ground_truth`` contains the
+    averaged heights.
 
     Args:
         T_wc: ``(N, 4, 4)`` float64 poses, with the y axis pointing down.
@@ -285,9 +286,9 @@ def _headings(line: Float) -> Float:
 
 
 def _drive(path: Float, speed: float) -> Float:
-    """Drive along a ``(K, 2)`` path, more slowly in bends.
+    """Compute the camera positions of a car that follows a ``(K, 2)`` path.
 
-    Returns ``(N, 2)`` camera positions at 10 Hz.
+    The car is slower in bends. Returns ``(N, 2)`` positions at 10 Hz.
     """
     along = np.cumsum(np.r_[0, np.linalg.norm(np.diff(path, axis=0), axis=1)])
     keep = np.r_[True, np.diff(along) > 1e-9]
@@ -346,7 +347,7 @@ def _terrain(xz: Float, height: Callable[[Float], Float]) -> Terrain:
 
 
 def _heights_of(xz: Float, up: Float) -> Callable[[Float], Float]:
-    """Make a smooth function of the height that averages the heights of several passes.
+    """Make a smooth height function. If a path passes a place twice, the heights are averaged.
 
     Args:
         xz: ``(N, 2)`` positions.

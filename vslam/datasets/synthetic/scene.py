@@ -113,7 +113,7 @@ def patches(
 
 
 def _rows(values: Float, n: int) -> Float:
-    """Broadcast ``(K,)`` or ``(n, K)`` to a copy of shape ``(n, K)``, faster than NumPy does."""
+    """Broadcast an array to a copy of shape ``(n, K)``, faster than NumPy does."""
     rows = np.empty((n, values.shape[-1]))
     rows[:] = values
     return rows

@@ -35,7 +35,7 @@ _SHADE_BIAS = 0.35  # m; an occluder must be this much higher than a point to sh
 
 
 class _PixelRun(NamedTuple):
-    """Neighbouring pixels of one row that see one surface.
+    """Neighbouring pixels of one image row in which the same surface is visible.
 
     The pixels are in the columns ``start`` to ``end - 1``, i8. ``x`` and ``y`` are the position of
     the sample in the first pixel, f8. In the other pixels, the sample has the same offset.
@@ -192,8 +192,8 @@ def _pool(pools, frame, x, z):
 def shade(visible, band, atlas, sky, light, shadows, pools, camera, view):
     """Shade the rows of a view that belong to a band of samples.
 
-    Neighbouring pixels that all see the same single surface are shaded together (a run). Other
-    pixels are shaded once for each surface that they see.
+    Neighbouring pixels in which only one surface is visible are shaded together (a run). If several
+    surfaces are visible in a pixel, the pixel is shaded once for each of them.
 
     Args:
         visible: result of `rasterise.find_visible`.
@@ -263,10 +263,11 @@ def shade(visible, band, atlas, sky, light, shadows, pools, camera, view):
 
 @inline
 def _kinds(seen, row, column, samples, number, weight, shift_u, shift_v):
-    """Collect the different surfaces that the samples of a pixel see, and return their number.
+    """Collect the surfaces that are visible at the samples of a pixel, and return their number.
 
-    For each surface, ``weight`` becomes the number of samples that see it. ``shift_u`` and
-    ``shift_v`` become the sums of the offsets of these samples from the pixel's centre.
+    For each surface, ``weight`` becomes the number of samples at which the surface is visible.
+    ``shift_u`` and ``shift_v`` become the sums of the offsets of these samples from the centre of
+    the pixel.
     """
     kinds = 0
     step = 1.0 / samples
@@ -288,7 +289,7 @@ def _kinds(seen, row, column, samples, number, weight, shift_u, shift_v):
 
 @inline
 def _alike(seen, row, column, samples, first):
-    """Return whether all samples of a pixel see the surface ``first``."""
+    """Return whether the surface ``first`` is visible at all samples of a pixel."""
     alike = True
     for a in range(samples):
         for b in range(samples):

@@ -19,8 +19,8 @@ from vslam.datasets.synthetic.textures import Rng
 class Palette:
     """The numbers of the town's textures in the atlas.
 
-    ``signs`` has the front and the back of each sign. ``later_twigs`` are the sparser twigs that
-    trees have after a change.
+    ``signs`` contains the front and the back of each sign. ``later_twigs`` are the sparser twigs of
+    trees whose appearance has changed.
     """
 
     sky: int
@@ -73,7 +73,7 @@ def _sign(rng: Rng, atlas: AtlasBuilder) -> tuple[int, int]:
 
 
 def _kerb(rng: Rng) -> textures.Grey:
-    """Kerb stones with a length of 1 m. The texture covers 4 m."""
+    """Make the texture of kerb stones with a length of 1 m. The texture covers 4 m."""
     tone = np.repeat(rng.uniform(135, 175, 4), 128)[None, :]
     grey = tone * (1.0 + 0.09 * textures.noise(rng, 32, 512, 8.0, 3))
     grey[:, ::128] = grey[:, 1::128] = 60.0
@@ -133,7 +133,7 @@ class Site:
         lamps: x and z of each street lamp.
         parts: surfaces of the things, in the world frame of the route.
         place: position of each thing, as in `town.Town`.
-        when: when each thing exists, as in `town.Town`.
+        when: in which part of the drive each thing exists, as in `town.Town`.
     """
 
     route: Route

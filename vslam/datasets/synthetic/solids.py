@@ -193,7 +193,7 @@ def _cards(
 
     Args:
         middle: ``(N, 3)`` positions.
-        size: ``(N,)`` lengths of their sides in metres.
+        size: ``(N,)`` lengths of the sides of the twigs in metres.
     """
     n = len(middle)
     heading, tilt, roll = rng.uniform((0, -0.6, 0), (2 * np.pi, 0.6, 6.3), (n, 3)).T[:, :, None]

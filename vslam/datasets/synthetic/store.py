@@ -74,7 +74,7 @@ def cache_folder() -> Path:
 
 
 def folder_name(variation: Variation) -> str:
-    """Return the name of the folder that all sequences of one variation share."""
+    """Return the name of the folder for all sequences whose towns have the same variation."""
     name = f"v{VERSION}-seed{variation.seed}"
     name += "-aliased" if variation.aliased else ""
     name += f"-moving{variation.moving}" if variation.moving else ""
@@ -93,7 +93,7 @@ def list_stored(cache: Path) -> list[Stored]:
 
 
 def _folder_size(folder: Path) -> int:
-    """Total size of the files in a folder in bytes."""
+    """Return the total size of the files in a folder in bytes."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
@@ -143,8 +143,8 @@ def render_sequence(
             centimetres, as 16-bit PNG files.
         until: number of the frame before which rendering ends. A later call can continue from
             there.
-        verify: compare the checksums of all frames. Otherwise, all file sizes and a few checksums
-            are compared.
+        verify: whether the checksums of all existing frames are checked. Otherwise, all file sizes
+            and a few checksums are checked.
         threads: number of frames that are rendered in parallel. The images do not depend on it.
         on_frame: called with the number of finished frames and the number of all frames.
 

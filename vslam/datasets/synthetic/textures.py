@@ -108,7 +108,7 @@ def sign(rng: Rng, size: int = 128) -> tuple[Grey, Grey]:
 
 
 def foliage(rng: Rng, size: int = 256, density: float = 1.0) -> tuple[Grey, Grey]:
-    """Make the texture of a twig with leaves, and its alpha. Leaves are sparser at the border."""
+    """Make the texture and the alpha channel of a twig. Its leaves are sparser at the border."""
     grey = np.full((size, size), 28.0, np.float32)
     alpha = np.zeros((size, size), np.float32)
     for _ in range(10):
@@ -121,7 +121,7 @@ def foliage(rng: Rng, size: int = 256, density: float = 1.0) -> tuple[Grey, Grey
 
 
 def hedge(rng: Rng) -> tuple[Grey, Grey]:
-    """Make the texture of a dense clipped hedge with an uneven upper edge, and its alpha."""
+    """Make the texture and the alpha channel of a clipped hedge, whose upper edge is uneven."""
     width, height = 512, 128
     grey = np.full((height, width), 20.0, np.float32)
     alpha = np.zeros((height, width), np.float32)
@@ -162,7 +162,7 @@ def bark(rng: Rng, size: int = 128) -> Grey:
 
 
 def fence(rng: Rng) -> tuple[Grey, Grey]:
-    """Make the texture of a fence of pickets or bars, 4 m long, and its alpha."""
+    """Make the texture and the alpha channel of a fence of pickets or bars, which is 4 m long."""
     height, width = 64, 256
     grey = np.full((height, width), float(rng.uniform(50, 190)), np.float32)
     grey += 12 * noise(rng, height, width, 16.0)

@@ -39,16 +39,17 @@ _ROADS = {
 
 @dataclass(frozen=True)
 class Town:
-    """A town of T things (objects).
+    """A town that consists of T things (objects).
 
-    If an object changes during the drive, its old and its new state are two things.
+    If an object changes during the drive, its old state and its new state are separate things.
 
     Attributes:
         surfaces: all surfaces, in the world frame of the route.
         atlas: textures of the surfaces.
         sky: number of the sky's panorama in the atlas.
         place: ``(T, 2)`` float64 x and z of each thing.
-        when: ``(T,)`` int8 ``ALWAYS``, ``BEFORE`` or ``AFTER``.
+        when: ``(T,)`` int8. A thing exists during the whole drive (``ALWAYS``), or only before or
+            after the change of an object (``BEFORE``, ``AFTER``).
         moving: surfaces of the moving cars, in the frames of the cars (see `solids`).
         lamps: ``(L, 2)`` float64 x and z of street lamps.
     """

@@ -131,7 +131,7 @@ def _sides(size: tuple[float, float, float], texture: int, thing: int) -> list[S
 
 
 def _paint_side(rng: Rng, outline: Float, glass: list[bool], paint: float) -> tuple[Grey, Grey]:
-    """Paint the side of a car, and its alpha."""
+    """Paint the texture and the alpha channel of the side of a car."""
     width, height = 512, 128
     at = (outline * [width - 1, -(height - 1)] + [0, height - 1]).round().astype(np.int32)
     grey = np.full((height, width), paint, np.float32)

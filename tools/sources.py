@@ -143,7 +143,7 @@ def _values(path: Path, filters: str, column: str, row: list[str]) -> list[float
 
 
 def _wanted(filters: str, row: list[str]) -> dict[str, str]:
-    """Return a filter as values by column. ``$1`` is replaced by the text of ``row[1]``."""
+    """Return the wanted value of each column of a filter. ``$1`` stands for the text ``row[1]``."""
 
     def text(found: re.Match[str]) -> str:
         cell = row[int(found[1])]

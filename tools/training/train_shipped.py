@@ -25,8 +25,8 @@ New weights are not identical to the shipped weights, for these reasons:
 - The shipped weights were also trained on frame 1500 of KITTI 00, which is the first frame of the
   second range of test frames. This frame was excluded afterwards.
 - Stage 1 was stopped after 14 of its 16 epochs.
-- Stage 4 ran with older code, which computed early features separately for each view.
-- Stage 6 ran with older code, which used the hard maximum over alignments.
+- Stage 4 was trained with older code, which computed early features separately for each view.
+- Stage 6 was trained with older code, which used the hard maximum over alignments.
 - Stages 6 and 7 started from weights in half precision.
 
 ``--paper`` trains the two stages of ``capsule-paper``, which is the network as the paper describes
@@ -115,7 +115,7 @@ class Stage:
         return out / self.name / f"{self.network}.safetensors"
 
     def finished(self, out: Path) -> bool:
-        """Return whether this stage is finished. It is if the model card, the last file, exists."""
+        """Return whether this stage is finished: the model card, which is written last, exists."""
         card = self.weights(out).with_suffix(".json")
         return card.exists() and bool(json.loads(card.read_text())["finished"])
 

@@ -142,8 +142,8 @@ def _flat(value: object) -> list[str]:
     """Flatten nested lists of text to a single list.
 
     Nested YAML aliases can expand a few lines into gigabytes, or form a cycle. Therefore, a list
-    that has more items than any matrix is replaced with the text "no number". The caller rejects this
-    text.
+    that has more items than any matrix is replaced with the text "no number". The caller rejects
+    this text.
     """
     found: list[str] = []
     waiting = [value]

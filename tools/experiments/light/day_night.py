@@ -9,7 +9,7 @@ keyframes are localised.
 
 A pose counts as right if it is within 2 m and 15 degrees of the ground truth. These limits are
 those of AirSLAM's experiment on the reuse of maps (Xu et al., T-RO 2025, section VII-D). Poses are
-compared relative to the nearest frame of the map. Therefore, drift of the map has no influence.
+compared relative to the nearest frame of the map. Therefore, the drift of the map has no influence.
 """
 
 from __future__ import annotations

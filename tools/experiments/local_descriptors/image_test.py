@@ -85,7 +85,7 @@ def measure(folder: Path, of_place: int) -> tuple[NDArray[np.bool_], NDArray[np.
 
 
 def warped(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Warp an image by a homography that moves its corners by up to 12 % of its size."""
+    """Warp an image by a random homography. Its corners move by up to 12 % of the image size."""
     height, width = image.shape
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
     moved = corners + rng.uniform(-0.12, 0.12, (4, 2)) * [width, height]

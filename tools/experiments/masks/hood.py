@@ -3,9 +3,9 @@
     python tools/experiments/masks/hood.py --data TOWNS --seq kitti07 --rows 0.2 0.35
 
 A hood with a random texture is painted over the lower part of the images of a stereo drive. The
-hood stays in place in the image while the street moves. The script runs the drive without the hood,
-with the hood, and with the hood and a mask. For each run, it prints the lost frames, the inliers
-and the ATE.
+hood stays in place in the image while the street moves. The script runs vslam on the drive without
+the hood, with the hood, and with the hood and a mask. For each run, it prints the number of lost
+frames, the number of inliers and the ATE.
 """
 
 from __future__ import annotations

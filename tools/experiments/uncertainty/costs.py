@@ -3,8 +3,8 @@
     python tools/experiments/uncertainty/costs.py --data "$KITTI_ROOT" --seq 06 --frames 51
 
 The script runs vslam on a stereo drive, alternately without a mask and with a mask that hides
-nothing. Therefore, both kinds of run do the same work apart from the mask. The script prints the medians of
-the CPU times. It fails if the trajectories of any two runs differ.
+nothing. Therefore, both kinds of run do the same work apart from the mask. The script prints the
+medians of the CPU times. It fails if the trajectories of any two runs differ.
 """
 
 from __future__ import annotations

@@ -4,10 +4,10 @@
 
 DATA is a folder in KITTI's format with exact ground truth, for example with rendered drives. vslam
 is run on every drive under every perturbation. The script prints the normalised estimation error
-squared (NEES) of the motion over intervals of 1 s and of 10 s. The NEES is defined by Bar-Shalom et al., Estimation
-with Applications to Tracking and Navigation, 2001, section 5.4. The script divides the NEES by the
-six degrees of freedom. The mean is then 1 if the covariances are consistent, and larger than 1 if
-the covariances are too small.
+squared (NEES) of the motion over intervals of 1 s and of 10 s. The NEES is defined by Bar-Shalom et
+al., Estimation with Applications to Tracking and Navigation, 2001, section 5.4. The script divides
+the NEES by the six degrees of freedom. The mean is then 1 if the covariances are consistent, and
+larger than 1 if the covariances are too small.
 """
 
 from __future__ import annotations

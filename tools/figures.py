@@ -74,7 +74,7 @@ class Entry:
     history: str = ""
 
     def paths(self, root: Path) -> list[str]:
-        """Return the paths of the files. Patterns are replaced by the files that match them."""
+        """Return the paths of the files. Patterns are replaced with the files that match them."""
         found = [sorted(root.glob(one)) if "*" in one else [root / one] for one in self.files]
         return [path.relative_to(root).as_posix() for path in chain(*found)]
 

@@ -4,8 +4,8 @@ Boards are recognised only for error messages. If the images do not show the exp
 message tells which board they show.
 
 A board lies in the plane z = 0 of its frame. The frame of a checkerboard or ChArUco board has x to
-the right, y down and z away from the viewer. The frame of an AprilGrid is that of Kalibr, with x to
-the right, y up and z towards the viewer.
+the right, y down and z away from the viewer. The frame of an AprilGrid is defined as in Kalibr,
+with x to the right, y up and z towards the viewer.
 """
 
 from __future__ import annotations
@@ -175,9 +175,9 @@ def find_corners(board: Board, image: Image, name: str = "") -> View | None:
 def same_order(board: Board, left: View, right: View) -> View:
     """Renumber the corners in the right image so that they correspond to those in the left image.
 
-    Some checkerboards look the same upside down. Their corners may therefore be numbered from
-    either end. The function chooses the numbering for which the offsets between corresponding
-    corners of the two images vary least.
+    Some checkerboards look the same upside down. Therefore, the numbering of their corners may
+    start at either end. The function chooses the numbering for which the offsets between
+    corresponding corners of the two images vary least.
     """
     if board.kind != "checkerboard":
         return right

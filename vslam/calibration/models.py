@@ -1,8 +1,8 @@
 """Camera models: pinhole with radial-tangential distortion, and equidistant (Kannala-Brandt).
 
 In the camera frame, x points right, y down and z forward. The centre of the upper left pixel is (0,
-0). The formulas are those of OpenCV's documentation: ``calib3d`` for radial-tangential distortion,
-and ``fisheye`` for equidistant distortion (Kannala and Brandt, PAMI 2006, equation 6).
+0). The formulas are the ones in OpenCV's documentation: ``calib3d`` for radial-tangential
+distortion, and ``fisheye`` for equidistant distortion (Kannala and Brandt, PAMI 2006, equation 6).
 """
 
 from __future__ import annotations

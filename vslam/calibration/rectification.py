@@ -1,4 +1,4 @@
-"""Warps images to those of an undistorted pinhole camera or of an aligned stereo pair.
+"""Rectifies images: removes the distortion, and aligns the images of a stereo pair.
 
 The x axis of the rectified pair is the baseline. The viewing direction of the rectified pair is as
 close as possible to the mean viewing direction of the two cameras. The rectified images show the

@@ -85,7 +85,7 @@ def open_raw_euroc(
 ) -> RawSource:
     """Open the unrectified images of a sequence, without its calibration and ground truth.
 
-    The arguments are those of `open_euroc`.
+    The arguments have the same meaning as for `open_euroc`.
     """
     _, found, stamps, files, pairing = _select(root, name, start, every, max_frames, monocular)
     times = stamps.astype(np.float64) * 1e-9

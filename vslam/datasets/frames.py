@@ -196,7 +196,7 @@ def stored_frames(
     Args:
         timestamps: ``(N,)`` float64 seconds, increasing.
         read: function that decodes the images of a frame. Its first argument is the index of the
-            frame. Its other argument and its results are those of ``TimedFrame.read``.
+            frame. Its second argument and its results are the same as for ``TimedFrame.read``.
     """
     return tuple(TimedFrame(time, partial(read, k)) for k, time in enumerate(timestamps.tolist()))
 

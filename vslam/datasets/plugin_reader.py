@@ -93,7 +93,7 @@ def _play(plugin: PlugIn, raw: Source, checked: partial[TimedFrame]) -> Iterator
 def _checked(plugin: PlugIn, root: Path, camera: Camera, frame: TimedFrame, at: str) -> TimedFrame:
     """Return a frame whose images are checked whenever they are read.
 
-    The images are those of the given frame. They must have the types and sizes that the calibration
+    The images of the given frame are used. They must have the types and sizes that the calibration
     of the camera demands.
     """
 

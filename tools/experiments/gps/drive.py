@@ -7,11 +7,13 @@ fix per second. The fixes have white noise and a bias that follows a random walk
 gaps, and jumps by 20 m that last ten seconds. The script prints the RMSE of the following
 positions, as a mean over the seeds:
 
-- those of the run without GPS, after the alignment for its sensor;
-- those of the fixes;
-- those of the fixes, interpolated at the times of the frames, with and without SE3 alignment;
-- those of the run with GPS, with and without SE3 alignment;
-- with ``--antenna``, those of a run with GPS for which the antenna is assumed to be at the camera.
+- the positions of the run without GPS, after the alignment for its sensor;
+- the positions of the fixes;
+- the positions of the fixes, interpolated at the times of the frames, with and without SE3
+  alignment;
+- the positions of the run with GPS, with and without SE3 alignment;
+- with ``--antenna``, the positions of a run with GPS, in which the antenna is assumed to be at the
+  camera.
 
 Finally, it prints the median CPU time that was needed to add the fixes after the drive.
 """

@@ -7,8 +7,8 @@ in the map, without using other images. The script counts how many poses are rig
 not given, the map is made from the whole drive. In this case, all images of the drive except its
 keyframes are localised.
 
-A pose counts as right if it is within 2 m and 15 degrees of the ground truth. These limits are
-those of AirSLAM's experiment on the reuse of maps (Xu et al., T-RO 2025, section VII-D). Poses are
+A pose counts as right if it is within 2 m and 15 degrees of the ground truth. These limits were
+also used in AirSLAM's experiment on map reuse (Xu et al., T-RO 2025, section VII-D). Poses are
 compared relative to the nearest frame of the map. Therefore, the drift of the map has no influence.
 """
 

@@ -208,9 +208,9 @@ def sheet_of_laws(sequence: Source, specs: Collection[str], index: int, seed: in
 
 
 def laws_for(sequence: Source) -> tuple[list[str], dict[str, str]]:
-    """Return which laws (kinds of perturbation) can be applied to a source.
+    """Return the names of the laws (kinds of perturbation) that can be applied to a source.
 
-    Also returns for each other law why it cannot be applied.
+    The second result maps the name of each other law to the reason why it cannot be applied.
     """
     applicable, reasons = [], {}
     for name in all_laws():

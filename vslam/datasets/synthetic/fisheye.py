@@ -67,8 +67,8 @@ def fisheye_rig(camera: Camera) -> FisheyeRig:
 def wide_camera(camera: Camera) -> Camera:
     """Return the rectified pinhole pair that is rendered for a fisheye pair.
 
-    The pinhole pair has the same focal length as the given pair. Its images are the smallest ones
-    that cover the view of the fisheye pair.
+    The pinhole pair has the same focal length as the given pair. Its images are just large enough
+    to cover the view of the fisheye pair.
     """
     rig = fisheye_rig(camera)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
@@ -96,7 +96,7 @@ def render_fisheye(
     interrupted rendering.
 
     Args:
-        route, variation, until, threads, on_frame: as for `render_sequence`.
+        route, variation, until, threads, on_frame: same meaning as for `render_sequence`.
         folder: output folder, to which ``mav0``, ``camchain.yaml`` and ``pinhole`` are written.
 
     Returns:

@@ -36,7 +36,7 @@ def render_rgbd(
     depths of distant points have the same uncertainty as with stereo.
 
     Args:
-        route, variation, threads, on_frame: as for `render_sequence`.
+        route, variation, threads, on_frame: same meaning as for `render_sequence`.
         out: output folder.
         until: number of the frame before which rendering ends.
 

@@ -83,8 +83,8 @@ def render_pairs(
 
     - the two image files, whether the images show the same place (1 or 0), and the kind of the
       pair;
-    - for each image, the frame at which it is taken, and the frame whose light and objects it
-      shows;
+    - for each image, the frame at whose position it is taken, and the frame whose light and objects
+      it shows;
     - the distance between the two frames (m);
     - the lateral shift (m), the rotation (degrees) and the rise (m) of the second camera;
     - the ratio of the exposures;
@@ -200,10 +200,13 @@ def _different(T_wc: Float, others: Float) -> NDArray[np.bool_]:
 
 
 def _look_alikes(route: Route, town: Town, passes: Passes, threads: int) -> NDArray[np.int64]:
-    """Return ``(P, 2)`` pairs of frames that show different places that look similar.
+    """Find pairs of frames that look similar although they show different places.
 
     There are several pairs for each place. The similarity of two places is the correlation of their
-    images, which are made small, blurred and normalised.
+    images, after the images were reduced in size, blurred and normalised.
+
+    Returns:
+        ``(P, 2)`` frame indices of the P pairs.
     """
     chosen = np.unique(np.linspace(0, len(route.T_wc) - 1, _PLACES).astype(int))
     c = route.camera

@@ -68,8 +68,9 @@ class Passes:
     def _light(self, frame: int, number: int) -> tuple[Light, float]:
         """Return the light at a frame of pass ``number``, and the darkness (0 by day, 1 at night).
 
-        The sun does not move during a pass. Between two passes, it moves while a cloud hides it.
-        Night falls slowly during the whole drive.
+        A pass is a part of the drive in which no street is revisited. The sun does not move during
+        a pass. Between two passes, the sun moves while a cloud hides it. Night falls slowly during
+        the whole drive.
         """
         seed, change = self._variation.seed, self._variation.change
         rng = np.random.default_rng([seed, 11])
@@ -138,9 +139,10 @@ def _switch_frames(place: NDArray[np.float64], cameras: NDArray[np.float64]) -> 
 
 
 def pass_starts(T_wc: NDArray[np.float64]) -> list[int]:
-    """Return the first frame of each pass of a drive.
+    """Divide a drive into passes, and return the first frame of each pass.
 
-    A pass begins at frame 0 and whenever the camera returns to an earlier street.
+    The first pass begins at frame 0. A new pass begins whenever the camera returns to a street in
+    which it was before.
 
     Args:
         T_wc: ``(N, 4, 4)`` poses of the drive.

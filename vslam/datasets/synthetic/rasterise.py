@@ -23,7 +23,7 @@ NUMBER, DETAIL_U, DETAIL_V, DETAIL, AMBIENT, SUN, GLOW, KEY, COLUMNS = range(19,
 
 
 class _Span(NamedTuple):
-    """Neighbouring samples of one row that lie on one surface.
+    """Neighbouring samples of one image row at which the same surface is drawn.
 
     The samples are ``begin`` to ``end - 1`` (i8), in row ``v`` in pixels (f8). Sample ``i`` lies at
     column ``shift + step i`` in pixels (f8), and has the inverse depth 1/z = ``value + slope i``
@@ -183,7 +183,7 @@ def _turn(T_wc, x, y, z):
 
 @inline
 def _affine(row, at, x, y, z, fx, fy, cx, cy):
-    """Write ``(x, y, z) . K^-1 (u, v, 1)`` as coefficients of u, v and 1."""
+    """Store the coefficients of u, v and 1 in ``(x, y, z) . K^-1 (u, v, 1)`` in ``row``."""
     row[at] = x / fx
     row[at + 1] = y / fy
     row[at + 2] = z - x * cx / fx - y * cy / fy

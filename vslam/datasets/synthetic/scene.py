@@ -91,7 +91,7 @@ def patches(
 ) -> Surfaces:
     """Make surfaces that differ only in their position and texture coordinates.
 
-    The arguments are those of `Surfaces`.
+    The arguments have the same meaning as the attributes of `Surfaces`.
     """
     arrays = [np.asarray(x, np.float64) for x in (origin, edge_s, edge_t)]
     n = max(len(x) if x.ndim == 2 else 1 for x in arrays)

@@ -323,7 +323,7 @@ def _shade_run(run, visible, number, atlas, light, shadows, pools, camera, buffe
     """Add a surface to the pixels of a run.
 
     The surface is row ``number`` of ``visible``. The result is written to ``buffers.total`` and
-    ``buffers.nearest``. The other arguments are those of `shade`.
+    ``buffers.nearest``. The other arguments have the same meaning as for `shade`.
     """
     start, end, x0, y, weight = run.start, run.end, run.x, run.y, run.weight
     texels, offset, log_size, T_wc = atlas.texels, atlas.offset, atlas.log_size, camera.T_wc

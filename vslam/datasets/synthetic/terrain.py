@@ -35,7 +35,7 @@ class Terrain:
     def height(self, xz: Float) -> Float:
         """Return the height of the ground above y = 0.
 
-        Outside of the grid, the height is that of the nearest point of the grid.
+        For a position outside of the grid, the height of the nearest point of the grid is returned.
 
         Args:
             xz: ``(N, 2)`` positions.

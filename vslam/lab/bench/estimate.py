@@ -24,8 +24,8 @@ class Estimate:
     """An estimate of the time and the disk space that the runs of a benchmark need.
 
     Attributes:
-        seconds: wall time in seconds for all runs together, if the requested number of runs takes
-            place at the same time.
+        seconds: wall time in seconds for all runs together. It is assumed that the requested number
+            of runs is executed at the same time.
         kept: size in bytes of the files that are kept.
         scratch: size in bytes of the files that are deleted after each run.
         basis: text that says on what the estimated time is based.

@@ -55,8 +55,8 @@ def measure(
     set, two empty lists are returned.
 
     Returns:
-        The scores of all detectors. Also the differences between the first detector and each other
-        detector.
+        Two lists. The first list contains the scores of the detectors. The second list contains,
+        for each detector except the first one, its average precision minus that of the first one.
     """
     query_set = test_set.query_set(condition, seed)
     if query_set is None:
@@ -259,7 +259,7 @@ def epipolar_inliers(a: DescribedImage, b: DescribedImage) -> int:
 def sequence_scores(scores: Matrix) -> Matrix:
     """Compute the similarity of sequences instead of single images (SeqSLAM).
 
-    The method is that of Milford and Wyeth, ICRA 2012.
+    The method is described by Milford and Wyeth, ICRA 2012.
 
     A sequence that ends at a query is compared with a sequence that ends at a gallery image. In the
     matrix of scores, the two sequences correspond to a straight line that ends at this pair of

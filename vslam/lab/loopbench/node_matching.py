@@ -1,8 +1,9 @@
 """Matches features using the direct index of a vocabulary.
 
-Only features whose words lie under the same node of the vocabulary tree are compared (Galvez-Lopez
-and Tardos, T-RO 2012, section IV). Loop closing compares all pairs of descriptors instead.
-Comparing all pairs finds a quarter more matches, but is too slow for thousands of image pairs.
+Two features are compared only if their visual words lie under the same node of the vocabulary tree
+(Galvez-Lopez and Tardos, T-RO 2012, section IV). Loop closing compares all pairs of descriptors
+instead. Comparing all pairs finds a quarter more matches, but it is too slow for thousands of image
+pairs.
 """
 
 from __future__ import annotations
@@ -55,8 +56,8 @@ def match_by_node(
         node_b, feature_b: direct index of image b.
         descriptors_b: ``(N, 4)`` uint64 descriptors of all features of image b.
         max_distance: largest Hamming distance in bits.
-        ratio: largest ratio of the distance of the best match to that of the second best match
-            under the same node. 1 disables this test.
+        ratio: largest ratio of two distances: the distance of the best match, divided by the
+            distance of the second best match under the same node. 1 disables this test.
 
     Returns:
         ``(M,)`` int32. For each feature of image a, it contains the index of the matching feature

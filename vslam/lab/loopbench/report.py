@@ -255,7 +255,7 @@ def _by_detector(
 def _online_words(scores: Iterable[OnlineScore]) -> list[str]:
     """Return sentences that name the best detector for each drive and each kind of verification.
 
-    The best detector has the highest recall without a wrong match.
+    The best detector is the one with the highest recall at 100 % precision.
     """
     sentences = []
     for data in dict.fromkeys(s.data for s in scores):

@@ -69,8 +69,8 @@ def open_set(spec: str, cache: Path, *, threads: int, progress_bar: ProgressBar)
     and for each change of the town, the town is rendered separately.
 
     Args:
-        spec: ``town:ROUTE[seed=101,aliased=1,places=150]`` for a rendered town. Otherwise, the
-            name of image data as for ``vslam train``.
+        spec: ``town:ROUTE[seed=101,aliased=1,places=150]`` for a rendered town. Otherwise, a source
+            of images in the same spelling as for ``vslam train``.
         cache: folder of rendered towns.
         progress_bar: progress bar that is opened while a town is rendered.
 

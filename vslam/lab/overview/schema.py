@@ -60,8 +60,8 @@ class RunEntry(Record):
       ``sim3`` for a monocular run, whose scale is arbitrary.
     - ``measures``: results of the run. The keys are the names in ``MEASURES``. A value is None if
       it is unknown.
-    - ``source``: the folder of the run. For another SLAM system, it is the trajectory file. For a
-      detector that was added to a run with ``--compare``, it is the trajectory file, too.
+    - ``source``: the folder of the run. For another SLAM system, and for a detector that was added
+      to a run with ``--compare``, it is the trajectory file instead.
     """
 
     drive: Drive

@@ -225,7 +225,7 @@ def read_poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) 
     Args:
         path: file in KITTI's or TUM's format.
         times: ``(N,)`` times of the frames in seconds.
-        kept: indices of the frames that the system received, which are those that were not dropped.
+        kept: indices of the frames that the system received. Dropped frames are not among them.
 
     Raises:
         InputError: the file is malformed.

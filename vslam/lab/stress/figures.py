@@ -39,7 +39,7 @@ _PANELS = (
 def draw_curves(report: StressJson) -> list[page.Figure]:
     """Draw the curves of a stress test, with one figure for each sequence and perturbation.
 
-    The strength of the perturbation increases to the right.
+    Stronger perturbations are further to the right.
     """
     systems = list(dict.fromkeys(entry.system for entry in report.boundaries))
     colors = {name: _COLORS[k % len(_COLORS)] for k, name in enumerate(systems)}

@@ -463,7 +463,7 @@ class VerificationConfig(Section):
 
 
 class LearnedMatchingConfig(Section):
-    """Verification of loop candidates using the network's local descriptors, where ORB fails."""
+    """Verification of loop candidates using learned local descriptors, where ORB fails."""
 
     max_candidates: int = Field(2, ge=1)
     """Upper bound of the number of candidates that are tried for a keyframe or a lost frame.
@@ -831,7 +831,7 @@ def thresholds_in_words(changed: Mapping[str, Any], most: int = 3) -> str:
 
     Args:
         changed: thresholds by dotted name.
-        most: number of thresholds that are listed. The other thresholds are only counted.
+        most: maximum number of thresholds that are listed. The other thresholds are only counted.
     """
     words = [f"{name}={value}" for name, value in changed.items()]
     more = [f"{len(words) - most} more in config.json"] if len(words) > most else []

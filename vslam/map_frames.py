@@ -90,7 +90,7 @@ class LandmarkCounts:
     """Counts how often landmarks should have been seen, and how often they were found.
 
     The counters of the map can be updated only while no other thread writes the map. Until then,
-    this object stores the landmarks to count.
+    this object stores the ids of the landmarks to be counted.
     """
 
     def __init__(self) -> None:
@@ -148,7 +148,7 @@ def update_landmarks(frame: Frame, map_: Map) -> None:
     """Update the landmarks of a frame after the map has changed.
 
     The ids of merged landmarks are replaced, and the ids of culled landmarks become -1.
-    ``frame.xyz`` is set to the present positions of the landmarks.
+    ``frame.xyz`` is set to the current positions of the landmarks.
 
     If two tracked landmarks were merged, only the first of the two features keeps the landmark.
     """

@@ -12,8 +12,9 @@ landmarks, so their errors are correlated. Therefore, the drift grows like a ran
 correlated steps (a first-order autoregressive process).
 
 A stereo camera adds a third part. The disparity offset of the camera is estimated during the drive
-(``backend/disparity_offset.py``). The error of this estimate makes all motions too long or too
-short by the same factor. In contrast to the drift, this error does not average out.
+(``backend/disparity_offset.py``). Because of an error in this estimate, all estimated motions are
+too long or too short by the same factor. The random steps of the drift partly cancel each other. An
+error in the disparity offset does not cancel, because it affects all motions in the same way.
 
 A covariance describes the error ``xi = [v, w]`` of a pose, in metres and radians, in the frame of
 the camera. If ``T_cw`` is the estimated pose, the true pose is ``exp(xi) T_cw``. The covariance

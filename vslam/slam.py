@@ -395,8 +395,9 @@ class Slam:
         """Advance the odometry to the next frame, before the pose of this frame is recorded.
 
         Args:
-            T_cw: ``(4, 4)`` pose of the frame by continuous motion from the last frame. It differs
-                from the pose in the map if the camera was relocalised.
+            T_cw: ``(4, 4)`` pose of the frame, computed from the continuous motion since the last
+                frame. It differs from the pose of the frame in the map if the camera was
+                relocalised.
             covariance, of_offset: see ``Odometry.move``.
         """
         frames = self._mapper.frames
@@ -485,7 +486,7 @@ class Slam:
         return self._closing.corrections
 
     def trajectory(self) -> Trajectory:
-        """Return the pose of every frame according to the present map.
+        """Return the pose of every frame according to the current map.
 
         The poses of lost frames are interpolated between the tracked frames before and after them.
         """
@@ -496,9 +497,9 @@ class Slam:
         return keyframe_trajectory(self.map)
 
     def in_map(self) -> NDArray[np.bool_]:
-        """Return which frames were tracked in the first part of the map, as ``(N,)`` bool.
+        """Determine which frames were tracked in the first part of the map. Returns ``(N,)`` bool.
 
-        This part contains the first keyframe of the map, and the sub-maps that loops have joined to
-        it.
+        The first part of the map contains the first keyframe and the sub-maps that closed loops
+        have joined to it.
         """
         return in_first_part(self.map, self._closing.closed, self._mapper.frames.table())

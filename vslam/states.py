@@ -69,7 +69,7 @@ class PolicyState:
     Attributes:
         gained_close: number of close points that the first frame after a keyframe tracks, as a
             running mean over keyframes.
-        gain_awaited: whether the next frame is the first after a keyframe.
+        gain_awaited: whether the next frame is the first frame after a keyframe.
         first_close: number of close points that the first frame after the last keyframe tracked.
         first_frame: index of the first frame after the last keyframe. It is -1 before the first
             keyframe.
@@ -89,7 +89,7 @@ class ConsistencyState:
     """State of the consistency test of loop candidates.
 
     Attributes:
-        places: places that recent keyframes resembled.
+        places: places in the map that recent keyframes resembled.
         verified: verified loops that another keyframe must still confirm. Each loop is stored with
             the value of ``turn`` at its keyframe.
         turn: number of keyframes that have been tested so far.
@@ -104,12 +104,12 @@ class ConsistencyState:
 class VerifierState:
     """State of the verifier of loop candidates.
 
-    It describes the last time when a verification with learned descriptors failed.
+    The state describes the last failed verification using learned descriptors.
 
     Attributes:
         resting_until: before this keyframe, learned descriptors are tried only for candidates that
             are clearly more similar than the failed one.
-        failed_similarity: similarity of the two images for which verification failed.
+        failed_similarity: similarity of the two images for which this verification failed.
     """
 
     resting_until: int = 0

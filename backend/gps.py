@@ -7,8 +7,8 @@ graph. The graph has the edges of the essential graph and a GPS factor for each 
 held fixed.
 
 At first, fixes have a Cauchy loss with a large scale. The scale shrinks from one optimisation to
-the next. In this way, even a map that has drifted far is pulled to its fixes. Afterwards, fixes
-that fail a chi-square test are discarded, and the remaining fixes have a Gaussian loss.
+the next. In this way, even a map that has drifted far is moved to its fixes. Afterwards, fixes that
+fail a chi-square test are discarded, and the remaining fixes have a Gaussian loss.
 
 The error of GPS is mostly a bias that changes slowly, which is caused by the atmosphere and by
 reflections. A hundred fixes in ten seconds therefore provide little more information than a single
@@ -16,9 +16,10 @@ fix. For this reason, all fixes within ``CORRELATION_S`` together have the weigh
 
 The drift of a metric map depends on the camera, its calibration and the loops that were closed.
 However, the pose graph has a single drift model for all maps. With this model, a map with little
-drift would be bent towards the bias of the fixes. Therefore, the standard deviations of the drift
-model are multiplied by a factor. The factor is chosen so that the fixes become most likely
-(empirical Bayes: MacKay, Bayesian Interpolation, 1992).
+drift would be bent towards the bias of the fixes. Therefore, the standard deviations of all tree
+and covisibility edges are multiplied by a common factor. The optimisation is repeated with several
+factors, and the factor that maximises the marginal likelihood of the fixes is chosen (empirical
+Bayes: MacKay, Bayesian Interpolation, 1992).
 """
 
 from __future__ import annotations
@@ -77,7 +78,8 @@ class Positions:
             given.
         arm: ``(M, 3)`` estimated position of the camera, in units of the map.
         lever: ``(M, 3)`` vector from the camera to the antenna, in metres.
-        enu: ``(M, 3)`` measured position relative to a reference point: east, north, up, in metres.
+        enu: ``(M, 3)`` measured position of the antenna relative to a reference point: east, north
+            and up, in metres.
         sigma: ``(M, 3)`` standard deviations of ``enu`` in metres.
     """
 
@@ -141,7 +143,7 @@ def anchor(
             without a prior.
 
     Raises:
-        InputError: the drive is too short to determine its direction.
+        InputError: the camera travelled too short a distance to determine the direction of travel.
     """
     T_wk = inverses(graph.T_cw)
     measured = (graph.kind != WEAK) & (graph.kind != GAP)
@@ -190,8 +192,8 @@ class Alignment:
 
     Attributes:
         S_enu_w: ``(4, 4)`` similarity transform from the map to ENU.
-        unsure: standard deviation of the direction of the drive, rad.
-        unsure_about: standard deviation of the rotation about the direction of the drive, rad.
+        unsure: standard deviation of the direction of travel, rad.
+        unsure_about: standard deviation of the rotation about the direction of travel, rad.
     """
 
     S_enu_w: Array
@@ -257,8 +259,8 @@ def _umeyama(p: Array, q: Array, up: Array, fixed: float | None) -> Array:
     estimated.
 
     Points on a line do not determine the rotation about this line. In this case, the upward axes
-    ``up`` of the camera determine the rotation. In all other cases, these axes have too little
-    weight to matter.
+    ``up`` of the camera determine the rotation. In all other cases, these axes have so little
+    weight that they hardly affect the result.
     """
     p_mean, q_mean = p.mean(axis=-2), q.mean(axis=-2)
     p0, q0 = p - p_mean[..., None, :], q - q_mean[..., None, :]
@@ -320,7 +322,7 @@ def _local_scale(T_wk: Array, T_enu_k: Array, scale: Array, part: NDArray[np.int
 
     The scale is the length of the path around the keyframe in ENU, divided by the length of the
     same path in the map. The path stays within the keyframe's part of the map. Where the length of
-    the path is 0, the previous ``scale`` is returned.
+    the path is 0, the given ``scale`` is returned.
     """
     scale = scale.copy()
     for label in np.unique(part):
@@ -337,8 +339,8 @@ def _local_scale(T_wk: Array, T_enu_k: Array, scale: Array, part: NDArray[np.int
 def _likeliest(
     factors: Callable[..., _Factors], part: NDArray[np.int64], config: PoseGraphConfig
 ) -> Array:
-    """Optimise the poses with each drift factor of ``_DRIFTS``. Returns the ``(N, 4, 4)`` poses for
-    the factor with which the fixes are most likely, given the edges.
+    """Optimise the poses with each factor of the drift model in ``_DRIFTS``. Returns the ``(N, 4,
+    4)`` poses for the factor that maximises the likelihood of the fixes, given the edges.
 
     The likelihood of the fixes is an integral over all poses of the keyframes. It is computed by
     Laplace's approximation. This approximation depends on the error at the optimum and on the

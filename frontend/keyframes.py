@@ -213,7 +213,7 @@ class KeyframePolicy:
         did not provide more of them.
 
         In addition, a minimum number of inliers is required. Otherwise, no keyframe would be made
-        when the camera drives beyond the end of a map. The last keyframe of a map has few landmarks
+        when the camera moves beyond the end of a map. The last keyframe of a map has few landmarks
         that at least three keyframes observe, so both conditions would hold until tracking is lost.
 
         Args:
@@ -230,11 +230,10 @@ class KeyframePolicy:
         )
 
     def is_due(self, index: int, evidence: KeyframeEvidence) -> bool:
-        """Return whether the frame with this index, which was tracked by patches, is to become a
-        keyframe.
+        """Return whether a frame that was tracked by patches must now become a keyframe as planned.
 
-        A keyframe is planned a few frames before it is expected to be needed. Its features can then
-        be extracted in the background.
+        A keyframe is planned a few frames before it is expected to be needed. The features of the
+        planned keyframe can then be extracted in the background.
         """
         if self.due < 0:
             soon = range(self._config.patch_lead_frames + 1)

@@ -27,8 +27,8 @@ from vslam.states import ConsistencyState
 
 
 class LoopConsistency:
-    """Tests the temporal consistency of loops. It stores which places recent keyframes resembled,
-    and which loops were verified for these keyframes.
+    """Tests the temporal consistency of loops. For this test, the places that recent keyframes
+    resembled and the loops that were verified for these keyframes are stored.
 
     Call ``update`` once for every keyframe, with or without candidates. Call ``confirm`` for every
     loop edge that was verified. Call ``reset`` after a loop has been closed.

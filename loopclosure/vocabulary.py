@@ -63,7 +63,7 @@ class Vocabulary:
         return len(self.weight)
 
     def words(self, descriptors: NDArray[np.uint8]) -> NDArray[np.int32]:
-        """Find the ``(M,)`` int32 visual word of each of ``(M, 32)`` uint8 descriptors."""
+        """Find the visual words of ``(M, 32)`` uint8 descriptors. Returns ``(M,)`` int32 words."""
         return descend(
             np.ascontiguousarray(descriptors).view(np.uint64),
             self.descriptors,

@@ -123,8 +123,8 @@ class KeyframeImages:
         """Remove the images of keyframes that were culled from the map.
 
         Args:
-            alive: ``(K,)`` bool for all keyframes up to the last one added; False for culled
-                keyframes.
+            alive: ``(K,)`` bool with an element for each keyframe up to the last one that was
+                added; False for culled keyframes.
         """
         for keyframe in [one for one in self._files if not alive[one]]:
             for kept in (self._files, self._maps, self._glances):

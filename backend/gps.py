@@ -437,7 +437,7 @@ def _factors(
         pose = gtsam.Pose3(T)
         start.insert(i, pose)
         # This prior determines the poses of parts without fixes. On a straight drive, it also
-        # determines the rotation about the direction of the drive.
+        # determines the rotation about the direction of travel.
         if graph.fixed[i]:
             vision.add(gtsam.PriorFactorPose3(i, pose, loose))
     edges, T_i_j = graph.edges, graph.T_i_j.copy()

@@ -23,7 +23,7 @@ def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config)
     The landmarks of the keyframe are projected into its neighbours, and the landmarks of the
     neighbours into the keyframe. If a projected landmark matches a feature that observes another
     landmark, the two landmarks are merged. If a projected landmark matches a feature without a
-    landmark, an observation is added.
+    landmark, the feature becomes an observation of the projected landmark.
     """
     neighbours = fusion_neighbours(map_, keyframe, config)
     for neighbour in neighbours:

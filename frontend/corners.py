@@ -152,7 +152,8 @@ def spread(x, y, score, width, height, quota):
     """Choose up to ``quota`` evenly spread corners. They are the corners with the best score in
     each cell of a grid.
 
-    The cells are as large as possible, but at least ``quota`` cells must contain a corner.
+    The cells of the grid are as large as possible, but at least ``quota`` cells must contain a
+    corner.
 
     The cell size is found by bisection, as in Bailo et al. ("Efficient adaptive non-maximal
     suppression", PRL 2018).

@@ -1,9 +1,9 @@
 """Cuts out image patches around keypoints, and stores the patches of the newest keyframes. Matches
 are aligned to these patches with sub-pixel accuracy.
 
-The patches of the newest keyframes are kept, and older patches are discarded. The newest keyframes
-observe nearly all landmarks that are being tracked, and a patch takes more memory than the rest of
-an observation.
+The patches of the newest keyframes are kept, and older patches are discarded. The patches of older
+keyframes are rarely needed, because the newest keyframes observe nearly all landmarks that are
+being tracked. In addition, a patch takes more memory than the rest of an observation.
 """
 
 from __future__ import annotations

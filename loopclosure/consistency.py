@@ -30,8 +30,8 @@ class LoopConsistency:
     """Tests the temporal consistency of loops. For this test, the places that recent keyframes
     resembled and the loops that were verified for these keyframes are stored.
 
-    Call ``update`` once for every keyframe, with or without candidates. Call ``confirm`` for every
-    loop edge that was verified. Call ``reset`` after a loop has been closed.
+    Call ``update`` once for every keyframe, even if the keyframe has no candidates. Call
+    ``confirm`` for every loop edge that was verified. Call ``reset`` after a loop has been closed.
     """
 
     def __init__(self, config: ConsistencyConfig) -> None:

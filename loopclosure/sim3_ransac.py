@@ -74,8 +74,8 @@ def align(
         seed: seed of the random samples; the same seed gives the same result.
         min_inliers: least number of inliers.
         max_draws: maximum number of samples.
-        confidence: a probability. Sampling ends when a better motion, if there were one, would have
-            been found with this probability.
+        confidence: a probability. Assume that a better motion exists. Sampling ends when such a
+            motion would have been found with this probability.
         fix_scale: whether the scale is fixed to 1. True for metric maps (stereo, RGB-D), False for
             monocular maps.
     """

@@ -270,7 +270,7 @@ class TrackResult:
         timestamp: seconds.
         T_wc: ``(4, 4)`` float64 pose (camera to world) at the time of tracking. Later bundle
             adjustments improve this pose. ``Slam.trajectory()`` returns the improved poses.
-        state: OK, WEAK, LOST or DROPPED.
+        state: how the frame was tracked: OK, WEAK, LOST or DROPPED.
         n_features: number of features that were extracted from the left image. It is 0 if the frame
             was tracked by patches.
         n_stereo: number of features with a stereo match.

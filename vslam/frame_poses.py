@@ -81,7 +81,7 @@ class FramePoses:
     """
 
     def __init__(self, keyframes: KeyframePoses, before: FrameTable | None = None) -> None:
-        """Begin with the poses of earlier frames of the same drive.
+        """Begin an empty list of poses, or continue the list of an earlier part of the same drive.
 
         Args:
             keyframes: the current poses of the keyframes.
@@ -139,7 +139,7 @@ class FramePoses:
         self._set(index, keyframe, np.eye(4), unit)
 
     def follow_reference(self, index: int, T_cw: Matrix) -> None:
-        """Make the pose ``T_cw`` of a frame relative to the current reference keyframe."""
+        """Store the pose ``T_cw`` of a frame relative to the current reference keyframe."""
         keyframes = self._keyframes
         reference = keyframes.reference
         T_rw = keyframes.keyframe_pose(reference) if keyframes.n_keyframes else np.eye(4)

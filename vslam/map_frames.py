@@ -139,7 +139,7 @@ def has_more_points(map_: Map, keyframe: int, frame: Frame) -> bool:
 
 
 def observe_keyframe(frame: Frame, map_: Map, keyframe: int) -> None:
-    """Let a frame that became a keyframe track all landmarks that this keyframe observes."""
+    """Make a frame that became a keyframe track all landmarks that this keyframe observes."""
     frame.landmark = map_.arrays.landmark[map_.rows(keyframe)]
     update_landmarks(frame, map_)
 

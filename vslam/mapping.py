@@ -4,7 +4,7 @@
 of this job visible to tracking. The merge happens at a fixed frame index, regardless of how long
 the job takes. Between two merges, tracking reads a ``MapView``, which is a copy of parts of the map
 made at the last merge. A method that needs the merged map first performs the merge. A merge also
-updates the frames that were given to ``Mapper.hold``.
+updates the poses and landmarks of the frames that were given to ``Mapper.hold``.
 
 After the merge, the other thread searches for a loop at the keyframe. If a loop is found, it is
 closed before the map is changed again.
@@ -350,7 +350,8 @@ class Mapper:
 
         The second keyframe is the newest frame.
 
-        This frame gets the twist between the two views. It tracks all landmarks that it observes.
+        The newest frame gets the twist between the two views, and tracks all landmarks that it
+        observes.
 
         Args:
             twist: function that is called after the merge. It returns the ``(6,)`` twist of the
@@ -439,7 +440,7 @@ class Mapper:
     def _changing(self) -> Iterator[Map]:
         """Yield the merged map for changes.
 
-        If the block raises an exception, the map becomes unusable.
+        If the ``with`` block raises an exception, the map becomes unusable.
         """
         self._settle()
         with self._shared.change() as map_:

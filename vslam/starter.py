@@ -20,7 +20,7 @@ from vslam.geometry import Matrix, se3_log
 
 @dataclass(frozen=True)
 class TwoViewStart:
-    """Two frames that begin a monocular map.
+    """The start of a monocular map or sub-map from two frames.
 
     Attributes:
         first, second: the two frames. The pose of the first frame is the pose at which the map
@@ -71,7 +71,7 @@ class TwoViewStart:
 
 @dataclass(frozen=True)
 class OneViewStart:
-    """A frame whose stereo points begin a map."""
+    """The start of a map or sub-map from the stereo points of a single frame."""
 
     frame: PlacedFrame
 

@@ -90,8 +90,8 @@ class ConsistencyState:
 
     Attributes:
         places: places in the map that recent keyframes resembled.
-        verified: verified loops that another keyframe must still confirm. Each loop is stored with
-            the value of ``turn`` at its keyframe.
+        verified: verified loops that are waiting to be confirmed by another keyframe. Each loop is
+            stored with the value of ``turn`` at its keyframe.
         turn: number of keyframes that have been tested so far.
     """
 
@@ -135,7 +135,7 @@ class RigState:
     """Measurements of a stereo rig.
 
     Attributes:
-        delay: the estimate of the delay between the two cameras (``DelayState``).
+        delay: state of the estimator of the delay between the two cameras (``DelayState``).
         sides: results of comparing the left and right images (``ComparedSides``).
     """
 

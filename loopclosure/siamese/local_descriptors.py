@@ -153,8 +153,8 @@ class KeyframeImages:
         return self._glances[keyframe]
 
     def glance_at(self, image: NDArray[np.uint8]) -> DescriptorMaps:
-        """Compute the descriptors of an image that is not stored, at the same width as in
-        ``glance``."""
+        """Resize an image that is not stored to the width that ``glance`` uses, and compute its
+        local descriptors."""
         return self.network.describe(image, GLANCE_WIDTH)
 
     def image(self, keyframe: int) -> NDArray[np.uint8]:

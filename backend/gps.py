@@ -111,12 +111,12 @@ class Anchored:
     Attributes:
         T_enu_k: ``(N, 4, 4)`` poses of the keyframes (camera to ENU), in metres.
         scale: ``(N,)`` metres per unit of the map at each keyframe.
-        used: ``(M,)`` bool, True for fixes that passed the chi-square test.
+        used: ``(M,)`` bool, True for GPS fixes that passed the chi-square test.
         residual_m: root mean square distance of the used fixes from the trajectory.
         S_enu_w: ``(4, 4)`` alignment of the whole map before the optimisation.
-        level: whether the fixes determine all rotations of the map. It is False if the fixes lie on
-            a straight line. The rotation about the line is then determined by the assumption that
-            the camera is upright.
+        level: whether the fixes determine the rotation of the map about every axis. The value is
+            False if the fixes lie on a straight line. The rotation about the line is then
+            determined by the assumption that the camera is upright.
     """
 
     T_enu_k: Array

@@ -111,8 +111,9 @@ class Frame:
         timestamp: float = 0.0,
         image: NDArray[np.uint8] | None = None,
     ) -> Frame:
-        """Create a frame that is not tracked yet. Its pose is the identity, and it has no
-        matches."""
+        """Create a frame that is not tracked yet. The pose of the frame is the identity, and its
+        features have no matches.
+        """
         features, n = extracted.features, len(extracted.features)
         return cls(
             index=index,
@@ -175,8 +176,9 @@ class Frame:
 
     @property
     def can_become_keyframe(self) -> bool:
-        """Whether the frame can become a keyframe. It cannot if its features come from the right
-        image, which happens when the left image is black."""
+        """Whether the frame can become a keyframe. A frame cannot become a keyframe if its features
+        come from the right image. This happens when the left image is black.
+        """
         return self.side == Side.LEFT
 
     @property

@@ -22,8 +22,8 @@ class KeyframeEvidence:
     Attributes:
         seconds_since_keyframe: time since the last keyframe, seconds.
         n_inliers: number of landmarks that this frame tracks.
-        n_reference: ``MapView.n_reference``, the number of well-observed landmarks of the reference
-            keyframe.
+        n_reference: number of landmarks of the reference keyframe that enough keyframes observe
+            (``MapView.n_reference``).
         tracked_close: number of close stereo features of this frame that track a landmark. A close
             feature has a depth that stereo measures accurately.
         untracked_close: number of close stereo features that track no landmark. None for a frame
@@ -253,5 +253,5 @@ class KeyframePolicy:
         return self._state
 
     def restore(self, state: PolicyState) -> None:
-        """Continue from a state that the method ``state`` returned."""
+        """Restore a state that the method ``state`` returned."""
         self._state = state

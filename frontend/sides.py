@@ -39,7 +39,7 @@ class Sides:
     Attributes:
         darker_stops: difference in exposure, in stops. It is positive if the right image is darker
             than the left one. It is 0 if the difference is below the threshold, or if a common gain
-            does not explain it.
+            does not explain the difference.
         black: the side whose image is black while the other image is not. Empty if there is no such
             side.
     """

@@ -260,7 +260,7 @@ class Tracker:
         )
 
     def restore(self, state: TrackerState, xyz: Matrix) -> Frame:
-        """Continue from a state that the method ``state`` returned. Returns the last tracked frame.
+        """Restore a state that the method ``state`` returned. Returns the last tracked frame.
 
         Args:
             xyz: ``(N, 3)`` positions of the landmarks that the last frame tracks, in the world

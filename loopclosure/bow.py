@@ -28,7 +28,8 @@ from vslam.map_kernels import count_shared
 
 class BowDetector:
     """A ``LoopDetector`` that compares images using bags of visual words. Keyframes must be added
-    in ascending order of their ids."""
+    in ascending order of their ids.
+    """
 
     name = "bow"
 

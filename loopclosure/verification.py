@@ -81,8 +81,9 @@ def verify(
 
     Returns:
         A loop edge. It is accepted with the reason "verified", or rejected with a different reason.
-        The pose and the numbers of matches come from the last step that was completed. The inliers
-        are pairs of a feature of the query and a landmark of the place, without duplicates.
+        The pose and the numbers of matches and inliers come from the last step that was completed.
+        The inliers are pairs of a feature of the query and a landmark of the place, without
+        duplicates.
     """
     query, match = candidate.query, candidate.match
     edge = LoopEdge.of(candidate)

@@ -92,7 +92,7 @@ class Verifier:
         return VerifierState()
 
     def restore(self, state: VerifierState) -> None:
-        """Continue from a state that the method ``state`` returned."""
+        """Restore a state that the method ``state`` returned."""
 
 
 def verifier_for(config: Config, camera: Camera, images: KeyframeImages | None = None) -> Verifier:

@@ -106,11 +106,11 @@ class LoopClosing:
             self._close(map_, search.loop)
 
     def consider(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> None:
-        """Verify the loop candidates of a keyframe, best first, and close the first true loop."""
+        """Verify the loop candidates of a keyframe, best first, and close the first loop found."""
         self.close(map_, self._find(map_, keyframe, candidates))
 
     def _find(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> LoopSearch:
-        """Verify loop candidates, best first, until one is a true loop. The map is only read."""
+        """Verify loop candidates, best first, until a candidate passes. The map is only read."""
         candidates = self.verifier.rate(map_, keyframe, candidates)
         _, rejected = self._consistency.update(keyframe, candidates, map_)
         rejections = {edge.match: edge for edge in rejected}

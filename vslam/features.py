@@ -251,7 +251,7 @@ class TrackingState(StrEnum):
     """How a frame was tracked.
 
     OK: the pose has enough inliers. WEAK: the pose has few inliers. LOST: the pose is only
-    predicted, or no map has begun yet. DROPPED: the images arrived while earlier images were still
+    predicted, or no map exists yet. DROPPED: the images arrived while earlier images were still
     being processed (``--realtime``), so the pose is interpolated.
     """
 

@@ -15,7 +15,7 @@ from vslam.map_kernels import collect_landmarks, count_seen_by
 
 
 class LocalMap(NamedTuple):
-    """The N landmarks around a keyframe.
+    """A copy of the N landmarks that a keyframe and its covisible keyframes observe.
 
     Attributes:
         ids: ``(N,)`` int32 ids of the landmarks.

@@ -420,7 +420,7 @@ class Mapper:
         )
 
     def restore(self, state: MapperState) -> None:
-        """Continue from a state that ``state`` returned.
+        """Restore a state that the method ``state`` returned.
 
         The map must be the map that was saved together with this state.
         """

@@ -79,7 +79,7 @@ class Mode:
         return None
 
     def restore(self, state: PolicyState) -> None:
-        """Continue from a state that ``state`` returned."""
+        """Restore a state that the method ``state`` returned."""
 
 
 class MapBuilding(Mode):

@@ -210,6 +210,6 @@ class Odometry:
         return (*self.T_odom_camera.ravel(), *self.now.numbers().tolist(), self._lost_s)
 
     def restore(self, state: tuple[float, ...]) -> None:
-        """Continue from a state that ``state`` returned."""
+        """Restore a state that the method ``state`` returned."""
         self.T_odom_camera = np.array(state[:16]).reshape(4, 4)
         self.now, self._lost_s = PoseUncertainty.of_numbers(np.array(state[16:-1])), state[-1]

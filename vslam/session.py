@@ -94,7 +94,7 @@ def open_map(
 
 @dataclass(frozen=True)
 class Session:
-    """The parts of SLAM that have a state, and the map in which the current drive began."""
+    """The parts of SLAM that have a state between frames, and the map in which the drive began."""
 
     context: TrackingContext
     closing: LoopClosing

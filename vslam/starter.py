@@ -29,7 +29,8 @@ class TwoViewStart:
             second frame.
         features: two ``(N,)`` int64 arrays with the indices of the matched features in the first
             frame and in the second frame.
-        points: ``(N, 3)`` triangulated points of these features, in the frame of the first camera.
+        points: ``(N, 3)`` points that were triangulated from these features, in the frame of the
+            first camera.
         predicted: whether the unit of the map was derived from the speed that the camera had before
             it was lost.
     """

@@ -29,8 +29,8 @@ class TrackerState:
         twist: ``(6,)`` twist of the camera per second at this frame. None if it is unknown.
         lost_frames: number of lost frames since this frame.
         n_tracked: number of landmarks that the frame tracked.
-        coarse: ``(Q,)`` uint8 pixels of the coarse pyramid levels of the frame (``coarse_levels``).
-            It is empty if the frame has no such levels.
+        coarse: ``(Q,)`` uint8 pixels of the small images of the frame (``coarse_levels``). The
+            array is empty if the frame has no such images.
     """
 
     index: int

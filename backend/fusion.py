@@ -38,7 +38,7 @@ def fusion_neighbours(map_: Map, keyframe: int, config: Config) -> list[int]:
 
     The neighbours are the ``mapping.fuse_neighbours`` keyframes that share the most landmarks with
     the keyframe. For each of these neighbours, the five keyframes that share the most landmarks
-    with the neighbour are included as well.
+    with the neighbour are also included.
     """
     first, _ = map_.covisible(keyframe)
     chosen = first[: config.mapping.fuse_neighbours].tolist()

@@ -97,7 +97,8 @@ class Positions:
     @property
     def crowding(self) -> Array:
         """Count the positions in a time window of ``CORRELATION_S`` around each position. Returns
-        ``(M,)`` numbers. The position itself is counted, too."""
+        ``(M,)`` numbers. Each position is itself included in its count.
+        """
         times = np.sort(self.seconds)
         first = np.searchsorted(times, self.seconds - 0.5 * CORRELATION_S, "left")
         last = np.searchsorted(times, self.seconds + 0.5 * CORRELATION_S, "right")

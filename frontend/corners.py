@@ -243,7 +243,8 @@ def occupy(x, y, score, width, size, best_of_cell):
     """Find the corner with the best score in each cell of ``size`` x ``size`` pixels, and write its
     index into ``best_of_cell``.
 
-    The index is -1 for an empty cell. If several corners have equal scores, the first one is used.
+    The index is -1 for an empty cell. If several corners have equal scores, the first corner is
+    used.
     """
     columns = (width + size - 1) // size
     best_of_cell[:] = -1

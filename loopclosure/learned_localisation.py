@@ -77,7 +77,7 @@ def localise(
 
     Args:
         query: local descriptors of the image.
-        keyframes: ids of keyframes of the place that have images, most similar first.
+        keyframes: ids of the keyframes of the place whose images are stored, most similar first.
         seed: seed of the random samples; the same seed gives the same result.
 
     Returns:

@@ -69,7 +69,7 @@ def align(
     Returns None if the best motion has fewer than ``min_inliers`` inliers.
 
     Args:
-        a, b: the same N matches, as observed by each camera.
+        a, b: the landmarks of the same N matches, as observed by camera a and by camera b.
         intrinsics: ``(6,)`` of both cameras, see ``Camera.intrinsics``.
         seed: seed of the random samples; the same seed gives the same result.
         min_inliers: least number of inliers.

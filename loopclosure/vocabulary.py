@@ -124,7 +124,7 @@ def descend(queries, descriptors, first_child, n_children, word):
     """Find the visual word of each query descriptor by descending the vocabulary tree from the root
     to a leaf.
 
-    Each step goes to the nearest child. If several children are equally near, the first one is
+    Each step goes to the nearest child. If several children are equally near, the first child is
     chosen.
 
     Args:

@@ -157,8 +157,9 @@ class LandmarkPatches(NamedTuple):
 
     Attributes:
         ids: ``(N,)`` int32 landmark ids, sorted.
-        where: ``(N,)`` int64, index into ``pixels`` and ``shift`` of the patch of each landmark.
-        view: ``(N,)`` int64, index into ``T_cw`` of the keyframe that the patch was taken from.
+        where: ``(N,)`` int64, index of the patch of each landmark in ``pixels`` and ``shift``.
+        view: ``(N,)`` int64, index in ``T_cw`` of the keyframe that the patch of each landmark was
+            taken from.
         size: ``(N,)`` float64, size of a pixel of the patch in full-resolution pixels.
         angle: ``(N,)`` float32, orientation of the feature in radians.
         pixels: ``(P, PATCH_PIXELS)`` uint8, the square patch around each keypoint, row by row.

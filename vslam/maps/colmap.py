@@ -1,4 +1,4 @@
-"""Writing of COLMAP's sparse model as text or binary files (https://colmap.github.io/format.html).
+"""Writes maps in COLMAP's format, as text or binary (https://colmap.github.io/format.html).
 
 COLMAP's poses are ``T_cw`` with x right, y down and z forward, as in vslam. COLMAP's pixel
 coordinates begin at the corner of the image, so the centre of the upper left pixel is (0.5, 0.5).

@@ -31,11 +31,12 @@ def explorer(
 ) -> list[Section]:
     """Return the section of the report with the interactive explorer.
 
-    The result is empty if fewer than two frames were tracked.
+    The section is empty if fewer than two frames were tracked.
 
     Args:
-        outcome: the run.
-        evaluation: errors of ``outcome.trajectory``. None if they cannot be computed.
+        outcome: the outcome of the run.
+        evaluation: errors of ``outcome.trajectory`` relative to the ground truth. None if they
+            cannot be computed.
         moments: images of keyframes, from a `vslam.run.moments.MomentRecorder`.
     """
     data = explorer_data(outcome, evaluation, moments)
@@ -58,8 +59,9 @@ def explorer_data(
     along x) and errors in metres. Unknown numbers are NaN.
 
     Args:
-        outcome: the run.
-        evaluation: errors of ``outcome.trajectory``. None if they cannot be computed.
+        outcome: the outcome of the run.
+        evaluation: errors of ``outcome.trajectory`` relative to the ground truth. None if they
+            cannot be computed.
         moments: images of keyframes, from a `vslam.run.moments.MomentRecorder`.
     """
     n = len(outcome.trajectory)

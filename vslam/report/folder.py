@@ -42,8 +42,8 @@ def create_run_folder(
 ) -> Path:
     """Create the folder ``out/<YYYYmmdd-HHMMSS>-<dataset>-<sequence>-<perturb>-<detector>``.
 
-    If thresholds differ from the defaults, the first changed threshold is appended to the name,
-    followed by the number of other changed thresholds. If the name is in use, a number is appended.
+    If some thresholds differ from their defaults, the first of these thresholds is appended to the
+    name, followed by the number of the others. If the name is in use, a number is appended.
     ``out/latest`` becomes a symbolic link to the folder if the file system supports such links.
 
     Raises:
@@ -73,7 +73,7 @@ def create_run_folder(
 
 
 def _safe(part: str) -> str:
-    """Turn a text into a valid part of a file name."""
+    """Replace characters of a text so that it can be part of a file name."""
     return re.sub(r"[^A-Za-z0-9.+=-]+", "_", part)[:_LONGEST_PART]
 
 
@@ -103,7 +103,8 @@ def write_results(
 
     Args:
         folder: an existing folder. Files of an earlier report are replaced.
-        outcome: the run. It may have lost all frames, or have no frames.
+        outcome: the outcome of the run. The run may have lost all frames, or may have processed no
+            frames.
         moments: images of keyframes for the HTML page.
         pictures: pictures of closed loops. Some of them are written as
             ``figures/loop-<frame>-<frame>.jpg``.
@@ -138,7 +139,10 @@ class Results:
 
     @contextlib.contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Run a part of the work. An exception of the block is recorded instead of raised."""
+        """Run the block as one part of the work.
+
+        If the block raises an exception, the exception is recorded and not passed on.
+        """
         try:
             yield
         except Exception as error:

@@ -1,4 +1,4 @@
-"""The tracking results of all frames, as the files ``frames.csv`` and ``covariance.csv``."""
+"""Writes the tracking results of all frames to ``frames.csv`` and ``covariance.csv``."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Tables and pictures of loops in a report.
+"""Creates the tables and pictures of loops in a report.
 
-Their size is limited, even if there are hundreds of rejected candidates.
+The size of the tables is limited, even if there are hundreds of rejected candidates.
 """
 
 from __future__ import annotations
@@ -123,7 +123,9 @@ def _evidence(loop: LoopEntry) -> Row:
 
 
 def _shared_reason(loops: list[LoopEntry]) -> str:
-    """Combine reasons that differ only in their numbers into one text.
+    """Combine the reasons for rejecting several loops into one text.
+
+    The reasons differ only in their numbers.
 
     The numbers are replaced by their ranges.
     """
@@ -143,7 +145,8 @@ def _right_share(loops: list[LoopEntry]) -> str:
 
 
 def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[Figure]:
-    """Draw a few closed loops. Wrong loops come first, then loops verified by learned descriptors.
+    """Draw pictures of a few closed loops. Wrong loops come first, then loops verified by learned
+    descriptors.
 
     Args:
         report: the content of ``report.json``, which lists the loops of the run.
@@ -168,7 +171,7 @@ def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[Fi
 
 
 def seen_note(report: ReportJson, seen: Collection[Figure]) -> str:
-    """Return a note that explains the pictures and says how many of the closed loops are shown."""
+    """Return a note that explains the pictures, and says how many of the closed loops they show."""
     note = "Lines connect matched points; at most 60 matches are drawn."
     if len(seen) < report.loops_closed:
         note += f" {len(seen)} of the {report.loops_closed} closed loops are shown."

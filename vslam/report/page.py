@@ -16,11 +16,11 @@ Row = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells. If a table has no rows, the table and its note are not shown.
+    """A table of a page. If a table has no rows, the table and its note are not shown.
 
     Attributes:
         head: a heading for each column.
-        rows: rows with a cell for each column.
+        the content. Each row has a cell for each column.
         texts: the headings of the columns that contain text. Text is aligned to the left.
         note: explanation below the table.
     """

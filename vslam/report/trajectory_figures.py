@@ -1,4 +1,4 @@
-"""Figures of the trajectory seen from above, and of the effect of loop closing on it."""
+"""Draws the trajectory seen from above, and the effect of loop closing on the trajectory."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Points = NDArray[np.float64]
 def top_view(
     outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
 ) -> Figure:
-    """Draw the estimate, the ground truth, weak and lost frames, closed loops and missed revisits.
+    """Draw the trajectory and the ground truth, weak and lost frames, loops and missed revisits.
 
     The trajectories of the detectors of ``--compare`` are dashed. Each of these trajectories is
     aligned separately.
@@ -185,7 +185,7 @@ def _at_frames(outcome: RunOutcome, path: Points, frames: NDArray[np.int64]) -> 
 
 
 def _aligned(outcome: RunOutcome, evaluation: Evaluation | None, points: Points) -> Points:
-    """Transform ``(N, 3)`` points from the world frame of the run to that of the ground truth."""
+    """Transform ``(N, 3)`` points from the world frame of the run to the ground-truth frame."""
     if evaluation is None:
         return points
     S = truth_alignment_of(outcome, evaluation).S_truth_world

@@ -1,4 +1,4 @@
-"""Compilation of all kernels before the first frame, so that it does not slow down the run.
+"""Compiles all kernels before the first frame, so that compilation does not slow down the run.
 
 Compilation takes most of the time of a first run. A process compiles one kernel at a time, because
 Numba holds a lock. Therefore, two processes share the work through Numba's cache. They run
@@ -16,8 +16,8 @@ commands show how long each share takes:
         time NUMBA_CACHE_DIR=$(mktemp -d) python -m vslam.run.warmup $share
     done
 
-Monocular runs need no further kernels, because their initialisation and their similarities use
-NumPy.
+Monocular runs need no further kernels. Their initialisation, and the similarity transformations of
+their loops, are computed with NumPy.
 
 A kernel that both processes need is compiled by the process that calls it first. Both must call it
 with the same types, because two processes can write to Numba's cache safely only if they write the
@@ -140,8 +140,8 @@ def cached(kernel: tuple[ModuleType, str]) -> tuple[Path, list[Path]]:
 def compile_shares() -> None:
     """Compile each of ``COMPILE_SHARES`` in its own process, and wait for both processes.
 
-    If a process fails, the caller must compile the kernels of this process. An exception such as
-    Ctrl-C ends both processes.
+    If a process fails, its kernels are not compiled, and the caller must compile them. An exception
+    such as Ctrl-C ends both processes.
     """
     # The executable of a frozen application is not Python.
     if not sys.executable or getattr(sys, "frozen", False):
@@ -269,7 +269,10 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
 
 
 def compile_recognition() -> None:
-    """Compile detection, verification and relocalisation by comparing a keyframe with itself."""
+    """Compile loop detection, verification and relocalisation.
+
+    For this purpose, a keyframe is compared with itself.
+    """
     config = Config()
     map_, features = map_synthetic(1)
     verify(map_, LoopCandidate(0, 0, 1.0), CAMERA, config.verification)

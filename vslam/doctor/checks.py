@@ -251,7 +251,7 @@ def sharpness(image: Image) -> float:
 
 
 def check_times(timestamps: Times) -> list[Finding]:
-    """Check timestamps (in seconds, in any order) for wrong order, gaps and jitter."""
+    """Check timestamps, in seconds, for wrong order, gaps and jitter."""
     steps = np.diff(timestamps)
     if len(steps) < 3:
         return [Finding("times", "unknown", f"{len(timestamps)} frames are too few")]

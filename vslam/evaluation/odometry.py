@@ -22,8 +22,7 @@ class MotionErrors:
         first: ``(M,)`` int64, index of the frame in which each motion begins.
         xi: ``(M, 6)`` errors in metres and radians, in the camera frame at the end of the motion.
             The true motion is ``exp(xi) T_last_first``.
-        covariance: ``(M, 6, 6)`` covariances of ``xi`` that SLAM predicted
-            (``relative_covariance``).
+        covariance: ``(M, 6, 6)`` predicted covariances of ``xi``, from ``relative_covariance``.
     """
 
     first: NDArray[np.int64]

@@ -1,6 +1,6 @@
 """A map with all data that a later run needs to continue the map.
 
-Unless the map belongs to an interrupted run, culled keyframes and landmarks have been removed.
+Culled keyframes and landmarks have been removed, except in a map with a checkpoint.
 """
 
 from __future__ import annotations

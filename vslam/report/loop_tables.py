@@ -145,8 +145,9 @@ def _right_share(loops: list[LoopEntry]) -> str:
 
 
 def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[Figure]:
-    """Draw pictures of a few closed loops. Wrong loops come first, then loops verified by learned
-    descriptors.
+    """Draw pictures of a few closed loops.
+
+    Wrong loops come first, followed by loops that were verified using learned descriptors.
 
     Args:
         report: the content of ``report.json``, which lists the loops of the run.

@@ -307,8 +307,9 @@ def run_page(
 
 
 def _gps(report: ReportJson) -> Section:
-    """Create the section about the georeferenced trajectory. The section is empty for a run without
-    GPS.
+    """Create the section about the georeferenced trajectory.
+
+    The section is empty for a run without GPS.
     """
     if (found := report.gps_track) is None:
         return Section("GPS", ())

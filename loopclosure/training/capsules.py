@@ -42,10 +42,10 @@ def route(
     """Compute output capsules from primary capsules by dynamic routing. Gradients flow only through
     the last iteration.
 
-    The equations are rearranged to ``s_j = Σ_t W_tj (Σ_p c_tpj u_tp)`` and ``û_j|i · v_j = u_tp ·
-    (W_tjᵀ v_j)``. In this form, sums over the places replace the prediction vectors. The sums are
-    vectors of size A. The prediction vectors would have ``I J D`` elements, which would have to be
-    written once and read five times.
+    The sums are rearranged as ``s_j = Σ_t W_tj (Σ_p c_tpj u_tp)`` and the scalar products as
+    ``û_j|i·v_j = u_tp·(W_tjᵀ v_j)``. In this form, sums over the places replace the prediction
+    vectors. The sums over the places are vectors of size A. The prediction vectors have ``I J D``
+    elements, which would have to be written once and read five times.
 
     Args:
         u: ``(N, T, P, A)`` primary capsules.

@@ -67,9 +67,9 @@ def export_onnx(network: SiameseNetwork, path: Path, about: dict[str, Any] | Non
     the size that the network needs. The output is a ``(D,)`` float32 descriptor of norm 1.
 
     The metadata of the file contains a second graph in base64, which compares a query image with N
-    gallery images. It computes ``similarity``, ``(N,)``, from three inputs. ``query``, ``(V, d)``,
-    and ``gallery``, ``(N, V, d)``, are the descriptors of the V views of each image, with
-    ``V d = D``. ``lengths``, ``(N, V)``, are the lengths of the descriptors in ``gallery``.
+    gallery images. This graph computes ``similarity``, ``(N,)``, from three inputs. ``query``,
+    ``(V, d)``, and ``gallery``, ``(N, V, d)``, are the descriptors of the V views of each image,
+    with ``V d = D``. ``lengths``, ``(N, V)``, are the lengths of the descriptors in ``gallery``.
 
     Args:
         about: description of the origin of the weights.

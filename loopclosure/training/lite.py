@@ -69,7 +69,8 @@ class LiteExtractor(nn.Module):
 
     :meth:`load_imagenet` folds the batch normalisations into the convolutions. Fine-tuning
     therefore does not change the statistics of the batch normalisations. The padding is symmetric.
-    It agrees with the padding of TensorFlow if the image has a side of ``16 n + 1`` pixels.
+    This padding agrees with the padding of TensorFlow if the image has a side of ``16 n + 1``
+    pixels.
 
     Attributes:
         out_channels: number of channels of the feature grid.

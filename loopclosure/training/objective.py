@@ -124,8 +124,8 @@ def blend(network: SiameseNetwork, before: dict[str, Tensor], share: float) -> N
     """Interpolate the weights of a network in place. If ``share`` is 0, the result has the weights
     ``before``. If it is 1, the current weights do not change.
 
-    Interpolated weights keep most of what fine-tuning has learned. They also keep more of what the
-    original network had learned (WiSE-FT, Wortsman et al., CVPR 2022).
+    Interpolated weights keep most of what fine-tuning has learned. Interpolated weights also keep
+    more of what the original network had learned (WiSE-FT, Wortsman et al., CVPR 2022).
     """
     after = network.state_dict()
     mixed = {

@@ -1,8 +1,8 @@
 """Prunes a network: removes the primary capsules with the lowest coupling coefficients.
 
-Zhou and Sun (Sci Rep 15, 7644, 2025) rank primary capsules by their coupling coefficients. They set
-the matrices W_ij of the lowest 20 % to 0. Zeros do not make the network faster. Therefore, this
-module removes the capsules from the network.
+Zhou and Sun (Sci Rep 15, 7644, 2025) rank primary capsules by their coupling coefficients. The
+authors set the matrices W_ij of the 20 % with the lowest coefficients to 0. Zeros do not make the
+network faster. Therefore, this module removes the capsules from the network.
 """
 
 from __future__ import annotations

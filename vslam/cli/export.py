@@ -322,7 +322,7 @@ def _export_images(
 
 
 def _image_of(frame: TimedFrame) -> NDArray[np.uint8]:
-    """Read the left image of a frame. It is in colour if the source has colour images."""
+    """Read the left image of a frame. The image is in colour if the source has colour images."""
     return frame.read(map)[0] if frame.colour is None else frame.colour()
 
 

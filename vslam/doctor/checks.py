@@ -144,7 +144,7 @@ def check_calibration(camera: Camera) -> Finding:
 
 
 def check_focal_length(fit: FocalFit | None, camera: Camera) -> Finding:
-    """Check whether the rotations of the camera fit the calibrated focal length.
+    """Check whether observed rotations of the camera agree with the calibrated focal length.
 
     Args:
         fit: the focal length that fits the motion of the camera best. None if too few frames have
@@ -229,7 +229,7 @@ def check_features(images: Sequence[Image], config: OrbConfig) -> Finding:
 
 
 def check_sharpness(images: Sequence[Image]) -> Finding:
-    """Check that images are not blurred, using the median of their ``sharpness``."""
+    """Check that images are not blurred, using the median of the ``sharpness`` of all images."""
     values = [sharpness(image) for image in images]
     middle = float(np.median(values))
     return judge(

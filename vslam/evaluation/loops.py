@@ -117,8 +117,8 @@ def metres_per_unit(T_wc: Poses, T_wc_true: Poses) -> NDArray[np.float64]:
     """Return the length of the unit of a monocular map at each frame, as ``(N,)`` metres.
 
     For consecutive frames, the true distance is divided by the estimated distance. The result is
-    the median of these ratios over the 41 frames around each frame. It is 1 if the camera did not
-    move.
+    the median of these ratios over the 41 frames around each frame. The result is 1 if the camera
+    did not move.
 
     Args:
         T_wc: ``(N, 4, 4)`` poses at the time of tracking.

@@ -32,8 +32,8 @@ class Evaluation:
         alignment: ``se3``, ``sim3`` or ``none``, the kind of transformation that was fitted before
             the comparison.
         on_one_line: whether all positions lie on one line. In this case, the positions do not
-            determine the rotation about this line, so it was fitted to the orientations. evo
-            rejects such trajectories.
+            determine the rotation about this line, so this rotation was fitted to the orientations.
+            evo rejects such trajectories.
         timestamps: ``(N,)`` timestamps of the estimate in seconds.
         ate_rmse_m, ate_mean_m, ate_max_m: RMSE, mean and maximum of ``errors_m``.
         errors_m: ``(N,)`` distance of each aligned position from the ground truth, in metres.
@@ -223,8 +223,8 @@ def read_pair(
     """Read an estimated trajectory and its ground truth, each in the format of KITTI or TUM.
 
     Args:
-        times: file with the timestamp of each frame in seconds, one per line (``times.txt``). It is
-            needed for files in KITTI's format, which contain no timestamps.
+        times: file with the timestamp of each frame in seconds, one per line (``times.txt``). This
+            file is needed for files in KITTI's format, which contain no timestamps.
 
     Raises:
         InputError: a file is malformed, or the files cannot be matched without timestamps.

@@ -110,7 +110,7 @@ def _parameters(camera: Camera) -> tuple[float, float, float, float]:
 def _write_binary(folder: Path, camera: Camera, images: list[_Image], points: list[_Point]) -> None:
     """Write COLMAP's binary files.
 
-    They are little-endian, as in COLMAP's ``reconstruction_io_binary.cc``.
+    The files are little-endian, as in COLMAP's ``reconstruction_io_binary.cc``.
     """
     (folder / "cameras.bin").write_bytes(
         struct.pack("<QIi2Q", 1, _CAMERA_ID, _PINHOLE, camera.width, camera.height)

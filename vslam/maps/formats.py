@@ -177,7 +177,7 @@ def landmark_colours(
 ) -> NDArray[np.uint8]:
     """Return the RGB colour of each landmark as ``(L, 3)`` uint8.
 
-    The colour is taken from the observation of median brightness.
+    The colour of a landmark is taken from its observation with the median brightness.
 
     Args:
         images: ``(H, W)`` grey or ``(H, W, 3)`` RGB image of each keyframe, in order.

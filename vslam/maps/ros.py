@@ -292,9 +292,9 @@ def _covariance(matrix: Matrix | None, R: Matrix) -> NDArray[np.float64]:
 def _velocity_covariance(pose: FramePose, before: FramePose | None) -> Matrix | None:
     """Return the ``(6, 6)`` covariance of the mean velocity between two frames.
 
-    It refers to the frame of the camera. The errors of the two poses relative to the landmarks are
-    independent. The error in the positions of the landmarks is the same for both poses, and
-    therefore cancels.
+    The covariance is given in the frame of the camera. The errors of the two poses relative to the
+    landmarks are independent. The error in the positions of the landmarks is the same for both
+    poses, and therefore cancels.
     """
     if before is None or before.near is None or pose.near is None:
         return None

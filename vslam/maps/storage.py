@@ -1,8 +1,8 @@
 """Reads and writes map files. A map file is an ``.npz`` file.
 
 A map file is written atomically, and it is checked when it is read. The arrays are not compressed,
-for two reasons. They are mostly descriptors, which do not compress well. In addition, a map should
-load within a second.
+for two reasons. First, most of the data are descriptors, which do not compress well. Second, a map
+should load within a second.
 """
 
 from __future__ import annotations

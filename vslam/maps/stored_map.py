@@ -37,8 +37,8 @@ class TruthAlignment:
     Attributes:
         name: name of the data set and the sequence of the ground truth.
         S_truth_world: ``(4, 4)`` transformation from the world frame of the map to the world frame
-            of the ground truth. It aligns the trajectory of the first drive with the ground truth.
-            It is a rigid motion, or a similarity for a monocular map.
+            of the ground truth. This transformation aligns the trajectory of the first drive with
+            the ground truth. It is a rigid motion, or a similarity for a monocular map.
     """
 
     name: str

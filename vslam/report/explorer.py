@@ -1,6 +1,6 @@
 """The interactive explorer in the HTML report of a run.
 
-It shows the pose, state and error of every frame, and images of some keyframes.
+The explorer shows the pose, state and error of every frame, and images of some keyframes.
 
 A frame adds 47 bytes to the page. An image with keypoints adds about 10,000 bytes. ``explorer.js``
 uses no plotting library, because a library such as Plotly (4.7 MB) would be larger than the rest of
@@ -108,7 +108,7 @@ def _encoded(moment: Moment) -> dict[str, Any]:
 def _packed(values: NDArray[Any], kind: str) -> str:
     """Encode an array in base64.
 
-    The text is a third as long as the same numbers in JSON. In contrast to JSON, the array may
-    contain NaN.
+    The encoded text is a third as long as the same numbers written as JSON. In contrast to JSON,
+    the encoded array may contain NaN.
     """
     return b64encode(values.astype(kind).tobytes()).decode()

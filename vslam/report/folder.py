@@ -131,7 +131,10 @@ def write_results(
 
 
 class Results:
-    """Writes the results of a run, even if some of them cannot be written."""
+    """Writes the results of a run.
+
+    If one result cannot be written, the other results are still written.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -264,8 +267,9 @@ def _config_text(outcome: RunOutcome) -> str:
 def write_trajectories(written: Results, outcome: RunOutcome) -> None:
     """Write the final trajectory and the ground truth of its frames.
 
-    Both are written in the formats of KITTI and TUM. If some frames have no ground truth, the
-    ground truth is written only in TUM's format, because only this format has timestamps.
+    Both trajectories are written in the formats of KITTI and TUM. If some frames have no ground
+    truth, the ground truth is written only in TUM's format, because only this format has
+    timestamps.
     """
     with written.file("trajectory_kitti.txt") as file:
         write_kitti(file, outcome.trajectory.T_wc)

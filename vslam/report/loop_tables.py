@@ -25,9 +25,10 @@ _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
 def loop_sections(report: ReportJson) -> list[Section]:
-    """Create the sections about closed loops, revisits, and rejected candidates with their reasons.
+    """Create the sections about closed loops, revisits and rejected loop candidates.
 
-    Only those rejected candidates that have the most inliers are listed.
+    Only the rejected candidates with the most inliers are listed. The reason for each rejection is
+    given.
     """
     return [
         Section("Loops closed", [_closed(report)]),

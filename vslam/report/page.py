@@ -50,7 +50,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class Tiles:
-    """The most important numbers, which readers should see first."""
+    """The most important numbers of a page, which readers should see first."""
 
     tiles: Sequence[Tile]
 

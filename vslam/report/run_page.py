@@ -117,7 +117,7 @@ def _together(report: ReportJson) -> str:
 
 
 def advice(report: ReportJson) -> str:
-    """Return advice to the user if many frames were lost. It is empty if few frames were lost."""
+    """Return advice to the user if many frames were lost, and otherwise no advice."""
     if report.lost_frames <= _MANY_LOST * report.frames:
         return ""
     return "Many frames were lost; vslam doctor checks images, calibration and timestamps."

@@ -102,10 +102,10 @@ def top_view(
 
 
 def loop_closing(outcome: RunOutcome, evaluation: Evaluation | None) -> Figure:
-    """Draw the keyframes before the first loop was closed and at the end of the run.
+    """Draw the positions of keyframes before the first loop closure and at the end of the run.
 
     Both sets of positions are transformed to the frame of the ground truth by the alignment of the
-    final trajectory. Therefore, every difference between the two sets is an effect of loop closing.
+    final trajectory. Therefore, all differences between the two sets are caused by loop closing.
     """
     figure, axes = _new_map("Map before and after loop closing", outcome, evaluation)
     before = _aligned(outcome, evaluation, _centres(outcome.corrections[0].T_cw_before))

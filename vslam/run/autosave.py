@@ -96,7 +96,10 @@ class Autosave:
     """Interface for saving a run at intervals. This base class saves nothing."""
 
     def frame(self, result: TrackResult) -> None:
-        """Append the pose of a tracked frame. This method is called for every frame in order."""
+        """Append the pose of a tracked frame to the trajectory file.
+
+        This method is called for every frame in order.
+        """
 
     def offer(self, slam: Slam, progress: Callable[[], Progress]) -> None:
         """Save the run if the next save is due. This method is called after ``frame``."""

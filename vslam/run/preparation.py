@@ -232,7 +232,8 @@ def at_their_times(
 ) -> Iterator[Played[PreparedFrame]]:
     """Yield prepared frames in order, each with its time of arrival.
 
-    In real time, a frame arrives at its timestamp. Otherwise, all frames arrive at the start.
+    In a real-time run, a frame arrives at its timestamp. In other runs, all frames count as arrived
+    at the start of the run.
 
     Args:
         workers: threads that prepare frames and extract features in advance.

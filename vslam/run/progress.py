@@ -78,7 +78,7 @@ class TrackLog:
         self._n = len(before)
 
     def append(self, track: TrackResult) -> None:
-        """Append the tracking result of the next frame."""
+        """Append the tracking result of the next frame to the table."""
         self._rows.extend(track.T_wc.ravel())
         self._rows.extend((
             track.timestamp, _STATES.index(track.state), track.n_features, track.n_stereo,
@@ -129,7 +129,7 @@ class Progress:
     corrections: list[LoopCorrection] = field(default_factory=list)
 
     def until(self, frames: int) -> Progress:
-        """Return the progress after the first ``frames`` frames."""
+        """Return the part of the progress that covers the first ``frames`` frames."""
         return replace(
             self,
             tracks=self.tracks.until(frames),

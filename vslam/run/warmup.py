@@ -1,11 +1,11 @@
 """Compiles all kernels before the first frame, so that compilation does not slow down the run.
 
-Compilation takes most of the time of a first run. A process compiles one kernel at a time, because
-Numba holds a lock. Therefore, two processes share the work through Numba's cache. They run
-``python -m vslam.run.warmup first`` and ``python -m vslam.run.warmup second``. The process of the
-run then calls ``EVERYTHING``, which loads the compiled kernels. This process compiles only missing
-kernels, so it does not need the memory of the compiler. Later runs load a kernel when they first
-call it.
+In the first run on a machine, compilation takes most of the time. A process compiles one kernel at
+a time, because Numba holds a lock. Therefore, two processes share the work through Numba's cache.
+These processes run ``python -m vslam.run.warmup first`` and ``python -m vslam.run.warmup second``.
+The process of the run then calls ``EVERYTHING``, which loads the compiled kernels. This process
+compiles only missing kernels, so it does not need the memory of the compiler. Later runs load a
+kernel when they first call it.
 
 When you add kernels, add a function that calls them to the entry of ``COMPILE_SHARES`` that takes
 less time. If ``run_everything`` does not call the kernels, add this function to ``EVERYTHING`` as
@@ -19,9 +19,9 @@ commands show how long each share takes:
 Monocular runs need no further kernels. Their initialisation, and the similarity transformations of
 their loops, are computed with NumPy.
 
-A kernel that both processes need is compiled by the process that calls it first. Both must call it
-with the same types, because two processes can write to Numba's cache safely only if they write the
-same signature.
+A kernel that both processes need is compiled by the process that calls it first. Both processes
+must call the kernel with the same types, because two processes can write to Numba's cache safely
+only if they write the same signature.
 """
 
 from __future__ import annotations
@@ -87,10 +87,11 @@ def compile_kernels(*, processes: int = 2, load: bool = False) -> None:
     Nothing is done if all kernels have been compiled.
 
     Args:
-        processes: number of processes. With 1, or on a single core, no other process is started.
-        load: load compiled kernels and GTSAM now, which takes 0.3 s. Real-time runs need this,
-            because no frame may wait. Otherwise, each kernel is loaded at its first call, which
-            takes 2 ms.
+        processes: number of processes that compile. If it is 1, or if there is a single core, no
+            other process is started.
+        load: if True, compiled kernels and GTSAM are loaded now, which takes 0.3 s. Real-time runs
+            need this, because no frame may wait. If False, each kernel is loaded at its first call,
+            which takes 2 ms.
     """
     if load:
         load_optimiser()

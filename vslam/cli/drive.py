@@ -52,7 +52,7 @@ def drive(
 
     Args:
         out: the folder in which the folder of the run is created.
-        resume: the folder of an interrupted run to continue. With None, a new run starts.
+        resume: the folder of an interrupted run to continue. If it is None, a new run starts.
     """
     if options.localize and output.save_map is not None:
         raise InputError("--save-map: localising does not change the map; leave it out.")

@@ -62,8 +62,8 @@ def open_images(
     """Open the images of a run again, with the options in its ``run.json``.
 
     Args:
-        data: the new location of the data if it has been moved. With None, the location in
-            ``run.json`` is used.
+        data: the new location of the data if the data have been moved. If it is None, the location
+            in ``run.json`` is used.
         on_render: function that is called while a synthetic sequence is rendered. Its arguments are
             the number of frames rendered so far and the total number.
 

@@ -99,7 +99,8 @@ class RevisitEntry(Record):
     """A range of frames in which the camera travels along an earlier part of its path again.
 
     The range is computed from the ground truth. ``loop_frame`` is the first frame of the range in
-    which a correct loop was closed. It is None if no correct loop was closed in the range.
+    which a correct loop was closed. If no correct loop was closed in the range, ``loop_frame`` is
+    None.
     """
 
     first_frame: int

@@ -1,4 +1,4 @@
-"""Georeferencing of a finished run with GPS fixes."""
+"""Georeferences a finished run using GPS fixes."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def _in_map(
     Args:
         T_kw: ``(K, 4, 4)`` poses of the keyframes.
         scale: ``(K,)`` factors. The translations from each keyframe to its frames are multiplied by
-            the factor of the keyframe. None leaves the translations unchanged.
+            the factor of the keyframe. If it is None, the translations do not change.
     """
     T_ck = table.T_c_reference.copy()
     if scale is not None:

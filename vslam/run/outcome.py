@@ -45,8 +45,8 @@ class RunOutcome:
         latency_ms: milliseconds from the arrival of each tracked frame until its pose is known, in
             a real-time run.
         wall_s, cpu_s: wall and CPU seconds from reading the first frame until the last frame is
-            tracked and mapped. If several detectors are compared, this is the time for all of them
-            together.
+            tracked and mapped. If several detectors are compared, these are the times for all
+            detectors together.
         step_s: wall seconds of the run with this detector alone. This time includes tracking,
             waiting for mapping, and completing the map at the end. It excludes reading images and
             extracting features.

@@ -60,8 +60,8 @@ def run_sequence(
 ) -> RunOutcome:
     """Run SLAM over a whole sequence, or over a stream until it ends.
 
-    A frame that cannot be read is skipped. It gets a predicted pose, counts as lost and is listed
-    in the outcome. A frame that is dropped in a real-time run gets an interpolated pose.
+    A frame that cannot be read is skipped. This frame gets a predicted pose, counts as lost and is
+    listed in the outcome. A frame that is dropped in a real-time run gets an interpolated pose.
 
     The run ends early after Ctrl-C, when the source ends unexpectedly, or when a component fails,
     for example the loop detector of a plug-in. After Ctrl-C, the current frame is completed first.
@@ -78,7 +78,7 @@ def run_sequence(
         autosave: saves the state of the run at intervals.
         resume: the saved state of an interrupted run. The run continues at the frame after this
             state. The outcome covers the frames before and after the interruption.
-        slam: the result of ``begin`` for the same settings. With None, this function calls
+        slam: the result of ``begin`` for the same settings. If it is None, this function calls
             ``begin``.
 
     Raises:
@@ -287,10 +287,10 @@ def _record_frame(
     played: Played[PreparedFrame],
     n_recorded: int,
 ) -> int:
-    """Record a frame, and also the map if mapping is not changing it.
+    """Record a frame. The map is also recorded, unless a mapping job is changing it.
 
     Returns:
-        The new number of recorded loops.
+        The number of loops that have been recorded so far.
     """
     recorder.frame(result)
     images = None if played.prepared is None else played.prepared.images
@@ -495,7 +495,7 @@ def _record_loops(recorder: Recorder, slam: Slam, n_recorded: int) -> int:
     """Record all loops except the first ``n_recorded`` loops, which are already recorded.
 
     Returns:
-        The new number of recorded loops.
+        The number of loops that have been recorded so far.
     """
     if len(slam.loops) > n_recorded:
         recorder.loops(slam.loops[n_recorded:], slam.map)

@@ -71,8 +71,8 @@ def play(
             timestamps.
         prepare: function that prepares a frame after its arrival, in a separate thread. Its first
             argument is the number of frames that arrived earlier, including dropped frames.
-        threads: number of threads. With 1, a frame is prepared only after the previous frame has
-            been used.
+        threads: number of threads. If it is 1, a frame is prepared only after the previous frame
+            has been used.
         live: whether each frame arrives when ``frames`` yields it, regardless of its timestamp.
 
     Yields:

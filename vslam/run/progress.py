@@ -55,7 +55,7 @@ class TrackTable:
         return self.rows[:, _POSE]
 
     def until(self, frames: int) -> TrackTable:
-        """Return the results of the first ``frames`` frames."""
+        """Return a table with the results of the first ``frames`` frames."""
         return replace(self, rows=self.rows[:frames], stage_ms=self.stage_ms[:frames])
 
     def results(self) -> list[TrackResult]:

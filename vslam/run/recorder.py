@@ -110,7 +110,7 @@ class Recorder:
         Args:
             result: the result of tracking the frame that became the keyframe.
             image: ``(H, W)`` uint8 left image.
-            xy: ``(N, 2)`` float32 positions of its features in pixels.
+            xy: ``(N, 2)`` float32 positions of the features of the image, in pixels.
             tracked: ``(N,)`` bool, whether each feature is an inlier match of a landmark.
         """
 
@@ -179,7 +179,8 @@ class Viewer:
     """A viewer that has been started.
 
     Attributes:
-        address: URL of the page that shows the viewer. It is empty for a window.
+        address: URL of the page that shows the viewer. The address is empty if the viewer is a
+            window.
         sink: the rerun object to which a recording is sent.
     """
 

@@ -320,8 +320,8 @@ def check_depth(images: Sequence[Image], depths: Sequence[Depth]) -> list[Findin
 def _registration(fit: NDArray[np.float32], views: Callable[[], int]) -> Finding:
     """Check whether depth edges fit the image edges best without a shift.
 
-    A different best shift is a fault only under two conditions. This shift must be the single clear
-    peak inside the search range, and more than one view must have been examined.
+    If a different shift fits best, this is a fault only under two conditions. The shift must be the
+    single clear peak inside the search range, and more than one view must have been examined.
     """
     reach = np.array(_REACH)
     best = np.array(np.unravel_index(np.argmax(fit), fit.shape)) - reach

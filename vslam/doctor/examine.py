@@ -240,7 +240,7 @@ def _disparities(
 
 
 def _rows_by_lag(by_lag: dict[int, list[_Pair]]) -> dict[int, float]:
-    """Return the median vertical error of stereo matches (px), by lag.
+    """For each lag, return the median vertical error of stereo matches in pixels.
 
     The lag is the delay of the right image in frames. Only frames that have matches for all lags
     are used.

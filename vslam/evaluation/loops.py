@@ -39,7 +39,7 @@ Poses = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Revisits:
-    """M stretches of the path on which the camera returns to places of its earlier path, in order.
+    """M stretches on which the camera follows an earlier part of its path again, in order of time.
 
     Attributes:
         first, last: ``(M,)`` index of the first and of the last frame of each stretch.
@@ -63,8 +63,7 @@ class LoopEvaluation:
     """The result of comparing the loops of a run with the ground truth.
 
     Attributes:
-        revisits: the M stretches of the path on which the camera returns to places of its earlier
-            path.
+        revisits: the M stretches on which the camera follows an earlier part of its path again.
         loop_frame: ``(M,)`` query frame of the first correct loop that was closed on each stretch.
             It is -1 if no correct loop was closed there.
         right: for each loop edge, whether its relative pose agrees with the ground truth. Rejected
@@ -146,12 +145,12 @@ def _in_metres(edge: LoopEdge, metres: float) -> LoopEdge:
 
 
 def revisits(T_wc: Poses, timestamps: NDArray[np.float64]) -> Revisits:
-    """Find the stretches of a path that the camera travels again in the same direction.
+    """Find the stretches of a path along which the camera had already travelled earlier.
 
-    A frame is a revisit if the camera passed within ``MAX_LATERAL_M`` of the same position earlier,
-    with a heading that differed by at most ``MAX_HEADING_DEG``. Between the two passages, there
-    must be at least ``MIN_SECONDS`` and a path of at least ``MIN_PATH_M``. The camera is assumed to
-    move on a straight line between two frames.
+    Only earlier passages in the same direction count. A frame is a revisit if the camera passed
+    within ``MAX_LATERAL_M`` of the same position earlier, with a heading that differed by at most
+    ``MAX_HEADING_DEG``. Between the two passages, there must be at least ``MIN_SECONDS`` and a path
+    of at least ``MIN_PATH_M``. The camera is assumed to move on a straight line between two frames.
 
     Args:
         T_wc: ``(N, 4, 4)`` true poses.

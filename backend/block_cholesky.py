@@ -2,7 +2,7 @@
 
 The structure of the matrix is analysed once for all iterations of an optimiser. The analysis
 computes a minimum degree elimination order (George and Liu, "The evolution of the minimum degree
-ordering algorithm", SIAM Review 1989) and the fill-in. It simulates the elimination on bit sets, so
+ordering algorithm", SIAM Review 1989) and the fill-in. The elimination is simulated on bit sets, so
 that the degrees are exact. This is feasible for a few thousand keyframes. The neighbours that a
 keyframe still has when it is eliminated give the nonzero blocks of its column in the factor.
 
@@ -137,8 +137,8 @@ def panel(structure, column):
     panel.
 
     A panel holds the transposed blocks of one column side by side. Element (i, j) of the k-th block
-    is ``S[begin + j * width + 6 * k + i]``. In this layout, the rows of a panel are long, which
-    suits vector instructions.
+    is ``S[begin + j * width + 6 * k + i]``. In this layout, the rows of a panel are long, so that
+    vector instructions are efficient.
     """
     first = structure.first[column]
     return BLOCK * BLOCK * first, BLOCK * (structure.first[column + 1] - first)

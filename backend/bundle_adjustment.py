@@ -134,8 +134,9 @@ def adjust(
 
 
 def observations_of(problem: BundleProblem, use: NDArray[np.bool_] | None) -> Observations:
-    """Convert the observations of a bundle problem to arguments of kernels. ``use`` is an ``(O,)``
-    bool mask of the observations that are used; None uses all observations."""
+    """Convert the observations of a bundle problem to the form in which kernels take them. ``use``
+    is an ``(O,)`` bool mask of the observations that are used; None uses all observations.
+    """
     return Observations(
         problem.first,
         problem.camera,
@@ -148,8 +149,9 @@ def observations_of(problem: BundleProblem, use: NDArray[np.bool_] | None) -> Ob
 
 
 def empty_equations(n_free: int, n_points: int, n_observations: int) -> NormalEquations:
-    """Allocate arrays for the normal equations. W is set to 0, because its blocks for fixed cameras
-    and unused observations are never written."""
+    """Allocate arrays for the normal equations. The array W is filled with 0, because its blocks
+    for fixed cameras and unused observations are never written.
+    """
     return NormalEquations(
         np.zeros((n_observations, 3, 6)),
         np.empty((n_points, 3, 3)),

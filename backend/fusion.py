@@ -23,7 +23,7 @@ def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config)
     The landmarks of the keyframe are projected into its neighbours, and the landmarks of the
     neighbours into the keyframe. If a projected landmark matches a feature that observes another
     landmark, the two landmarks are merged. If a projected landmark matches a feature without a
-    landmark, an observation is added.
+    landmark, the feature becomes an observation of the projected landmark.
     """
     neighbours = fusion_neighbours(map_, keyframe, config)
     for neighbour in neighbours:
@@ -38,7 +38,7 @@ def fusion_neighbours(map_: Map, keyframe: int, config: Config) -> list[int]:
 
     The neighbours are the ``mapping.fuse_neighbours`` keyframes that share the most landmarks with
     the keyframe. For each of these neighbours, the five keyframes that share the most landmarks
-    with the neighbour are included as well.
+    with the neighbour are also included.
     """
     first, _ = map_.covisible(keyframe)
     chosen = first[: config.mapping.fuse_neighbours].tolist()

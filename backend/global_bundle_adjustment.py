@@ -1,8 +1,8 @@
 """Global bundle adjustment: optimises hundreds of keyframes whose trajectory contains loops.
 
 The problem, the loss and the optimisation steps are the same as in ``bundle_adjustment``. Only the
-reduced camera system is solved differently. Keyframes that share no landmark are not coupled in
-this system. The system is therefore stored as sparse 6x6 blocks and factorised by
+reduced camera system is solved differently. In this system, keyframes that share no landmark are
+not coupled. The system is therefore stored as sparse 6x6 blocks and factorised by
 ``block_cholesky`` (Triggs et al., "Bundle adjustment - a modern synthesis", section 6.3).
 """
 
@@ -197,8 +197,8 @@ def cameras_met(i, start, points, first, camera, n_free, last, met):
     """Find the free cameras that have a larger index than ``i`` and observe a point that camera
     ``i`` also observes.
 
-    The indices of these cameras are written into ``met``, and their number is returned. ``last``
-    prevents repetitions.
+    The indices of these cameras are written into ``met``, and their number is returned. The array
+    ``last`` is used to list each camera only once.
     """
     n = 0
     for p in points[start[i] : start[i + 1]]:
@@ -214,7 +214,8 @@ def cameras_met(i, start, points, first, camera, n_free, last, met):
 @kernel
 def pair_slots(structure, first, camera, n_free):
     """For each pair of observations of the same point, find the block that couples their two
-    cameras. Returns ``(N,)`` int32 slots of these blocks in the Cholesky factor.
+    cameras. Returns ``(N,)`` int32 slots, which are the positions of these blocks in the Cholesky
+    factor.
 
     The pairs are in the order in which ``reduce_points_sparsely`` visits them. Cameras are in
     elimination order.

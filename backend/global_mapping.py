@@ -49,7 +49,7 @@ def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
     have been culled are left out.
 
     The first keyframe of each connected part of the map is held fixed, because nothing else
-    determines the position of the part. Two keyframes are connected if they observe a common
+    determines the position of this part. Two keyframes are connected if they observe a common
     landmark.
     """
     living = map_.living_keyframes()

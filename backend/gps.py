@@ -7,8 +7,8 @@ graph. The graph has the edges of the essential graph and a GPS factor for each 
 held fixed.
 
 At first, fixes have a Cauchy loss with a large scale. The scale shrinks from one optimisation to
-the next. In this way, even a map that has drifted far is pulled to its fixes. Afterwards, fixes
-that fail a chi-square test are discarded, and the remaining fixes have a Gaussian loss.
+the next. In this way, even a map that has drifted far is moved to its fixes. Afterwards, fixes that
+fail a chi-square test are discarded, and the remaining fixes have a Gaussian loss.
 
 The error of GPS is mostly a bias that changes slowly, which is caused by the atmosphere and by
 reflections. A hundred fixes in ten seconds therefore provide little more information than a single
@@ -16,9 +16,10 @@ fix. For this reason, all fixes within ``CORRELATION_S`` together have the weigh
 
 The drift of a metric map depends on the camera, its calibration and the loops that were closed.
 However, the pose graph has a single drift model for all maps. With this model, a map with little
-drift would be bent towards the bias of the fixes. Therefore, the standard deviations of the drift
-model are multiplied by a factor. The factor is chosen so that the fixes become most likely
-(empirical Bayes: MacKay, Bayesian Interpolation, 1992).
+drift would be bent towards the bias of the fixes. Therefore, the standard deviations of all tree
+and covisibility edges are multiplied by a common factor. The optimisation is repeated with several
+factors, and the factor that maximises the marginal likelihood of the fixes is chosen (empirical
+Bayes: MacKay, Bayesian Interpolation, 1992).
 """
 
 from __future__ import annotations
@@ -77,7 +78,8 @@ class Positions:
             given.
         arm: ``(M, 3)`` estimated position of the camera, in units of the map.
         lever: ``(M, 3)`` vector from the camera to the antenna, in metres.
-        enu: ``(M, 3)`` measured position relative to a reference point: east, north, up, in metres.
+        enu: ``(M, 3)`` measured position of the antenna relative to a reference point: east, north
+            and up, in metres.
         sigma: ``(M, 3)`` standard deviations of ``enu`` in metres.
     """
 
@@ -95,7 +97,8 @@ class Positions:
     @property
     def crowding(self) -> Array:
         """Count the positions in a time window of ``CORRELATION_S`` around each position. Returns
-        ``(M,)`` numbers. The position itself is counted, too."""
+        ``(M,)`` numbers. Each position is itself included in its count.
+        """
         times = np.sort(self.seconds)
         first = np.searchsorted(times, self.seconds - 0.5 * CORRELATION_S, "left")
         last = np.searchsorted(times, self.seconds + 0.5 * CORRELATION_S, "right")
@@ -109,12 +112,12 @@ class Anchored:
     Attributes:
         T_enu_k: ``(N, 4, 4)`` poses of the keyframes (camera to ENU), in metres.
         scale: ``(N,)`` metres per unit of the map at each keyframe.
-        used: ``(M,)`` bool, True for fixes that passed the chi-square test.
+        used: ``(M,)`` bool, True for GPS fixes that passed the chi-square test.
         residual_m: root mean square distance of the used fixes from the trajectory.
         S_enu_w: ``(4, 4)`` alignment of the whole map before the optimisation.
-        level: whether the fixes determine all rotations of the map. It is False if the fixes lie on
-            a straight line. The rotation about the line is then determined by the assumption that
-            the camera is upright.
+        level: whether the fixes determine the rotation of the map about every axis. The value is
+            False if the fixes lie on a straight line. The rotation about the line is then
+            determined by the assumption that the camera is upright.
     """
 
     T_enu_k: Array
@@ -141,7 +144,7 @@ def anchor(
             without a prior.
 
     Raises:
-        InputError: the drive is too short to determine its direction.
+        InputError: the camera travelled too short a distance to determine the direction of travel.
     """
     T_wk = inverses(graph.T_cw)
     measured = (graph.kind != WEAK) & (graph.kind != GAP)
@@ -190,8 +193,8 @@ class Alignment:
 
     Attributes:
         S_enu_w: ``(4, 4)`` similarity transform from the map to ENU.
-        unsure: standard deviation of the direction of the drive, rad.
-        unsure_about: standard deviation of the rotation about the direction of the drive, rad.
+        unsure: standard deviation of the direction of travel, rad.
+        unsure_about: standard deviation of the rotation about the direction of travel, rad.
     """
 
     S_enu_w: Array
@@ -257,8 +260,8 @@ def _umeyama(p: Array, q: Array, up: Array, fixed: float | None) -> Array:
     estimated.
 
     Points on a line do not determine the rotation about this line. In this case, the upward axes
-    ``up`` of the camera determine the rotation. In all other cases, these axes have too little
-    weight to matter.
+    ``up`` of the camera determine the rotation. In all other cases, these axes have so little
+    weight that they hardly affect the result.
     """
     p_mean, q_mean = p.mean(axis=-2), q.mean(axis=-2)
     p0, q0 = p - p_mean[..., None, :], q - q_mean[..., None, :]
@@ -320,7 +323,7 @@ def _local_scale(T_wk: Array, T_enu_k: Array, scale: Array, part: NDArray[np.int
 
     The scale is the length of the path around the keyframe in ENU, divided by the length of the
     same path in the map. The path stays within the keyframe's part of the map. Where the length of
-    the path is 0, the previous ``scale`` is returned.
+    the path is 0, the given ``scale`` is returned.
     """
     scale = scale.copy()
     for label in np.unique(part):
@@ -337,8 +340,8 @@ def _local_scale(T_wk: Array, T_enu_k: Array, scale: Array, part: NDArray[np.int
 def _likeliest(
     factors: Callable[..., _Factors], part: NDArray[np.int64], config: PoseGraphConfig
 ) -> Array:
-    """Optimise the poses with each drift factor of ``_DRIFTS``. Returns the ``(N, 4, 4)`` poses for
-    the factor with which the fixes are most likely, given the edges.
+    """Optimise the poses with each factor of the drift model in ``_DRIFTS``. Returns the ``(N, 4,
+    4)`` poses for the factor that maximises the likelihood of the fixes, given the edges.
 
     The likelihood of the fixes is an integral over all poses of the keyframes. It is computed by
     Laplace's approximation. This approximation depends on the error at the optimum and on the
@@ -435,7 +438,7 @@ def _factors(
         pose = gtsam.Pose3(T)
         start.insert(i, pose)
         # This prior determines the poses of parts without fixes. On a straight drive, it also
-        # determines the rotation about the direction of the drive.
+        # determines the rotation about the direction of travel.
         if graph.fixed[i]:
             vision.add(gtsam.PriorFactorPose3(i, pose, loose))
     edges, T_i_j = graph.edges, graph.T_i_j.copy()

@@ -26,7 +26,7 @@ RECENT_KEYFRAMES = 3  # how long a landmark is on probation, in keyframes (ORB-S
 
 
 def map_keyframe(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Run local mapping for a keyframe that was just inserted and linked to its landmarks.
+    """Run local mapping for a new keyframe. The keyframe must already be linked to its landmarks.
 
     The steps are: cull recent landmarks, triangulate new landmarks, fuse landmarks, run local
     bundle adjustment, and cull keyframes.

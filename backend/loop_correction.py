@@ -20,9 +20,9 @@ def move_keyframes(
     the landmark. A landmark whose anchor is not among ``keyframes`` does not move.
 
     The landmark keeps its position relative to the anchor. Its distance range therefore stays the
-    same, and its normal is rotated with the anchor. The range and the normal are exact only if all
-    keyframes that observe the landmark move in the same way. Culled keyframes need no update,
-    because their poses are stored relative to other keyframes.
+    same, and its normal is rotated with the anchor. The distance range and the normal are exact
+    only if all keyframes that observe the landmark move in the same way. Culled keyframes need no
+    update, because their poses are stored relative to other keyframes.
 
     Args:
         keyframes: ``(N,)`` ids of keyframes that have not been culled.

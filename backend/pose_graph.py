@@ -164,9 +164,9 @@ def connectivity(map_: Map) -> NDArray[np.int64]:
     """Measure how well each keyframe and all later keyframes are connected to the earlier
     keyframes. Returns ``(n_keyframes,)`` int64.
 
-    The value of a keyframe is the largest number of landmarks that two keyframes share, where one
-    of them is earlier than this keyframe, and the other is this keyframe or a later one. The value
-    is 0 for the first keyframe.
+    For each keyframe, all pairs of keyframes are considered in which one keyframe is earlier than
+    the given keyframe and the other keyframe is not. The value is the largest number of landmarks
+    that such a pair shares. The value is 0 for the first keyframe.
     """
     living = map_.living_keyframes()
     pairs, shared = covisible_pairs(map_.arrays, living, map_.n_keyframes, 1)
@@ -178,8 +178,9 @@ def connectivity(map_: Map) -> NDArray[np.int64]:
 
 
 def _spans(pair: tuple[int, int], keyframes: NDArray[np.int64]) -> bool:
-    """Return whether any of the ids ``keyframes`` is greater than the first id of the pair and not
-    greater than the second id of the pair. ``keyframes`` must be sorted."""
+    """Return whether any of the ids ``keyframes`` is greater than the first id of a pair and at
+    most equal to the second id of the pair. ``keyframes`` must be sorted.
+    """
     low, high = np.searchsorted(keyframes, pair, side="right")
     return bool(low < high)
 
@@ -197,13 +198,14 @@ def edge_sigmas(
     Drift is modelled as a random walk, so the variance of a tree or covisibility edge grows with
     its length. All these edges are derived from the same measurement, the estimated path. If the
     edges were treated as independent, a path with more edges would have a smaller total
-    uncertainty. Therefore, the variance of an edge is multiplied by the number of edges that cover
-    the path at the ends of the edge. All edges together then have the uncertainty of the drift
+    uncertainty. Therefore, the variance of an edge is multiplied by the number of edges that span
+    the path at the ends of this edge. All edges together then have the uncertainty of the drift
     model, regardless of their number.
 
-    The translation of a GAP edge may be wrong by a share of the predicted distance, or by the
-    distance that a slow car drives in the elapsed time. The larger of these two errors is used. A
-    WEAK edge has very large standard deviations, because almost nothing is known about it.
+    Two possible errors in the translation of a GAP edge are compared: a fraction of the predicted
+    distance, and the distance that a slow car travels in the elapsed time. The larger error is
+    used. A WEAK edge has very large standard deviations, because almost nothing is known about the
+    motion.
 
     Args:
         seconds: ``(E, 2)`` timestamps of the ends of the edges.

@@ -4,8 +4,8 @@
 Each keyframe has a similarity transform ``S_wc`` from the camera frame to the world. The transform
 is a ``(4, 4)`` matrix with the scale in its upper left 3x3 block, so that ``@`` composes
 similarities. Lengths in the camera frame are in the unit that the map had around the keyframe
-before the correction. Initially, all scales are 1. Only loop edges measure other scales. GTSAM
-optimises the graph with its built-in Similarity3 factors.
+before the correction. Initially, all scales are 1. Only loop edges measure scales that differ from
+1. GTSAM optimises the graph with its built-in Similarity3 factors.
 """
 
 from __future__ import annotations

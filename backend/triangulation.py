@@ -26,7 +26,7 @@ def map_stereo_points(
     ``min_stereo_points`` stereo features are used instead (section III-E of the ORB-SLAM2 paper).
 
     Args:
-        far: whether far features are used as well.
+        far: whether landmarks are also created from far stereo features.
 
     Returns:
         ``(N,)`` ids of the new landmarks.
@@ -85,8 +85,9 @@ def triangulate_with_neighbours(
 
 
 def median_depth(map_: Map, keyframe: int) -> float:
-    """Return the median depth of the landmarks that a keyframe observes. It measures the scale of
-    the scene."""
+    """Return the median depth of the landmarks that a keyframe observes. This depth measures the
+    scale of the scene.
+    """
     points, T_cw = map_.arrays.xyz[map_.landmarks_of(keyframe)], map_.arrays.T_cw[keyframe]
     return float(np.median(points @ T_cw[2, :3] + T_cw[2, 3]))
 
@@ -218,8 +219,9 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
 
 @kernel
 def perpendicular(t):
-    """Return ``(2, 3)``: two unit vectors that are orthogonal to the vector ``t`` and to each
-    other."""
+    """Compute two unit vectors that are orthogonal to the vector ``t`` and to each other. Returns
+    ``(2, 3)``.
+    """
     across = np.zeros((2, 3))
     least = 0
     for i in range(1, 3):
@@ -382,8 +384,9 @@ def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_
 
 @inner_kernel
 def agrees(T, p, xy, u_right, scale, intrinsics):
-    """Return whether a point agrees with an observation: it lies in front of the camera, and its
-    reprojection error passes the chi-square test."""
+    """Return whether a point agrees with an observation. This is the case if the point lies in
+    front of the camera and its reprojection error passes the chi-square test.
+    """
     z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
     if z <= 0.0:
         return False

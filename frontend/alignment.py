@@ -49,7 +49,7 @@ def align_frame(
     Returns:
         ``(N, 2)`` float32, the new value of ``Frame.shift``: the offset from each feature to its
         aligned position, in full-resolution pixels. It is NaN where a match was not aligned. The
-        result is None if the frame has no pyramid or no landmark has a patch.
+        result is None if the frame has no image pyramid or if no landmark has a patch.
     """
     features = frame.features
     if frame.pyramid is None or not len(known.ids):

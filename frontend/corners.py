@@ -152,7 +152,8 @@ def spread(x, y, score, width, height, quota):
     """Choose up to ``quota`` evenly spread corners. They are the corners with the best score in
     each cell of a grid.
 
-    The cells are as large as possible, but at least ``quota`` cells must contain a corner.
+    The cells of the grid are as large as possible, but at least ``quota`` cells must contain a
+    corner.
 
     The cell size is found by bisection, as in Bailo et al. ("Efficient adaptive non-maximal
     suppression", PRL 2018).
@@ -242,7 +243,8 @@ def occupy(x, y, score, width, size, best_of_cell):
     """Find the corner with the best score in each cell of ``size`` x ``size`` pixels, and write its
     index into ``best_of_cell``.
 
-    The index is -1 for an empty cell. If several corners have equal scores, the first one is used.
+    The index is -1 for an empty cell. If several corners have equal scores, the first corner is
+    used.
     """
     columns = (width + size - 1) // size
     best_of_cell[:] = -1

@@ -26,7 +26,7 @@ from vslam.workers import Job, Urgency, Workers
 
 class Corners(NamedTuple):
     """The features that a corner detector found in the images of a frame, and their stereo matches.
-    Both are independent of tracking.
+    The features and the matches are independent of tracking.
 
     Attributes:
         found: the features of the left image, or of the right image if the left one is black.
@@ -57,8 +57,8 @@ class FrameImages:
         coarse: ``coarse_levels`` of ``pyramid``; None if ``pyramid`` is None.
         sides: result of comparing the exposure of the left and the right image; None if there is no
             right image, or if it has not been read.
-        problem: why the second image could not be read, so that only the left one is used; None if
-            there was no such problem.
+        problem: why the second image could not be read, so that only the left image is used; None
+            if there was no such problem.
     """
 
     def __init__(

@@ -59,8 +59,9 @@ class Frame:
             position. Before features are extracted, ``features`` has one entry for each landmark
             whose image patch was found.
         pyramid, row_offset, side: see the class ``Extracted``.
-        T_camera_left: ``(4, 4)`` transform from the left camera to the camera: the identity, or
-            ``Camera.T_right_left``.
+        T_camera_left: ``(4, 4)`` transform from the left camera to "the camera". It is the identity
+            if the features come from the left image, and ``Camera.T_right_left`` if they come from
+            the right image.
         T_cw: ``(4, 4)`` estimated pose of the left camera (world to camera).
         landmark: ``(N,)`` int32, id of the landmark that each feature tracks, or -1 if it tracks
             none.
@@ -75,9 +76,9 @@ class Frame:
         twist: ``(6,)`` velocity of the camera when the frame was tracked, as a twist per second;
             None if unknown. ``exp(twist dt)`` maps points from the camera frame at one time to the
             camera frame dt seconds later.
-        source: the images from which ``extract`` takes the features; None after extraction.
-        coarse: the ``coarse_levels`` of the image, to which the next frame is aligned; None if
-            frames are not aligned.
+        source: the images from which ``extract`` extracts the features; None after extraction.
+        coarse: the small images of the frame (``coarse_levels``), to which the next frame is
+            aligned; None if frames are not aligned.
         mask: the mask of the image; None if all pixels are used.
     """
 
@@ -110,8 +111,9 @@ class Frame:
         timestamp: float = 0.0,
         image: NDArray[np.uint8] | None = None,
     ) -> Frame:
-        """Create a frame that is not tracked yet. Its pose is the identity, and it has no
-        matches."""
+        """Create a frame that is not tracked yet. The pose of the frame is the identity, and its
+        features have no matches.
+        """
         features, n = extracted.features, len(extracted.features)
         return cls(
             index=index,
@@ -174,8 +176,9 @@ class Frame:
 
     @property
     def can_become_keyframe(self) -> bool:
-        """Whether the frame can become a keyframe. It cannot if its features come from the right
-        image, which happens when the left image is black."""
+        """Whether the frame can become a keyframe. A frame cannot become a keyframe if its features
+        come from the right image. This happens when the left image is black.
+        """
         return self.side == Side.LEFT
 
     @property

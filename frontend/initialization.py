@@ -5,7 +5,7 @@ other cases, a homography does not explain the matches. Therefore, both models a
 same random samples, and the model with the better score is used.
 
 A reconstruction is accepted only if one motion explains clearly more points than any other motion.
-The reason is that a map with a wrong start cannot be repaired later.
+The reason is that a map with wrong first points cannot be repaired later.
 
 All samples are fitted and scored in one batch. For this batch, NumPy is as fast as a Numba kernel,
 and NumPy needs no compilation.
@@ -59,7 +59,8 @@ class TwoViews:
 
     Attributes:
         T_2_1: ``(4, 4)`` transform from camera 1 to camera 2; its translation has length 1.
-        match: ``(M,)`` int64, indices of the matches that were triangulated.
+        match: ``(M,)`` int64, indices of the triangulated matches among all matches of the two
+            views.
         points: ``(M, 3)`` triangulated points, in the frame of camera 1. The unit of length is the
             distance between the two cameras.
     """

@@ -22,8 +22,8 @@ class KeyframeEvidence:
     Attributes:
         seconds_since_keyframe: time since the last keyframe, seconds.
         n_inliers: number of landmarks that this frame tracks.
-        n_reference: ``MapView.n_reference``, the number of well-observed landmarks of the reference
-            keyframe.
+        n_reference: number of landmarks of the reference keyframe that enough keyframes observe
+            (``MapView.n_reference``).
         tracked_close: number of close stereo features of this frame that track a landmark. A close
             feature has a depth that stereo measures accurately.
         untracked_close: number of close stereo features that track no landmark. None for a frame
@@ -61,15 +61,15 @@ def needs_keyframe(
 ) -> bool:
     """Return whether a stereo or RGB-D frame should become a keyframe.
 
-    A keyframe is needed if the last one is old. A keyframe is also needed if the view has changed
-    enough, or if too few close points are tracked. For these last two reasons, a keyframe is made
-    only if local mapping is idle or the need is urgent.
+    A keyframe is needed if the last keyframe is old. A keyframe is also needed if the view has
+    changed enough, or if too few close points are tracked. For these last two reasons, a keyframe
+    is made only if local mapping is idle or the need is urgent.
 
-    A lack of close points is a reason for a keyframe only if a new keyframe would provide more of
-    them. On a motorway, close points are scarce and leave the view before they are seen twice. Even
-    the first frame after a keyframe then tracks too few of them. In that case, a lower threshold
-    applies: a fraction of the number of close points that such a first frame tracks on average
-    (``gained_close``).
+    A lack of close points is a reason for a keyframe only if a new keyframe would provide more
+    close points. On a motorway, close points are scarce and leave the view before they are seen
+    twice. Even the first frame after a keyframe then tracks too few close points. In that case, a
+    lower threshold applies: a fraction of the number of close points that such a first frame tracks
+    on average (``gained_close``).
 
     The lower threshold applies only if enough far points constrain the pose. Their number must be
     at least the usual threshold for close points. In fog there are no far points, so the usual
@@ -130,8 +130,8 @@ def count_close(
     state changes only if this frame is the first frame after a keyframe.
 
     A single frame may track few close points by chance. Close points are scarce only if several
-    frames in a row track few of them. Therefore, the running mean is an exponential moving average.
-    It starts at a high value.
+    frames in a row track few close points. Therefore, the running mean is an exponential moving
+    average. It starts at a high value.
     """
     if not state.gain_awaited:
         return state
@@ -210,16 +210,17 @@ class KeyframePolicy:
         keyframe.
 
         A lack of close points is not a reason to map a known place again, because the old keyframe
-        did not provide more of them.
+        did not provide more close points.
 
-        In addition, a minimum number of inliers is required. Otherwise, no keyframe would be made
-        when the camera drives beyond the end of a map. The last keyframe of a map has few landmarks
-        that at least three keyframes observe, so both conditions would hold until tracking is lost.
+        In addition, the frame must have a minimum number of inliers. Otherwise, no keyframe would
+        be made when the camera moves beyond the end of a map. The last keyframe of a map has few
+        landmarks that at least three keyframes observe, so both conditions would hold until
+        tracking is lost.
 
         Args:
             n_inliers: number of landmarks that the frame tracks.
             n_shared: number of these landmarks that the old keyframe observes. The old keyframe is
-                the one that observes the most of them.
+                the keyframe that observes the largest number of these landmarks.
             n_place: number of landmarks that the old keyframe and at least two other keyframes
                 observe.
         """
@@ -230,11 +231,10 @@ class KeyframePolicy:
         )
 
     def is_due(self, index: int, evidence: KeyframeEvidence) -> bool:
-        """Return whether the frame with this index, which was tracked by patches, is to become a
-        keyframe.
+        """Return whether a frame that was tracked by patches must now become a keyframe as planned.
 
-        A keyframe is planned a few frames before it is expected to be needed. Its features can then
-        be extracted in the background.
+        A keyframe is planned a few frames before it is expected to be needed. The features of the
+        planned keyframe can then be extracted in the background.
         """
         if self.due < 0:
             soon = range(self._config.patch_lead_frames + 1)
@@ -254,5 +254,5 @@ class KeyframePolicy:
         return self._state
 
     def restore(self, state: PolicyState) -> None:
-        """Continue from a state that the method ``state`` returned."""
+        """Restore a state that the method ``state`` returned."""
         self._state = state

@@ -47,9 +47,9 @@ class Mask:
     def shows(self, xy: NDArray[np.floating], octave: NDArray[np.integer]) -> NDArray[np.bool_]:
         """Return ``(N,)`` bool, True for features that the mask allows.
 
-        ``xy`` is the ``(N, 2)`` positions of the features, in full-resolution pixels. ``octave`` is
-        their ``(N,)`` pyramid levels. Positions outside the image are clamped to the border of the
-        image.
+        ``xy`` contains the ``(N, 2)`` positions of the features, in full-resolution pixels.
+        ``octave`` contains their ``(N,)`` pyramid levels. Positions outside the image are clamped
+        to the border of the image.
         """
         shapes = self.levels.shapes[octave]
         ratio = self.levels.shapes[0, ::-1] / shapes[:, ::-1]

@@ -1,9 +1,9 @@
 """Cuts out image patches around keypoints, and stores the patches of the newest keyframes. Matches
 are aligned to these patches with sub-pixel accuracy.
 
-The patches of the newest keyframes are kept, and older patches are discarded. The newest keyframes
-observe nearly all landmarks that are being tracked, and a patch takes more memory than the rest of
-an observation.
+The patches of the newest keyframes are kept, and older patches are discarded. The patches of older
+keyframes are rarely needed, because the newest keyframes observe nearly all landmarks that are
+being tracked. In addition, a patch takes more memory than the rest of an observation.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class RecentPatches:
     """
 
     def __init__(self, capacity: int) -> None:
-        """``capacity`` is the number of keyframes whose patches are kept."""
+        """Create an empty store. It keeps the patches of up to ``capacity`` keyframes."""
         self._keyframes = np.full(capacity, -1, np.int64)  # id of the keyframe in each slot, or -1
         self._n_features = np.zeros(capacity, np.int64)
         self._pixels = np.empty((capacity, 0, PATCH_PIXELS), np.uint8)
@@ -154,8 +154,8 @@ def certainty_of(frame: Frame, config: AlignmentConfig) -> NDArray[np.uint8] | i
     pyramid.
 
     The position of an aligned match is accurate. A feature without a match is also considered
-    accurate, because a landmark that is created from it is defined by its position. A match that
-    was not aligned is off by about half a pixel.
+    accurate, because a landmark that is created from it is defined by its position. The position of
+    a match that was not aligned is wrong by about half a pixel.
     """
     if frame.pyramid is None:
         return 1

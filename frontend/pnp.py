@@ -300,8 +300,8 @@ def ransac_pose(points, uvr, inverse_sigma2, intrinsics, seed, min_inliers, max_
         seed: uint64; the same seed gives the same result.
         min_inliers: least number of inliers of an acceptable pose.
         max_draws: maximum number of samples.
-        confidence: a probability. Sampling ends when the probability that no better pose with at
-            least ``min_inliers`` inliers was missed reaches this value.
+        confidence: a probability. Assume that a better pose with at least ``min_inliers`` inliers
+            exists. Sampling ends when such a pose would have been found with this probability.
 
     Returns:
         The best pose ``T_cw``, ``(4, 4)``, and an ``(N,)`` bool mask of its inliers. The number of

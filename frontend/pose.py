@@ -60,11 +60,11 @@ def pose_covariance(
 ) -> NDArray[np.float64]:
     """Estimate the covariance of an optimised pose relative to the landmarks.
 
-    If the errors of all observations were independent and as large as their weights say, the
-    covariance would be the inverse of the normal matrix times a variance factor. In practice,
-    neither is true. Observations of near landmarks have larger errors than their weights say,
-    because depth errors matter more there. Errors are correlated, because one corner is often
-    observed in several octaves.
+    Assume that the errors of all observations were independent and had the variances that the
+    weights of the observations imply. The covariance would then be the inverse of the normal matrix
+    times a variance factor. In practice, both assumptions are wrong. Observations of near landmarks
+    have larger errors than their weights imply, because depth errors matter more at short
+    distances. Errors are correlated, because one corner is often observed in several octaves.
 
     Therefore, the spread of the gradient is measured instead of assumed (the sandwich estimator of
     White, Econometrica 1980). The gradients are summed over the cells of a grid, within which

@@ -56,9 +56,9 @@ class Relocaliser:
     def __init__(self, context: TrackingContext, locate: Locate, recognise: Recognise) -> None:
         """
         Args:
-            locate: returns the keyframes that look similar to a frame, best first.
-            recognise: called if a frame cannot be located at any of these keyframes using ORB
-                descriptors.
+            locate: function that returns the keyframes that look similar to a frame, best first.
+            recognise: function that is called if a frame cannot be located at any of these
+                keyframes using ORB descriptors.
         """
         self._context = context
         self._locate = locate

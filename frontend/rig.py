@@ -116,7 +116,7 @@ class RigCalibration:
         return RigState(self.delay.state().numbers(), self.sides.numbers())
 
     def restore(self, state: RigState) -> None:
-        """Continue from a state that the method ``state`` returned.
+        """Restore a state that the method ``state`` returned.
 
         Raises:
             ValueError: the stored state is damaged.

@@ -229,8 +229,8 @@ class SideDelay:
         seconds: the delay in seconds. It is positive if the right image is taken later than the
             left image.
         sigma: standard deviation of ``seconds``. It is estimated from the disagreement between
-            groups of frames (cluster-robust: Liang and Zeger, Biometrika 1986). Infinite until
-            there are enough groups.
+            groups of frames (cluster-robust: Liang and Zeger, Biometrika 1986). It is infinite
+            until there are enough groups.
     """
 
     def __init__(self, camera: Camera, config: StereoConfig) -> None:
@@ -273,7 +273,7 @@ class SideDelay:
         return deepcopy(self._state)
 
     def restore(self, state: DelayState) -> None:
-        """Continue from a state that the method ``state`` returned."""
+        """Restore a state that the method ``state`` returned."""
         self.seconds, self.sigma = 0.0, np.inf
         self._state = deepcopy(state)
         self._solve()

@@ -39,7 +39,7 @@ class Sides:
     Attributes:
         darker_stops: difference in exposure, in stops. It is positive if the right image is darker
             than the left one. It is 0 if the difference is below the threshold, or if a common gain
-            does not explain it.
+            does not explain the difference.
         black: the side whose image is black while the other image is not. Empty if there is no such
             side.
     """
@@ -53,9 +53,8 @@ class ComparedSides:
     """A summary of the differences in exposure of all stereo pairs of a drive.
 
     Attributes:
-        n: number of comparisons.
-        n_black_left, n_black_right: number of comparisons in which the image of this side was
-            black.
+        n: number of stereo pairs that were compared.
+        n_black_left, n_black_right: number of stereo pairs whose left or right image was black.
         darker_stops: all values of ``Sides.darker_stops`` that are not 0.
     """
 
@@ -109,8 +108,9 @@ def balanced(left: Grey, right: Grey, sides: Sides) -> tuple[Grey, Grey]:
 
 
 def _shares(image: Grey) -> NDArray[np.float64]:
-    """Compute the ``(256,)`` cumulative histogram of an image. For each grey value, it is the share
-    of the pixels whose grey value is at most as high."""
+    """Compute the ``(256,)`` cumulative histogram of an image. Entry i is the fraction of the
+    pixels whose grey value is at most i.
+    """
     counts = np.bincount(image[::_STRIDE, ::_STRIDE].ravel(), minlength=256)
     return np.cumsum(counts) / counts.sum()
 

@@ -210,8 +210,8 @@ def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
     with a patch of the left image. Returns the shift, in pixels of the pyramid level, and the sum
     of absolute differences (SAD) at this shift.
 
-    The shift is relative to ``x_r``. The shift is NaN if a patch would leave the image, or if the
-    least SAD is at an end of the search range.
+    The shift is relative to the column ``x_r`` of the right image. The shift is NaN if a patch
+    would leave the image, or if the least SAD is at an end of the search range.
     """
     height, width = image_l.shape
     if (

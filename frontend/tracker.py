@@ -51,7 +51,8 @@ class Found:
         visible: ``(N,)`` int32 ids of the landmarks that the frame should see.
         keyframe: id of the keyframe at which the frame was relocalised; -1 if it was not
             relocalised.
-        is_doubtful: True if the frame has so few inliers that its matches may be wrong.
+        is_doubtful: True if the frame has so few inliers that its matches with landmarks may be
+            wrong.
     """
 
     state: TrackingState
@@ -63,7 +64,7 @@ class Found:
 
     @classmethod
     def at_start(cls, frame: Frame, *, begun: bool) -> Found:
-        """Create the result for a frame before tracking starts.
+        """Create the result for a frame that was not tracked because no map exists yet.
 
         If the frame has started a map (``begun``), the state is OK, and all landmarks that the
         frame created are inliers. Otherwise the state is LOST.
@@ -228,7 +229,7 @@ class Tracker:
         self.last, self.lost_frames, self.status = frame, 0, TrackerStatus.TRACKING
 
     def lose(self) -> None:
-        """Update the state after a frame that was not tracked."""
+        """Count a frame that was not tracked as lost, and update the state of the tracker."""
         self.lost_frames += 1
         self.status = TrackerStatus.LOST
 
@@ -259,7 +260,7 @@ class Tracker:
         )
 
     def restore(self, state: TrackerState, xyz: Matrix) -> Frame:
-        """Continue from a state that the method ``state`` returned. Returns the last tracked frame.
+        """Restore a state that the method ``state`` returned. Returns the last tracked frame.
 
         Args:
             xyz: ``(N, 3)`` positions of the landmarks that the last frame tracks, in the world

@@ -320,8 +320,8 @@ def uncertainty_of(
     Returns:
         Two matrices. The first is the ``(6, 6)`` covariance of the pose ``T_cw`` relative to the
         points that the frame tracks (``pose_covariance``). The second is the ``(6, 3)`` effect on
-        the motion if the disparity offset is wrong by ``offset_sigma`` (``offset_effect``). It is
-        None if ``offset_sigma`` is 0.
+        the motion if the disparity offset is wrong by ``offset_sigma`` (``offset_effect``). The
+        second matrix is None if ``offset_sigma`` is 0.
     """
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
     observed = _observed_points(frame, matched, context)
@@ -338,9 +338,10 @@ def uncertainty_of(
 def _observed_points(
     frame: Frame, matched: NDArray[np.integer], context: TrackingContext
 ) -> tuple[NDArray[np.float64], ...]:
-    """Return the arguments of ``optimise_pose`` that follow the pose. They describe the points that
-    the features ``matched`` track. For matches that were aligned, the aligned positions are
-    used."""
+    """Return the arguments of ``optimise_pose`` that follow ``T_cw``. These arguments describe the
+    points that the features ``matched`` track. For matches that were aligned, the aligned positions
+    are used.
+    """
     uvr, weight = observations(frame, matched, context)
     certainty = np.ones(len(matched))
     if frame.shift is not None:

@@ -126,7 +126,7 @@ def grain(image, stride, least):
 
 
 def is_faint(images: Sequence[Grey], counts: Sequence[int], config: Config) -> bool:
-    """Return whether any of the images has few corners because of low contrast.
+    """Return whether at least one of the images has few corners because of low contrast.
 
     An image that is out of focus also has few corners. Such an image is not counted, because
     raising its contrast would only amplify rounding errors. An image that shows nothing at all is

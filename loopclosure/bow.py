@@ -1,8 +1,8 @@
 """Detects loops by comparing bags of visual words.
 
-Candidates are chosen as in ORB-SLAM (Mur-Artal et al., T-RO 2015, sections III-E and VII-A). A
-candidate meets three conditions. It shares many visual words with the query. It belongs to one of
-the groups of covisible keyframes with the highest total scores. Its score is at least the lowest
+Loop candidates are chosen as in ORB-SLAM (Mur-Artal et al., T-RO 2015, sections III-E and VII-A).
+Each candidate meets three conditions. It shares many visual words with the query. It belongs to one
+of the groups of covisible keyframes with the highest total scores. Its score is at least the lowest
 score among the keyframes that are covisible with the query. A single pass over the inverted index
 gives the scores of all keyframes.
 """
@@ -28,7 +28,8 @@ from vslam.map_kernels import count_shared
 
 class BowDetector:
     """A ``LoopDetector`` that compares images using bags of visual words. Keyframes must be added
-    in ascending order of their ids."""
+    in ascending order of their ids.
+    """
 
     name = "bow"
 

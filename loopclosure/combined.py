@@ -21,8 +21,8 @@ class CombinedDetector:
     The scores of different detectors are not comparable, so the candidates of all detectors are
     interleaved. The best candidate of each detector comes first, then the second best of each, and
     so on. Candidates for the same keyframe are joined. Several keyframes of the same place may all
-    remain candidates. The reason is that after a change in lighting, only one of them may be
-    recognisable.
+    remain candidates. The reason is that after a change in lighting, only one of these keyframes
+    may be recognisable.
     """
 
     def __init__(self, name: str, detectors: list[LoopDetector]) -> None:

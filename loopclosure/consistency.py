@@ -27,11 +27,11 @@ from vslam.states import ConsistencyState
 
 
 class LoopConsistency:
-    """Tests the temporal consistency of loops. It stores which places recent keyframes resembled,
-    and which loops were verified for these keyframes.
+    """Tests the temporal consistency of loops. For this test, the places that recent keyframes
+    resembled and the loops that were verified for these keyframes are stored.
 
-    Call ``update`` once for every keyframe, with or without candidates. Call ``confirm`` for every
-    loop edge that was verified. Call ``reset`` after a loop has been closed.
+    Call ``update`` once for every keyframe, even if the keyframe has no candidates. Call
+    ``confirm`` for every loop edge that was verified. Call ``reset`` after a loop has been closed.
     """
 
     def __init__(self, config: ConsistencyConfig) -> None:
@@ -91,8 +91,8 @@ class LoopConsistency:
         not.
 
         Returns:
-            The edge. It is marked as not accepted if too few keyframes have agreed so far. A
-            keyframe counts only once, even if several of its edges agree.
+            The loop edge. The edge is marked as not accepted if the loops of too few keyframes have
+            agreed so far. A keyframe counts only once, even if several of its loop edges agree.
         """
         if not edge.accepted:
             return edge
@@ -113,8 +113,8 @@ class LoopConsistency:
     def confirmed_by_earlier(
         self, map_: Map, camera: Camera, config: VerificationConfig
     ) -> Iterator[LoopEdge]:
-        """Yield verified loops that an earlier keyframe confirms, although too few keyframes have
-        agreed with them so far. The newest loop comes first.
+        """Yield verified loops that are confirmed by an earlier keyframe. So far, the loops of too
+        few keyframes have agreed with these loops. The newest loop comes first.
 
         An earlier keyframe confirms a loop if it meets three conditions. It is covisible with the
         query of the loop. It can be verified at the same place as the query. The two loops imply
@@ -166,7 +166,7 @@ class LoopConsistency:
         return ConsistencyState(tuple(self._series), tuple(self._verified), self._turn)
 
     def restore(self, state: ConsistencyState) -> None:
-        """Continue from a state that the method ``state`` returned."""
+        """Restore a state that the method ``state`` returned."""
         self._series, self._verified = list(state.places), list(state.verified)
         self._turn = state.turn
 

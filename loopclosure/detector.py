@@ -20,8 +20,8 @@ class LoopDetector(Protocol):
 
     All detectors share the later stages: rating and verification of candidates, consistency, and
     correction. However, the descriptors that are used to verify candidates depend on the detector.
-    The setting ``verification.descriptors`` selects these descriptors. Its default is different for
-    different detectors.
+    The setting ``verification.descriptors`` selects these descriptors. The default of this setting
+    depends on the detector.
 
     For ``bow``, ``capsule-paper`` and plug-ins, candidates are verified using only ORB descriptors.
     For ``both`` and the other networks, candidates that fail this verification are verified again

@@ -77,7 +77,7 @@ def localise(
 
     Args:
         query: local descriptors of the image.
-        keyframes: ids of keyframes of the place that have images, most similar first.
+        keyframes: ids of the keyframes of the place whose images are stored, most similar first.
         seed: seed of the random samples; the same seed gives the same result.
 
     Returns:
@@ -117,7 +117,7 @@ def localise(
 
 
 def view_of(map_: Map, keyframe: int, images: KeyframeImages) -> View:
-    """Create the ``View`` of a keyframe that has an image."""
+    """Create the ``View`` of a keyframe whose image is stored."""
     a, rows = map_.arrays, map_.rows(keyframe)
     landmark = a.landmark[rows]
     observing = np.flatnonzero(landmark >= 0)
@@ -132,8 +132,10 @@ def guided_search(
     camera: Camera,
     config: LearnedMatchingConfig,
 ) -> PoseEstimate:
-    """Refine the pose of an image. All landmarks of the views are searched for near their
-    projections, and the pose is optimised with all matches. Both steps are done twice."""
+    """Refine the pose of an image. All landmarks that the keyframes ``views`` observe are searched
+    for near their projections, and the pose is optimised with all matches. Both steps are done
+    twice.
+    """
     _, first = np.unique(np.concatenate([view.landmarks for view in views]), return_index=True)
     landmarks = np.concatenate([view.landmarks for view in views])[first]
     xyz = map_.arrays.xyz[landmarks]

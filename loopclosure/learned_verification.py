@@ -70,7 +70,8 @@ class LearnedTrials:
         """Record the result of verifying a candidate with learned descriptors.
 
         Args:
-            located: whether the attempt found a pose, even if the loop was rejected afterwards.
+            located: whether the verification found a pose, even if the loop was rejected
+                afterwards.
         """
         if located:
             self.state = replace(self.state, resting_until=0)
@@ -90,7 +91,7 @@ def with_similarities(
     already done this.
 
     Args:
-        candidates: the candidates, best first. At most ``config.max_compared`` of them are
+        candidates: the loop candidates, best first. At most ``config.max_compared`` candidates are
             compared.
         glance: function that returns the coarse descriptors of the query image. It is called only
             if there is a candidate to compare.
@@ -204,8 +205,8 @@ def recognise(
         match: id of the keyframe.
 
     Returns:
-        The pose and the observed landmarks. None if the frame fails the tests that a loop must
-        pass. Also None if too few of its keypoints coincide with landmarks to continue tracking.
+        The pose and the observed landmarks. The result is None if the frame fails the tests that a
+        loop must pass, or if too few of its keypoints coincide with landmarks to continue tracking.
     """
     gates = config.verification
     around = [match, *map_.covisible(match)[0].tolist()]
@@ -225,8 +226,8 @@ def recognise(
 def observed_features(
     map_: Map, query: int, estimate: PoseEstimate, camera: Camera, config: LearnedMatchingConfig
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Pair features of the query with landmarks of a place that are predicted at the same image
-    position.
+    """Pair features of the query image with landmarks of a place whose predicted image positions
+    coincide with the features.
 
     If a feature already observes a landmark, the depths of both landmarks must agree. Otherwise, a
     corner of a car could be paired with a corner of the facade behind the car.
@@ -302,7 +303,7 @@ def _rejection_reason(
     loop passes all tests.
 
     Args:
-        query_seen: the result of ``_seen_of_query``.
+        query_seen: the two numbers that ``_seen_of_query`` returned.
     """
     assert edge.T_query_match is not None
     distance = float(np.linalg.norm(inverse(edge.T_query_match)[:3, 3]))

@@ -93,8 +93,9 @@ def precision_at_recall(curve: PrecisionRecall, recall: float) -> float:
 
 
 def accepted_at(curve: PrecisionRecall, threshold: float) -> tuple[float, float]:
-    """Return the precision and the recall at a threshold on the score. If no pair is accepted, the
-    precision is 1 and the recall is 0."""
+    """Return the precision and the recall at a threshold on the score. If no pair is
+    accepted, the precision is defined as 1, and the recall is 0.
+    """
     k = int(np.searchsorted(curve.thresholds, threshold))
     return float(curve.precision[k]), float(curve.recall[k])
 

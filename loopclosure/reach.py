@@ -10,13 +10,13 @@ from vslam.map import Map
 
 
 def beyond_reach(map_: Map, keyframe: int, config: SiameseConfig) -> NDArray[np.float64]:
-    """Compute how far each keyframe is beyond the reach of the camera. A keyframe within reach may
-    be the place that the camera is revisiting.
+    """Compute how far each keyframe is beyond the reach of the camera. A keyframe is within reach
+    if, according to odometry, the camera may be revisiting it.
 
     The result is the distance between the camera and each keyframe, minus a bound on the position
-    error of odometry. The bound is a constant plus a fraction of the distance driven since the
+    error of odometry. The bound is a constant plus a fraction of the distance travelled since the
     keyframe. A monocular map has no metric scale, and its scale drifts. In a monocular map, the
-    bound is therefore a larger fraction of the distance driven, with no constant term.
+    bound is therefore a larger fraction of the distance travelled, with no constant term.
 
     Keyframes of other sub-maps are always within reach. The camera was lost between the sub-maps,
     so their relative pose is unknown. In a monocular map, their relative scale is unknown as well.

@@ -88,7 +88,8 @@ def detector_with_images(
 
     Args:
         weights, late: see :func:`create_detector`.
-        local_weights: weights of the local descriptors; None uses the weights that vslam ships.
+        local_weights: weights of the local-descriptor network; None uses the weights that vslam
+            ships.
 
     Returns:
         The detector, and the store of images. The store is None if candidates are verified using
@@ -153,11 +154,12 @@ def create_detector(
 
 
 def create_images(name: str, config: Config, weights: Path | None = None) -> KeyframeImages | None:
-    """Create the store of keyframe images. The images are needed to rate and verify candidates with
-    learned descriptors. Returns None if ``verification.descriptors`` selects only ORB descriptors.
+    """Create the store of keyframe images. The images are needed to rate and verify loop candidates
+    using learned descriptors. Returns None if ``verification.descriptors`` selects only ORB
+    descriptors.
 
     Raises:
-        InputError: the network of the local descriptors cannot be read.
+        InputError: the local-descriptor network cannot be read.
     """
     descriptors = config.verification.descriptors
     if descriptors == "auto":

@@ -69,13 +69,13 @@ def align(
     Returns None if the best motion has fewer than ``min_inliers`` inliers.
 
     Args:
-        a, b: the same N matches, as observed by each camera.
+        a, b: the landmarks of the same N matches, as observed by camera a and by camera b.
         intrinsics: ``(6,)`` of both cameras, see ``Camera.intrinsics``.
         seed: seed of the random samples; the same seed gives the same result.
         min_inliers: least number of inliers.
         max_draws: maximum number of samples.
-        confidence: a probability. Sampling ends when a better motion, if there were one, would have
-            been found with this probability.
+        confidence: a probability. Assume that a better motion exists. Sampling ends when such a
+            motion would have been found with this probability.
         fix_scale: whether the scale is fixed to 1. True for metric maps (stereo, RGB-D), False for
             monocular maps.
     """

@@ -6,11 +6,11 @@ The first steps follow ORB-SLAM (T-RO 2015, section VII-B) and, for stereo, ORB-
 section III-D). The descriptors of two keyframes are matched, and a motion is estimated by RANSAC.
 Then all landmarks of the place are matched near their projections, and the pose is refined.
 
-ORB-SLAM then only counts inliers. However, if two different facades or cars look alike, there are
-many inliers, too. The tests in this module therefore also look for evidence against the loop. There
-are two such tests. First, the inliers must be spread over the image. Second, the landmarks on each
-side of the loop are projected into the keyframe on the other side. Most of the landmarks that
-should be visible in that keyframe must be found.
+ORB-SLAM then only counts inliers. However, two different facades or cars that look alike also give
+many inliers. The tests in this module therefore also look for evidence against the loop. There are
+two such tests. First, the inliers must be spread over the image. Second, the landmarks on each side
+of the loop are projected into the keyframe on the other side. Most of the landmarks that should be
+visible in that keyframe must be found.
 """
 
 from __future__ import annotations
@@ -81,8 +81,9 @@ def verify(
 
     Returns:
         A loop edge. It is accepted with the reason "verified", or rejected with a different reason.
-        The pose and the numbers of matches come from the last step that was completed. The inliers
-        are pairs of a feature of the query and a landmark of the place, without duplicates.
+        The pose and the numbers of matches and inliers come from the last step that was completed.
+        Each inlier is a pair of a feature of the query keyframe and a landmark of the place. There
+        are no duplicates.
     """
     query, match = candidate.query, candidate.match
     edge = LoopEdge.of(candidate)
@@ -181,14 +182,15 @@ def _consensus(
 
 def relative_scale(map_: Map, edge: LoopEdge, T_cw: Matrix, *, default: float) -> float:
     """Estimate the scale of a monocular loop. It is the factor that converts lengths around the
-    match to lengths around the query.
+    match keyframe to lengths around the query keyframe.
 
-    An inlier feature of the query may also observe a landmark of its own. The depth of this
-    landmark, divided by the depth of the matched landmark of the place, is one estimate of the
-    scale. The median of these estimates is returned.
+    An inlier feature of the query keyframe may also observe another landmark, which was mapped on
+    the query's side of the loop. The depth of this landmark, divided by the depth of the matched
+    landmark of the place, is one estimate of the scale. The median of these estimates is returned.
 
     Args:
-        T_cw: ``(4, 4)`` pose of the query (world to camera), in the world frame of the place.
+        T_cw: ``(4, 4)`` pose of the query keyframe (world to camera), in the world frame of the
+            place.
         default: the result if there are too few features that observe landmarks on both sides.
     """
     a = map_.arrays
@@ -218,8 +220,10 @@ def _observations(map_: Map, rows: NDArray[np.int64]) -> tuple[Matrix, Matrix]:
 
 
 def place_of(map_: Map, match: int, query: int, config: VerificationConfig) -> NDArray[np.int64]:
-    """Return the ids of the keyframes that form the place of a candidate: the match and its most
-    covisible keyframes. Keyframes that are covisible with the query are excluded."""
+    """Return the ids of the keyframes that form the place of a loop candidate: the match keyframe
+    and its most covisible keyframes. Keyframes that are covisible with the query keyframe are
+    excluded.
+    """
     near_query = {query, *map_.covisible(query)[0].tolist()}
     around = [k for k in map_.covisible(match)[0].tolist() if k not in near_query]
     return np.array([match, *around[: config.place_keyframes]], np.int64)
@@ -343,7 +347,7 @@ def reverse_match(
     camera: Camera,
     config: VerificationConfig,
 ) -> GuidedMatches:
-    """Search for the landmarks of the query keyframe in the image of the match keyframe."""
+    """Search for the landmarks of a loop's query keyframe in the image of its match keyframe."""
     T_match_query = inverse(T_query_match)
     T_match_query[:3, 3] *= edge.scale  # lengths in the unit around the query, like the landmarks
     T_mw = T_match_query @ map_.keyframe_pose(edge.query)

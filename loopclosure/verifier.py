@@ -38,8 +38,8 @@ class Verifier:
 
     Attributes:
         images: the store of keyframe images that verification needs; None if it needs no images.
-        verified_memory: number of keyframes for which a verified loop is kept while it waits for
-            other loops that agree with it.
+        verified_memory: number of further keyframes during which a verified loop is kept while it
+            waits for other loops that agree with it.
     """
 
     images: KeyframeImages | None = None
@@ -92,7 +92,7 @@ class Verifier:
         return VerifierState()
 
     def restore(self, state: VerifierState) -> None:
-        """Continue from a state that the method ``state`` returned."""
+        """Restore a state that the method ``state`` returned."""
 
 
 def verifier_for(config: Config, camera: Camera, images: KeyframeImages | None = None) -> Verifier:

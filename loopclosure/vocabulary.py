@@ -63,7 +63,7 @@ class Vocabulary:
         return len(self.weight)
 
     def words(self, descriptors: NDArray[np.uint8]) -> NDArray[np.int32]:
-        """Find the ``(M,)`` int32 visual word of each of ``(M, 32)`` uint8 descriptors."""
+        """Find the visual words of ``(M, 32)`` uint8 descriptors. Returns ``(M,)`` int32 words."""
         return descend(
             np.ascontiguousarray(descriptors).view(np.uint64),
             self.descriptors,
@@ -124,7 +124,7 @@ def descend(queries, descriptors, first_child, n_children, word):
     """Find the visual word of each query descriptor by descending the vocabulary tree from the root
     to a leaf.
 
-    Each step goes to the nearest child. If several children are equally near, the first one is
+    Each step goes to the nearest child. If several children are equally near, the first child is
     chosen.
 
     Args:

@@ -144,7 +144,8 @@ def seed_centres(data, members, branching, state, nearest, centres):
 @inner_kernel
 def assign(data, members, centres, n_centres, label):
     """Assign each member of a node to the nearest cluster centre. If several centres are equally
-    near, the first one is chosen. Returns the number of members whose centre has changed."""
+    near, the first centre is chosen. Returns the number of members whose centre has changed.
+    """
     changed = 0
     for i in range(len(members)):
         nearest, least = 0, 257

@@ -36,19 +36,20 @@ _NARROWEST, _WIDEST = 10.0, 150.0  # degrees, plausible fields of view of a came
 class Camera:
     """A rectified stereo pair, an RGB-D camera or a single camera.
 
-    Both images of a stereo pair have the same focal lengths, and a point has the same row in both.
+    Both images of a stereo pair have the same focal lengths. A point lies in the same row of both
+    images.
 
     Attributes:
         fx, fy: focal lengths in pixels.
         cx, cy: principal point of the left camera in pixels.
         baseline: distance from the left to the right camera in metres. It is 0 for a single camera.
-            The map of a single camera has an arbitrary unit instead of metres
-            (``backend/two_views.py``). An RGB-D camera has no right camera. Its baseline states how
-            accurate the depth is: a stereo pair with this baseline would measure depth equally
-            accurately (``frontend/depth.py``).
+            A map that is built with a single camera has an arbitrary unit of length instead of
+            metres (``backend/two_views.py``). An RGB-D camera has no right camera. For an RGB-D
+            camera, this value describes the accuracy of the depth: a stereo pair with this baseline
+            would measure depth equally accurately (``frontend/depth.py``).
         width, height: image size in pixels.
-        depth: whether the second image is a depth image instead of a right image. It holds the
-            depth of each pixel of the left image.
+        depth: whether the second image of a frame is a depth image instead of a right image. The
+            depth image holds the depth of each pixel of the left image.
         right_delay: seconds from the exposure of the left image of a pair to the exposure of the
             right image. It is negative if the right image is exposed first, and 0 if both cameras
             share a trigger.
@@ -124,7 +125,7 @@ class Camera:
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:
-        """The camera in the form that kernels use.
+        """The parameters of the camera as an array, which kernels use.
 
         The array is ``(6,)`` float64 ``[fx, fy, cx, cy, bf, disparity_weight]``.
         """
@@ -163,8 +164,8 @@ def calibration_doubts(camera: Camera) -> list[str]:
     """Return the reasons why a calibration is implausible.
 
     Each reason is one sentence without a full stop. The list is empty if the calibration is
-    plausible. A camera can really have such a calibration. More often, the calibration belongs to
-    other images.
+    plausible. A camera can have such a calibration. More often, however, the calibration belongs to
+    different images.
     """
     off_centre = principal_point_doubt((camera.cx, camera.cy), (camera.width, camera.height))
     doubts = [off_centre] if off_centre else []
@@ -181,7 +182,8 @@ def calibration_doubts(camera: Camera) -> list[str]:
 def principal_point_doubt(principal: tuple[float, float], size: tuple[int, int]) -> str:
     """Return the reason why a principal point is implausible.
 
-    The reason is a sentence without a full stop. It is empty if the principal point is plausible.
+    The reason is one sentence without a full stop. The result is an empty string if the principal
+    point is plausible.
 
     Args:
         principal: column and row of the principal point in pixels.
@@ -212,7 +214,7 @@ def _cause(across: float, down: float) -> str:
 
 
 def field_of_view(camera: Camera) -> tuple[float, float]:
-    """Horizontal and vertical field of view of a camera, in degrees."""
+    """Compute the horizontal and vertical field of view of a camera, in degrees."""
     across, down = (
         2 * math.degrees(math.atan(size / (2 * focal)))
         for size, focal in ((camera.width, camera.fx), (camera.height, camera.fy))
@@ -232,7 +234,7 @@ Made = TypeVar("Made")
 
 
 class ImageMap(Protocol):
-    """A function that applies another function to each image of a frame, such as ``map``.
+    """The type of functions that, like ``map``, apply a given function to each image of a frame.
 
     The built-in ``map`` processes one image after the other. The ``map`` of a thread pool processes
     the images in parallel. Both return the same results in the same order.

@@ -48,11 +48,13 @@ class LoopClosing:
     Attributes:
         detector: proposes loop candidates.
         verifier: decides which candidates are loops.
-        edges: the outcome of every candidate, in order.
-        corrections: the loops that were closed.
-        closed: the edges of all closed loops. Their translations are in the present unit of the
-            map. The loops of a loaded map come first.
-        problems: one sentence for each step that failed. Such a failure leaves the map unchanged.
+        edges: the outcome of every loop candidate so far, in the order in which the outcomes were
+            recorded.
+        corrections: for each loop that was closed in this run, how the loop corrected the map.
+        closed: the loop edges of all closed loops. Their translations are in the current unit of
+            the map. The loops of a loaded map come first.
+        problems: one sentence for each step of loop closing that failed. Such a failure leaves the
+            map unchanged.
     """
 
     def __init__(
@@ -104,11 +106,11 @@ class LoopClosing:
             self._close(map_, search.loop)
 
     def consider(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> None:
-        """Verify the loop candidates of a keyframe, best first, and close the first true loop."""
+        """Verify the loop candidates of a keyframe, best first, and close the first loop found."""
         self.close(map_, self._find(map_, keyframe, candidates))
 
     def _find(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> LoopSearch:
-        """Verify loop candidates, best first, until one is a true loop. The map is only read."""
+        """Verify loop candidates, best first, until a candidate passes. The map is only read."""
         candidates = self.verifier.rate(map_, keyframe, candidates)
         _, rejected = self._consistency.update(keyframe, candidates, map_)
         rejections = {edge.match: edge for edge in rejected}
@@ -130,12 +132,12 @@ class LoopClosing:
     def state(self) -> ClosingState:
         """Return the state of loop closing for a checkpoint.
 
-        It does not contain the detector and the images.
+        The state does not include the loop detector or the images.
         """
         return ClosingState(self._consistency.state(), self.verifier.state(), self._followed)
 
     def restore(self, state: ClosingState) -> None:
-        """Continue from a state that ``state`` returned."""
+        """Continue loop closing from a state that the method ``state`` returned."""
         self._consistency.restore(state.consistency)
         self.verifier.restore(state.verifier)
         self._followed = state.followed
@@ -201,9 +203,10 @@ class LoopClosing:
 
     @contextmanager
     def _failure_reported(self, what: str) -> Iterator[None]:
-        """Log an exception of the block and add it to ``problems`` instead of raising it.
+        """Log an exception of the ``with`` block and add it to ``problems``.
 
-        This is used for steps that leave the map unchanged when they fail.
+        The exception is not raised again. This context manager is used for steps that leave the map
+        unchanged when they fail.
         """
         try:
             yield
@@ -217,8 +220,9 @@ class LoopClosing:
         """Solve the pose graph with a verified loop.
 
         Returns:
-            The outcome for the list ``edges``, and the loop. The loop is None if it contradicts the
-            other edges of the graph.
+            The loop edge with the outcome, to be recorded in ``edges``, and the verified loop with
+            its correction. The second value is None if the loop contradicts the other edges of the
+            graph.
         """
         start = time.perf_counter()
         solution = self._solution(map_, edge, Hypothesis.PREDICTED)
@@ -229,7 +233,7 @@ class LoopClosing:
         return replace(edge, reason="closed"), _Loop(edge, solution, start)
 
     def _close(self, map_: Map, loop: _Loop) -> None:
-        """Correct the map by a loop that ``_solve`` accepted."""
+        """Correct the map using a loop that ``_solve`` accepted."""
         edge, solution = loop.edge, loop.solution
         if self._global is not None:  # its snapshot does not contain this loop
             self._global.cancel()

@@ -70,40 +70,40 @@ class WeakImageConfig(Section):
     """Images with much noise or little contrast (docs/research/stress.md)."""
 
     noise_from: float = Field(5.0, ge=0)
-    """An image is blurred if the standard deviation of its noise is at least this, in grey levels.
-    Images without added noise have at most 2.5. [own]"""
+    """An image is blurred if the standard deviation of its noise is at least this value, in grey
+    levels. Images without added noise have at most 2.5. [own]"""
     noise_left: float = Field(4.0, gt=0)
     """Standard deviation of the noise that should remain after the blur, in grey levels. A smaller
     value blurs the image more. [own]"""
     max_blur: float = Field(3.5, gt=0)
     """Upper bound of the standard deviation of the Gaussian blur, in pixels. [own]"""
     spikes_from: float = Field(0.04, ge=0, le=1)
-    """A median filter is applied if more than this share of the pixels are spikes. A spike is a
+    """A median filter is applied if more than this fraction of the pixels are spikes. A spike is a
     pixel that is much brighter or much darker than both of its neighbours. [own]"""
     few_features: float = Field(0.5, ge=0, le=1)
-    """Contrast is measured only in images that yield fewer features than this share of
+    """Contrast is measured only in images that yield fewer features than this fraction of
     `orb.n_features`. [own]"""
     low_contrast: float = Field(6.0, ge=0)
-    """The contrast of an image is raised if it is below this, in grey levels. With 0, the contrast
-    is never raised. To measure the contrast, the image is divided into blocks of 16 x 16 pixels,
-    and the standard deviation of the grey values is computed for each block. The contrast is the
-    median of these standard deviations. [own]"""
+    """The contrast of an image is raised if it is below this value, in grey levels. With 0, the
+    contrast is never raised. To measure the contrast, the image is divided into blocks of 16 x 16
+    pixels, and the standard deviation of the grey values is computed for each block. The contrast
+    is the median of these standard deviations. [own]"""
     least_detail: float = Field(0.25, ge=0)
     """An image counts as out of focus if the mean absolute second difference of its grey values is
-    below this share of its contrast. The contrast of such an image is not raised. Sharp images have
-    a share of 0.4 or more. [own]"""
+    below this fraction of its contrast. The contrast of such an image is not raised. In sharp
+    images, this ratio is 0.4 or more. [own]"""
     raised_contrast: float = Field(12.0, gt=0)
     """Contrast is raised until the grey values in each window have this standard deviation, in grey
     levels. The default is the contrast of KITTI's images on a bright day. [own]"""
     contrast_window: int = Field(33, ge=3)
     """Side of the window in which contrast is raised, in pixels. [own]"""
     flat_share: float = Field(0.25, gt=0, le=1)
-    """The contrast of a window counts as at least this share of the median contrast of all windows.
-    This limits how much the noise in flat parts of the image is amplified. A larger share amplifies
-    flat parts less. [own]"""
+    """The contrast of a window counts as at least this fraction of the median contrast of all
+    windows. This limits how much the noise in flat parts of the image is amplified. A larger
+    fraction amplifies flat parts less. [own]"""
     least_contrast: float = Field(0.15, gt=0)
-    """The contrast of a window also counts as at least this, in grey levels. Rounding alone causes
-    a standard deviation of this size. [own]"""
+    """The contrast of a window also counts as at least this value, in grey levels. Rounding alone
+    causes a standard deviation of this size. [own]"""
 
 
 class StereoConfig(Section):
@@ -112,28 +112,29 @@ class StereoConfig(Section):
     max_descriptor_distance: int = Field(75, ge=0, le=256)
     """Upper bound of the descriptor distance of a match, in bits. [OS2 III-A, customary]"""
     sad_window: int = Field(5, ge=1)
-    """Half width of the patch that is compared by the sum of absolute differences (SAD), in pixels
-    of the keypoint's octave. [OS2 III-A, customary]"""
+    """Half width of the patch that is compared using the sum of absolute differences (SAD), in
+    pixels of the keypoint's octave. [OS2 III-A, customary]"""
     sad_search: int = Field(5, ge=1)
     """The patch is searched for up to this distance to the left and to the right, in pixels of the
     keypoint's octave. [OS2 III-A, customary]"""
     balance_from: float = Field(0.3, ge=0)
-    """The darker image of a stereo pair is brightened before matching if the gain between the two
-    images is above this, in stops (factors of two). [own]"""
+    """The darker image of a stereo pair is brightened before stereo matching if the gain between
+    the two images is above this value, in stops (factors of two). [own]"""
     max_gain_disagreement: float = Field(0.75, gt=0)
     """A difference in brightness counts as a gain only if the gains of dark and of bright pixels
-    differ by at most this, in stops. [own]"""
+    differ by at most this value, in stops. [own]"""
     clipped_from: int = Field(250, ge=1, le=255)
-    """A pixel counts as overexposed if its grey value is at least this. Overexposed pixels are
-    ignored when the gain is measured. Video of limited range (16 to 235) needs about 230. [own]"""
+    """A pixel counts as overexposed if its grey level is at least this value. Overexposed pixels
+    are ignored when the gain is measured. Video of limited range (16 to 235) needs about 230.
+    [own]"""
     black_below: float = Field(6.0, gt=0, le=255)
-    """An image of a stereo pair counts as black if the 95 % quantile of its pixels is below this,
-    in grey levels, and the other image has contrast. A black image is not used. Video of limited
-    range (16 to 235) needs about 22. [own]"""
+    """An image of a stereo pair counts as black if the 95 % quantile of its pixels is below this
+    value, in grey levels, and the other image has contrast. A black image is not used. Video of
+    limited range (16 to 235) needs about 22. [own]"""
     close_depth_baselines: float = Field(40.0, gt=0)
-    """A stereo point is close if its depth is below this, in baselines. Close points are mapped
-    from a single stereo pair. Most far points are triangulated from several keyframes. [OS2 III-A,
-    printed]"""
+    """A stereo point is close if its depth is below this value, in baselines. Close points are
+    mapped from a single stereo pair. Most far points are triangulated from several keyframes. [OS2
+    III-A, printed]"""
     offset_sigma: float = Field(0.2, ge=0)
     """Prior standard deviation of an offset that all disparities have in common, in pixels. The
     offset is estimated from the motion of the camera (docs/research/motorway.md). A larger value
@@ -142,7 +143,7 @@ class StereoConfig(Section):
     """The offset is estimated again after this many keyframes. [own]"""
     least_delay: float = Field(1.2e-3, gt=0)
     """The report warns if the measured delay of the right camera differs too much from the delay in
-    the calibration. The difference must exceed this, in seconds, and also `delay_sigmas`
+    the calibration. The difference must exceed this value, in seconds, and also `delay_sigmas`
     (docs/research/stress.md). [own]"""
     delay_sigmas: float = Field(5.0, gt=0)
     """The report warns of a delay only if the difference also exceeds this many standard deviations
@@ -153,15 +154,15 @@ class DepthConfig(Section):
     """Depth images [OS2, III-A]."""
 
     min_metres: float = Field(0.1, gt=0)
-    """A measured depth below this, in metres, counts as unknown. [own]"""
+    """A measured depth below this value, in metres, counts as unknown. [own]"""
     max_metres: float = Field(100.0, gt=0)
-    """A measured depth above this, in metres, counts as unknown. [own]"""
+    """A measured depth above this value, in metres, counts as unknown. [own]"""
     edge_radius: float = Field(4.0, ge=0)
     """A keypoint gets a depth only if the depths within this radius agree, in pixels at octave 0.
     The default is one pixel more than the radius of FAST's circle. [own]"""
     edge_ratio: float = Field(0.07, gt=0)
-    """A keypoint lies on a depth edge if the depths around it differ by more than this share of the
-    nearest depth. Such a keypoint gets no depth. [own]"""
+    """A keypoint lies on a depth edge if the depths around it differ by more than this fraction of
+    the nearest depth. Such a keypoint gets no depth. [own]"""
 
 
 class AlignmentConfig(Section):
@@ -174,7 +175,7 @@ class AlignmentConfig(Section):
     pixels of its octave. [own]"""
     min_correlation: float = Field(0.85, gt=0, le=1)
     """A match is aligned only if the normalised cross-correlation of its patch with the image is at
-    least this. [own]"""
+    least this value. [own]"""
     certainty: int = Field(4, ge=1, le=255)
     """Ratio of the variance of a keypoint's position to the variance of an aligned match. A larger
     ratio gives aligned matches more weight. [own]"""
@@ -194,10 +195,10 @@ class TrackingConfig(Section):
     patch_min_inliers: int = Field(40, ge=10)
     """Features are extracted for a frame if fewer patches than this agree with its pose. [own]"""
     patch_min_inlier_ratio: float = Field(0.8, ge=0, le=1)
-    """Features are extracted for a frame if less than this share of its patches agree with its
-    pose. The share falls below 0.8 among moving vehicles, but not in static scenes. [own]"""
+    """Features are extracted for a frame if less than this fraction of its patches agree with its
+    pose. This fraction falls below 0.8 among moving vehicles, but not in static scenes. [own]"""
     patch_retry_ratio: float = Field(0.86, ge=0, le=1)
-    """If less than this share of the patches agree with the pose of a frame, the patches are
+    """If less than this fraction of the patches agree with the pose of a frame, the patches are
     searched for a second time. The first search begins at a pose that sparse image alignment has
     refined, and this alignment may have followed moving objects. The second search begins at the
     predicted pose. The result with more inliers is used. [own]"""
@@ -235,21 +236,21 @@ class TrackingConfig(Section):
     """A frame is tracked from the reference keyframe if tracking from the previous frame has fewer
     inliers than this. [OS1 V-B, customary]"""
     min_inlier_ratio: float = Field(0.3, ge=0, le=1)
-    """A frame is also tracked from the reference keyframe if less than this share of the matches
+    """A frame is also tracked from the reference keyframe if less than this fraction of the matches
     with the previous frame are inliers. [own]"""
     min_inliers_frame: int = Field(10, ge=3)
     """A frame is matched with the local map only if tracking from the previous frame, from the
     reference keyframe or with `predicted_window` gives at least this many inliers. Otherwise, the
     frame is LOST. [OS1 V-B, customary]"""
     min_inliers: int = Field(30, ge=3)
-    """A frame with fewer inliers than this in the local map is WEAK. Its pose is used, but reported
-    as uncertain. [OS1 V-D, customary]"""
+    """A frame with fewer inliers than this in the local map is WEAK. Its pose is used, but it is
+    reported as uncertain. [OS1 V-D, customary]"""
     min_inliers_lost: int = Field(15, ge=3)
     """A frame with fewer inliers than this in the local map is LOST. Its pose is only predicted.
     [own]"""
     depth_min_inlier_ratio: float = Field(0.2, ge=0, le=1)
-    """A frame of an RGB-D camera is also LOST if less than this share of its matches are inliers.
-    [own]"""
+    """A frame of an RGB-D camera is also LOST if less than this fraction of its matches are
+    inliers. [own]"""
     lost_frames_before_restart: int = Field(3, ge=1)
     """A stereo or RGB-D camera starts a sub-map at the predicted pose after this many lost frames.
     [own]"""
@@ -278,8 +279,8 @@ class InitializationConfig(Section):
     draws: int = Field(300, ge=1)
     """Number of RANSAC draws for each of the two models. ORB-SLAM uses 200. [OS1 IV, own]"""
     homography_share: float = Field(0.45, gt=0, lt=1)
-    """The homography is chosen if its share of the sum of both scores is above this. Otherwise, the
-    fundamental matrix is chosen. [OS1 IV, printed]"""
+    """The homography is chosen if its fraction of the sum of both scores is above this value.
+    Otherwise, the fundamental matrix is chosen. [OS1 IV, printed]"""
     max_error: float = Field(2.0, gt=0)
     """Upper bound of the reprojection error of an inlier, in pixels at octave 0.
     [OS1 IV, customary]"""
@@ -290,11 +291,11 @@ class InitializationConfig(Section):
     """At least this many points must be triangulated with a parallax of `min_parallax_deg`. [OS1
     IV, customary]"""
     min_point_share: float = Field(0.7, gt=0, le=1)
-    """At least this share of the inliers of the model must be triangulated in front of both
+    """At least this fraction of the inliers of the model must be triangulated in front of both
     cameras. [OS1 IV, own]"""
     max_rival_share: float = Field(0.7, gt=0, le=1)
-    """The motion is ambiguous if the second-best motion explains more than this share of the points
-    that the best motion explains. An ambiguous motion is rejected. [OS1 IV, customary]"""
+    """The motion is ambiguous if the second-best motion explains more than this fraction of the
+    points that the best motion explains. An ambiguous motion is rejected. [OS1 IV, customary]"""
     min_landmarks: int = Field(100, ge=8)
     """At least this many landmarks must remain after the first bundle adjustment.
     [OS1 IV, customary]"""
@@ -313,8 +314,8 @@ class KeyframeConfig(Section):
     """Keyframe decision [OS2, III-E]."""
 
     max_interval_s: float = Field(1.0, gt=0)
-    """A keyframe is inserted if the last one is at least this old, in seconds.
-    [OS1 V-E, customary]"""
+    """A keyframe is inserted if the last keyframe is at least this old, in seconds. [OS1 V-E,
+    customary]"""
     depth_max_interval_s: float = Field(0.3, gt=0)
     """Replaces `max_interval_s` for an RGB-D camera, in seconds. It is shorter, because such a
     camera is usually hand-held. [own]"""
@@ -325,7 +326,7 @@ class KeyframeConfig(Section):
     """If a frame tracks too few close points, it becomes a keyframe only if it could add more new
     close points than this. [OS2 III-E, printed]"""
     min_kept_close: float = Field(0.2, ge=0, le=1)
-    """If keyframes add on average fewer close points than `min_tracked_close`, this share of the
+    """If keyframes add on average fewer close points than `min_tracked_close`, this fraction of the
     average replaces `min_tracked_close` (docs/research/motorway.md). [own]"""
     first_gain: float = Field(2.0, ge=0)
     """Before the first observation, the number of close points that a keyframe adds is assumed to
@@ -334,17 +335,17 @@ class KeyframeConfig(Section):
     """Weight of the latest keyframe in the running mean of the number of close points that a
     keyframe adds. A larger weight adapts faster to the scene. [own]"""
     patch_kept_close: float = Field(0.4, ge=0, le=1)
-    """A frame tracked by patches becomes a keyframe if it tracks less than this share of the close
-    points that the first frame after the last keyframe tracked. [own]"""
+    """A frame that was tracked by patches becomes a keyframe if it tracks less than this fraction
+    of the close points that the first frame after the last keyframe tracked. [own]"""
     patch_lead_frames: int = Field(2, ge=0)
     """When frames are tracked by patches, a keyframe is planned up to this many frames ahead, so
     that its features can be extracted in advance. [own]"""
     max_tracked_ratio: float = Field(0.75, gt=0, le=1)
-    """A keyframe is inserted if the frame tracks less than this share of the landmarks of the
-    reference keyframe. A larger share inserts keyframes more often. [OS1 V-E, customary]"""
+    """A keyframe is inserted if the frame tracks less than this fraction of the landmarks of the
+    reference keyframe. A larger fraction inserts keyframes more often. [OS1 V-E, customary]"""
     urgent_ratio: float = Field(0.25, gt=0, le=1)
     """A keyframe is inserted, even while local mapping is busy, if the frame tracks less than this
-    share of the landmarks of the reference keyframe. [OS1 V-E, customary]"""
+    fraction of the landmarks of the reference keyframe. [OS1 V-E, customary]"""
     monocular_ratio: float = Field(0.9, gt=0, le=1)
     """Replaces `max_tracked_ratio` for a monocular camera. [OS1 V-E, printed]"""
     monocular_min_tracked: int = Field(100, ge=0)
@@ -356,8 +357,8 @@ class KeyframeConfig(Section):
     """A keyframe is old after this time, in seconds. If the camera returns to a known place, an old
     keyframe becomes the reference again, and no new keyframe is inserted. [own]"""
     known_ratio: float = Field(0.5, gt=0)
-    """A place is known if the frame tracks at least this share of the landmarks of an old keyframe.
-    With a larger share, more new keyframes are inserted at old places. [own]"""
+    """A place is known if the frame tracks at least this fraction of the landmarks of an old
+    keyframe. With a larger fraction, more new keyframes are inserted at old places. [own]"""
     known_min_inliers: int = Field(50, ge=0)
     """A place is known only if the frame tracks at least this many landmarks. [own]"""
     merge_after_frames: int = Field(2, ge=1)
@@ -379,8 +380,8 @@ class MappingConfig(Section):
     """Replaces `neighbours` for a monocular camera. [OS1 VI-C, customary]"""
     min_baseline_ratio: float = Field(0.01, ge=0)
     """With a monocular camera, landmarks are triangulated between two keyframes only if the
-    distance between the keyframes is at least this share of the median depth.
-    [OS1 VI-C, customary]"""
+    distance between the keyframes is at least this fraction of the median depth. [OS1 VI-C,
+    customary]"""
     min_parallax_cosine: float = Field(0.9998, gt=0, le=1)
     """Upper bound of the cosine of the parallax of a triangulated point. The default corresponds to
     1.1 degrees. A larger value also accepts points with less parallax. [OS1 VI-C, customary]"""
@@ -396,12 +397,12 @@ class MappingConfig(Section):
     """If a keyframe has fewer close stereo features than this, its nearest stereo features are
     mapped, up to this number. [OS2 III-E, printed]"""
     min_found_ratio: float = Field(0.25, ge=0, le=1)
-    """A recent landmark is culled if it is found in less than this share of the frames in which it
-    should be visible. [OS1 VI-B, printed]"""
+    """A recent landmark is culled if it is found in less than this fraction of the frames in which
+    it should be visible. [OS1 VI-B, printed]"""
     redundant_ratio: float = Field(0.9, gt=0, le=1)
-    """A keyframe is culled if more than this share of its landmarks are redundant. A landmark is
-    redundant if at least three other keyframes observe it. With a larger share, more keyframes are
-    kept. [OS1 VI-E, printed]"""
+    """A keyframe is culled if more than this fraction of its landmarks are redundant. A landmark is
+    redundant if at least three other keyframes observe it. With a larger fraction, more keyframes
+    are kept. [OS1 VI-E, printed]"""
     min_shared: int = Field(15, ge=1)
     """Two keyframes are joined by a covisibility edge if they share at least this many landmarks.
     [OS1 III-D, printed]"""
@@ -430,8 +431,8 @@ class VerificationConfig(Section):
     max_draws: int = Field(600, ge=1)
     """Upper bound of the number of RANSAC draws. [OS1 VII-B, own]"""
     confidence: float = Field(0.99, gt=0, lt=1)
-    """Probability with which RANSAC must draw at least one sample without outliers.
-    [OS1 VII-B, own]"""
+    """The probability with which RANSAC must draw at least one sample without outliers. [OS1 VII-B,
+    own]"""
     min_consensus: int = Field(15, ge=6)
     """RANSAC must find at least this many inliers. [OS1 VII-B, own]"""
     place_keyframes: int = Field(10, ge=0)
@@ -446,51 +447,53 @@ class VerificationConfig(Section):
     min_inliers: int = Field(40, ge=6)
     """At least this many inliers must remain after guided search. [OS1 VII-B, customary]"""
     min_inlier_ratio: float = Field(0.5, ge=0, le=1)
-    """At least this share of the matches of guided search must be inliers. [own]"""
+    """At least this fraction of the matches of the guided search must be inliers. [own]"""
     min_elsewhere: int = Field(15, ge=0)
-    """At least this many inliers must lie outside the vertical third of the image that has the most
-    inliers. Two similar but different places often agree in a single object only. [own]"""
+    """At least this many inliers must lie outside a vertical strip that is a third of the image
+    wide. The strip is placed where it contains as many inliers as possible. Two different places
+    that look similar often agree only in a single object. [own]"""
     min_cells: int = Field(8, ge=1)
     """At least this many cells of an 8 x 4 grid over the image must contain inliers. [own]"""
     min_cell_ratio: float = Field(0.3, ge=0, le=1)
-    """At least this share of the grid cells into which landmarks of the place are projected must
+    """At least this fraction of the grid cells into which landmarks of the place are projected must
     contain inliers. [own]"""
     min_seen_ratio: float = Field(0.07, ge=0, le=1)
-    """Guided search must find at least this share of those landmarks of the match that should be
-    visible in the query, and vice versa. [own]"""
+    """Guided search must find at least this fraction of the landmarks of the matched keyframe that
+    should be visible in the query. It must also find this fraction of the landmarks of the query
+    that should be visible in the matched keyframe. [own]"""
     max_distance: float = Field(15.0, gt=0)
     """Upper bound of the distance between the cameras of query and match, in metres. [own]"""
 
 
 class LearnedMatchingConfig(Section):
-    """Verification of loop candidates using the network's local descriptors, where ORB fails."""
+    """Verification of loop candidates using learned local descriptors, where ORB fails."""
 
     max_candidates: int = Field(2, ge=1)
     """Upper bound of the number of candidates that are tried for a keyframe or a lost frame.
     [own]"""
     max_compared: int = Field(5, ge=0)
-    """If the detector has not compared its candidates by local descriptors, this many of the best
-    candidates are compared before verification. [own]"""
+    """If the detector has not compared its candidates using local descriptors, this many of the
+    best candidates are compared before verification. [own]"""
     views: int = Field(2, ge=1)
     """Upper bound of the number of keyframes that are matched at each place. [own]"""
     most_shared: float = Field(0.4, gt=0, le=1)
     """The image of a keyframe is not kept for the network if the keyframe shares at least this
-    share of its landmarks with another keyframe whose image is kept. [own]"""
+    fraction of its landmarks with another keyframe whose image is kept. [own]"""
     min_similarity: float = Field(0.35, ge=0, le=1)
-    """Two images are matched only if their similarity by local descriptors is at least this.
-    [own]"""
+    """Two images are matched only if their similarity according to local descriptors is at least
+    this value. [own]"""
     retry_interval: int = Field(8, ge=0)
     """After a failed attempt, `retry_factor` applies to this many keyframes. [own]"""
     retry_factor: float = Field(1.1, ge=1)
     """During the `retry_interval` keyframes after a failed attempt, a place is tried only if its
     similarity is at least this many times the similarity in the failed attempt. [own]"""
     min_share: float = Field(0.1, ge=0, le=1)
-    """At least this share of the cells of the network's coarse feature map must agree with one
+    """At least this fraction of the cells of the network's coarse feature map must agree with one
     homography. [own]"""
     min_coarse_similarity: float = Field(0.3, ge=-1, le=1)
-    """Two coarse descriptors match only if their cosine is at least this. [own]"""
+    """Two coarse descriptors match only if their cosine is at least this value. [own]"""
     min_fine_similarity: float = Field(0.5, ge=-1, le=1)
-    """Two fine descriptors match only if their cosine is at least this. [own]"""
+    """Two fine descriptors match only if their cosine is at least this value. [own]"""
     reach: int = Field(5, ge=1)
     """The fine match is searched for up to this distance to each side of the coarse match, in cells
     of the network's fine feature map. [own]"""
@@ -503,26 +506,27 @@ class LearnedMatchingConfig(Section):
     max_draws: int = Field(1000, ge=1)
     """Upper bound of the number of RANSAC draws. [own]"""
     confidence: float = Field(0.99, gt=0, lt=1)
-    """Probability with which RANSAC must draw at least one sample without outliers. [own]"""
+    """The probability with which RANSAC must draw at least one sample without outliers. [own]"""
     min_consensus: int = Field(40, ge=4)
     """RANSAC must find at least this many inliers. [own]"""
     min_consensus_ratio: float = Field(0.15, ge=0, le=1)
-    """At least this share of the landmarks that are searched for must be inliers of RANSAC.
+    """At least this fraction of the landmarks that are searched for must be inliers of RANSAC.
     [own]"""
     min_inliers: int = Field(80, ge=6)
     """At least this many inliers must remain after guided search. [own]"""
     min_elsewhere: int = Field(40, ge=0)
-    """At least this many inliers must lie outside the vertical third of the image that has the most
-    inliers. [own]"""
+    """At least this many inliers must lie outside a vertical strip that is a third of the image
+    wide. The strip is placed where it contains as many inliers as possible. [own]"""
     min_seen_ratio: float = Field(0.3, ge=0, le=1)
-    """Guided search must find at least this share of those landmarks of the match that should be
-    visible in the query, and vice versa. [own]"""
+    """Guided search must find at least this fraction of the landmarks of the matched keyframe that
+    should be visible in the query. It must also find this fraction of the landmarks of the query
+    that should be visible in the matched keyframe. [own]"""
     fuse_pixels: float = Field(2.0, gt=0)
     """A keypoint can observe a matched landmark only if it lies within this distance of the
     landmark's projection, in pixels at octave 0. [own]"""
     verified_memory: int = Field(10, ge=1)
     """With learned verification, `consistency.verified_memory` is raised to this number if it is
-    smaller, because only some keyframes have an image to verify a loop with. [own]"""
+    smaller, because only some keyframes have an image with which a loop can be verified. [own]"""
 
 
 class ConsistencyConfig(Section):
@@ -532,8 +536,8 @@ class ConsistencyConfig(Section):
     """At least this many consecutive keyframes must resemble the place. OS1 requires 3.
     [OS1 VII-A, own]"""
     max_gap: int = Field(1, ge=0)
-    """Up to this many keyframes between two keyframes that resemble the place need not resemble it.
-    OS1 allows none. [OS1 VII-A, own]"""
+    """Between two keyframes that resemble the place, up to this many keyframes need not resemble
+    it. OS1 allows none. [OS1 VII-A, own]"""
     min_shared: int = Field(30, ge=1)
     """Keyframes that share at least this many landmarks with a candidate belong to the same place.
     [own]"""
@@ -545,8 +549,8 @@ class ConsistencyConfig(Section):
     """Each verified loop implies a pose of the query. Two loops agree if these positions are at
     most this far apart, in metres. [own]"""
     max_turn: float = Field(1.0, gt=0)
-    """Two loops agree only if the orientations of the query that they imply differ by at most this,
-    in degrees. [own]"""
+    """Two loops agree only if the orientations of the query that they imply differ by at most this
+    value, in degrees. [own]"""
     min_moved: float = Field(2.0, ge=0)
     """At the end of a drive, an earlier keyframe may confirm a loop only if it is at least this far
     from the query, in metres. A nearer keyframe would only repeat the evidence of the query.
@@ -565,8 +569,8 @@ class RelocalizationConfig(Section):
     max_draws: int = Field(600, ge=1)
     """Upper bound of the number of RANSAC draws. [OS1 V-C, own]"""
     confidence: float = Field(0.99, gt=0, lt=1)
-    """Probability with which RANSAC must draw at least one sample without outliers.
-    [OS1 V-C, customary]"""
+    """The probability with which RANSAC must draw at least one sample without outliers. [OS1 V-C,
+    customary]"""
     min_consensus: int = Field(10, ge=4)
     """RANSAC must find at least this many inliers. [OS1 V-C, customary]"""
     first_window: float = Field(8.0, gt=0)
@@ -574,22 +578,22 @@ class RelocalizationConfig(Section):
     min_inliers: int = Field(50, ge=6)
     """A frame is relocalised if it has at least this many inliers. [OS1 V-C, customary]"""
     min_elsewhere: int = Field(15, ge=0)
-    """At least this many inliers must lie outside the vertical third of the image that has the most
-    inliers. [own]"""
+    """At least this many inliers must lie outside a vertical strip that is a third of the image
+    wide. The strip is placed where it contains as many inliers as possible. [own]"""
     max_candidates: int = Field(5, ge=1)
     """Upper bound of the number of places that are tried for a lost frame. [own]"""
     doubtful_gap: float = Field(1.5, gt=1)
-    """A frame comes after a gap if the time since the last tracked frame exceeds the usual interval
-    between frames by more than this factor. [own]"""
+    """A frame counts as coming after a gap if the time since the last tracked frame exceeds the
+    usual interval between frames by more than this factor. [own]"""
     doubtful_share: float = Field(0.5, ge=0, le=1)
-    """A frame is doubtful if it tracks less than this share of the landmarks of the reference
+    """A frame is doubtful if it tracks less than this fraction of the landmarks of the reference
     keyframe, and if there is a second reason for doubt. The second reason is that the frame comes
-    after a gap, that its pose could not be predicted, or that it tracks less than this share of the
-    number of landmarks in the previous frame. For a doubtful frame, vslam searches the whole map.
-    [own]"""
+    after a gap, that its pose could not be predicted, or that it tracks less than this fraction of
+    the number of landmarks in the previous frame. For a doubtful frame, vslam searches the whole
+    map. [own]"""
     better: float = Field(1.5, ge=1)
-    """A doubtful frame is moved to the place that the search of the whole map finds if it has more
-    inliers there than this many times its number of inliers in tracking. [own]"""
+    """For a doubtful frame, the pose that the search of the whole map finds is used only if it has
+    more than this many times as many inliers as the tracked pose. [own]"""
     neighbours: int = Field(20, ge=1)
     """The landmarks of this many keyframes around a candidate place are matched. [own]"""
 
@@ -616,13 +620,13 @@ class BowConfig(Section):
     exclude_recent: int = Field(20, ge=1)
     """This many of the newest keyframes, including the query, are never candidates. [own]"""
     common_words_ratio: float = Field(0.8, ge=0, le=1)
-    """The number of words that a candidate shares with the query must be at least this share of the
-    largest number that any keyframe shares with the query. [OS1 III-E, customary]"""
+    """The number of words that a candidate shares with the query must be at least this fraction of
+    the largest number that any keyframe shares with the query. [OS1 III-E, customary]"""
     group_size: int = Field(10, ge=0)
     """A candidate forms a group with at most this many of its most covisible keyframes.
     [OS1 III-E, customary]"""
     group_score_ratio: float = Field(0.75, ge=0, le=1)
-    """A group is kept if its score is at least this share of the score of the best group. [OS1
+    """A group is kept if its score is at least this fraction of the score of the best group. [OS1
     III-E, printed]"""
     max_groups: int = Field(30, ge=1)
     """Upper bound of the number of groups. Groups are formed around the candidates with the highest
@@ -671,7 +675,7 @@ class PoseGraphConfig(Section):
     weak_rotation: float = Field(1.0, gt=0)
     """Standard deviation of the rotation of a weak edge, in radians. [own]"""
     gap_translation: float = Field(0.5, gt=0)
-    """Standard deviation of the translation of a gap, as a share of the predicted distance.
+    """Standard deviation of the translation of a gap, as a fraction of the predicted distance.
     [own]"""
     gap_speed: float = Field(2.0, gt=0)
     """Lower bound of the standard deviation of the translation of a gap, in metres per second of
@@ -688,7 +692,7 @@ class PoseGraphConfig(Section):
     iterations: int = Field(50, ge=1)
     """Upper bound of the number of Levenberg-Marquardt iterations. [own]"""
     max_loop_error: float = Field(30.0, gt=0)
-    """A loop is rejected if its chi-square after optimisation is above this. [own]"""
+    """A loop is rejected if its chi-square after optimisation is above this value. [own]"""
     max_strain: float = Field(60.0, gt=0)
     """A loop is rejected if the chi-square of all other edges exceeds this number times the number
     of closed loops. [own]"""
@@ -698,12 +702,12 @@ class SiameseConfig(Section):
     """Loop candidates from a Siamese network [ZS]."""
 
     threshold: float = Field(0.9, ge=0, le=1)
-    """A keyframe is a loop candidate if its similarity is at least this. [ZS, printed]"""
+    """A keyframe is a loop candidate if its similarity is at least this value. [ZS, printed]"""
     offered: float = Field(0.1, ge=0, le=1)
     """Replaces `threshold` if learned descriptors verify the candidates. A smaller value proposes
     more candidates. [own]"""
     reranked: int = Field(20, ge=1)
-    """This many of the most similar keyframes are re-ranked by local descriptors. [own]"""
+    """This many of the most similar keyframes are ranked again using local descriptors. [own]"""
     max_candidates: int = Field(5, ge=1)
     """Upper bound of the number of candidates for a query. The best candidates are kept. [own]"""
     recent_keyframes: int = Field(10, ge=0)
@@ -715,17 +719,17 @@ class SiameseConfig(Section):
     """If learned descriptors verify the candidates, the query is compared only with keyframes
     within this distance, in metres. `reach_share` increases this distance. [own]"""
     reach_share: float = Field(0.05, ge=0)
-    """This share of the distance driven since the keyframe is added to `reach`. The default is
-    several times the drift of a stereo camera in a street, which is about one per cent. [own]"""
+    """This fraction of the distance travelled since the keyframe is added to `reach`. The default
+    is several times the drift of a stereo camera in a street, which is about one per cent. [own]"""
     monocular_reach_share: float = Field(0.3, ge=0)
     """Replaces `reach` and `reach_share` in monocular maps, whose scale is unknown and drifts. The
-    query is compared only with keyframes that are nearer than this share of the distance driven
-    since the keyframe. The default is twice the value that KITTI 00 needs, where the scale drifts
-    by a factor of 2.3. [own]"""
+    query is compared only with keyframes that are nearer than this fraction of the distance
+    travelled since the keyframe. The default is twice the value that KITTI 00 needs, where the
+    scale drifts by a factor of 2.3. [own]"""
     reach_angle: float = Field(60.0, gt=0, le=180)
-    """The query is compared only with keyframes whose viewing direction differs from its own by at
-    most this, in degrees. The detectors do not recognise a place from behind or from the side.
-    [own]"""
+    """The query is compared only with keyframes whose viewing direction differs from that of the
+    query by at most this value, in degrees. The detectors do not recognise a place that is seen
+    from behind or from the side. [own]"""
     embedded_at_once: int = Field(8, ge=1)
     """Upper bound of the number of keyframes that the network processes for one query. The nearest
     keyframes are chosen. [own]"""
@@ -831,7 +835,7 @@ def thresholds_in_words(changed: Mapping[str, Any], most: int = 3) -> str:
 
     Args:
         changed: thresholds by dotted name.
-        most: number of thresholds that are listed. The other thresholds are only counted.
+        most: maximum number of thresholds that are listed. The other thresholds are only counted.
     """
     words = [f"{name}={value}" for name, value in changed.items()]
     more = [f"{len(words) - most} more in config.json"] if len(words) > most else []

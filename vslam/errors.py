@@ -37,7 +37,7 @@ class DroppedFrameError(UnreadableImageError):
 class BrokenSourceError(InputError):
     """A video, bag or camera ended early. The file was cut off, or the device was unplugged.
 
-    During a run, the results for the frames before the break are kept. The run fails only if there
+    During a run, the results for the frames before this point are kept. The run fails only if there
     are no such frames.
     """
 

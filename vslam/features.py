@@ -119,11 +119,11 @@ class Extracted:
         features: the N features that were extracted from the image of ``side``.
         pyramid: the pyramid of this image. None if matches in this image are not refined to
             sub-pixel accuracy.
-        row_offset: ``(N,)`` float32 pixels. This is the row of the stereo match in the right image
-            minus the row of the feature in the left image. NaN for a feature without this
-            measurement. None if no feature has this measurement.
-        side: the camera whose image was used. The right image is used only if the left image is
-            black. In this case, no feature has a stereo match.
+        row_offset: ``(N,)`` float32 pixels. The row offset is the row of the stereo match in the
+            right image minus the row of the feature in the left image. It is NaN for a feature
+            whose row offset was not measured. None if no row offset was measured.
+        side: the camera whose image was used. Features are extracted from the right image only if
+            the left image is black. In this case, no feature has a stereo match.
     """
 
     features: Features
@@ -133,7 +133,7 @@ class Extracted:
 
     @classmethod
     def nothing(cls) -> Extracted:
-        """Return a result without features, for a frame without images."""
+        """Return a feature-extraction result without features, for a frame without images."""
         return cls(Features.none())
 
 
@@ -157,8 +157,9 @@ class LandmarkPatches(NamedTuple):
 
     Attributes:
         ids: ``(N,)`` int32 landmark ids, sorted.
-        where: ``(N,)`` int64, index into ``pixels`` and ``shift`` of the patch of each landmark.
-        view: ``(N,)`` int64, index into ``T_cw`` of the keyframe that the patch was taken from.
+        where: ``(N,)`` int64, index of the patch of each landmark in ``pixels`` and ``shift``.
+        view: ``(N,)`` int64, index in ``T_cw`` of the keyframe that the patch of each landmark was
+            taken from.
         size: ``(N,)`` float64, size of a pixel of the patch in full-resolution pixels.
         angle: ``(N,)`` float32, orientation of the feature in radians.
         pixels: ``(P, PATCH_PIXELS)`` uint8, the square patch around each keypoint, row by row.
@@ -251,7 +252,7 @@ class TrackingState(StrEnum):
     """How a frame was tracked.
 
     OK: the pose has enough inliers. WEAK: the pose has few inliers. LOST: the pose is only
-    predicted, or no map has begun yet. DROPPED: the images arrived while earlier images were still
+    predicted, or no map exists yet. DROPPED: the images arrived while earlier images were still
     being processed (``--realtime``), so the pose is interpolated.
     """
 
@@ -263,22 +264,22 @@ class TrackingState(StrEnum):
 
 @dataclass(frozen=True)
 class TrackResult:
-    """The result of tracking one frame. Lost frames have a result, too.
+    """The result of tracking one frame. A lost frame also has a result.
 
     Attributes:
         index: frame number within the run, from 0.
         timestamp: seconds.
         T_wc: ``(4, 4)`` float64 pose (camera to world) at the time of tracking. Later bundle
-            adjustments improve it: ``Slam.trajectory()`` returns the final poses.
-        state: OK, WEAK, LOST or DROPPED.
+            adjustments improve this pose. ``Slam.trajectory()`` returns the improved poses.
+        state: how the frame was tracked: OK, WEAK, LOST or DROPPED.
         n_features: number of features that were extracted from the left image. It is 0 if the frame
             was tracked by patches.
         n_stereo: number of features with a stereo match.
         n_matches: number of landmarks that were matched by descriptor or by patch before the last
             pose optimisation.
-        n_inliers: number of these matches that are inliers of the last pose optimisation.
+        n_inliers: number of matched landmarks that are inliers of the last pose optimisation.
         is_keyframe: whether the frame became a keyframe.
-        relocalised: whether the pose was found by a search in the whole map.
+        relocalised: whether the pose was found by relocalisation, which searches the whole map.
         stage_ms: wall time of each stage of the pipeline, in milliseconds.
         T_odom_camera: ``(4, 4)`` pose from odometry, which drifts but never jumps. It is the
             identity at the first frame. None in results that were read from files of older

@@ -1,6 +1,7 @@
 """The pose of every frame relative to a keyframe.
 
-When the pose of a keyframe is corrected, the frames that are relative to it move with it.
+When the pose of a keyframe is corrected, the frames whose poses are relative to this keyframe move
+with it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from vslam.trajectory import Trajectory, bridge_gaps
 
 
 class KeyframePoses(Protocol):
-    """The present poses of the keyframes, to which the poses of frames are relative.
+    """The current poses of the keyframes, to which the poses of frames are relative.
 
     Attributes:
         n_keyframes: number of keyframes, including culled keyframes.
@@ -80,10 +81,10 @@ class FramePoses:
     """
 
     def __init__(self, keyframes: KeyframePoses, before: FrameTable | None = None) -> None:
-        """Begin with the poses of earlier frames of the same drive.
+        """Begin an empty list of poses, or continue the list of an earlier part of the same drive.
 
         Args:
-            keyframes: the present poses of the keyframes.
+            keyframes: the current poses of the keyframes.
             before: poses of the earlier frames. None if there are no earlier frames.
         """
         self._keyframes = keyframes
@@ -138,7 +139,7 @@ class FramePoses:
         self._set(index, keyframe, np.eye(4), unit)
 
     def follow_reference(self, index: int, T_cw: Matrix) -> None:
-        """Make the pose ``T_cw`` of a frame relative to the present reference keyframe."""
+        """Store the pose ``T_cw`` of a frame relative to the current reference keyframe."""
         keyframes = self._keyframes
         reference = keyframes.reference
         T_rw = keyframes.keyframe_pose(reference) if keyframes.n_keyframes else np.eye(4)
@@ -156,7 +157,7 @@ class FramePoses:
         return index % self._n
 
     def pose(self, index: int) -> Matrix:
-        """Return ``T_cw`` of a frame, computed from the present pose of its keyframe.
+        """Return the pose ``T_cw`` of a frame, computed from the current pose of its keyframe.
 
         Index -1 is the last frame.
         """

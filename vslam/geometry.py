@@ -120,7 +120,7 @@ def se3_log(T: Matrix) -> Matrix:
 
 @kernel
 def solve_positive(H: Matrix, b: Matrix) -> Matrix:
-    """Solve ``H x = b`` for a small symmetric positive definite ``H`` by Cholesky.
+    """Solve ``H x = b`` by Cholesky factorisation for a small symmetric positive definite ``H``.
 
     Args:
         H: ``(n, n)``. Only the lower triangle is read.
@@ -160,7 +160,7 @@ def solve_positive(H: Matrix, b: Matrix) -> Matrix:
 def symmetric_eigen(A: Matrix) -> tuple[Matrix, Matrix]:
     """Compute the eigenvalues and eigenvectors of a small symmetric matrix.
 
-    The method is cyclic Jacobi rotations (Golub and Van Loan, "Matrix Computations", 8.5). The
+    The function uses cyclic Jacobi rotations (Golub and Van Loan, "Matrix Computations", 8.5). The
     results are exact to round-off even if eigenvalues coincide.
 
     Returns:

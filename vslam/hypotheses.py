@@ -82,10 +82,10 @@ def solve(
     """Build and optimise the pose graph with a new loop. The map is only read.
 
     Args:
-        closed: loops that were closed before, in the present unit of the map.
+        closed: loops that were closed before, in the current unit of the map.
         edge: the new loop, whose relative pose is known.
-        monocular: whether to optimise similarities instead of rigid motions. A monocular map needs
-            similarities, because its scale drifts.
+        monocular: whether the map is monocular. For a monocular map, similarities are optimised
+            instead of rigid motions, because its scale drifts.
     """
     predicted = hypothesis is Hypothesis.PREDICTED
     graph = essential_graph(map_, [*closed, edge], config, driven=predicted)
@@ -113,10 +113,10 @@ def joined_submaps(map_: Map, closed: Sequence[LoopEdge]) -> NDArray[np.int64]:
 
 
 def _aligned(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
-    """Return initial poses ``T_cw`` for a camera that was carried to another place.
+    """Compute initial poses ``T_cw`` under the hypothesis that the lost camera was carried away.
 
-    The sub-map at one end of the loop is moved rigidly to the place that the loop gives it. The
-    result is ``(n_keyframes, 4, 4)``.
+    The sub-map at one end of the loop is moved rigidly to the pose that the loop implies. The
+    result has shape ``(n_keyframes, 4, 4)``.
     """
     T_cw = map_.arrays.T_cw[: map_.n_keyframes].copy()
     moving, keyframes = _moving_submap(map_, closed, edge)
@@ -132,10 +132,11 @@ def _aligned(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
 
 
 def _aligned_similarities(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
-    """Return initial ``S_wc`` for a monocular camera that was carried to another place.
+    """Compute initial ``S_wc`` under the hypothesis that the lost monocular camera was carried
+    away.
 
-    The sub-map at one end of the loop is moved to the place that the loop gives it. It also adopts
-    the unit of the other sub-map, so its poses become similarities.
+    The sub-map at one end of the loop is moved to the pose that the loop implies. This sub-map is
+    also scaled to the unit of length of the other sub-map, so its poses become similarities.
     """
     T_cw = map_.arrays.T_cw[: map_.n_keyframes]
     S_wc = inverses(T_cw)

@@ -41,7 +41,7 @@ def row_speeds(
     The row velocity of a point is the same in both images.
 
     Returns:
-        ``(N, 6)``, in focal lengths.
+        ``(N, 6)`` derivatives, in focal lengths.
     """
     zero = np.zeros_like(x)
     return np.column_stack([zero, inverse_depth, -y * inverse_depth, -1.0 - y * y, x * y, x])
@@ -71,7 +71,7 @@ def columns_without_delay(
     delay: float,
     camera: Camera,
 ) -> NDArray[np.float32]:
-    """Correct columns in the right image, as if it had been taken ``delay`` seconds earlier.
+    """Compute the columns that stereo matches would have without the delay of the right image.
 
     Args:
         xy: ``(N, 2)`` pixels in the left image.
@@ -79,7 +79,7 @@ def columns_without_delay(
         twist: ``(6,)`` twist of the points relative to the camera, per second.
 
     Returns:
-        The ``(N,)`` corrected columns.
+        ``(N,)`` columns of the matches if the right image had been taken ``delay`` seconds earlier.
     """
     x, y = rays(xy, camera)
     measured = xy[:, 0].astype(np.float64) - u_right

@@ -161,7 +161,7 @@ class _KernelCache(FunctionCache):
 
 
 def _use_temporary_cache() -> None:
-    """Keep the kernels of this process and of its child processes in a temporary folder."""
+    """Keep compiled kernels of this process and its child processes in a temporary folder."""
     try:
         folder = tempfile.mkdtemp(prefix="vslam-kernels-")
     except OSError as error:

@@ -26,7 +26,8 @@ def locked(lock: Path, folder: Path, doing: str) -> Iterator[None]:
 
     Raises:
         InputError: another process holds the lock.
-        OSError: the lock cannot be created, for example on a file system without locks.
+        OSError: the lock cannot be created, for example because the file system does not support
+            locks.
     """
     while True:
         with lock.open("ab") as file:

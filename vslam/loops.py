@@ -19,8 +19,9 @@ class LoopCandidate:
             not in the map.
         match: the keyframe of the map that shows the same place. It has not been culled.
         score: similarity in the detector's own measure. Higher scores mean greater similarity.
-        similarity: similarity of the two images by the network's local descriptors. Learned
-            verification is tried only for similar images. None if the similarity was not computed.
+        similarity: similarity of the two images according to learned local descriptors.
+            Verification using these descriptors is tried only for similar images. None if the
+            similarity was not computed.
         promising: whether the candidate is verified even if the consistency test rejects it.
         proposed_by: name of the detector that proposed the candidate. Several names are joined by
             ``+``.
@@ -54,20 +55,23 @@ class LoopEdge:
     """The outcome of a loop candidate. Rejected candidates are kept for the report.
 
     Attributes:
-        query, match: the two keyframes that may show the same place, as in ``LoopCandidate``.
+        query: the keyframe for which the detector searched the map.
+        match: the keyframe of the map that, according to the detector, shows the same place.
         score: similarity in the detector's own measure.
         proposed_by: name of the detector that proposed the candidate.
         accepted: whether the loop was closed.
         reason: "closed", or the reason in a few words why the candidate was rejected.
-        n_matches: number of landmarks around the match that were matched to features of the query.
+        n_matches: number of landmarks around the keyframe ``match`` that were matched to features
+            of the keyframe ``query``.
         n_inliers: number of matches that agree with ``T_query_match``.
-        T_query_match: ``(4, 4)`` float64, maps points from the camera of the match to the camera of
-            the query, in the unit of the map around the match. None if the candidate was rejected
-            before this pose was computed.
+        T_query_match: ``(4, 4)`` float64, maps points from the camera of the keyframe ``match`` to
+            the camera of the keyframe ``query``, in the unit of the map around ``match``. None if
+            the candidate was rejected before this pose was computed.
         features: ``(N,)`` int32, indices of the inlier features within the query keyframe.
         landmarks: ``(N,)`` int32, the landmark that each of these features observes.
-        scale: number of map units around the query per map unit around the match. It is 1 in metric
-            maps. In monocular maps, it differs from 1 by the scale drift.
+        scale: number of map units around the keyframe ``query`` per map unit around the keyframe
+            ``match``. It is 1 in metric maps. In monocular maps, it differs from 1 by the scale
+            drift.
         matched_by: the kind of descriptors that were matched, "orb" or "learned".
     """
 
@@ -92,12 +96,12 @@ class LoopEdge:
         reason: str = "",
         matched_by: Literal["orb", "learned"] = "orb",
     ) -> LoopEdge:
-        """Create a loop edge without a relative pose from a candidate.
+        """Create a loop edge from a candidate. The edge has no relative pose.
 
         Args:
             candidate: a candidate that was rejected or has not been verified yet.
             reason: why the candidate was rejected. Empty if it has not been verified yet.
-            matched_by: the kind of descriptors that were matched.
+            matched_by: the kind of descriptors that were matched, "orb" or "learned".
         """
         return cls(
             candidate.query,
@@ -111,7 +115,7 @@ class LoopEdge:
 
 
 def loop_entry(loop: LoopEdge) -> dict[str, Any]:
-    """Convert a loop to a JSON object, without its features and landmarks."""
+    """Convert a loop edge to a JSON object, without its features and landmarks."""
     entry = {name: value for name, value in vars(loop).items() if name not in _LEFT_OUT}
     T = loop.T_query_match
     return entry | {"T_query_match": None if T is None else T.tolist()}
@@ -121,10 +125,10 @@ _LEFT_OUT = ("features", "landmarks")
 
 
 def loop_of(entry: dict[str, Any]) -> LoopEdge:
-    """Read a loop from the JSON object that ``loop_entry`` returned.
+    """Read a loop edge from a JSON object that ``loop_entry`` returned.
 
     Raises:
-        KeyError, TypeError, ValueError: the object does not describe a loop.
+        KeyError, TypeError, ValueError: the object does not describe a loop edge.
     """
     T = entry["T_query_match"]
     T_query_match = None if T is None else np.array(T, np.float64).reshape(4, 4)
@@ -164,7 +168,7 @@ class PerKeyframe:
     """An array of any length for each of K keyframes, such as visual words or an encoded image.
 
     Attributes:
-        first: ``(K + 1,)`` int64 offsets.
+        first: ``(K + 1,)`` int64 offsets into ``values``.
         values: ``(N, ...)`` values of all keyframes. Keyframe k has ``values[first[k]:first[k +
             1]]``.
     """
@@ -182,7 +186,7 @@ class PerKeyframe:
     def select(self, keyframes: NDArray[np.int64]) -> PerKeyframe:
         """Return the values of ``(M,)`` keyframes, which are renumbered from 0.
 
-        Keyframes that have no entry get no values.
+        A keyframe that has no entry in this table gets an empty array.
         """
         nothing = self.values[:0]
         parts = [self.of(k) if k < len(self) else nothing for k in keyframes.tolist()]
@@ -214,9 +218,9 @@ class DetectorMemory:
 class ResembledPlace:
     """A place that recent keyframes resembled.
 
-    It consists of a loop candidate and its covisible keyframes. ``length`` is the number of
-    consecutive keyframes that resembled it. ``age`` is the number of keyframes since the last of
-    them.
+    The place consists of the keyframe that a loop candidate matched, and of the keyframes that are
+    covisible with it. ``length`` is the number of consecutive keyframes that resembled the place.
+    ``age`` is the number of keyframes since the last keyframe that resembled the place.
     """
 
     keyframes: frozenset[int]

@@ -44,32 +44,35 @@ class Arrays(NamedTuple):
 
     Attributes:
         T_cw: ``(K, 4, 4)`` f8, pose of each keyframe.
-        first_row: ``(K + 1,)`` i8, first row of each keyframe.
+        first_row: ``(K + 1,)`` i8, row (index) of the first keypoint of each keyframe in the arrays
+            of keypoints.
         keyframe_alive: ``(K,)`` bool, False for a culled keyframe.
         xyz: ``(L, 3)`` f8, position of each landmark in the world frame.
         normal: ``(L, 3)`` f8, mean viewing direction of each landmark.
-        distance_range: ``(L, 2)`` f8, least and greatest distance at which the pyramid detects the
-            landmark.
+        distance_range: ``(L, 2)`` f8, least and greatest distance at which each landmark can be
+            detected in the image pyramid.
         landmark_descriptor: ``(L, 4)`` u8, 256-bit descriptor of each landmark.
         first_keyframe: ``(L,)`` i4, the first keyframe that observed the landmark.
         visible: ``(L,)`` i4, number of frames in which the landmark was expected to be visible.
         found: ``(L,)`` i4, number of frames in which the landmark was found.
         landmark_alive: ``(L,)`` bool, False for a culled or merged landmark.
         merged_into: ``(L,)`` i4, the landmark that this landmark was merged into.
-        head: ``(L,)`` i4, the first row that observes the landmark. It begins a linked list.
+        head: ``(L,)`` i4, row (index) of the first keypoint that observes the landmark. This
+            keypoint begins a linked list.
         n_observations: ``(L,)`` i4, number of observations. A stereo observation counts twice
             (ORB-SLAM2).
         xy: ``(R, 2)`` f4, position of each keypoint in pixels.
-        u_right: ``(R,)`` f4, column of the stereo match in pixels. NaN if there is no match.
+        u_right: ``(R,)`` f4, column of the stereo match in the right image, in pixels. NaN if there
+            is no match.
         octave: ``(R,)`` u1, pyramid level.
         angle: ``(R,)`` f4, orientation in radians.
         descriptor: ``(R, 4)`` u8, 256-bit descriptor of each keypoint.
         keyframe: ``(R,)`` i4, the keyframe that the keypoint belongs to.
         landmark: ``(R,)`` i4, the landmark that the keypoint observes.
-        next_row: ``(R,)`` i4, the next row of the linked list of rows that observe the same
-            landmark.
-        certainty: ``(R,)`` u1, variance of a keypoint without sub-pixel alignment, divided by the
-            variance of ``xy``.
+        next_row: ``(R,)`` i4, row (index) of the next keypoint in the linked list of keypoints that
+            observe the same landmark.
+        certainty: ``(R,)`` u1, ratio of two variances: the variance of a keypoint position without
+            sub-pixel alignment, divided by the variance of ``xy``.
     """
 
     T_cw: NDArray[np.float64] = np.zeros((0, 4, 4))
@@ -112,8 +115,8 @@ class KeyframeTable(NamedTuple):
         timestamp: ``(K,)`` f8, seconds.
         frame: ``(K,)`` i8, index of the frame that became the keyframe.
         parent: ``(K,)`` i8, parent of the keyframe in the spanning tree, or -1.
-        session: ``(K,)`` i8, number of the drive in which the keyframe was added, from 0. The
-            timestamp and the frame index refer to this drive.
+        session: ``(K,)`` i8, index of the drive in which the keyframe was added. The first drive
+            has index 0. The timestamp and the frame index refer to this drive.
         unit_scale: ``(K,)`` f8, factor by which loop closures have scaled lengths near the keyframe
             since it was added. It is always 1 in metric maps.
         T_c_parent: ``(K, 4, 4)`` f8, pose of a culled keyframe relative to its parent. It is the
@@ -138,10 +141,10 @@ class Scalars:
     """Numbers that describe the whole map.
 
     Attributes:
-        session: number of the drive in which new keyframes are added, from 0.
+        session: index of the drive to which new keyframes belong. The first drive has index 0.
         disparity_offset: number of pixels by which every measured disparity is too small. All
-            stereo columns ``Arrays.u_right`` are already corrected by this offset
-            (``backend/disparity_offset.py``).
+            columns of stereo matches in the right image (``Arrays.u_right``) are already corrected
+            by this offset (``backend/disparity_offset.py``).
         offset_information: inverse variance of the measurements from which ``disparity_offset`` was
             estimated.
         calibrated_until: the newest keyframe from which the disparity offset was estimated, or -1.
@@ -204,7 +207,7 @@ class Map:
 
     @property
     def sessions(self) -> NDArray[np.int64]:
-        """``(n_keyframes,)`` number of the drive in which each keyframe was added, as a view."""
+        """``(n_keyframes,)`` index of the drive in which each keyframe was added, as a view."""
         return self.keyframes.session[: self.n_keyframes]
 
     @property
@@ -217,12 +220,12 @@ class Map:
 
     @property
     def restarts(self) -> list[int]:
-        """Keyframes at which mapping restarted after the camera was lost, in order."""
+        """Ids of the keyframes at which mapping restarted after the camera was lost, ascending."""
         return np.flatnonzero(self.keyframes.restart[: self.n_keyframes]).tolist()
 
     @property
     def unpredicted_restarts(self) -> list[int]:
-        """Keyframes at which mapping restarted with a pose that was not predicted."""
+        """Ids of the keyframes at which mapping restarted with a pose that was not predicted."""
         unpredicted = self.keyframes.restart[: self.n_keyframes] == UNPREDICTED
         return np.flatnonzero(unpredicted).tolist()
 
@@ -329,7 +332,7 @@ class Map:
         return of_arrays | {name: column[: self.n_keyframes] for name, column in of_keyframes}
 
     def with_columns(self, columns: dict[str, NDArray]) -> Map:
-        """Return this map with other arrays.
+        """Create a map with the given arrays and the scalars of this map.
 
         The arrays are not copied.
 
@@ -380,7 +383,7 @@ class Map:
         return new_id[resolved]
 
     def rows(self, keyframe: int) -> slice:
-        """Return the range of rows that hold the keypoints of a keyframe."""
+        """Return the range of indices of a keyframe's keypoints in the arrays of the map."""
         first = self.arrays.first_row
         return slice(int(first[keyframe]), int(first[keyframe + 1]))
 
@@ -457,14 +460,16 @@ class Map:
         return np.flatnonzero(self.arrays.keyframe_alive[: self.n_keyframes])
 
     def living_landmarks(self) -> NDArray[np.int64]:
-        """Return the ids of the landmarks that were neither culled nor merged into another one."""
+        """Return the ids of the landmarks that were neither culled nor merged into another
+        landmark.
+        """
         return np.flatnonzero(self.arrays.landmark_alive[: self.n_landmarks])
 
 
 def loop_of_living(map_: Map, loop: LoopEdge) -> LoopEdge:
-    """Move a loop to keyframes that have not been culled.
+    """Move a loop edge to keyframes that have not been culled.
 
-    A culled keyframe of the loop is replaced by its parent, and the relative pose is adapted.
+    A culled keyframe of the edge is replaced by its parent, and the relative pose is adapted.
 
     Raises:
         ValueError: the relative pose of the loop is unknown.

@@ -90,7 +90,7 @@ class LandmarkCounts:
     """Counts how often landmarks should have been seen, and how often they were found.
 
     The counters of the map can be updated only while no other thread writes the map. Until then,
-    this object stores the landmarks to count.
+    this object stores the ids of the landmarks to be counted.
     """
 
     def __init__(self) -> None:
@@ -139,7 +139,7 @@ def has_more_points(map_: Map, keyframe: int, frame: Frame) -> bool:
 
 
 def observe_keyframe(frame: Frame, map_: Map, keyframe: int) -> None:
-    """Let a frame that became a keyframe track all landmarks that this keyframe observes."""
+    """Make a frame that became a keyframe track all landmarks that this keyframe observes."""
     frame.landmark = map_.arrays.landmark[map_.rows(keyframe)]
     update_landmarks(frame, map_)
 
@@ -148,7 +148,7 @@ def update_landmarks(frame: Frame, map_: Map) -> None:
     """Update the landmarks of a frame after the map has changed.
 
     The ids of merged landmarks are replaced, and the ids of culled landmarks become -1.
-    ``frame.xyz`` is set to the present positions of the landmarks.
+    ``frame.xyz`` is set to the current positions of the landmarks.
 
     If two tracked landmarks were merged, only the first of the two features keeps the landmark.
     """

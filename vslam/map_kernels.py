@@ -102,7 +102,9 @@ def detach_keyframe(a, keyframe):
 
 @kernel
 def observed_by(a, landmark, keyframe):
-    """Return the row of the keypoint of ``keyframe`` that observes a landmark, or -1."""
+    """Return the row of the keypoint with which a keyframe observes a landmark, or -1. The row is
+    the index of the keypoint in the arrays of the map.
+    """
     row = a.head[landmark]
     while row >= 0:
         if a.keyframe[row] == keyframe:
@@ -230,7 +232,9 @@ def refresh_landmarks(a, landmarks, scales):
 
 @kernel
 def predict_octave(distance, farthest, log_scale, levels):
-    """Predict the pyramid level at which a landmark is detected from a distance (ORB-SLAM, V-D)."""
+    """Predict the pyramid level at which a landmark at a given distance is detected (ORB-SLAM,
+    V-D).
+    """
     level = int(np.ceil(np.log(farthest / distance) / log_scale))
     return min(max(level, 0), levels - 1)
 
@@ -322,8 +326,9 @@ def gather_observations(a, landmarks, index):
     Only keyframes with ``index[keyframe] >= 0`` are considered.
 
     Returns:
-        ``(P + 1,)`` int64 offsets, and the rows of the keypoints, sorted by landmark. The rows of
-        landmark i begin at offset i and end before offset i + 1.
+        ``(P + 1,)`` int64 offsets, and the rows (indices) of the keypoints in the arrays of the
+        map, sorted by landmark. The rows of landmark i begin at ``offsets[i]`` and end before
+        ``offsets[i + 1]``.
     """
     first = np.zeros(len(landmarks) + 1, np.int64)
     for i in range(len(landmarks)):

@@ -15,7 +15,7 @@ from vslam.map_kernels import collect_landmarks, count_seen_by
 
 
 class LocalMap(NamedTuple):
-    """The N landmarks around a keyframe.
+    """A copy of the N landmarks that a keyframe and its covisible keyframes observe.
 
     Attributes:
         ids: ``(N,)`` int32 ids of the landmarks.
@@ -33,8 +33,8 @@ class LocalMap(NamedTuple):
 def local_map(map_: Map, keyframe: int, limit: int) -> LocalMap:
     """Copy the landmarks of a keyframe and of its covisible keyframes (ORB-SLAM, V-D).
 
-    ORB-SLAM also takes the neighbours of the covisible keyframes. These neighbours made no
-    difference in our measurements (docs/explanation/design.md).
+    ORB-SLAM also takes the neighbours of the covisible keyframes. Including these neighbours made
+    no difference in our measurements (docs/explanation/design.md).
 
     Args:
         limit: greatest number of keyframes. The keyframes that share the most landmarks are chosen.

@@ -4,7 +4,7 @@
 of this job visible to tracking. The merge happens at a fixed frame index, regardless of how long
 the job takes. Between two merges, tracking reads a ``MapView``, which is a copy of parts of the map
 made at the last merge. A method that needs the merged map first performs the merge. A merge also
-updates the frames that were given to ``Mapper.hold``.
+updates the poses and landmarks of the frames that were given to ``Mapper.hold``.
 
 After the merge, the other thread searches for a loop at the keyframe. If a loop is found, it is
 closed before the map is changed again.
@@ -215,10 +215,11 @@ class Mapper:
         self._counts.add(visible, found)
 
     def merge_if_due(self, frame: int) -> None:
-        """Merge if this frame is at least ``merge_after_frames`` newer than the last keyframe.
+        """Make the result of the mapping job visible to tracking if the job is old enough.
 
-        If the frame is at least ``_CLOSE_AFTER_FRAMES`` newer than the last keyframe, a loop that
-        was found at this keyframe is closed.
+        This is the case if the frame is at least ``merge_after_frames`` newer than the last
+        keyframe. If the frame is at least ``_CLOSE_AFTER_FRAMES`` newer than the last keyframe, a
+        loop that was found at this keyframe is closed.
         """
         age = frame - self.last_frame
         if age >= self._config.keyframes.merge_after_frames:
@@ -274,7 +275,7 @@ class Mapper:
             self._start_search()
 
     def _settle(self) -> Map:
-        """Merge, close the loop that was found, if any, and return the map."""
+        """Merge the mapping job, close the loop if one was found, and return the map."""
         map_ = self.merge()
         if self._search is not None:
             search, self._search = self._search.result(), None
@@ -300,8 +301,8 @@ class Mapper:
         frame that shares no landmark with the map begins a sub-map.
 
         Args:
-            predicted: whether the pose was predicted. It matters only if the frame begins a
-                sub-map.
+            predicted: whether the pose of the frame was predicted. This value matters only if the
+                frame begins a sub-map.
         """
         with self._changing() as map_:
             self._make_room(map_, frame)
@@ -349,7 +350,8 @@ class Mapper:
 
         The second keyframe is the newest frame.
 
-        This frame gets the twist between the two views. It tracks all landmarks that it observes.
+        The newest frame gets the twist between the two views, and tracks all landmarks that it
+        observes.
 
         Args:
             twist: function that is called after the merge. It returns the ``(6,)`` twist of the
@@ -418,7 +420,7 @@ class Mapper:
         )
 
     def restore(self, state: MapperState) -> None:
-        """Continue from a state that ``state`` returned.
+        """Restore a state that the method ``state`` returned.
 
         The map must be the map that was saved together with this state.
         """
@@ -428,7 +430,7 @@ class Mapper:
         self.refer_to(state.reference)
 
     def continue_drive(self) -> None:
-        """Treat the reference keyframe as the last inserted keyframe, if it is of this drive."""
+        """If the reference keyframe belongs to this drive, treat it as the last inserted one."""
         map_, newest = self.map, self.reference
         if map_.n_keyframes and map_.sessions[newest] == map_.scalars.session:
             self.last_frame = int(map_.frames[newest])
@@ -438,7 +440,7 @@ class Mapper:
     def _changing(self) -> Iterator[Map]:
         """Yield the merged map for changes.
 
-        If the block raises an exception, the map becomes unusable.
+        If the ``with`` block raises an exception, the map becomes unusable.
         """
         self._settle()
         with self._shared.change() as map_:
@@ -470,8 +472,8 @@ class Mapper:
     def _move(self, frame: Frame, before: MapView) -> None:
         """Update the pose of a frame after a merge has changed the map.
 
-        A frame whose pose is recorded moves with its keyframe. Any other frame moves with the
-        reference keyframe.
+        If the pose of the frame has been recorded, the frame moves with the keyframe that this pose
+        is relative to. Otherwise, the frame moves with the reference keyframe.
         """
         growth = self.view.unit_scale / before.unit_scale
         self.rig.correct_offset(frame)
@@ -492,7 +494,7 @@ class Mapper:
     def _start(self, job: Callable[[Map], None]) -> None:
         """Start a mapping job.
 
-        Until the merge, tracking continues with the present view of the map.
+        Until the merge, tracking continues with the current view of the map.
         """
         self._shared.start(job)
         self._is_merged = False

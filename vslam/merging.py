@@ -134,7 +134,7 @@ def _candidates(
     images: KeyframeImages | None,
     config: Config,
 ) -> list[LoopCandidate]:
-    """Find keyframes of the first map that resemble a keyframe of the second map.
+    """Find keyframes of the first map that may show the same place as a keyframe of the second map.
 
     Keyframes that already share enough landmarks with this keyframe are left out.
     """

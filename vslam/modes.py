@@ -57,8 +57,8 @@ class Mode:
     def map_far_points(self) -> bool:
         """Map the far stereo points of the last frame if it began a map or sub-map.
 
-        This method is called if the frame directly after the first keyframe of a map was lost.
-        Other keyframes have no far points that are not mapped yet.
+        This method is called if the frame directly after the first keyframe of a map or sub-map was
+        lost. For later keyframes, all far points are already mapped.
 
         Returns:
             True if points were added, so that tracking can be tried again.
@@ -79,7 +79,7 @@ class Mode:
         return None
 
     def restore(self, state: PolicyState) -> None:
-        """Continue from a state that ``state`` returned."""
+        """Restore a state that the method ``state`` returned."""
 
 
 class MapBuilding(Mode):
@@ -167,7 +167,7 @@ class MapBuilding(Mode):
     def _match_features(self, frame: PlacedFrame) -> bool:
         """Match the features of a frame that was tracked by patches.
 
-        A keyframe needs such matches.
+        Only a frame with matched features can become a keyframe.
 
         Returns:
             False if the features do not match the map. The frame is then left unchanged.

@@ -12,8 +12,9 @@ landmarks, so their errors are correlated. Therefore, the drift grows like a ran
 correlated steps (a first-order autoregressive process).
 
 A stereo camera adds a third part. The disparity offset of the camera is estimated during the drive
-(``backend/disparity_offset.py``). The error of this estimate makes all motions too long or too
-short by the same factor. In contrast to the drift, this error does not average out.
+(``backend/disparity_offset.py``). Because of an error in this estimate, all estimated motions are
+too long or too short by the same factor. The random steps of the drift partly cancel each other. An
+error in the disparity offset does not cancel, because it affects all motions in the same way.
 
 A covariance describes the error ``xi = [v, w]`` of a pose, in metres and radians, in the frame of
 the camera. If ``T_cw`` is the estimated pose, the true pose is ``exp(xi) T_cw``. The covariance
@@ -32,9 +33,9 @@ from numpy.typing import NDArray
 from vslam.geometry import Matrix, inverse, orthonormalised
 
 # The computed covariance of the drift is multiplied by the first number. The second number is the
-# correlation of consecutive steps of the drift. Both were chosen on three rendered drives so that
-# the squared errors over 1 s and 10 s match the covariances. They were tested on other drives
-# (docs/research/uncertainty.md).
+# correlation of consecutive steps of the drift. Both were tuned on three rendered drives so that
+# the squared errors over intervals of 1 s and 10 s match the covariances. They were tested on other
+# drives (docs/research/uncertainty.md).
 DRIFT, CORRELATION = 1.4, 0.4
 # Standard deviations of the acceleration of a lost camera, in m/s^2 and rad/s^2.
 ACCELERATION, TURNING = 2.0, 1.0
@@ -209,6 +210,6 @@ class Odometry:
         return (*self.T_odom_camera.ravel(), *self.now.numbers().tolist(), self._lost_s)
 
     def restore(self, state: tuple[float, ...]) -> None:
-        """Continue from a state that ``state`` returned."""
+        """Restore a state that the method ``state`` returned."""
         self.T_odom_camera = np.array(state[:16]).reshape(4, 4)
         self.now, self._lost_s = PoseUncertainty.of_numbers(np.array(state[16:-1])), state[-1]

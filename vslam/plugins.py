@@ -1,7 +1,8 @@
 """Loop detectors, readers and perturbations that other packages provide as entry points.
 
-docs/howto/plugins.md explains how to write one. Plug-ins are found in the metadata of packages. A
-package is imported only when its plug-in is used, so a broken package does not affect other runs.
+docs/howto/plugins.md explains how to write a plug-in. Plug-ins are found in the metadata of
+packages. A package is imported only when its plug-in is used, so a broken package does not affect
+other runs.
 """
 
 from __future__ import annotations

@@ -94,7 +94,7 @@ def open_map(
 
 @dataclass(frozen=True)
 class Session:
-    """The parts of SLAM that have a state, and the map in which the present drive began."""
+    """The parts of SLAM that have a state between frames, and the map in which the drive began."""
 
     context: TrackingContext
     closing: LoopClosing
@@ -112,7 +112,7 @@ class Session:
         copied.
 
         Args:
-            drive: source of the images of the present drive, such as "kitti 06".
+            drive: source of the images of the current drive, such as "kitti 06".
         """
         map_, images, opened = self.mapper.complete(), self.closing.verifier.images, self.opened
         return StoredMap(
@@ -179,10 +179,11 @@ class Session:
         self.odometry.resume(T_odom_camera, uncertainty)
 
     def resume(self) -> None:
-        """Resume a drive after its last frame, if the map was opened to resume a drive.
+        """If ``resume=True`` was passed to ``open_map``, continue the drive after its last frame.
 
-        With a checkpoint, the results are identical to the results of an uninterrupted run. Without
-        a checkpoint, tracking continues from the last pose and speed.
+        If the map was saved with a checkpoint, the results are identical to the results of an
+        uninterrupted run. Without a checkpoint, tracking continues from the last pose and speed. If
+        ``resume=True`` was not passed, nothing is done.
         """
         frames = self.opened.frames
         if frames is None:

@@ -81,9 +81,10 @@ class SharedMap:
 
     @contextmanager
     def _invalidated_on_error(self) -> Iterator[None]:
-        """Make every later access to the map raise an error if the block raises an exception.
+        """Make every later access to the map raise an error if the ``with`` block raises an
+        exception.
 
-        An exception leaves the map incomplete.
+        The reason is that an exception may leave the map incomplete.
         """
         try:
             yield

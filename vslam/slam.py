@@ -43,7 +43,7 @@ from vslam.workers import Workers
 
 
 def _ignore(result: TrackResult) -> None:
-    """Do nothing with a result."""
+    """Do nothing with a result. This function is the default of ``on_pose``."""
 
 
 class Slam:
@@ -56,9 +56,10 @@ class Slam:
     >>> slam.trajectory().T_wc
     >>> slam.save(path)
 
-    ``Slam.load(path)`` continues in the saved map. The camera is relocalised in this map, and new
-    places are added. If relocalisation fails, a new sub-map begins. A loop may join this sub-map to
-    the map later. With ``localize=True``, the map is not changed.
+    ``Slam.load(path)`` reads the saved map, and SLAM continues in this map. The camera is
+    relocalised in this map, and new places are added. If relocalisation fails, a new sub-map
+    begins. A loop may join this sub-map to the map later. With ``localize=True``, the map is not
+    changed.
 
     Attributes:
         context: camera, thresholds and pyramid scales, for ``FrameImages``.
@@ -97,8 +98,8 @@ class Slam:
             images: store of the keyframe images, from which learned descriptors are computed. These
                 descriptors verify loops where ORB fails. None verifies loops with ORB only. This
                 argument is used only if ``detector`` is an object.
-            start: a map to continue in. It must have been made with the same camera, detector and
-                pyramid, and it is changed in place. ``Slam.load`` reads such a map from a file.
+            start: a map to continue in. The map must have been made with the same camera, detector
+                and pyramid, and is changed in place. ``Slam.load`` reads such a map from a file.
             localize: only track in the map ``start``, without changing it.
             resume: continue the last drive of the map ``start``. Otherwise, a new drive begins,
                 whose timestamps are independent of earlier drives. The poses equal those of an
@@ -374,7 +375,7 @@ class Slam:
     def skip(self, timestamp: float, *, dropped: bool = False) -> TrackResult:
         """Add a frame without images at the predicted pose.
 
-        Its state is LOST, or DROPPED if there was no time to process its images.
+        The state of the frame is LOST, or DROPPED if there was no time to process its images.
         """
         frame = self._next_frame(Extracted.nothing(), timestamp, None)
         frame.T_cw = self._tracker.predict(timestamp, self._mapper.frames, self._mapper.view)
@@ -395,8 +396,9 @@ class Slam:
         """Advance the odometry to the next frame, before the pose of this frame is recorded.
 
         Args:
-            T_cw: ``(4, 4)`` pose of the frame by continuous motion from the last frame. It differs
-                from the pose in the map if the camera was relocalised.
+            T_cw: ``(4, 4)`` pose of the frame, computed from the continuous motion since the last
+                frame. It differs from the pose of the frame in the map if the camera was
+                relocalised.
             covariance, of_offset: see ``Odometry.move``.
         """
         frames = self._mapper.frames
@@ -485,7 +487,7 @@ class Slam:
         return self._closing.corrections
 
     def trajectory(self) -> Trajectory:
-        """Return the pose of every frame according to the present map.
+        """Return the pose of every frame according to the current map.
 
         The poses of lost frames are interpolated between the tracked frames before and after them.
         """
@@ -496,9 +498,9 @@ class Slam:
         return keyframe_trajectory(self.map)
 
     def in_map(self) -> NDArray[np.bool_]:
-        """Return which frames were tracked in the first part of the map, as ``(N,)`` bool.
+        """Determine which frames were tracked in the first part of the map. Returns ``(N,)`` bool.
 
-        This part contains the first keyframe of the map, and the sub-maps that loops have joined to
-        it.
+        The first part of the map contains the first keyframe and the sub-maps that closed loops
+        have joined to it.
         """
         return in_first_part(self.map, self._closing.closed, self._mapper.frames.table())

@@ -20,7 +20,7 @@ from vslam.geometry import Matrix, se3_log
 
 @dataclass(frozen=True)
 class TwoViewStart:
-    """Two frames that begin a monocular map.
+    """The start of a monocular map or sub-map from two frames.
 
     Attributes:
         first, second: the two frames. The pose of the first frame is the pose at which the map
@@ -29,7 +29,8 @@ class TwoViewStart:
             second frame.
         features: two ``(N,)`` int64 arrays with the indices of the matched features in the first
             frame and in the second frame.
-        points: ``(N, 3)`` triangulated points of these features, in the frame of the first camera.
+        points: ``(N, 3)`` points that were triangulated from these features, in the frame of the
+            first camera.
         predicted: whether the unit of the map was derived from the speed that the camera had before
             it was lost.
     """
@@ -71,7 +72,7 @@ class TwoViewStart:
 
 @dataclass(frozen=True)
 class OneViewStart:
-    """A frame whose stereo points begin a map."""
+    """The start of a map or sub-map from the stereo points of a single frame."""
 
     frame: PlacedFrame
 

@@ -29,8 +29,8 @@ class TrackerState:
         twist: ``(6,)`` twist of the camera per second at this frame. None if it is unknown.
         lost_frames: number of lost frames since this frame.
         n_tracked: number of landmarks that the frame tracked.
-        coarse: ``(Q,)`` uint8 pixels of the coarse pyramid levels of the frame (``coarse_levels``).
-            It is empty if the frame has no such levels.
+        coarse: ``(Q,)`` uint8 pixels of the small images of the frame (``coarse_levels``). The
+            array is empty if the frame has no such images.
     """
 
     index: int
@@ -69,7 +69,7 @@ class PolicyState:
     Attributes:
         gained_close: number of close points that the first frame after a keyframe tracks, as a
             running mean over keyframes.
-        gain_awaited: whether the next frame is the first after a keyframe.
+        gain_awaited: whether the next frame is the first frame after a keyframe.
         first_close: number of close points that the first frame after the last keyframe tracked.
         first_frame: index of the first frame after the last keyframe. It is -1 before the first
             keyframe.
@@ -89,9 +89,9 @@ class ConsistencyState:
     """State of the consistency test of loop candidates.
 
     Attributes:
-        places: places that recent keyframes resembled.
-        verified: verified loops that another keyframe must still confirm. Each loop is stored with
-            the value of ``turn`` at its keyframe.
+        places: places in the map that recent keyframes resembled.
+        verified: verified loops that are waiting to be confirmed by another keyframe. Each loop is
+            stored with the value of ``turn`` at its keyframe.
         turn: number of keyframes that have been tested so far.
     """
 
@@ -104,12 +104,12 @@ class ConsistencyState:
 class VerifierState:
     """State of the verifier of loop candidates.
 
-    It describes the last time when a verification with learned descriptors failed.
+    The state describes the last failed verification using learned descriptors.
 
     Attributes:
         resting_until: before this keyframe, learned descriptors are tried only for candidates that
             are clearly more similar than the failed one.
-        failed_similarity: similarity of the two images for which verification failed.
+        failed_similarity: similarity of the two images for which this verification failed.
     """
 
     resting_until: int = 0
@@ -135,7 +135,7 @@ class RigState:
     """Measurements of a stereo rig.
 
     Attributes:
-        delay: the estimate of the delay between the two cameras (``DelayState``).
+        delay: state of the estimator of the delay between the two cameras (``DelayState``).
         sides: results of comparing the left and right images (``ComparedSides``).
     """
 

@@ -119,7 +119,7 @@ class Job(Generic[T]):
 
 
 class _Thread(threading.local):
-    """What a queue stores about each thread."""
+    """The state of one thread, as stored by the queue."""
 
     runs_job = False
 
@@ -188,11 +188,11 @@ class _Queue:
         job.error, job.is_done = CancelledError(), True
 
     def _can_help(self) -> bool:
-        """Return whether this thread can run a job while it waits for another one."""
+        """Return whether this thread can run a job while it waits for another job."""
         return bool(self._jobs) and not self._thread.runs_job
 
     def _take(self, job: Job[Any] | None = None) -> Job[Any]:
-        """Remove a job from the queue: the given one, or the first of the most urgent ones."""
+        """Remove a job from the queue: the given job, or the first of the most urgent jobs."""
         chosen = job or min(self._jobs, key=lambda job: job.urgency)
         self._jobs.remove(chosen)
         return chosen

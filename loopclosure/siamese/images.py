@@ -86,8 +86,8 @@ def turn_homography(width: int, height: int, degrees: float) -> NDArray[np.float
     The homography maps pixels of an image to pixels of the image that the camera would take after a
     rotation by ``degrees``.
 
-    The horizontal field of view is assumed to be 80 degrees, which is common on cars. A homography
-    of this kind only scales vertical coordinates. Therefore, the homography also holds for images
+    The horizontal field of view is assumed to be 80 degrees, which is common on cars. A rotation to
+    the right only scales vertical coordinates. Therefore, the homography is also valid for images
     whose height was scaled.
     """
     focal = width / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))

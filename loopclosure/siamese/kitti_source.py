@@ -45,9 +45,9 @@ def read_kitti(
         every: step between images. With 2, every second image is used.
         frames: ranges of image numbers, such as ``0-249+1500-1699``. They replace ``first`` and
             ``last``.
-        truth: ``.mat`` file with a loop matrix of the whole sequence. It marks the pairs of images
-            that show the same place. The images of an unmarked pair show different places if they
-            are more than 25 m apart. Otherwise, their relation is unknown.
+        truth: ``.mat`` file with a loop matrix of the whole sequence. The matrix marks the pairs of
+            images that show the same place. The images of an unmarked pair show different places if
+            they are more than 25 m apart. Otherwise, their relation is unknown.
         near: distance in metres, below 25, within which two images show the same place. Published
             loop matrices also mark pairs of images that are 20 m or more apart.
 

@@ -123,8 +123,8 @@ class KeyframeImages:
         """Remove the images of keyframes that were culled from the map.
 
         Args:
-            alive: ``(K,)`` bool for all keyframes up to the last one added; False for culled
-                keyframes.
+            alive: ``(K,)`` bool with an element for each keyframe up to the last one that was
+                added; False for culled keyframes.
         """
         for keyframe in [one for one in self._files if not alive[one]]:
             for kept in (self._files, self._maps, self._glances):
@@ -153,8 +153,8 @@ class KeyframeImages:
         return self._glances[keyframe]
 
     def glance_at(self, image: NDArray[np.uint8]) -> DescriptorMaps:
-        """Compute the descriptors of an image that is not stored, at the same width as in
-        ``glance``."""
+        """Resize an image that is not stored to the width that ``glance`` uses, and compute its
+        local descriptors."""
         return self.network.describe(image, GLANCE_WIDTH)
 
     def image(self, keyframe: int) -> NDArray[np.uint8]:

@@ -1,5 +1,6 @@
-"""Writes image sources to one small file, and reads such a file. The file is meant for machines
-without space for the original images."""
+"""Writes image sources to one small file, and reads such a file. Such a file is useful on machines
+that have too little space for the original images.
+"""
 
 from __future__ import annotations
 

@@ -80,8 +80,8 @@ def relation_of_views(views: NDArray[np.float64]) -> NDArray[np.int8]:
     differ by less than 35 degrees. Two images show different places if they are more than 40 m
     apart and do not look along the same street. Otherwise, the relation is unknown.
 
-    Two images look along the same street if three conditions are met. Their viewing directions are
-    similar or opposite. The images are less than 160 m apart. One camera is less than 25 m to the
+    Two cameras look along the same street if three conditions are met. Their viewing directions are
+    similar or opposite. The cameras are less than 160 m apart. One camera is less than 25 m to the
     side of the line of sight of the other camera.
 
     Args:

@@ -1,5 +1,7 @@
-"""Augments images by random changes in viewpoint, lighting, occlusion and sensor. A changed image
-still shows the same place."""
+"""Augments images with random changes in viewpoint, lighting, occlusion and sensor.
+
+The augmented image still shows the same place.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Defines how a network reads an image, and the branch of the network that computes the descriptor
-of the image."""
+"""Defines the branch of a network that computes descriptors, and the layout of its input images."""
 
 from __future__ import annotations
 
@@ -40,7 +39,7 @@ class Layout(NamedTuple):
 
     Attributes:
         size: height and width of the input image.
-        views: number of views. A view is a part of the image with its own descriptor. Views are
+        views: number of views. A view is a part of the image that has its own descriptor. Views are
             evenly spaced from left to right.
         view_width: number of columns of a view. None if the whole image is the only view.
         half_angle, middle: see :class:`preprocessing.Unrolling`. If ``half_angle`` is 0, the image
@@ -139,15 +138,15 @@ class CapsuleShape(BaseModel):
 
     @property
     def cuts(self) -> list[slice]:
-        """Columns of each view in the array from which the views are cut."""
+        """For each view, the range of columns in the array from which the views are cut."""
         width, view = self.input[1], self.view[1]
         step = (width - view) // self.cut_stride // max(1, self.views - 1)
         columns = (view - 1) // self.cut_stride + 1
         return [slice(k * step, k * step + columns) for k in range(self.views)]
 
     def for_images_of(self, size: Size) -> CapsuleShape:
-        """Adapt the shape to images with a different height and width. Each view keeps
-        approximately its share of the width.
+        """Adapt the shape to images with a different height and width. Each view still covers
+        approximately the same fraction of the width.
 
         Raises:
             InputError: the views become too narrow.
@@ -170,12 +169,12 @@ class CapsuleShape(BaseModel):
 
     @property
     def places(self) -> int:
-        """Number of places (cells) in the feature grid of a view."""
+        """Number of cells in the feature grid of a view. A cell is called a place."""
         rows, columns = self.grid
         return rows * columns
 
     def with_layout(self, layout: Layout) -> CapsuleShape:
-        """Return the same shape with a different layout of the input image.
+        """Return a copy of the shape with a different layout of the input image.
 
         Raises:
             InputError: the views do not fit the image.
@@ -201,12 +200,12 @@ class CapsuleBranch(nn.Module):
 
     The descriptor consists of the flattened output capsules. With several views, it is the
     concatenation of the descriptors of the views, from left to right. The descriptor of each view
-    is scaled by the share of the view that shows texture. The reason is that an area without
-    texture, for example fog or a covered lens, does not distinguish places.
+    is multiplied by the fraction of the view that shows texture, because areas without texture do
+    not distinguish places. Such areas are, for example, fog or a covered part of the lens.
 
     With the extractor lite0, the views are cut from the early features of the whole image. These
-    features are computed only once. At the border of a view, the features depend on the
-    neighbouring pixels of the image instead of padding.
+    features are computed only once. Therefore, the features at the border of a view depend on the
+    image next to the view. They do not depend on padding.
     """
 
     def __init__(self, shape: CapsuleShape) -> None:
@@ -260,7 +259,7 @@ class CapsuleBranch(nn.Module):
         return capsules
 
     def _textured_share(self, texture: Tensor) -> Tensor:
-        """Compute the ``(N, V)`` share of each view that shows texture."""
+        """Compute the fraction of each view that shows texture, as an ``(N, V)`` tensor."""
         starts = [cut.start * self.shape.cut_stride for cut in self.shape.cuts]
         width = self.shape.view[1]
         shares = [texture[..., k : k + width].mean((1, 2, 3)) for k in starts]

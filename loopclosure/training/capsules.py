@@ -1,14 +1,14 @@
 """Implements capsules and dynamic routing between them.
 
 The module implements equations 4 to 9 of Zhou and Sun, Sci Rep 15, 7644 (2025), which are based on
-Sabour et al., NIPS 2017. There are N images, I primary capsules of dimension A, and J output
-capsules of dimension D. Primary capsules have T types at P places. A type is a group of channels of
-the extractor, and a place is a cell of the feature grid. The index of a primary capsule is
-``i = t P + p``.
+Sabour et al., NIPS 2017. In the shapes of arrays, N is the number of images. There are I primary
+capsules of dimension A, and J output capsules of dimension D. Primary capsules have T types at P
+places. A type is a group of channels of the extractor, and a place is a cell of the feature grid.
+The index of a primary capsule is ``i = t P + p``.
 
-All places of a type share the same matrices. ``route`` therefore sums over the places first, and
-never computes the prediction vectors. ``tests/reference_routing.py`` implements the equations of
-the paper literally.
+All places of a type share the same matrices. Therefore, ``route`` sums over the places first, and
+never computes the prediction vectors of single capsules. ``tests/reference_routing.py`` implements
+the equations of the paper literally.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ def route(
     """Compute output capsules from primary capsules by dynamic routing. Gradients flow only through
     the last iteration.
 
-    The sums are rearranged as ``s_j = Σ_t W_tj (Σ_p c_tpj u_tp)`` and
-    ``û_j|i · v_j = u_tp · (W_tjᵀ v_j)``. In this form, sums over the places replace the prediction
-    vectors. The sums are vectors of size A. The prediction vectors would have ``I J D`` numbers,
-    which would have to be written once and read five times.
+    The sums are rearranged as ``s_j = Σ_t W_tj (Σ_p c_tpj u_tp)`` and the scalar products as
+    ``û_j|i·v_j = u_tp·(W_tjᵀ v_j)``. In this form, sums over the places replace the prediction
+    vectors. The sums over the places are vectors of size A. The prediction vectors have ``I J D``
+    elements, which would have to be written once and read five times.
 
     Args:
         u: ``(N, T, P, A)`` primary capsules.
@@ -53,15 +53,15 @@ def route(
         iterations: number of iterations, at least 1.
         over: axis of the softmax. With ``primary``, the coupling coefficients sum to 1 over i, as
             in Zhou and Sun. With ``output``, the coefficients sum to 1 over j, as in Sabour et al.
-        alive: ``(I,)`` bool, False for primary capsules that are ignored, as if they were removed.
-            None uses all capsules.
+        alive: ``(I,)`` bool, False for primary capsules that are ignored, as if they did not exist.
+            If it is None, all capsules are used.
 
     Returns:
         Three arrays: the output capsules ``v``, ``(N, J, D)``; the numerators of the coupling
         coefficients ``e``, ``(N, T, J, P)``; the denominators of the coupling coefficients
         ``total``, ``(N, 1, J, 1)`` or ``(1,)``. :func:`couplings` divides the numerators by the
-        denominators. The coefficients are returned undivided, because ``route`` itself divides only
-        the sums over P, which needs a sixth of the divisions.
+        denominators. The coefficients are not divided here, because ``route`` divides only the sums
+        over P. In this way, it needs only a sixth of the divisions.
     """
     n, types, places, size = u.shape
     outputs, _, _, depth = W.shape
@@ -130,8 +130,8 @@ class CapsuleLayer(nn.Module):
     Each primary capsule i has a type t(i), and is located at a place, which is a cell of the
     feature grid. Its transform to output capsule j is ``W_ij = W_t(i)j diag(g_i)``. There is a
     matrix for each pair of type and output capsule, and a gain vector of size A for each primary
-    capsule. The gain vectors distinguish the places. A separate matrix for each i and j would need
-    tens of millions of parameters.
+    capsule. Therefore, capsules of the same type at different places have different transforms. A
+    separate matrix for each i and j would need tens of millions of parameters.
 
     A pruned capsule has no entry in ``gains`` and ``place``, and takes no part in any product or
     softmax.
@@ -141,8 +141,8 @@ class CapsuleLayer(nn.Module):
         gains: ``(T, K, A)`` gain vectors of the K kept places of each type. Before pruning, all
             places are kept.
         place: ``(T, K)`` int64 buffer with the indices of the kept places.
-        alive: ``(T K,)`` bool buffer, True for capsules that are not masked. Tests use it to
-            compare removal with masking.
+        alive: ``(T K,)`` bool buffer, True for capsules that are not masked. Tests use the mask to
+            check that masking and removal of capsules give the same results.
     """
 
     place: Tensor

@@ -43,7 +43,8 @@ def save_checkpoint(
     """Write everything that is needed to resume an interrupted training run.
 
     Args:
-        pairs: the image pairs of the current epoch; None between epochs.
+        pairs: the image pairs of the current epoch. None if the checkpoint is written between two
+            epochs.
 
     Raises:
         ResultsError: the file cannot be written. In this case, an existing file is not changed.
@@ -73,7 +74,7 @@ def load_checkpoint(
         was written between two epochs.
 
     Raises:
-        InputError: the file is damaged, or comes from a different version of vslam, or was written
+        InputError: the file is damaged, comes from a different version of vslam, or was written
             with different settings.
     """
     try:

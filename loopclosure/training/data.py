@@ -26,13 +26,13 @@ _EITHER = ({"citycentre", "newcollege"},)
 
 @dataclass(frozen=True)
 class Collection:
-    """All images of all sources of training data.
+    """The images of all sources of training data.
 
     Attributes:
         names: names of the N images, as ``source/folder/file``.
         images: ``(N, H, W)`` uint8 grey images.
-        relation: ``(N, N)`` int8 relation of each pair. The value is 1 for the same place, -1 for
-            different places, and 0 if this is unknown.
+        relation: ``(N, N)`` int8 relation of each pair of images. The value is 1 if both images
+            show the same place, -1 if they show different places, and 0 if this is unknown.
         unit: ``(N,)`` int64 label of the group that an image belongs to. Images with the same label
             are never split between training and validation.
         sources: name of each source, and its number of images.
@@ -128,8 +128,8 @@ def divide(
     """Split the images into training and validation images. Images of the same unit, for example of
     the same stretch of road, are not split.
 
-    Images of other units may show the same place as a validation image, for example at the ends of
-    a stretch of road. Such images are used neither for training nor for validation.
+    An image of a different unit may show the same place as a validation image, for example at the
+    end of a stretch of road. Such an image is used neither for training nor for validation.
 
     Raises:
         InputError: there are too few images.
@@ -148,8 +148,9 @@ def divide(
 
 
 def validation_images(validation: NDArray[np.int64], most: int, seed: int) -> NDArray[np.int64]:
-    """Choose at most ``most`` of the ``(M,)`` validation images. The same seed gives the same
-    choice in every training run."""
+    """Choose at most ``most`` of the ``(M,)`` validation images at random. If two training runs
+    have the same seed, they use the same images.
+    """
     if len(validation) <= most:
         return validation
     picked = np.random.default_rng([seed, 2]).choice(len(validation), most, replace=False)
@@ -157,7 +158,7 @@ def validation_images(validation: NDArray[np.int64], most: int, seed: int) -> ND
 
 
 def check_emphasis(collection: Collection, emphasis: Mapping[str, float]) -> None:
-    """Check that the collection contains all sources for which ``emphasis`` gives a frequency.
+    """Check that the collection contains all sources that are named in ``emphasis``.
 
     Raises:
         InputError: a source does not exist.
@@ -186,15 +187,15 @@ def draw_pairs(
     Args:
         chosen: ``(M,)`` indices of the images from which pairs are drawn.
         count: number of pairs.
-        hard: ``(M, K)`` indices of similar images of other places for each chosen image, padded
-            with -1; see :func:`mine`.
-        hard_share: share of the pairs of different places whose second image is drawn from
-            ``hard``.
-        same_share: share of the pairs that show the same place. These pairs are spread evenly over
-            the list.
+        hard: ``(M, K)`` for each chosen image, the indices of at most K similar images that show
+            other places. Rows are padded with -1. :func:`mine` computes this array.
+        hard_share: fraction of the pairs of different places for which the second image is drawn
+            from ``hard``.
+        same_share: fraction of the pairs that show the same place. These pairs are spread evenly
+            over the list of pairs.
         together: number of consecutive pairs whose first images come from the same source.
-        emphasis: relative frequency of each source. Images of a source are drawn as first images of
-            pairs with this frequency. The default is 1.
+        emphasis: relative frequency of each source among the first images of the pairs. The
+            frequency is 1 for sources that are not named.
     """
     relation = collection.relation[np.ix_(chosen, chosen)]
     sizes = [size for _, size in collection.sources]
@@ -227,7 +228,7 @@ def draw_pairs(
 def mine(
     collection: Collection, chosen: NDArray[np.int64], alike: NDArray[np.float32], k: int = 10
 ) -> NDArray[np.int64]:
-    """Find, for each image, the ``k`` most similar images of other places (hard negatives).
+    """For each image, find the ``k`` most similar images that show other places (hard negatives).
 
     Args:
         chosen: ``(M,)`` indices of the images.

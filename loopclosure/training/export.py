@@ -47,9 +47,9 @@ class _Embedding(nn.Module):
 class _Comparison(nn.Module):
     """A module that computes the ``(N,)`` similarities of a query image to N gallery images.
 
-    The inputs are the ``(V, d)`` descriptors of the V views of the query, the ``(N, V, d)``
-    descriptors of the views of the gallery images, and the ``(N, V)`` lengths of the descriptors of
-    the gallery.
+    The inputs are the ``(V, d)`` descriptors of the V views of the query image, the ``(N, V, d)``
+    descriptors of the views of the gallery images, and the ``(N, V)`` lengths of these gallery
+    descriptors.
     """
 
     def __init__(self, network: SiameseNetwork) -> None:
@@ -67,16 +67,16 @@ def export_onnx(network: SiameseNetwork, path: Path, about: dict[str, Any] | Non
     the size that the network needs. The output is a ``(D,)`` float32 descriptor of norm 1.
 
     The metadata of the file contains a second graph in base64, which compares a query image with N
-    gallery images. It computes ``similarity``, ``(N,)``, from three inputs. ``query``, ``(V, d)``,
-    and ``gallery``, ``(N, V, d)``, are the descriptors of the V views of each image, with
-    ``V d = D``. ``lengths``, ``(N, V)``, are the lengths of the descriptors in ``gallery``.
+    gallery images. This graph computes ``similarity``, ``(N,)``, from three inputs. ``query``,
+    ``(V, d)``, and ``gallery``, ``(N, V, d)``, are the descriptors of the V views of each image,
+    with ``V d = D``. ``lengths``, ``(N, V)``, are the lengths of the descriptors in ``gallery``.
 
     Args:
         about: description of the origin of the weights.
 
     Returns:
-        The largest difference between an element of a descriptor from torch and the same element
-        from ONNX Runtime, for random images.
+        The largest absolute difference between the descriptors that torch and ONNX Runtime compute
+        for random images.
 
     Raises:
         ResultsError: the file cannot be written, or ONNX Runtime and torch give different results.
@@ -120,8 +120,9 @@ def to_onnx(
     module: nn.Module, inputs: tuple[Tensor, ...], names: list[str], outputs: list[str],
     dynamic_shapes: Any = None,
 ) -> onnx.ModelProto:  # fmt: skip
-    """Convert a torch module to an ONNX graph. A tensor is stored in half precision if half
-    precision represents it exactly."""
+    """Convert a torch module to an ONNX graph. A tensor is stored in half precision if no precision
+    is lost.
+    """
     log = logging.getLogger("torch.onnx")
     level = log.level
     log.setLevel(logging.ERROR)  # hides warnings about missing torchvision and renamed inputs
@@ -154,8 +155,9 @@ def write_onnx(model: onnx.ModelProto, path: Path, metadata: dict[str, str]) -> 
 
 
 def _halve(graph: onnx.GraphProto) -> None:
-    """Store the tensors of a graph in half precision where this is exact. Nodes of the graph
-    convert them back to single precision."""
+    """Store the tensors of a graph in half precision if no precision is lost. Additional nodes of
+    the graph convert these tensors back to single precision.
+    """
     casts = []
     for tensor in graph.initializer:
         if tensor.data_type != TensorProto.FLOAT:

@@ -61,7 +61,8 @@ class Separable(nn.Module):
 
 class Stem(nn.Module):
     """The first layer of the extractor, an ordinary 7x7 convolution. A separable convolution would
-    save nothing, because the image has only one grey channel."""
+    not be faster, because the image has only one grey channel.
+    """
 
     def __init__(self, outputs: int, stride: int) -> None:
         super().__init__()
@@ -95,7 +96,7 @@ class PrimaryCapsules(nn.Module):
 
 class LightExtractor(nn.Sequential):
     """The light feature extractor of Zhou and Sun: strided separable convolutions with dilations 1,
-    2 and 3. An image of 227x227 pixels becomes a grid of 15x15 cells.
+    2 and 3. An image of 227x227 pixels gives a feature grid of 15x15 cells.
 
     Attributes:
         out_channels: number of channels of the feature grid.

@@ -1,5 +1,8 @@
-"""Creates the network that a training run starts from. Its weights are random, from another
-training run, from ImageNet, or pruned."""
+"""Creates the network that a training run starts from.
+
+The network has random weights, weights from an earlier training run, ImageNet weights, or pruned
+weights.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +55,7 @@ def starting_network(
 
     Returns:
         The network, the settings that fit it, and entries for the model card. The network is None
-        for random weights.
+        if training starts from random weights.
 
     Raises:
         InputError: the weights are missing, are damaged, or belong to a different network.
@@ -98,9 +101,10 @@ def resized(network: SiameseNetwork, layout: Layout) -> SiameseNetwork:
     size, the views, and the cylindrical projection.
 
     Convolutions and transforms stay the same. The gains of the places (cells of the feature grid)
-    are interpolated over the new grid. In this way, most of the training can use small images,
-    which needs a third of the time (progressive resizing by Howard, DAWNBench entry of fast.ai,
-    2018).
+    are interpolated over the new grid.
+
+    With this function, most of the training can use small images, and the training takes a third of
+    the time. The method is called progressive resizing (Howard, DAWNBench entry of fast.ai, 2018).
 
     Raises:
         InputError: the network is pruned, or the views do not fit the image.
@@ -166,9 +170,9 @@ def _prune(
 def milliseconds_per_image(*networks: SiameseNetwork, repeats: int = 50) -> list[float]:
     """Measure the time that each network takes to embed one image on one core, in milliseconds.
 
-    The networks take turns, so that other load on the machine affects all of them equally. Each
-    measurement is repeated, and the shortest time is returned, because other processes can only
-    make a measurement longer.
+    The networks are measured in turn, so that other processes on the machine affect all networks
+    equally. Each measurement is repeated, and the shortest time is returned. The reason is that
+    other processes can only make a measurement longer.
     """
     best = [float("inf")] * len(networks)
     threads = torch.get_num_threads()

@@ -65,11 +65,12 @@ class InvertedResidual(nn.Module):
 
 class LiteExtractor(nn.Module):
     """The feature extractor: a stem and eleven inverted residual blocks for images with one grey
-    channel. An image of 193x193 pixels becomes a grid of 13x13 cells.
+    channel. An image of 193x193 pixels gives a feature grid of 13x13 cells.
 
     :meth:`load_imagenet` folds the batch normalisations into the convolutions. Fine-tuning
     therefore does not change the statistics of the batch normalisations. The padding is symmetric.
-    It agrees with the padding of TensorFlow if the side of the image is ``16 n + 1``.
+    This padding agrees with the padding of TensorFlow if the image has a side of ``16 n + 1``
+    pixels.
 
     Attributes:
         out_channels: number of channels of the feature grid.
@@ -111,8 +112,9 @@ class LiteExtractor(nn.Module):
         return [cast(InvertedResidual, block) for block in self.blocks]
 
     def freeze(self, blocks: int) -> None:
-        """Exclude the stem and the first ``blocks`` blocks from training. With 0, everything is
-        trained."""
+        """Exclude the stem and the first ``blocks`` blocks from training. If ``blocks`` is 0, all
+        parameters are trained.
+        """
         if blocks:
             self.stem.requires_grad_(False)
         for number, block in enumerate(self.residuals):

@@ -26,8 +26,8 @@ def cross_entropy(logits: Tensor, same: Tensor) -> Tensor:
 
 
 def contrast(alike: Tensor, same: Tensor, relation: Tensor, temperature: float) -> Tensor:
-    """Compute the InfoNCE loss. This loss compares each pair of images of the same place with all
-    images of other places in the batch.
+    """Compute the InfoNCE loss. For each pair of images of the same place, this loss compares their
+    similarity with the similarities to all images of other places in the batch.
 
     The loss is that of van den Oord et al. (2018), in the symmetric form of CLIP. Zhou and Sun
     (2025) do not use this loss.
@@ -36,8 +36,8 @@ def contrast(alike: Tensor, same: Tensor, relation: Tensor, temperature: float) 
         alike: ``(2 N, 2 N)`` cosine similarities of the images of N pairs. The first images of all
             pairs come first, followed by the second images.
         same: ``(N,)`` bool, True for pairs of the same place.
-        relation: ``(2 N, 2 N)`` int8 relation of these images: 1 for the same place, -1 for
-            different places, 0 if unknown.
+        relation: ``(2 N, 2 N)`` int8 relation of each two of these images. The value is 1 for the
+            same place, -1 for different places, and 0 if this is unknown.
     """
     if not bool(same.any()):
         return alike.sum() * 0.0
@@ -89,9 +89,10 @@ def validate(
     """Measure how well a network retrieves images of the same place among the validation images.
     The queries are augmented copies of these images.
 
-    All pairs are used for which it is known whether both images show the same place. There is one
-    exception: a query is paired with at most five images of its place. Most pairs therefore show
-    different places, as in a SLAM run. Every call uses the same augmentations and pairs.
+    Only pairs of images are used for which it is known whether both images show the same place.
+    Each query is paired with at most five images of its place, and with all images that are known
+    to show different places. Therefore, most pairs show different places, as in a SLAM run. Every
+    call uses the same augmentations and pairs.
 
     Returns:
         The measures of :func:`vslam.loopclosure.precision_recall.summary`, and the scores and
@@ -120,11 +121,11 @@ def validate(
 
 @torch.no_grad()
 def blend(network: SiameseNetwork, before: dict[str, Tensor], share: float) -> None:
-    """Interpolate the weights of a network in place. Share 0 gives the weights ``before``, and
-    share 1 gives the current weights.
+    """Interpolate the weights of a network in place. If ``share`` is 0, the result has the weights
+    ``before``. If it is 1, the current weights do not change.
 
-    Interpolated weights keep most of what fine-tuning has learned. They also keep more of what the
-    original network had learned (WiSE-FT, Wortsman et al., CVPR 2022).
+    Interpolated weights keep most of what fine-tuning has learned. Interpolated weights also keep
+    more of what the original network had learned (WiSE-FT, Wortsman et al., CVPR 2022).
     """
     after = network.state_dict()
     mixed = {
@@ -139,8 +140,9 @@ def calibrate(network: SiameseNetwork, score: NDArray, same: NDArray) -> None:
     """Fit the parameters a and b of the network's head, ``p = sigmoid(a - b d)``, in place, so that
     p is a calibrated probability.
 
-    The pairs of the same place and the pairs of different places get equal total weights. The order
-    of the scores does not change, so average precision does not change either.
+    In the fit, the pairs of the same place have the same total weight as the pairs of different
+    places. The fit does not change the order of the scores. Therefore, it does not change the
+    average precision.
     """
     head = network.head
     a, b = head.log_a.exp().item(), head.log_b.exp().item()

@@ -37,13 +37,13 @@ class Unrolling(nn.Module):
 
     Args:
         size: height and width of the images.
-        half_angle: angle from the middle of the image to either side, in degrees; 0 leaves images
-            flat. All cameras use the same value, because some cameras are not calibrated. If the
-            value is the half angle of the camera itself, a rotation becomes exactly a shift.
-            Otherwise, it becomes approximately a shift.
-        middle: share of the height that the middle column keeps. If it is the cosine of
-            ``half_angle``, the sides keep their whole height, and no pixel is black. If it is 1,
-            the middle keeps its whole height.
+        half_angle: angle from the middle of the image to either side, in degrees. If it is 0,
+            images are not projected. The same value is used for all cameras, because some cameras
+            are not calibrated. If the value is the half angle of the camera itself, a rotation
+            becomes exactly a shift. Otherwise, it becomes approximately a shift.
+        middle: fraction of the image height that the middle column of the projected image shows. If
+            it is the cosine of ``half_angle``, the outermost columns show the whole height, and no
+            pixel is black. If it is 1, the middle column shows the whole height.
     """
 
     grid: Tensor | None
@@ -87,7 +87,8 @@ def standardised(images: Tensor, texture: Tensor | None = None) -> Tensor:
 
     Args:
         images: ``(N, 1, H, W)`` images in [0, 1].
-        texture: result of :func:`textured`; None computes it.
+        texture: texture masks of the images from :func:`textured`. If it is None, the masks are
+            computed.
     """
     texture = textured(images) if texture is None else texture
     weight = texture + 1e-3  # in an image without texture, all pixels count equally

@@ -1,8 +1,8 @@
-"""Pruning: removes the primary capsules with the lowest coupling coefficients.
+"""Prunes a network: removes the primary capsules with the lowest coupling coefficients.
 
-Zhou and Sun (Sci Rep 15, 7644, 2025) rank primary capsules by their coupling coefficients. They set
-the matrices W_ij of the lowest 20 % to 0. Multiplying by zeros saves no time, so this module
-removes these capsules.
+Zhou and Sun (Sci Rep 15, 7644, 2025) rank primary capsules by their coupling coefficients. The
+authors set the matrices W_ij of the 20 % with the lowest coefficients to 0. Zeros do not make the
+network faster. Therefore, this module removes the capsules from the network.
 """
 
 from __future__ import annotations
@@ -49,8 +49,9 @@ def lowest(activity: Tensor, fraction: float = 0.2) -> Tensor:
     ``(T, K)`` bool mask.
 
     Zhou and Sun (2025) do not say how many capsules they remove from each type. This function
-    selects the same number for all types. A single dense product can then still compute all types
-    together. If capsules have equal activity, the capsule with the lower index is selected first.
+    selects the same number for all types. In this way, a single dense matrix product can still
+    compute all types together. If capsules have equal activity, the capsule with the lower index is
+    selected first.
     """
     dropped = round(fraction * activity.shape[1])
     order = torch.argsort(activity, dim=1, stable=True)

@@ -13,8 +13,9 @@ from vslam.loopclosure.training.branches import CapsuleShape
 
 
 class TrainSettings(BaseModel):
-    """The settings of a training run. The file ``settings.json`` stores the settings, and the
-    option ``--settings`` reads such a file."""
+    """The settings of a training run. They are stored in the file ``settings.json``, and the option
+    ``--settings`` reads such a file.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -32,14 +32,14 @@ def aligned(alike: Tensor, most: Tensor) -> Tensor:
     number of views. For each shift, a cosine similarity is computed from the views that overlap.
 
     The result is the soft maximum of these similarities. A soft maximum is used because two shifts
-    may fit about equally well. This happens if the camera has rotated by half the spacing of the
-    views, or has moved forwards. The result can slightly exceed 1. Zhou and Sun (2025) compare only
-    whole images.
+    may fit about equally well. This happens if the camera has moved forwards. It also happens if
+    the camera has rotated by half the angle between two neighbouring views. The result can slightly
+    exceed 1. Zhou and Sun (2025) compare only whole images.
 
     Args:
-        alike: ``(..., V, V)`` scalar products of the descriptors of each view of one image and each
-            view of the other image.
-        most: ``(..., V, V)`` products of the lengths of the same descriptors.
+        alike: ``(..., V, V)`` scalar products of the descriptors of views. Element ``[..., i, j]``
+            belongs to view i of one image and view j of the other image.
+        most: ``(..., V, V)`` products of the lengths of the same two descriptors.
     """
     views = alike.shape[-1]
     v = torch.arange(views, device=alike.device)
@@ -110,7 +110,7 @@ class DistanceHead(nn.Module):
             lengths: ``(M, V)`` lengths of the descriptors in ``gallery``.
 
         Returns:
-            ``(M,)`` logits of the similarities.
+            ``(M,)`` logits of the probabilities that two images show the same place.
         """
         alike = (gallery @ query.T).transpose(1, 2)
         most = _lengths(query[None])[:, :, None] * lengths[:, None]
@@ -142,8 +142,9 @@ class SiameseNetwork(nn.Module):
         return cosines(a, b, self.branch.views)
 
     def logits(self, a: Tensor, b: Tensor) -> Tensor:
-        """Compute the ``(N,)`` logits of the probabilities that ``similarity`` returns. The loss
-        needs the logits."""
+        """Compute the ``(N,)`` logits of the probabilities that ``similarity`` returns. The
+        training loss is computed from the logits.
+        """
         return self.head(a, b)
 
     def similarity(self, a: Tensor, b: Tensor) -> Tensor:
@@ -152,8 +153,10 @@ class SiameseNetwork(nn.Module):
         return torch.sigmoid(self.head(a, b))
 
     def compare(self, query: Tensor, gallery: Tensor) -> Tensor:
-        """Compute the ``(M,)`` similarities of a ``(D,)`` descriptor and each of ``(M, D)``
-        descriptors."""
+        """Compute the ``(M,)`` probabilities that a query image and each of M gallery images show
+        the same place. ``query`` is a ``(D,)`` descriptor, and ``gallery`` contains ``(M, D)``
+        descriptors.
+        """
         by_view = _by_view(gallery, self.branch.views)
         query = _by_view(query[None], self.branch.views)[0]
         return torch.sigmoid(self.head.compare(query, by_view, _lengths(by_view)))
@@ -168,11 +171,12 @@ class SiameseNetwork(nn.Module):
 
 
 def build_network(name: str, shape: CapsuleShape | None = None) -> SiameseNetwork:
-    """Create a network with random weights, which are drawn from the global generator of torch.
+    """Create a network with random weights. They are drawn from torch's global random generator.
 
     Args:
         name: one of ``NETWORKS``.
-        shape: shape of the capsule branch; None uses the shape of Zhou and Sun (2025).
+        shape: structure of the capsule branch. If it is None, the structure of Zhou and Sun (2025)
+            is used.
 
     Raises:
         InputError: the name is unknown.
@@ -210,8 +214,8 @@ def save_network(
 
 
 def load_network(path: Path) -> tuple[SiameseNetwork, dict[str, Any]]:
-    """Read a network from a file that :func:`save_network` wrote. Returns the network in eval mode,
-    and the argument ``about`` of :func:`save_network`.
+    """Read a network from a file that was written by :func:`save_network`. Returns the network in
+    eval mode, and the argument ``about`` of :func:`save_network`.
 
     Raises:
         InputError: the file is missing, damaged or not from this version of vslam.

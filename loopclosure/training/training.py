@@ -71,10 +71,10 @@ class TrainingOutcome:
     """The result of a training run.
 
     Attributes:
-        finished: False if the training run was stopped early. In this case, a call of ``train``
-            with ``resume`` continues the training run.
-        figures: validation measures of the best network after calibration.
-        progress: the progress of the training run, with the loss and the validation measures of
+        finished: False if the training run was stopped early. In this case, the training run can be
+            continued by calling ``train`` with ``resume=True``.
+        figures: validation metrics of the best network after calibration.
+        progress: the progress of the training run, with the loss and the validation metrics of
             every epoch.
         weights: file of the best network.
         train, validation: indices of the training and validation images.
@@ -100,8 +100,8 @@ def train(
     on_step: OnStep | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> TrainingOutcome:
-    """Train a Siamese network. The weights, a log, the lists of image pairs, and checkpoints are
-    written to a folder.
+    """Train a Siamese network, and write its weights, a log, the lists of image pairs and
+    checkpoints to a folder.
 
     Args:
         collection: the images and their relations.
@@ -116,9 +116,9 @@ def train(
             and training stops.
 
     Raises:
-        InputError: there is too little data, the device or a source is unknown, the device does not
+        InputError: there are too few images, the device or a source is unknown, the device does not
             support the required bfloat16, or the checkpoint has different settings. The error is
-            also raised if ``learned_share`` is set, but there is no network to start from.
+            also raised if ``learned_share`` is below 1 but ``start`` is None.
         ResultsError: the loss is not finite, or the results cannot be written. If the loss is not
             finite, the last good checkpoint is kept.
     """
@@ -195,7 +195,7 @@ def calibrated(
     weights: Path,
     device: torch.device,
 ) -> dict[str, float]:
-    """Calibrate a network and write its weights. Returns the validation measures of the network.
+    """Calibrate a network and write its weights. Returns the validation metrics of the network.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -209,8 +209,7 @@ def calibrated(
 
 @dataclass(frozen=True)
 class _Training:
-    """The data that training steps read, and the state that training steps change. The state
-    consists of the network, the optimiser and the progress."""
+    """A training run in progress: its data, the network, the optimiser and the progress."""
 
     collection: Collection
     settings: TrainSettings
@@ -298,8 +297,9 @@ class _Training:
         )  # fmt: skip
 
     def end_epoch(self, validation: NDArray[np.int64], weights: Path) -> None:
-        """Validate the network after an epoch. Its weights are written if they are the best so
-        far."""
+        """Validate the network after an epoch. If its weights are the best so far, they are written
+        to a file.
+        """
         network, progress = self.network, self.progress
         augmentation = self.settings.augmentation
         figures = validate(network, self.collection, validation, augmentation, self.device)[0]
@@ -364,7 +364,7 @@ def _mixed_precision(settings: TrainSettings, device: torch.device) -> bool:
 
 
 def write_log(path: Path, history: list[dict[str, float]]) -> None:
-    """Write the loss and the validation measures of each epoch as a CSV file.
+    """Write the loss and the validation metrics of each epoch as a CSV file.
 
     Raises:
         ResultsError: the file cannot be written.

@@ -145,7 +145,7 @@ def calibrate(
 
 
 def _check_place(out: Path) -> None:
-    """Check before any work begins that a calibration can be written to a file.
+    """Check that the calibration can be written to a file, before any work begins.
 
     Raises:
         InputError: the file cannot be written, is not YAML, or belongs to another program.
@@ -163,8 +163,8 @@ def _check_place(out: Path) -> None:
 def _keep_earlier(*files: Path) -> None:
     """Rename the files of an earlier calibration.
 
-    ``a.yaml`` is renamed to ``a-1.yaml``. All files get the same number, which is the first number
-    that is free for all of them.
+    ``a.yaml`` is renamed to ``a-1.yaml``. All files get the same number. It is the smallest number
+    for which none of the new names exists.
     """
     for n in count(1):
         kept = {path: path.with_stem(f"{path.stem}-{n}") for path in files}
@@ -184,7 +184,7 @@ def _keep_earlier(*files: Path) -> None:
 def _board(
     kind: str, size: str, square: float | None, marker: float | None, tags: str, *, stereo: bool
 ) -> Board:
-    """Return the calibration board that the options describe."""
+    """Create the calibration board that the command-line options describe."""
     from vslam.calibration.boards import Board, Kind, read_board
 
     if kind not in get_args(Kind):
@@ -213,7 +213,7 @@ def _board(
 
 
 def _frames(raw: RawSource, most: int) -> Iterator[TimedFrame]:
-    """Yield the frames of a source.
+    """Yield the frames of a source, or a sample of them.
 
     If the source has more than ``most`` frames, about ``most`` frames are yielded, which are spread
     evenly. If the source ends early because it is damaged, a warning is printed, and the frames

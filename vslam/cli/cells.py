@@ -1,7 +1,7 @@
 """The systems and the data that are tested by ``vslam bench`` and ``vslam stress``.
 
-These commands run a grid. Each cell of the grid is one run of a system on a sequence, with a
-perturbation and a random seed.
+These commands perform a grid of runs. Each cell of the grid is one run of a system on a sequence,
+with a perturbation and a random seed.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ class Systems:
 
     Attributes:
         detectors: loop detectors of vslam.
-        weights: weight files by detector. Detectors that use the shipped weights are not included.
-        others: templates of the commands that run other systems, by name
+        weights: the weight file of each detector. Detectors that use the shipped weights are not
+            included.
+        others: the command template of each other system, by name of the system
             (``vslam.lab.stress.external``).
     """
 
@@ -81,7 +82,7 @@ def choose_systems(
 def _others(
     wanted: list[str], given: Collection[str], python: Path | None, vocabulary: Path | None
 ) -> dict[str, str]:
-    """Return templates of the commands that run other systems, by name."""
+    """Return the command template of each other system, by name of the system."""
     from vslam.lab.stress import orbslam3
     from vslam.lab.stress.external import check_template
 

@@ -1,7 +1,7 @@
-"""A command of vslam in a child process that ends when its parent process ends.
+"""Runs a command of vslam in a child process, which ends when its parent process ends.
 
-It is started with ``python -m vslam.cli.child run ...``. The standard input of this process is a
-pipe from the parent process. When the parent ends, even if it is killed, the pipe closes. This
+The child process is started with ``python -m vslam.cli.child run ...``. Its standard input is a
+pipe from the parent process. When the parent ends, even if it is killed, the pipe closes. The child
 process then ends, too, because nobody would read its results.
 """
 

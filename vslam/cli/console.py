@@ -14,7 +14,7 @@ class Console:
     """Draws progress bars and prints messages. If ``shown`` is False, it does nothing.
 
     The package rich is imported only when something is shown, because its import takes as long as
-    tracking forty frames. A bar appears at its first step.
+    tracking forty frames. A progress bar appears when its first step is done.
     """
 
     def __init__(self, *, shown: bool) -> None:
@@ -66,7 +66,8 @@ class Console:
     def count_bar(self, what: str, total: int) -> Iterator[Callable[[], None]]:
         """Show a bar that counts items.
 
-        The method yields a function, which must be called when one of ``total`` items is done.
+        The method yields a function, which must be called whenever one of the ``total`` items is
+        done.
         """
         with self._bar(what) as update:
             update(total=total)

@@ -1,4 +1,4 @@
-"""The work of ``vslam run`` after the options have been checked."""
+"""Performs the work of ``vslam run`` after the options have been checked."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 class Output:
     """Options that determine what a run shows and writes.
 
-    They may be changed when a run is resumed.
+    These options may be changed when a run is resumed.
     """
 
     record: bool
@@ -52,7 +52,7 @@ def drive(
 
     Args:
         out: the folder in which the folder of the run is created.
-        resume: the folder of an interrupted run to continue. With None, a new run starts.
+        resume: the folder of an interrupted run to continue. If it is None, a new run starts.
     """
     if options.localize and output.save_map is not None:
         raise InputError("--save-map: localising does not change the map; leave it out.")
@@ -178,10 +178,11 @@ def _refuse_live_source(source: Source, resume: Path | None) -> None:
 def _unfinished(
     options: RunOptions, source: Source, resume: Path | None, lock: ExitStack
 ) -> Unfinished | None:
-    """Find the saved state of the run to resume. None for a new run.
+    """Read the saved state of the run to resume. The result is None for a new run.
 
     Raises:
-        InputError: there is no saved state, or the map to continue was made with another camera.
+        InputError: there is no saved state, or the map to continue was made with a different
+            camera.
     """
     from vslam.run.autosave import find_unfinished, lock_run
     from vslam.run.pipeline import require_camera

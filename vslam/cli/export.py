@@ -224,7 +224,7 @@ def ros(
 
 
 def _beside(run: Path, name: str) -> Path:
-    """Return the path of a file to write into the folder of a run.
+    """Return the default path of an exported file, which is in the folder of the run.
 
     If ``run`` is a map file, the new path is in the folder of the map file, with the same stem.
     """
@@ -232,7 +232,7 @@ def _beside(run: Path, name: str) -> Path:
 
 
 def _graph(run: Path) -> tuple[PoseGraph, Map]:
-    """Return the pose graph and the map of a run or of a map file.
+    """Compute the pose graph of a run or of a map file, and return it with the map.
 
     The weights of the edges depend on the thresholds of the run. For a map file, the thresholds of
     its last drive are used.
@@ -290,10 +290,10 @@ def _export_images(
     link: bool,
     quiet: bool,
 ) -> None:
-    """Write the images of the keyframes of a run into a new folder, and then write the model.
+    """Write the images of the keyframes of a run into a new folder, and then the map.
 
-    The model is written by the function ``save``. It is called with the folder, the map, the names
-    of the images and the colours of the landmarks.
+    The function ``save`` writes the map in the format of another program. Its arguments are the
+    folder, the map, the names of the images and the colours of the landmarks.
     """
     from vslam.maps.formats import landmark_colours, save_image
     from vslam.maps.new_output import new_output
@@ -322,7 +322,7 @@ def _export_images(
 
 
 def _image_of(frame: TimedFrame) -> NDArray[np.uint8]:
-    """Read the left image of a frame. It is in colour if the source has colour images."""
+    """Read the left image of a frame. The image is in colour if the source has colour images."""
     return frame.read(map)[0] if frame.colour is None else frame.colour()
 
 

@@ -1,4 +1,4 @@
-"""The command line application, and its entry point."""
+"""The command-line application, and its entry point."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class _Command(TyperCommand):
 
 
 class _Group(TyperGroup):
-    """A group of commands under one name, with vslam's own help."""
+    """A group of commands with a common name, such as ``vslam map``, with vslam's own help."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         from vslam.cli.help import show_help
@@ -97,7 +97,7 @@ def _plain(message: str) -> str:
 
 
 def application(groups: Collection[ModuleType]) -> typer.Typer:
-    """Create a command line application from the commands that some modules define."""
+    """Create a command line application from the commands that the given modules define."""
     made = typer.Typer(
         help="Visual SLAM in pure Python.",
         cls=_Group,

@@ -174,7 +174,7 @@ def merge(
 
 
 def _thresholds_of(stored: list[StoredMap], files: list[Path]) -> Config:
-    """Return the thresholds of the first map.
+    """Return the thresholds with which the first map was made.
 
     If other maps were made with other thresholds, a message lists these maps.
     """

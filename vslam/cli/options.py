@@ -1,4 +1,4 @@
-"""Options that several commands share, and functions that open the data that they describe."""
+"""Defines options that several commands share, and opens the data that these options describe."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ def kitti_root() -> str:
 
 
 def sequences(default: str) -> Any:
-    """Define the option ``--seqs``. Its default is ``default``."""
+    """Define the option ``--seqs`` with the given default value."""
     return option(
         INPUT,
         "LIST",
@@ -309,7 +309,7 @@ def reads_source(
     the images.
 
     Args:
-        without: options that the command does not have.
+        without: names of the options to leave out.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:

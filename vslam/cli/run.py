@@ -273,7 +273,7 @@ def _antenna(text: str) -> tuple[float, float, float]:
 
 
 def _compared(names: str, detector: str) -> tuple[str, ...]:
-    """Return the detectors that ``--compare`` lists, without repetitions."""
+    """Return the loop detectors that the option ``--compare`` lists, without repetitions."""
     from vslam.loopclosure.registry import require_detector
 
     found = tuple(names_in(names))
@@ -287,10 +287,11 @@ def _compared(names: str, detector: str) -> tuple[str, ...]:
 def _map_to_continue(
     file: Path, detector: DetectorName | None
 ) -> tuple[Path, DetectorName, dict[str, object]]:
-    """Find the map to continue, and read the detector and the thresholds with which it was made.
+    """Read the detector and the thresholds with which the map to continue was made.
 
-    The map is a file, or it lies in the folder of a run. Its path is made absolute, because
-    ``runs/latest`` changes when this run creates its folder.
+    ``file`` is a map file or the folder of a run that contains a map. The returned path of the map
+    is absolute. The reason is that ``runs/latest`` refers to a different folder as soon as this run
+    has created its folder.
     """
     from vslam.maps.storage import made_with, map_file_of
 

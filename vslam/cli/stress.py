@@ -204,10 +204,10 @@ def foreign(
 
 
 def _fitting(laws: list[str], opened: Mapping[str, Source]) -> tuple[list[str], list[str]]:
-    """Find the perturbations that can be applied to every sequence.
+    """Find those perturbations that can be applied to every sequence.
 
     Returns:
-        These perturbations, and a note on each perturbation that cannot be applied.
+        These perturbations, and a note for each perturbation that cannot be applied to a sequence.
     """
     from vslam.datasets.perturbation import laws_for
 

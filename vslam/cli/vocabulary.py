@@ -138,7 +138,7 @@ def info(
 def _find(images: list[str]) -> list[Path]:
     """Return the image files of all folders and glob patterns.
 
-    The files are sorted by name, without repetitions.
+    The files are sorted by name, and no file occurs twice.
     """
     import glob
 

@@ -1,4 +1,4 @@
-"""Checks of a calibration from images of a board, and the HTML page with the results."""
+"""Checks a calibration from images of a board, and writes an HTML page with the results."""
 
 from __future__ import annotations
 
@@ -136,9 +136,9 @@ def _kept(check: str, n: int, dropped: Sequence[tuple[str, float]]) -> Finding:
 
 
 def _cells(fit: CameraFit) -> NDArray[np.int64]:
-    """Divide the image into cells, and return the cell in which each corner of all views lies.
+    """Divide the image into cells, and return the cell number of each detected board corner.
 
-    Cells are numbered column by column.
+    The corners of all views of the board are included. Cells are numbered column by column.
     """
     xy = np.concatenate([view.xy for view in fit.views]) / (fit.model.width, fit.model.height)
     x, y = (xy * _CELLS).astype(np.int64).clip(0, np.subtract(_CELLS, 1)).T
@@ -146,10 +146,10 @@ def _cells(fit: CameraFit) -> NDArray[np.int64]:
 
 
 def _shared(cells: NDArray[np.int64], residuals: Array) -> float:
-    """Return the fraction of the squared residuals that is systematic.
+    """Return the systematic fraction of the squared reprojection errors, from 0 to 1.
 
-    This is the fraction that the mean residual of each image cell explains. It is about 0 for
-    noise, and close to 1 for a camera model that does not fit the lens.
+    It is the fraction of the squared errors that is explained by the mean error in each cell of the
+    image. It is about 0 for noise, and close to 1 for a camera model that does not fit the lens.
     """
     n = np.bincount(cells)
     sums = np.stack([np.bincount(cells, weights=column) for column in residuals.T], axis=1)

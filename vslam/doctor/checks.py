@@ -1,4 +1,4 @@
-"""The checks of a data set. They examine images, matches and timestamps.
+"""Checks of a data set, which examine its images, its stereo matches and its timestamps.
 
 The checks are short and share this file, so that their thresholds are in one place.
 """
@@ -66,7 +66,7 @@ _REACH = 16, 48  # px, vertical and horizontal search range; the sensors are sid
 
 
 def check_rectification(matches: Matches) -> Finding:
-    """Check the rectification of a stereo pair, using the median row difference of matches.
+    """Check the rectification of a stereo pair, using the row differences of stereo matches.
 
     In a rectified pair, both points of a match lie in the same row.
     """
@@ -103,9 +103,9 @@ def check_sides(matches: Matches) -> Finding:
 
 
 def check_scale(camera: Camera, matches: Matches | None) -> Finding:
-    """Report the field of view, the baseline and the median depth.
+    """Report the field of view, the baseline, and the median depth of the scene.
 
-    The user must compare these numbers with the scene, because images do not reveal a wrong
+    The user must compare these numbers with the real scene, because images do not reveal a wrong
     baseline. Only a baseline that seems to be in a wrong unit is reported as a fault.
 
     Args:
@@ -144,7 +144,7 @@ def check_calibration(camera: Camera) -> Finding:
 
 
 def check_focal_length(fit: FocalFit | None, camera: Camera) -> Finding:
-    """Check whether the rotations of the camera fit the calibrated focal length.
+    """Check whether observed rotations of the camera agree with the calibrated focal length.
 
     Args:
         fit: the focal length that fits the motion of the camera best. None if too few frames have
@@ -164,7 +164,7 @@ def check_focal_length(fit: FocalFit | None, camera: Camera) -> Finding:
 
 
 def check_exposure(pairs: Sequence[tuple[Image, Image]], several: Sequence[Matches]) -> Finding:
-    """Check whether the same points have the same brightness in both images."""
+    """Check whether the same points have the same brightness in both images of a stereo pair."""
     ratios = []
     for (left, right), matches in zip(pairs, several, strict=True):
         greys = [
@@ -184,7 +184,8 @@ def check_exposure(pairs: Sequence[tuple[Image, Image]], several: Sequence[Match
 def check_synchronisation(rows_of_lag: Mapping[int, float]) -> tuple[Finding, int]:
     """Check whether the two cameras are synchronised.
 
-    They are not synchronised if the right image of another frame fits the left image better.
+    The cameras are not synchronised if left images fit the right images of other frames better than
+    the right images of the same frames.
 
     Args:
         rows_of_lag: median vertical error of stereo matches (px) by lag. The lag is the delay of
@@ -228,7 +229,7 @@ def check_features(images: Sequence[Image], config: OrbConfig) -> Finding:
 
 
 def check_sharpness(images: Sequence[Image]) -> Finding:
-    """Check that images are not blurred, using the median of their ``sharpness``."""
+    """Check that images are not blurred, using the median of the ``sharpness`` of all images."""
     values = [sharpness(image) for image in images]
     middle = float(np.median(values))
     return judge(
@@ -250,7 +251,7 @@ def sharpness(image: Image) -> float:
 
 
 def check_times(timestamps: Times) -> list[Finding]:
-    """Check timestamps (s) for wrong order, gaps and jitter. They need not be sorted."""
+    """Check timestamps, in seconds, for wrong order, gaps and jitter."""
     steps = np.diff(timestamps)
     if len(steps) < 3:
         return [Finding("times", "unknown", f"{len(timestamps)} frames are too few")]
@@ -319,8 +320,8 @@ def check_depth(images: Sequence[Image], depths: Sequence[Depth]) -> list[Findin
 def _registration(fit: NDArray[np.float32], views: Callable[[], int]) -> Finding:
     """Check whether depth edges fit the image edges best without a shift.
 
-    Another shift is a fault only if it is the single clear peak inside the search range, and if
-    more than one view was examined.
+    If a different shift fits best, this is a fault only under two conditions. The shift must be the
+    single clear peak inside the search range, and more than one view must have been examined.
     """
     reach = np.array(_REACH)
     best = np.array(np.unravel_index(np.argmax(fit), fit.shape)) - reach
@@ -363,9 +364,9 @@ def _edge_fit(image: Image, depth: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def depth_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Find the pixels at which the depth jumps by more than a tenth, as ``(H, W)`` bool.
+    """Find the pixels at which the depth changes abruptly, by more than a tenth.
 
-    A depth of 0 means that the depth is unknown.
+    The result is ``(H, W)`` bool. A depth of 0 means that the depth is unknown.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         log = np.where(depth > 0, np.log(depth), np.nan)

@@ -1,7 +1,7 @@
-"""Examination of a sequence by the checks of ``vslam doctor``.
+"""Examines a sequence with the checks of ``vslam doctor``.
 
-All timestamps are checked, and a few frames that are spread over the sequence. The result is a
-table of findings, and pictures.
+The examination checks all timestamps, and a few frames that are spread over the sequence. The
+result consists of the findings of the checks, and of pictures.
 """
 
 from __future__ import annotations
@@ -104,9 +104,10 @@ def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
 
 
 def _examine_mask(sequence: Source, lefts: dict[int, Image]) -> tuple[list[Finding], list[Picture]]:
-    """Measure the fraction of the first image that the mask hides, and draw this part in red.
+    """Measure which fraction of the image the mask hides, and draw the hidden part in red.
 
-    The two lists of the result, findings and pictures, are empty if there is no mask.
+    The picture shows the first image. The result is a list of findings and a list of pictures. Both
+    lists are empty if there is no mask.
     """
     frame = next(iter(lefts), None)
     read = None if frame is None else sequence.stored[frame].mask
@@ -138,7 +139,7 @@ class _Pair:
 
 
 def _pairs(sequence: Source, lefts: dict[int, Image], lag: int) -> list[_Pair]:
-    """Match each left image with the right image ``lag`` frames later.
+    """Match each left image with the right image that was taken ``lag`` frames later.
 
     Pairs whose right image is missing or cannot be read are left out.
     """
@@ -239,7 +240,7 @@ def _disparities(
 
 
 def _rows_by_lag(by_lag: dict[int, list[_Pair]]) -> dict[int, float]:
-    """Return the median vertical error of stereo matches (px) for each lag.
+    """For each lag, return the median vertical error of stereo matches in pixels.
 
     The lag is the delay of the right image in frames. Only frames that have matches for all lags
     are used.

@@ -1,4 +1,4 @@
-"""The results of checks, and their text for the terminal and for the HTML page."""
+"""Results of checks, which are shown in the terminal and on the HTML page."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ class Finding:
 def judge(check: str, wrong: bool, measured: str, fix: str) -> Finding:
     """Create the finding of a check.
 
-    It is a ``fault`` with the given fix if ``wrong`` is True. Otherwise, it is ``good``.
+    If ``wrong`` is True, the verdict is ``fault``, and the finding contains the advice ``fix``.
+    Otherwise, the verdict is ``good``.
     """
     return Finding(check, "fault", measured, fix) if wrong else Finding(check, "good", measured)
 

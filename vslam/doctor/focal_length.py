@@ -1,9 +1,9 @@
-"""Estimation of the focal length from the motion of the camera.
+"""Estimates the focal length from the motion of the camera.
 
 With a wrong focal length, a stereo pair reconstructs a scene that is stretched along the optical
 axis. A pure translation of the camera is consistent with such a scene, but a rotation about any
-axis other than the optical axis is not. For each focal length, the motion between two frames is
-optimised. The estimate is the focal length with the least reprojection error.
+axis other than the optical axis is not. For each tested focal length, the motion between two frames
+is optimised. The estimate is the focal length with the smallest reprojection error.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _STEP = 0.02  # step of the logarithm of the factor, to measure the curvature at
 
 @dataclass(frozen=True)
 class Moved:
-    """N points that were seen in two frames.
+    """Image positions of N points that were seen in two frames.
 
     Attributes:
         before, after: ``(N, 2)`` positions in pixels in the left images of the first and the second
@@ -127,7 +127,7 @@ def _best_pose(
 
 
 def _fits(moved: Moved, camera: Camera, factor: float, pose: Vectors) -> bool:
-    """Return whether most points agree with a motion between two frames."""
+    """Return whether most points agree with an estimated motion between two frames."""
     error, variance, _ = _errors(moved, camera, factor, pose)
     return float(np.median((error**2).sum(axis=1) / variance)) < _CAUCHY
 

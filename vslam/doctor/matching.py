@@ -1,4 +1,4 @@
-"""Matching of two images without assumptions about the poses of the cameras.
+"""Matches two images without assumptions about the poses of the cameras.
 
 A run searches for stereo matches only in the same rows, but a check of the rectification must
 search the whole image.
@@ -42,7 +42,7 @@ class Matches:
 def match_images(left: Image, right: Image) -> Matches:
     """Find ORB matches that satisfy one epipolar geometry, and refine them using optical flow.
 
-    If there are fewer than twelve matches, no matches are returned.
+    If fewer than twelve matches are found, the result contains no matches.
     """
     orb = cv2.ORB.create(_FEATURES)
     kp_left, d_left = orb.detectAndCompute(left, None)
@@ -87,7 +87,7 @@ def _same_view(image: Image, other: Image) -> bool:
 
 
 def joined(several: list[Matches]) -> Matches:
-    """Join the matches of several pairs of images. At least one pair is needed."""
+    """Join the matches of several image pairs into one object. At least one pair is needed."""
     return Matches(
         np.concatenate([matches.left for matches in several]),
         np.concatenate([matches.right for matches in several]),
@@ -95,7 +95,7 @@ def joined(several: list[Matches]) -> Matches:
 
 
 def _normalised(image: Image, model: Image) -> Image:
-    """Give an image the brightness and contrast of another image.
+    """Adjust the brightness and contrast of an image to those of another image.
 
     Optical flow assumes that both images have the same brightness and contrast.
     """

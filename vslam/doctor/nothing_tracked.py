@@ -1,4 +1,4 @@
-"""Explanation of why a run tracked no frame. A few frames of the run are examined."""
+"""Explains why a run tracked no frame, by examining a few frames of the run."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Evaluation of trajectories and loop closures against ground truth."""
+"""Evaluates trajectories and loop closures against ground truth."""

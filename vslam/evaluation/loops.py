@@ -1,8 +1,8 @@
-"""Evaluation of loop closures: which revisited places were recognised, and which loops are wrong.
+"""Evaluates loop closures: which revisits were found, and which loops are wrong.
 
-The ATE alone does not show this. Without drift, a missed loop causes no error. A wrong loop may
-distort only a part of the map with few frames. Therefore, each loop and each revisit is judged
-separately.
+The ATE alone shows neither of these. If there is no drift, a missed loop causes no error. A wrong
+loop may distort only a part of the map that contains few frames. Therefore, each loop and each
+revisit is judged separately.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ Poses = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Revisits:
-    """M stretches of the path on which the camera revisits places, in order.
+    """M stretches on which the camera follows an earlier part of its path again, in order of time.
 
     Attributes:
-        first, last: ``(M,)`` first and last frame of each stretch.
-        first_match, last_match: ``(M,)`` earlier frames that were taken at the same places as
-            ``first`` and ``last``.
+        first, last: ``(M,)`` index of the first and of the last frame of each stretch.
+        first_match, last_match: ``(M,)`` indices of earlier frames. They were taken at the same
+            places as the frames ``first`` and ``last``.
         length_m: ``(M,)`` length of each stretch in metres.
     """
 
@@ -63,12 +63,12 @@ class LoopEvaluation:
     """The result of comparing the loops of a run with the ground truth.
 
     Attributes:
-        revisits: the M stretches of the path on which the camera revisits places.
+        revisits: the M stretches on which the camera follows an earlier part of its path again.
         loop_frame: ``(M,)`` query frame of the first correct loop that was closed on each stretch.
             It is -1 if no correct loop was closed there.
-        right: for each loop edge, whether its relative pose is right. Rejected edges are included.
-            None if the edge has no pose or its frames have no ground truth.
-        n_wrong: number of accepted edges whose relative pose is wrong.
+        right: for each loop edge, whether its relative pose agrees with the ground truth. Rejected
+            edges are included. None if the edge has no pose or its frames have no ground truth.
+        n_wrong: number of accepted edges whose relative pose disagrees with the ground truth.
     """
 
     revisits: Revisits
@@ -80,7 +80,8 @@ class LoopEvaluation:
     def n_found(self) -> int:
         """Number of revisited stretches of the path on which a correct loop was closed.
 
-        One loop per stretch is enough, because tracking then continues in the old map.
+        One loop per stretch is sufficient, because tracking then continues in the old part of the
+        map.
         """
         return int(np.count_nonzero(self.loop_frame >= 0))
 
@@ -115,8 +116,8 @@ def metres_per_unit(T_wc: Poses, T_wc_true: Poses) -> NDArray[np.float64]:
     """Return the length of the unit of a monocular map at each frame, as ``(N,)`` metres.
 
     For consecutive frames, the true distance is divided by the estimated distance. The result is
-    the median of these ratios over the 41 frames around each frame. It is 1 if the camera did not
-    move.
+    the median of these ratios over the 41 frames around each frame. The result is 1 if the camera
+    did not move.
 
     Args:
         T_wc: ``(N, 4, 4)`` poses at the time of tracking.
@@ -144,12 +145,12 @@ def _in_metres(edge: LoopEdge, metres: float) -> LoopEdge:
 
 
 def revisits(T_wc: Poses, timestamps: NDArray[np.float64]) -> Revisits:
-    """Find the stretches on which the camera revisits places in the same direction.
+    """Find the stretches of a path along which the camera had already travelled earlier.
 
-    A frame is a revisit if the camera passed within ``MAX_LATERAL_M`` of the same position earlier,
-    with a heading that differed by at most ``MAX_HEADING_DEG``. Between the two passages, there
-    must be at least ``MIN_SECONDS`` and a path of at least ``MIN_PATH_M``. The path between two
-    frames is assumed to be straight.
+    Only earlier passages in the same direction count. A frame is a revisit if the camera passed
+    within ``MAX_LATERAL_M`` of the same position earlier, with a heading that differed by at most
+    ``MAX_HEADING_DEG``. Between the two passages, there must be at least ``MIN_SECONDS`` and a path
+    of at least ``MIN_PATH_M``. The camera is assumed to move on a straight line between two frames.
 
     Args:
         T_wc: ``(N, 4, 4)`` true poses.
@@ -193,15 +194,16 @@ def judge_loops(
     """Determine whether each loop edge is right, and whether each revisit was found by a loop.
 
     An edge is right if ``T_query_match`` agrees with the ground truth within ``MAX_TRANSLATION_M``
-    and ``MAX_ROTATION_DEG``. An accepted edge that is right finds a stretch under two conditions.
-    First, the match of the edge must belong to an earlier passage, not to the frames directly
-    before the query. Second, the query of the edge must lie on the stretch or within
-    ``MAX_INTERRUPTION_M`` of it. This tolerance is needed because the camera sees a place shortly
-    before it reaches the place and shortly after it leaves the place.
+    and ``MAX_ROTATION_DEG``. An accepted edge that is right counts as finding a revisited stretch
+    if two conditions are met. First, the match of the edge must belong to an earlier passage, not
+    to the frames directly before the query. Second, the query of the edge must lie on the stretch
+    or within ``MAX_INTERRUPTION_M`` of it. This tolerance is needed because the camera sees a place
+    shortly before it reaches the place and shortly after it leaves the place.
 
     Args:
         edges: accepted and rejected loops.
-        frames: ``(K,)`` frame of each keyframe. It is -1 if the keyframe belongs to another drive.
+        frames: ``(K,)`` index of the frame that became each keyframe. It is -1 if the keyframe
+            belongs to a different drive.
         T_wc: ``(N, 4, 4)`` ground truth of the frames.
         timestamps: ``(N,)`` seconds.
     """
@@ -254,7 +256,8 @@ def _earlier_passage(
     """For each of S samples of the path, find the nearest sample of an earlier passage.
 
     Returns:
-        ``(S,)`` indices of samples. The index is -1 if the camera was not at this place earlier.
+        ``(S,)`` index of the nearest earlier sample. It is -1 if the camera was not near this
+        sample earlier.
     """
     from scipy.spatial import cKDTree
 

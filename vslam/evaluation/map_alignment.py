@@ -1,8 +1,8 @@
 """The transformation from a map to its ground truth, and the error of localisation in the map.
 
 A trajectory is usually aligned with its ground truth before both are compared. Frames that were
-localised in a map are not aligned in this way. They are transformed by the alignment of the map.
-Therefore, their error includes the error of the map.
+localised in an existing map are not aligned in this way. Their positions are transformed by the
+alignment of the map. Therefore, their error includes the error of the map.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from vslam.run.outcome import RunOutcome
 def name_of_world(outcome: RunOutcome) -> str:
     """Return the name of the world frame of the ground truth of a run.
 
-    All rendered drives along the same route have the same name, even if their light or traffic
-    differ.
+    All rendered drives along the same route have the same world frame, even if the light or the
+    traffic differs. Therefore, they have the same name.
     """
     return f"{outcome.sequence.dataset} {outcome.sequence.name.partition('+')[0]}"
 
@@ -27,7 +27,7 @@ def name_of_world(outcome: RunOutcome) -> str:
 def truth_alignment_of(outcome: RunOutcome, evaluation: Evaluation) -> TruthAlignment:
     """Return the transformation from a map to its ground truth.
 
-    It is the alignment of the trajectory of the run that made the map.
+    It is the transformation that aligns the trajectory of the run that made the map.
     """
     truth = outcome.ground_truth
     assert truth is not None

@@ -1,4 +1,4 @@
-"""Errors of odometry over short motions, and a comparison with the predicted covariances."""
+"""Measures errors of odometry over short motions, and compares them with the covariances."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from vslam.trajectory import Trajectory
 
 @dataclass(frozen=True, eq=False)
 class MotionErrors:
-    """Errors of M motions. All motions have about the same duration.
+    """Errors of M estimated motions of the camera. All motions have about the same duration.
 
     Attributes:
         first: ``(M,)`` int64, index of the frame in which each motion begins.
         xi: ``(M, 6)`` errors in metres and radians, in the camera frame at the end of the motion.
             The true motion is ``exp(xi) T_last_first``.
-        covariance: ``(M, 6, 6)`` covariances of ``xi`` that ``relative_covariance`` predicts.
+        covariance: ``(M, 6, 6)`` predicted covariances of ``xi``, from ``relative_covariance``.
     """
 
     first: NDArray[np.int64]
@@ -53,14 +53,14 @@ class MotionErrors:
 def motion_errors(
     tracks: Sequence[TrackResult], truth: Trajectory, interval_s: float
 ) -> MotionErrors:
-    """Compare the motions that odometry measured with the true motions.
+    """Compare the motions that odometry estimated with the true motions.
 
     Args:
         tracks: result of tracking each frame. Frames without an uncertainty or without a true pose
             are not used.
         truth: true poses at the times of some or all frames.
-        interval_s: duration of a motion in seconds. The motion ends at the first frame that is at
-            least this long after its first frame.
+        interval_s: duration of a motion in seconds. Each motion ends at the first frame that is at
+            least ``interval_s`` later than the first frame of the motion.
     """
     true_pose = dict(zip(truth.timestamps.tolist(), truth.T_wc, strict=True))
     usable = [

@@ -1,7 +1,7 @@
-"""Error metrics of a trajectory: ATE, RPE and KITTI's drift, as they are usually defined.
+"""Computes error metrics of a trajectory: ATE, RPE and KITTI's drift.
 
-The package evo (Grupp, 2017) computes ATE and RPE. Therefore, the command line of evo gives the
-same values. Only this module imports evo.
+The metrics have their usual definitions. The package evo (Grupp, 2017) computes ATE and RPE.
+Therefore, the command line of evo gives the same values. Only this module imports evo.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ _EVO_FLAGS = {"se3": " --align", "sim3": " --align --correct_scale", "none": ""}
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Errors of an estimated trajectory relative to the ground truth, over N matched frames.
+    """Errors of an estimated trajectory relative to the ground truth, computed from N frames.
 
     Attributes:
         frames: number N of compared frames.
         alignment: ``se3``, ``sim3`` or ``none``, the kind of transformation that was fitted before
             the comparison.
         on_one_line: whether all positions lie on one line. In this case, the positions do not
-            determine the rotation about this line, so it was fitted to the orientations. evo
-            rejects such trajectories.
+            determine the rotation about this line, so this rotation was fitted to the orientations.
+            evo rejects such trajectories.
         timestamps: ``(N,)`` timestamps of the estimate in seconds.
         ate_rmse_m, ate_mean_m, ate_max_m: RMSE, mean and maximum of ``errors_m``.
         errors_m: ``(N,)`` distance of each aligned position from the ground truth, in metres.
@@ -75,7 +75,7 @@ def evaluate_trajectory(
     The alignment is ``se3`` or ``sim3``. With ``none``, the trajectories are compared without
     alignment.
 
-    Trajectories with the same timestamps are compared frame by frame. Otherwise, each pose is
+    Two trajectories with the same timestamps are compared frame by frame. Otherwise, each pose is
     compared with the true pose that is nearest in time, if the two timestamps differ by at most 10
     ms. ``Evaluation.frames`` is the number of such pairs.
 
@@ -158,9 +158,10 @@ def _align(estimate: Any, reference: Any, with_scale: bool) -> bool:
 
 
 def _with_axes(trajectory: Any) -> NDArray[np.float64]:
-    """Return the positions of a trajectory, and two further points for each pose.
+    """Return the positions of a trajectory, and two more points for each pose.
 
-    The further points lie to the right of the camera and below it. The result is ``(3, 3N)``.
+    One of the two points lies to the right of the camera, and the other point lies below the
+    camera. The result is ``(3, 3N)``.
     """
     T_wc = np.array(trajectory.poses_se3)
     position = T_wc[:, :3, 3]
@@ -222,8 +223,8 @@ def read_pair(
     """Read an estimated trajectory and its ground truth, each in the format of KITTI or TUM.
 
     Args:
-        times: file with the timestamp of each frame in seconds, one per line (``times.txt``). It is
-            needed for files in KITTI's format, which contain no timestamps.
+        times: file with the timestamp of each frame in seconds, one per line (``times.txt``). This
+            file is needed for files in KITTI's format, which contain no timestamps.
 
     Raises:
         InputError: a file is malformed, or the files cannot be matched without timestamps.

@@ -1,6 +1,7 @@
-"""Construction of a map from the arrays of an untrusted file.
+"""Builds a map from the arrays of an untrusted file.
 
-Everything that kernels rely on is checked first.
+All properties of the arrays that compiled kernels rely on are checked first, because kernels do not
+check their arguments.
 """
 
 from __future__ import annotations
@@ -209,7 +210,7 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
 
 
 def _check_merges(merged_into: NDArray[np.int32], alive: NDArray[np.bool_]) -> None:
-    """Check the chains of landmarks that were merged into other landmarks.
+    """Check the entries of landmarks that were merged into other landmarks.
 
     Every chain of ``merged_into`` must end at a landmark that was not culled, or at -1.
     """

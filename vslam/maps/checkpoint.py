@@ -1,4 +1,4 @@
-"""Storage of a checkpoint of SLAM (``vslam.states.Checkpoint``) in a map file."""
+"""Stores a checkpoint of SLAM (``vslam.states.Checkpoint``) in a map file."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def checked_checkpoint(
 
     Args:
         map_: the map of the same file, which has been checked.
-        n_frames: number of frames of the drive so far.
+        n_frames: number of frames of the drive up to the checkpoint.
 
     Raises:
         KeyError, TypeError, ValueError, OverflowError: the checkpoint is damaged. The message

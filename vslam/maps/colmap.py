@@ -1,4 +1,4 @@
-"""Writing of COLMAP's sparse model as text or binary files (https://colmap.github.io/format.html).
+"""Writes maps in COLMAP's format, as text or binary (https://colmap.github.io/format.html).
 
 COLMAP's poses are ``T_cw`` with x right, y down and z forward, as in vslam. COLMAP's pixel
 coordinates begin at the corner of the image, so the centre of the upper left pixel is (0.5, 0.5).
@@ -110,7 +110,7 @@ def _parameters(camera: Camera) -> tuple[float, float, float, float]:
 def _write_binary(folder: Path, camera: Camera, images: list[_Image], points: list[_Point]) -> None:
     """Write COLMAP's binary files.
 
-    They are little-endian, as in COLMAP's ``reconstruction_io_binary.cc``.
+    The files are little-endian, as in COLMAP's ``reconstruction_io_binary.cc``.
     """
     (folder / "cameras.bin").write_bytes(
         struct.pack("<QIi2Q", 1, _CAMERA_ID, _PINHOLE, camera.width, camera.height)

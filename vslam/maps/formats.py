@@ -1,4 +1,4 @@
-"""Writing of maps in the formats of other programs: nerfstudio, g2o, PLY and PNG."""
+"""Writes maps in the formats of other programs: nerfstudio, g2o, PLY and PNG."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def save_nerfstudio(
     The format is described at https://docs.nerf.studio/quickstart/data_conventions.html.
 
     Cameras look along -z with y up (OpenGL). ``transform_matrix`` is the pose of a camera (camera
-    to world). The z axis of the world frame points up. ``applied_transform`` maps vslam's world
-    frame to the world frame of both files.
+    to world). The z axis of the world frame points up. ``applied_transform`` is the transformation
+    from vslam's world frame to the world frame of both files.
 
     Pixel coordinates begin at the corner of the image, as in COLMAP. The rays of nerfstudio go
     through ``column + 0.5`` (``Cameras.get_image_coords``), although its documentation suggests
@@ -84,13 +84,13 @@ def save_g2o(
     triangle of its information matrix, row by row, with the translation first.
 
     The information of rotations is per square radian. GTSAM, SE-Sync and the examples of Ceres
-    expect this unit. g2o itself measures the error of a rotation by qx qy qz. For small angles,
-    this error is half the angle. Therefore, rotations have only a quarter of their weight in g2o.
+    expect this unit. g2o itself uses qx qy qz as the error of a rotation. For small angles, this
+    error is half the angle. Therefore, rotations have only a quarter of their weight in g2o.
 
     Args:
         ids: ``(N,)`` ids of the vertices.
         T_wc: ``(N, 4, 4)`` poses of the vertices.
-        edges: ``(E, 2)`` the two vertices i and j of each edge, as indices into ``ids``.
+        edges: ``(E, 2)`` indices of the two vertices i and j of each edge, in ``ids``.
         T_i_j: ``(E, 4, 4)`` measured pose of j in the frame of i.
         sigmas: ``(E, 2)`` standard deviations of the translation (m) and of the rotation (rad), for
             each axis.
@@ -177,7 +177,7 @@ def landmark_colours(
 ) -> NDArray[np.uint8]:
     """Return the RGB colour of each landmark as ``(L, 3)`` uint8.
 
-    The colour is taken from the observation of median brightness.
+    The colour of a landmark is taken from its observation with the median brightness.
 
     Args:
         images: ``(H, W)`` grey or ``(H, W, 3)`` RGB image of each keyframe, in order.

@@ -1,4 +1,4 @@
-"""Output files and folders that either are complete or do not exist."""
+"""Writes output files and folders so that they are either complete or do not exist."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from vslam.errors import InputError, ResultsError
 
 @contextmanager
 def new_output(path: Path, *, folder: bool = False) -> Iterator[Path]:
-    """Yield the path of a temporary file to write, or of an empty temporary folder.
+    """Yield the path of a temporary file or folder, to which the output is written.
 
-    If the block succeeds, the file or folder is renamed to ``path``. If the block fails, the file
-    or folder is removed.
+    If the block succeeds, the temporary file or folder is renamed to ``path``. If the block raises
+    an exception, the temporary file or folder is removed.
 
     Raises:
         InputError: ``path`` exists already. If a folder is written, an existing empty folder is
@@ -46,7 +46,7 @@ def new_output(path: Path, *, folder: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def replaced_file(path: Path) -> Iterator[BinaryIO]:
-    """Yield the path of a temporary file to write. At the end, it replaces ``path`` atomically.
+    """Yield the path of a temporary file, which replaces ``path`` atomically at the end.
 
     Before it replaces ``path``, the temporary file is synced to the disk. After an error, ``path``
     is unchanged.
@@ -78,7 +78,7 @@ def replaced_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def require_place(path: Path, option: str) -> None:
-    """Check before a long computation that a file can be written to a path.
+    """Check that a file can be written to a path. Call this before a long computation.
 
     Args:
         path: the path.

@@ -1,4 +1,4 @@
-"""A map in the form that other programs use: images with poses, points, and their observations."""
+"""A map in the form that other programs use: images with poses, points, and observations."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ PIXEL_CENTRE = 0.5
 class Reconstruction:
     """The keyframes, landmarks and observations of a map, without culled entries.
 
-    There are K keyframes and L landmarks, which are numbered without gaps, and N observations. All
-    observations are in left images.
+    There are K keyframes, L landmarks and N observations. Keyframes and landmarks are numbered
+    without gaps. All observations are features of left images.
 
     Attributes:
         camera: camera of all keyframes. The centre of the upper left pixel is (0, 0), as in OpenCV.
@@ -30,8 +30,8 @@ class Reconstruction:
         T_cw: ``(K, 4, 4)`` float64 poses.
         xyz: ``(L, 3)`` float64 positions in the world frame. Each landmark is observed at least
             once.
-        keyframe, landmark: ``(N,)`` int64, the keyframe and the landmark of each observation. They
-            are sorted by keyframe.
+        keyframe, landmark: ``(N,)`` int64, the index of the keyframe and the index of the landmark
+            of each observation. Observations are sorted by keyframe.
         xy: ``(N, 2)`` float64 position of each observation in the image, in pixels.
     """
 

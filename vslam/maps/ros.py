@@ -1,4 +1,4 @@
-"""Conversion of poses and landmarks to ROS 2 messages and bags. ROS need not be installed.
+"""Converts poses and landmarks to ROS 2 messages and bags. ROS need not be installed.
 
 The frames follow REP 105: ``map`` -> ``odom`` -> ``base_link`` -> ``camera_optical``. Their axes
 follow REP 103. In ``map``, ``odom`` and ``base_link``, x points forward, y left and z up. In
@@ -91,9 +91,9 @@ class FramePose:
 
 
 def in_ros_axes(T: Matrix) -> Matrix:
-    """Convert motions between camera frames to motions between frames with the axes of ROS.
+    """Convert transformations between camera frames to the axes of ROS (x forward, z up).
 
-    The motions have the shape ``(..., 4, 4)``.
+    ``T`` and the result have the shape ``(..., 4, 4)``.
     """
     result: Matrix = T_BASE_OPTICAL @ T @ T_BASE_OPTICAL.T
     return result
@@ -103,7 +103,8 @@ def odometry_message(types: Types, pose: FramePose, before: FramePose | None) ->
     """Create ``nav_msgs/Odometry`` with the pose and the mean velocity of ``base_link``.
 
     The pose is given in the frame ``odom``. The velocity is given in the axes of ``base_link``. It
-    is the mean velocity since the frame ``before``. If ``before`` is None, the velocity is zero.
+    is the mean velocity between the earlier frame ``before`` and this frame. If ``before`` is None,
+    the velocity is zero.
     """
     twist, R = np.zeros(6), T_BASE_OPTICAL[:3, :3]
     if before is not None:
@@ -194,8 +195,8 @@ def save_bag(
     """Write an MCAP file with the topics of ``TOPICS``.
 
     Args:
-        poses: the poses for the topics ``/tf`` and ``/odom``. At least one pose is needed.
-        trajectory: the poses for the topic ``/path``.
+        poses: the poses to write to the topics ``/tf`` and ``/odom``. At least one pose is needed.
+        trajectory: the final poses of the camera, to write to the topic ``/path``.
         xyz: ``(N, 3)`` landmarks in the world frame of the trajectory.
 
     Raises:
@@ -254,7 +255,7 @@ def save_bag(
 def frame_poses(
     odometry: Trajectory, trajectory: Trajectory, covariances: dict[str, tuple[Matrix, Matrix]]
 ) -> list[FramePose]:
-    """Combine the results of a run into the poses of its frames.
+    """Combine the trajectories and covariances of a run into one pose for each frame.
 
     Args:
         odometry: poses of the camera in the odometry frame.
@@ -291,8 +292,9 @@ def _covariance(matrix: Matrix | None, R: Matrix) -> NDArray[np.float64]:
 def _velocity_covariance(pose: FramePose, before: FramePose | None) -> Matrix | None:
     """Return the ``(6, 6)`` covariance of the mean velocity between two frames.
 
-    It refers to the frame of the camera. The errors of the two poses relative to the landmarks are
-    independent. Both poses have the same error of the landmarks, which therefore cancels.
+    The covariance is given in the frame of the camera. The errors of the two poses relative to the
+    landmarks are independent. The error in the positions of the landmarks is the same for both
+    poses, and therefore cancels.
     """
     if before is None or before.near is None or pose.near is None:
         return None

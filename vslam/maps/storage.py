@@ -1,8 +1,8 @@
-"""Reading and writing of map files. A map file is an ``.npz`` file.
+"""Reads and writes map files. A map file is an ``.npz`` file.
 
 A map file is written atomically, and it is checked when it is read. The arrays are not compressed,
-for two reasons. They are mostly descriptors, which do not compress well. In addition, a map should
-load within a second.
+for two reasons. First, most of the data are descriptors, which do not compress well. Second, a map
+should load within a second.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ def save_map(path: Path | str, stored: StoredMap, *, resumable: bool = False) ->
     the arrays of ``ARRAYS``. The data of the loop detector for each keyframe (``PerKeyframe``) are
     stored as ``detector_NAME_first`` and ``detector_NAME_values``. The images of the keyframes are
     stored as ``image_first`` and ``image_values``. Observations are sorted by landmark. The
-    observations of one landmark are in the order of the linked list of the landmark.
+    observations of a landmark are stored in the order of its linked list.
 
     Args:
         path: the file.
         stored: the map.
-        resumable: also write culled keyframes and landmarks, and the checkpoint if there is a
-            checkpoint. Otherwise, only living keyframes and landmarks are written.
+        resumable: if True, culled keyframes and landmarks are also written, and the checkpoint if
+            there is one. If False, culled keyframes and landmarks are left out.
 
     Raises:
         OSError: the file cannot be written.
@@ -61,7 +61,7 @@ def save_map(path: Path | str, stored: StoredMap, *, resumable: bool = False) ->
 def load_map(path: Path | str) -> StoredMap:
     """Read a map from a file, and remove culled keyframes and landmarks.
 
-    Everything that kernels rely on is checked.
+    All properties of the arrays that compiled kernels rely on are checked.
 
     Raises:
         InputError: the file is missing or damaged, is not a map, or has another schema version.
@@ -74,7 +74,7 @@ def load_checkpoint(path: Path | str) -> StoredMap:
     """Read a map from which a run can be resumed.
 
     If the map has a checkpoint, culled keyframes and landmarks are kept. Otherwise, they are
-    removed. Everything that kernels rely on is checked.
+    removed. All properties of the arrays that compiled kernels rely on are checked.
 
     Args:
         path: a map file, or the folder of a run that has a map file.
@@ -169,7 +169,7 @@ def map_file_of(path: Path | str) -> Path:
 
 
 class MadeWith(NamedTuple):
-    """The camera, the name of the detector and the changed thresholds with which a map was made."""
+    """The camera, the detector and the non-default thresholds with which a map was made."""
 
     camera: Camera
     detector: str

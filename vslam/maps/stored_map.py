@@ -1,6 +1,6 @@
 """A map with all data that a later run needs to continue the map.
 
-Usually, culled keyframes and landmarks have been removed.
+Culled keyframes and landmarks have been removed, except in a map with a checkpoint.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class TruthAlignment:
     Attributes:
         name: name of the data set and the sequence of the ground truth.
         S_truth_world: ``(4, 4)`` transformation from the world frame of the map to the world frame
-            of the ground truth. It aligns the trajectory of the first drive with the ground truth.
-            It is a rigid motion, or a similarity for a monocular map.
+            of the ground truth. This transformation aligns the trajectory of the first drive with
+            the ground truth. It is a rigid motion, or a similarity for a monocular map.
     """
 
     name: str
@@ -52,12 +52,12 @@ class StoredMap:
     Attributes:
         map: keyframes, landmarks and observations.
         camera: camera of all keyframes.
-        loops: closed loops, without features and landmarks. Their translations are in the present
+        loops: closed loops, without features and landmarks. Their translations are in the current
             unit of the map.
         detector: data that the loop detector has stored about the keyframes.
         images: JPEG files (uint8) of keyframes, from which learned descriptors can be computed.
             None if the run used no learned descriptors.
-        frames: frame poses of the last drive. None if they were not kept.
+        frames: poses of the frames of the last drive. None if they were not kept.
         drives: source of the images of each drive, such as "kitti 06".
         thresholds: thresholds of the last drive that differed from the defaults, by dotted name.
         truth_alignment: the transformation from the map to the frame of a ground truth. None
@@ -81,13 +81,13 @@ class StoredMap:
     def compact(self, *, copy: bool = True) -> StoredMap:
         """Copy the map without its culled keyframes and landmarks.
 
-        The remaining keyframes and landmarks are numbered without gaps. Poses relative to a culled
-        keyframe become relative to the parent of this keyframe. Landmarks are ordered by the first
-        remaining keyframe that observes them.
+        The remaining keyframes and landmarks are numbered without gaps. Poses of frames relative to
+        a culled keyframe are converted to poses relative to the parent of this keyframe. Landmarks
+        are ordered by the first remaining keyframe that observes them.
 
         Args:
             copy: if False and if all keypoints are kept, the arrays of keypoints are views instead
-                of copies. These arrays are three quarters of a map.
+                of copies. These arrays make up three quarters of the size of a map.
         """
         return self.select(self.map.living_keyframes(), copy=copy)
 
@@ -98,7 +98,7 @@ class StoredMap:
 
         Args:
             keyframes: ``(K,)`` ids of keyframes that were not culled, in ascending order. The poses
-                of frames are kept only if all such keyframes are selected.
+                of frames are kept only if all keyframes that were not culled are selected.
             copy: if False and if all keypoints are kept, the arrays of keypoints are views instead
                 of copies.
         """
@@ -188,15 +188,15 @@ def selected(map_: Map, keyframes: NDArray[np.int64], *, copy: bool = True) -> M
 def observations(
     rows: NDArray[np.int64], first: NDArray[np.int64], u_right: NDArray[np.float32]
 ) -> dict[str, NDArray]:
-    """Create the arrays of ``Arrays`` that represent observations.
+    """Create the arrays of a map (``Arrays``) that represent observations.
 
     Args:
         rows: ``(O,)`` indices of the keypoints that observe the landmarks, sorted by landmark. Each
             keypoint occurs at most once.
         first: ``(L + 1,)`` offset of each landmark in ``rows``. No keypoint observes a culled
             landmark.
-        u_right: ``(R,)`` columns of the stereo matches of all keypoints in the right image. NaN
-            without a stereo match.
+        u_right: ``(R,)`` column of the stereo match of each keypoint, in the right image. NaN for a
+            keypoint without a stereo match.
     """
     count = np.diff(first)
     landmark, next_row = (np.full(len(u_right), NONE, np.int32) for _ in range(2))
@@ -220,7 +220,7 @@ def observations(
 
 
 def appended(one: StoredMap, other: StoredMap) -> StoredMap:
-    """Append a map to another map, as a sub-map at an unknown place.
+    """Append a map to another map, as a sub-map at an unknown pose.
 
     Neither of the two maps may contain culled keyframes or landmarks.
     """
@@ -267,7 +267,7 @@ def appended(one: StoredMap, other: StoredMap) -> StoredMap:
 def _spanning_tree(
     map_: Map, keyframes: NDArray[np.int64], new_id: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Return the columns ``parent`` and ``restart`` of the selected keyframes."""
+    """Return the arrays ``parent`` and ``restart`` for a map of the selected keyframes."""
     n, parents = len(keyframes), map_.parents.tolist()
     parent = np.full(n, NONE, np.int64)
     for k, keyframe in enumerate(keyframes.tolist()):
@@ -293,9 +293,9 @@ def _spanning_tree(
 
 
 def _renumbered(frames: FrameTable, map_: Map, new_id: NDArray[np.int64]) -> FrameTable:
-    """Make the poses of frames relative to keyframes that were not culled.
+    """Convert the poses of frames so that they are relative to keyframes that were not culled.
 
-    The new ids of these keyframes are used.
+    The result refers to these keyframes by their new ids.
     """
     reference = frames.reference.copy()
     T_c_reference, unit = frames.T_c_reference.copy(), frames.unit_scale.copy()
@@ -339,8 +339,8 @@ def near_frames(
 ) -> NDArray[np.int64]:
     """Return the ids of the keyframes near some frames of a drive, without culled keyframes.
 
-    The frames ``first`` to ``last`` contain some keyframes. A keyframe is included if it is at most
-    ``within`` metres from one of them. The ids are in ascending order.
+    A keyframe is included if it is at most ``within`` metres from any keyframe that was made from
+    the frames ``first`` to ``last``. The ids are in ascending order.
     """
     from scipy.spatial import cKDTree
 

@@ -72,7 +72,7 @@ Drawing = tuple[str, str, Figure]  # name, caption and figure
 
 
 def new_figure(title: str, x_label: str, y_label: str, height: float) -> tuple[Figure, Axes]:
-    """Create a figure with one plot. The title is at the left, and ``height`` is in inches."""
+    """Create a figure with one plot. The title is at the upper left. ``height`` is in inches."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()

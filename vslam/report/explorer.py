@@ -1,6 +1,6 @@
 """The interactive explorer in the HTML report of a run.
 
-It shows the pose, state and error of every frame, and images of some keyframes.
+The explorer shows the pose, state and error of every frame, and images of some keyframes.
 
 A frame adds 47 bytes to the page. An image with keypoints adds about 10,000 bytes. ``explorer.js``
 uses no plotting library, because a library such as Plotly (4.7 MB) would be larger than the rest of
@@ -31,11 +31,12 @@ def explorer(
 ) -> list[Section]:
     """Return the section of the report with the interactive explorer.
 
-    The result is empty if fewer than two frames were tracked.
+    The section is empty if fewer than two frames were tracked.
 
     Args:
-        outcome: the run.
-        evaluation: errors of ``outcome.trajectory``. None if they cannot be computed.
+        outcome: the outcome of the run.
+        evaluation: errors of ``outcome.trajectory`` relative to the ground truth. None if they
+            cannot be computed.
         moments: images of keyframes, from a `vslam.run.moments.MomentRecorder`.
     """
     data = explorer_data(outcome, evaluation, moments)
@@ -58,8 +59,9 @@ def explorer_data(
     along x) and errors in metres. Unknown numbers are NaN.
 
     Args:
-        outcome: the run.
-        evaluation: errors of ``outcome.trajectory``. None if they cannot be computed.
+        outcome: the outcome of the run.
+        evaluation: errors of ``outcome.trajectory`` relative to the ground truth. None if they
+            cannot be computed.
         moments: images of keyframes, from a `vslam.run.moments.MomentRecorder`.
     """
     n = len(outcome.trajectory)
@@ -106,7 +108,7 @@ def _encoded(moment: Moment) -> dict[str, Any]:
 def _packed(values: NDArray[Any], kind: str) -> str:
     """Encode an array in base64.
 
-    The text is a third as long as the same numbers in JSON. In contrast to JSON, the array may
-    contain NaN.
+    The encoded text is a third as long as the same numbers written as JSON. In contrast to JSON,
+    the encoded array may contain NaN.
     """
     return b64encode(values.astype(kind).tobytes()).decode()

@@ -1,4 +1,4 @@
-"""The figures of a report: maps, errors, tracking and times."""
+"""Draws the figures of a report: maps, errors, tracking and times."""
 
 from __future__ import annotations
 
@@ -49,9 +49,11 @@ def draw_figures(
     """Draw all figures of the report for which the run has data.
 
     Args:
-        outcome: the run.
-        evaluation: errors of ``outcome.trajectory``. None if they cannot be computed.
-        verdict: evaluation of ``outcome.loops``. None if a frame has no ground truth.
+        outcome: the outcome of the run.
+        evaluation: errors of ``outcome.trajectory`` relative to the ground truth. None if they
+            cannot be computed.
+        verdict: comparison of ``outcome.loops`` with the ground truth. None if a frame has no
+            ground truth.
     """
     return draw(_drawings(outcome, evaluation, verdict))
 
@@ -195,9 +197,10 @@ def _tracked_points(outcome: RunOutcome) -> Figure:
 
 
 def _usable_features(outcome: RunOutcome) -> tuple[str, list[int]]:
-    """Return the features that can become landmarks: their name, and their number in each frame.
+    """Return a name for the features that can become landmarks, and their number in each frame.
 
-    Both depend on the sensor.
+    For a monocular camera, these are all features. For other cameras, they are the features with a
+    known depth.
     """
     sensor = outcome.sequence.camera.sensor
     if sensor == "mono":

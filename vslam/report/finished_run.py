@@ -1,4 +1,4 @@
-"""Reading of a finished run from its folder: the report, the map and the images."""
+"""Reads a finished run from its folder: the report, the map and the images."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _WITHOUT_IMAGES = "export g2o, euroc or ply --no-colours, which need no images"
 class FinishedRun:
     """The content of the folder of a finished run.
 
-    ``map`` contains no culled keyframes. ``loops`` are the closed loops. They have the relative
+    ``map`` contains no culled keyframes. ``loops`` contains the closed loops, with the relative
     poses that were measured when the loops were verified.
     """
 
@@ -62,14 +62,14 @@ def open_images(
     """Open the images of a run again, with the options in its ``run.json``.
 
     Args:
-        data: the new location of the data if it has been moved. With None, the location in
-            ``run.json`` is used.
+        data: the new location of the data if the data have been moved. If it is None, the location
+            in ``run.json`` is used.
         on_render: function that is called while a synthetic sequence is rendered. Its arguments are
             the number of frames rendered so far and the total number.
 
     Raises:
-        InputError: the images are missing, belong to another camera or came from a live camera, or
-            the map was made from several drives.
+        InputError: the images are missing, they belong to a different camera, they came from a live
+            camera, or the map was made from several drives.
     """
     if set(run.map.sessions) != {run.map.scalars.session}:  # the report covers only the last drive
         raise InputError(
@@ -89,7 +89,7 @@ def open_images(
 
 
 def keyframe_frames(run: FinishedRun, source: Source) -> Iterator[TimedFrame]:
-    """Return the frames that became the keyframes of a run, in the order of the map.
+    """Return the frames that became keyframes of a run, in the order of the keyframes in the map.
 
     Raises:
         InputError: the timestamps of the images differ from the timestamps of the run.

@@ -42,8 +42,8 @@ def create_run_folder(
 ) -> Path:
     """Create the folder ``out/<YYYYmmdd-HHMMSS>-<dataset>-<sequence>-<perturb>-<detector>``.
 
-    If thresholds differ from the defaults, the first changed threshold is appended to the name,
-    followed by the number of other changed thresholds. If the name is in use, a number is appended.
+    If some thresholds differ from their defaults, the first of these thresholds is appended to the
+    name, followed by the number of the others. If the name is in use, a number is appended.
     ``out/latest`` becomes a symbolic link to the folder if the file system supports such links.
 
     Raises:
@@ -73,7 +73,7 @@ def create_run_folder(
 
 
 def _safe(part: str) -> str:
-    """Turn a text into a valid part of a file name."""
+    """Replace characters of a text so that it can be part of a file name."""
     return re.sub(r"[^A-Za-z0-9.+=-]+", "_", part)[:_LONGEST_PART]
 
 
@@ -103,7 +103,8 @@ def write_results(
 
     Args:
         folder: an existing folder. Files of an earlier report are replaced.
-        outcome: the run. It may have lost all frames, or have no frames.
+        outcome: the outcome of the run. The run may have lost all frames, or may have processed no
+            frames.
         moments: images of keyframes for the HTML page.
         pictures: pictures of closed loops. Some of them are written as
             ``figures/loop-<frame>-<frame>.jpg``.
@@ -130,7 +131,10 @@ def write_results(
 
 
 class Results:
-    """Writes the results of a run, even if some of them cannot be written."""
+    """Writes the results of a run.
+
+    If one result cannot be written, the other results are still written.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -138,7 +142,10 @@ class Results:
 
     @contextlib.contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Run a part of the work. An exception of the block is recorded instead of raised."""
+        """Run the block as one part of the work.
+
+        If the block raises an exception, the exception is recorded and not passed on.
+        """
         try:
             yield
         except Exception as error:
@@ -260,8 +267,9 @@ def _config_text(outcome: RunOutcome) -> str:
 def write_trajectories(written: Results, outcome: RunOutcome) -> None:
     """Write the final trajectory and the ground truth of its frames.
 
-    Both are written in the formats of KITTI and TUM. If some frames have no ground truth, the
-    ground truth is written only in TUM's format, because only this format has timestamps.
+    Both trajectories are written in the formats of KITTI and TUM. If some frames have no ground
+    truth, the ground truth is written only in TUM's format, because only this format has
+    timestamps.
     """
     with written.file("trajectory_kitti.txt") as file:
         write_kitti(file, outcome.trajectory.T_wc)

@@ -1,4 +1,4 @@
-"""The tracking results of all frames, as the files ``frames.csv`` and ``covariance.csv``."""
+"""Writes the tracking results of all frames to ``frames.csv`` and ``covariance.csv``."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ def write_covariances(path: Path, tracks: list[TrackResult]) -> None:
 
     The columns are the timestamp (s) and the upper triangles of two covariances, row by row.
 
-    Both are covariances of ``[x, y, z, rx, ry, rz]`` in metres and radians, in the frame of the
-    camera (``vslam.odometry``). The first covariance describes the pose relative to the landmarks
-    around the camera (``local``). The second covariance describes the pose relative to the start of
-    the drive (``drive``).
+    The two matrices are covariances of ``[x, y, z, rx, ry, rz]`` in metres and radians, in the
+    frame of the camera (``vslam.odometry``). The first covariance describes the pose relative to
+    the landmarks around the camera (``local``). The second covariance describes the pose relative
+    to the start of the drive (``drive``).
     """
     upper = np.triu_indices(6)
     pairs = [f"{_AXES[row]}_{_AXES[column]}" for row, column in zip(*upper, strict=True)]

@@ -1,6 +1,6 @@
-"""Tables and pictures of loops in a report.
+"""Creates the tables and pictures of loops in a report.
 
-Their size is limited, even if there are hundreds of rejected candidates.
+The size of the tables is limited, even if there are hundreds of rejected candidates.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
 def loop_sections(report: ReportJson) -> list[Section]:
-    """Create the sections about closed loops, revisits, and rejected candidates with their reasons.
+    """Create the sections about closed loops, revisits and rejected loop candidates.
 
-    Only those rejected candidates that have the most inliers are listed.
+    Only the rejected candidates with the most inliers are listed. The reason for each rejection is
+    given.
     """
     return [
         Section("Loops closed", [_closed(report)]),
@@ -123,7 +124,9 @@ def _evidence(loop: LoopEntry) -> Row:
 
 
 def _shared_reason(loops: list[LoopEntry]) -> str:
-    """Combine reasons that differ only in their numbers into one text.
+    """Combine the reasons for rejecting several loops into one text.
+
+    The reasons differ only in their numbers.
 
     The numbers are replaced by their ranges.
     """
@@ -143,7 +146,9 @@ def _right_share(loops: list[LoopEntry]) -> str:
 
 
 def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[Figure]:
-    """Draw a few closed loops. Wrong loops come first, then loops verified by learned descriptors.
+    """Draw pictures of a few closed loops.
+
+    Wrong loops come first, followed by loops that were verified using learned descriptors.
 
     Args:
         report: the content of ``report.json``, which lists the loops of the run.
@@ -168,7 +173,7 @@ def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[Fi
 
 
 def seen_note(report: ReportJson, seen: Collection[Figure]) -> str:
-    """Return a note that explains the pictures and says how many of the closed loops are shown."""
+    """Return a note that explains the pictures, and says how many of the closed loops they show."""
     note = "Lines connect matched points; at most 60 matches are drawn."
     if len(seen) < report.loops_closed:
         note += f" {len(seen)} of the {report.loops_closed} closed loops are shown."

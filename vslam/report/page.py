@@ -16,11 +16,11 @@ Row = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells. If a table has no rows, the table and its note are not shown.
+    """A table of a page. If a table has no rows, the table and its note are not shown.
 
     Attributes:
         head: a heading for each column.
-        rows: rows with a cell for each column.
+        the content. Each row has a cell for each column.
         texts: the headings of the columns that contain text. Text is aligned to the left.
         note: explanation below the table.
     """
@@ -50,7 +50,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class Tiles:
-    """The most important numbers, which readers should see first."""
+    """The most important numbers of a page, which readers should see first."""
 
     tiles: Sequence[Tile]
 

@@ -1,4 +1,4 @@
-"""Rendering of pages as Markdown, as HTML and in a terminal, and writing of files."""
+"""Renders pages as Markdown, as HTML and in a terminal, and writes files."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def write_files(
     Args:
         folder: the folder to write to.
         files: text or bytes by file name, in the order in which they are written.
-        fix: advice to the user in the error message.
+        fix: advice to the user, which is added to the error message.
 
     Raises:
         ResultsError: a file cannot be written.

@@ -1,4 +1,4 @@
-"""The page about one run, which shows the numbers of ``report.json``."""
+"""Creates the page about one run, which shows the numbers of ``report.json``."""
 
 from __future__ import annotations
 
@@ -109,15 +109,15 @@ def _before_map(report: ReportJson) -> str:
 
 
 def _together(report: ReportJson) -> str:
-    """Return a remark that the speed and memory are those of several detectors together.
+    """Return a remark that speed and memory were measured for several detectors together.
 
-    The remark is empty for a single detector.
+    The remark is empty if the run used a single detector.
     """
     return f", {len(report.detectors)} detectors together" if report.detectors else ""
 
 
 def advice(report: ReportJson) -> str:
-    """Return advice to the user if many frames were lost. It is empty if few frames were lost."""
+    """Return advice to the user if many frames were lost, and otherwise no advice."""
     if report.lost_frames <= _MANY_LOST * report.frames:
         return ""
     return "Many frames were lost; vslam doctor checks images, calibration and timestamps."
@@ -177,7 +177,8 @@ def _loops(report: ReportJson) -> Tile:
 def _revisits(report: ReportJson) -> str:
     """Return the number of revisits that were found by loops, for the summary.
 
-    If the drive has no revisits, the text gives the number of correct loops on shorter stretches.
+    Only stretches of at least ``MIN_LENGTH_M`` count as revisits. If the drive has no such stretch,
+    the text gives the number of correct loops on shorter stretches.
     """
     if report.revisit_stretches:
         return f"{report.loops_found} of {counted(report.revisit_stretches, 'revisit')} found"
@@ -189,8 +190,8 @@ def _revisits(report: ReportJson) -> str:
 def detector_section(report: ReportJson) -> Section:
     """Create a section that compares the detectors of a run with ``--compare``.
 
-    The table has a row for each detector. The detector of ``--detector`` comes first. The result is
-    empty without a comparison.
+    The table has a row for each detector. The detector of ``--detector`` comes first. The section
+    is empty for a run without ``--compare``.
 
     Columns without any value are left out. The number of closed loops is shown only if there is no
     ground truth that shows which revisits were found.
@@ -223,7 +224,7 @@ def detector_section(report: ReportJson) -> Section:
 def _left_out(report: ReportJson) -> str:
     """Return the reason why a comparison of detectors that was requested is missing.
 
-    The reason is empty if nothing is missing.
+    The text is empty if no comparison is missing.
     """
     if report.detectors or not report.compare:
         return ""
@@ -306,7 +307,10 @@ def run_page(
 
 
 def _gps(report: ReportJson) -> Section:
-    """Create the section about the georeferenced trajectory. It is empty without GPS."""
+    """Create the section about the georeferenced trajectory.
+
+    The section is empty for a run without GPS.
+    """
     if (found := report.gps_track) is None:
         return Section("GPS", ())
     latitude, longitude, altitude = found.datum

@@ -67,18 +67,18 @@ class StageTime(Record):
 
 
 class LoopEntry(Record):
-    """A loop candidate that was accepted or rejected. It refers to frames of this run.
+    """A loop candidate that was accepted or rejected. Frames are numbered as in this run.
 
-    - ``query_frame``: index of the frame for which loops were searched. None for a frame that did
-      not become a keyframe.
-    - ``match_frame``: index of the earlier frame at the same place. None for a keyframe of an
-      earlier drive.
+    - ``query_frame``: index of the frame for which the detector searched for loops. None if this
+      frame did not become a keyframe.
+    - ``match_frame``: index of the earlier frame that shows the same place. None if it belongs to
+      an earlier drive.
     - ``right``: whether the relative pose agrees with the ground truth. None if this is unknown.
     - ``moved_m``: the largest distance by which the correction moved a keyframe, in metres. In a
       monocular map, it is in map units. None for rejected candidates.
     - ``correction_s``: the duration of the correction in seconds. None for rejected candidates.
     - ``matched_by``: the descriptors from which the relative pose was computed.
-    - ``proposed_by``: the detectors that found the candidate, joined by ``+``.
+    - ``proposed_by``: the names of the detectors that found the candidate, joined by ``+``.
     """
 
     query_frame: int | None
@@ -96,10 +96,11 @@ class LoopEntry(Record):
 
 
 class RevisitEntry(Record):
-    """A range of frames in which the camera revisits places, according to the ground truth.
+    """A range of frames in which the camera travels along an earlier part of its path again.
 
-    ``loop_frame`` is the first of these frames in which a correct loop was closed. It is None if
-    the revisit was missed.
+    The range is computed from the ground truth. ``loop_frame`` is the first frame of the range in
+    which a correct loop was closed. If no correct loop was closed in the range, ``loop_frame`` is
+    None.
     """
 
     first_frame: int
@@ -111,11 +112,11 @@ class RevisitEntry(Record):
 
 
 class Measures(Record):
-    """The results of a run, or of a detector that is compared with the run.
+    """The results of a run, or of another detector on the frames of the run (``--compare``).
 
-    Errors are None without ground truth. KITTI's drift is also None if the path is shorter than 100
-    m. ``causal_ate_rmse_m`` is the ATE of the poses at the time of tracking
-    (``trajectory_causal.tum``), after their own alignment.
+    All errors are None if there is no ground truth. KITTI's drift is also None if the path is
+    shorter than 100 m. ``causal_ate_rmse_m`` is the ATE of the poses at the time of tracking
+    (``trajectory_causal.tum``). These poses are aligned with the ground truth separately.
 
     ``loops_closed`` is the number of accepted candidates. ``loops_wrong`` is the number of wrong
     loops among them. ``loops_found`` is the number of revisited stretches with a correct loop, and
@@ -155,11 +156,12 @@ class MapFigures(Record):
     """The results of localisation in the map that a run continued.
 
     - ``in_map_percent``: percentage of frames whose final pose is in the map.
-    - ``weak_percent``: percentage of frames whose pose is in the map but has few inliers (WEAK).
-    - ``first_fix_s``: seconds from the first frame to the first localised frame. None if no frame
-      was localised.
-    - ``sought``: number of frames at which the whole map was searched.
-    - ``found``: number of these searches that succeeded.
+    - ``weak_percent``: percentage of frames that were tracked in the map, but with few inliers
+      (tracking state WEAK).
+    - ``first_fix_s``: seconds from the first frame to the first frame that was localised in the
+      map. None if no frame was localised.
+    - ``sought``: number of frames for which vslam searched the whole map for the pose.
+    - ``found``: number of these searches that found a pose.
     - ``error_m``: RMSE of the positions in the map, in metres. The trajectory of the run is not
       aligned with the ground truth. Instead, the positions are transformed by the alignment of the
       map. Therefore, a constant offset of all positions counts as an error. None if the map was not
@@ -175,13 +177,13 @@ class MapFigures(Record):
 
 
 class GpsFigures(Record):
-    """Numbers about the georeferenced trajectory. They are also written to ``gps.json``.
+    """Results of georeferencing a trajectory with GPS. They are also written to ``gps.json``.
 
     - ``datum``: origin of the local east-north-up frame, as latitude and longitude in degrees and
       altitude in metres. The origin is the first GPS fix.
     - ``antenna``: position of the antenna in the frame of the left camera (x right, y down, z
       forward), in metres.
-    - ``fixes``: number of fixes at tracked frames.
+    - ``fixes``: number of GPS fixes that were measured between tracked frames.
     - ``refused``: number of these fixes that failed the chi-square test.
     - ``residual_m``: root mean square distance of the other fixes from the trajectory, in metres.
     - ``metres_per_unit``: mean length of a map unit, in metres.
@@ -201,8 +203,9 @@ class GpsFigures(Record):
 
 
 class Machine(Record):
-    """The machine on which a run was made. ``cores`` is the number of cores that the process may
-    use.
+    """The machine on which the run was performed.
+
+    ``cores`` is the number of cores that the process may use.
     """
 
     cpu: str
@@ -217,9 +220,9 @@ class ReportJson(Measures, Document):
     - ``frames``: number of processed frames. ``skipped_frames`` is the number of frames with an
       image that could not be read. ``dropped_frames`` is the number of frames that were replaced by
       a newer frame in a real-time run.
-    - ``lost_before_map``: number of lost frames before the first tracked frame, in a run that began
-      a new map. ``longest_loss_s`` is the longest time in seconds from a lost frame to the next
-      tracked frame, or to the end.
+    - ``lost_before_map``: number of lost frames before the first tracked frame. Only a run that
+      begins a new map counts these frames. ``longest_loss_s`` is the longest time in seconds from a
+      lost frame to the next tracked frame, or to the end.
     - ``warnings``: sentences about problems of the images or the rig that the run has detected.
     - ``evaluation_remark``: the reason why no errors were computed, or the number of frames that
       the errors cover.

@@ -1,4 +1,4 @@
-"""Computation of the numbers in ``report.json`` from the outcome of a run."""
+"""Computes the numbers in ``report.json`` from the outcome of a run."""
 
 from __future__ import annotations
 
@@ -53,11 +53,14 @@ def summarize(
     """Compute the content of ``report.json``.
 
     Args:
-        outcome: the run.
-        evaluation: errors of ``outcome.trajectory``. None if they cannot be computed.
-        verdict: evaluation of ``outcome.loops``. None if a frame has no ground truth.
+        outcome: the outcome of the run.
+        evaluation: errors of ``outcome.trajectory`` relative to the ground truth. None if they
+            cannot be computed.
+        verdict: comparison of ``outcome.loops`` with the ground truth. None if a frame has no
+            ground truth.
         evo_command: command that repeats the evaluation. None if evo cannot evaluate the run.
-        remark: the reason why there is no evaluation, or the number of frames that it covers.
+        remark: the reason why there is no evaluation, or the number of frames that the evaluation
+            covers.
     """
     frames = len(outcome.tracks)
     states = Counter(track.state for track in outcome.tracks)
@@ -177,7 +180,7 @@ def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
 
 
 def causal_ate(outcome: RunOutcome) -> float | None:
-    """Compute the ATE of the poses at the time of tracking. None if it cannot be computed."""
+    """Compute the ATE of the poses at the time of tracking, or None if that is impossible."""
     ground_truth = outcome.ground_truth
     if ground_truth is None or not outcome.tracks:
         return None
@@ -210,7 +213,7 @@ def _detectors(
 ) -> list[DetectorFigures]:
     """Compute the results of all detectors of a run with ``--compare``.
 
-    The detector of ``--detector`` comes first. The result is empty without a comparison.
+    The detector of ``--detector`` comes first. The result is empty for a run without ``--compare``.
     """
     if not outcome.compared:
         return []
@@ -243,7 +246,7 @@ def _figures_in_map(outcome: RunOutcome) -> MapFigures | None:
 
 
 def gps_figures(outcome: RunOutcome) -> GpsFigures | None:
-    """Compute the numbers about the georeferenced trajectory. None without GPS."""
+    """Compute the numbers about the georeferenced trajectory, or None for a run without GPS."""
     if (track := outcome.gps_track) is None:
         return None
     ate, ground_truth = None, outcome.ground_truth
@@ -298,7 +301,7 @@ def _loops(outcome: RunOutcome, verdict: LoopEvaluation | None) -> list[LoopEntr
 def _frame(frames: NDArray[np.int64], keyframe: int) -> int | None:
     """Return the index of the frame of this run that became a keyframe.
 
-    The result is None for -1 and for keyframes of earlier drives.
+    The result is None if the keyframe number is -1 or belongs to an earlier drive.
     """
     return int(frames[keyframe]) if keyframe >= 0 and frames[keyframe] >= 0 else None
 

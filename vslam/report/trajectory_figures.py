@@ -1,4 +1,4 @@
-"""Figures of the trajectory seen from above, and of the effect of loop closing on it."""
+"""Draws the trajectory seen from above, and the effect of loop closing on the trajectory."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Points = NDArray[np.float64]
 def top_view(
     outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
 ) -> Figure:
-    """Draw the estimate, the ground truth, weak and lost frames, closed loops and missed revisits.
+    """Draw the trajectory and the ground truth, weak and lost frames, loops and missed revisits.
 
     The trajectories of the detectors of ``--compare`` are dashed. Each of these trajectories is
     aligned separately.
@@ -102,10 +102,10 @@ def top_view(
 
 
 def loop_closing(outcome: RunOutcome, evaluation: Evaluation | None) -> Figure:
-    """Draw the keyframes before the first loop was closed and at the end of the run.
+    """Draw the positions of keyframes before the first loop closure and at the end of the run.
 
     Both sets of positions are transformed to the frame of the ground truth by the alignment of the
-    final trajectory. Therefore, every difference between the two sets is an effect of loop closing.
+    final trajectory. Therefore, all differences between the two sets are caused by loop closing.
     """
     figure, axes = _new_map("Map before and after loop closing", outcome, evaluation)
     before = _aligned(outcome, evaluation, _centres(outcome.corrections[0].T_cw_before))
@@ -185,7 +185,7 @@ def _at_frames(outcome: RunOutcome, path: Points, frames: NDArray[np.int64]) -> 
 
 
 def _aligned(outcome: RunOutcome, evaluation: Evaluation | None, points: Points) -> Points:
-    """Transform ``(N, 3)`` points from the world frame of the run to that of the ground truth."""
+    """Transform ``(N, 3)`` points from the world frame of the run to the ground-truth frame."""
     if evaluation is None:
         return points
     S = truth_alignment_of(outcome, evaluation).S_truth_world

@@ -1,1 +1,1 @@
-"""A run over a sequence, which prepares, tracks and records the frames and collects the results."""
+"""Runs SLAM over a sequence: prepares, tracks and records the frames, and collects the results."""

@@ -1,4 +1,4 @@
-"""Saving of the state of a run at intervals, so that a killed run loses at most a minute of work.
+"""Saves the state of a run at intervals, so that a killed run loses at most a minute of work.
 
 The pose of each tracked frame is appended to ``trajectory_online.tum`` as a line. At intervals, the
 map is copied between two frames, if possible while no keyframe is being mapped. A thread then
@@ -41,7 +41,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Unfinished:
-    """The saved state of an interrupted run: a map file, and the progress up to the same frame."""
+    """The saved state of an interrupted run.
+
+    It consists of a map file, and of the progress of the run up to the same frame.
+    """
 
     map: Path
     progress: Progress
@@ -54,7 +57,7 @@ def lock_run(folder: Path) -> Iterator[None]:
     If the lock cannot be created, for example on a full disk, the run continues without a lock.
 
     Raises:
-        InputError: another process is running in the folder.
+        InputError: another process is performing a run in the folder.
     """
     with ExitStack() as lock:
         with suppress(OSError):
@@ -63,7 +66,7 @@ def lock_run(folder: Path) -> Iterator[None]:
 
 
 def find_unfinished(folder: Path) -> Unfinished:
-    """Find the saved state from which a run can be resumed.
+    """Read the saved state of an interrupted run, from which the run can be resumed.
 
     When the run is resumed, the frames after the saved state are tracked again. The poses of these
     frames are removed from ``trajectory_online.tum``.
@@ -93,10 +96,13 @@ class Autosave:
     """Interface for saving a run at intervals. This base class saves nothing."""
 
     def frame(self, result: TrackResult) -> None:
-        """Append the pose of a tracked frame. This method is called for every frame in order."""
+        """Append the pose of a tracked frame to the trajectory file.
+
+        This method is called for every frame in order.
+        """
 
     def offer(self, slam: Slam, progress: Callable[[], Progress]) -> None:
-        """Save the run if saving is due. This method is called after ``frame``."""
+        """Save the run if the next save is due. This method is called after ``frame``."""
 
     def close(self, slam: Slam, progress: Callable[[], Progress], *, resumable: bool) -> None:
         """End the saving of a run.
@@ -114,8 +120,8 @@ NO_AUTOSAVE = Autosave()
 class FolderAutosave(Autosave):
     """Saves the state of a run into the folder of the run.
 
-    If writing fails, for example on a full disk, one warning is logged and the run continues.
-    Saving is tried again the next time.
+    If writing fails, for example on a full disk, one warning is logged and the run continues. The
+    next save is attempted as usual.
     """
 
     def __init__(self, folder: Path, seconds: float, drive: str) -> None:
@@ -123,8 +129,8 @@ class FolderAutosave(Autosave):
 
         Args:
             folder: the folder of the run.
-            seconds: interval between two saved maps. A killed run loses at most the work of this
-                time. With 0, no map is saved.
+            seconds: seconds between two saved maps. If the run is killed, it loses at most the work
+                of this interval. If the value is 0, no map is saved.
             drive: name of the drive in the map file.
         """
         self._folder, self._seconds, self._drive = folder, seconds, drive

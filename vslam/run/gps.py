@@ -1,4 +1,4 @@
-"""Georeferencing of a finished run with GPS fixes."""
+"""Georeferences a finished run using GPS fixes."""
 
 from __future__ import annotations
 
@@ -22,19 +22,20 @@ _LONGEST_S = 0.5  # no position is interpolated between two frames with a longer
 
 @dataclass(frozen=True)
 class GpsTrack:
-    """A drive in the local east-north-up frame (ENU) of a datum.
+    """A georeferenced drive, in a local east-north-up frame (ENU).
 
     Attributes:
         trajectory: poses of the frames (camera to ENU), in metres.
         geodetic: ``(N, 3)`` latitude and longitude (degrees) and altitude (m) of the frames.
         datum: ``(3,)`` latitude, longitude and altitude of the origin of the ENU frame. The origin
             is the first GPS fix.
-        visual: ``(N, 3)`` positions of the trajectory without GPS. The whole trajectory is aligned
-            with the fixes by one transformation.
-        fixes: ``(M, 3)`` positions of the antenna in ENU. Only fixes that were measured during the
+        visual: ``(N, 3)`` positions of the frames in ENU, estimated without GPS. A single
+            transformation aligns all of these positions with the fixes.
+        fixes: ``(M, 3)`` positions of the antenna in ENU. Only fixes that were measured between two
             tracked frames are included.
         antenna: ``(3,)`` position of the antenna in the frame of the camera, in metres.
-        anchored: the poses of the keyframes in ENU, and the fixes from which they were computed.
+        anchored: the poses of the keyframes in ENU, and the fixes from which these poses were
+            computed.
     """
 
     trajectory: Trajectory
@@ -53,7 +54,8 @@ def locate(stored: StoredMap, fixes: Fixes, config: PoseGraphConfig) -> GpsTrack
         stored: the map, which contains the poses of the frames of its last drive.
 
     Raises:
-        InputError: fewer than three fixes belong to tracked frames, or the drive is too short.
+        InputError: fewer than three fixes were measured between tracked frames, or the drive is too
+            short.
     """
     stored = stored.compact(copy=False)
     map_, table = stored.map, stored.frames
@@ -90,7 +92,7 @@ def _in_map(
     Args:
         T_kw: ``(K, 4, 4)`` poses of the keyframes.
         scale: ``(K,)`` factors. The translations from each keyframe to its frames are multiplied by
-            the factor of the keyframe. None leaves the translations unchanged.
+            the factor of the keyframe. If it is None, the translations do not change.
     """
     T_ck = table.T_c_reference.copy()
     if scale is not None:
@@ -105,11 +107,11 @@ def _in_map(
 def _positions(
     table: FrameTable, T_kw: NDArray[np.float64], fixes: Fixes
 ) -> tuple[Positions, NDArray[np.float64]]:
-    """Return the fixes that lie in time between two tracked frames, and the datum.
+    """Return the GPS fixes that were measured between two tracked frames, and the datum.
 
     For each fix, the positions of the camera and the antenna are interpolated at the time of the
-    fix. The positions are given in the frame of a keyframe. It is the reference keyframe of the
-    frame before the fix.
+    fix. Both positions are given in the frame of a keyframe. This keyframe is the reference
+    keyframe of the last tracked frame before the fix.
     """
     at = np.searchsorted(table.timestamp, fixes.times, "right") - 1
     at[fixes.times == table.timestamp[-1]] -= 1

@@ -1,4 +1,4 @@
-"""Pictures of closed loops. A picture shows both images of a loop, with the verified matches."""
+"""Draws pictures of closed loops. A picture shows the two images of a loop and their matches."""
 
 from __future__ import annotations
 
@@ -45,10 +45,11 @@ def loop_matches(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the positions of landmarks in the images of both keyframes of a closed loop.
 
-    After a loop is closed, the inlier features of the query observe the landmarks of the matched
-    place. If the matched keyframe itself does not observe such a landmark, the landmark is
-    projected into its image. Features that lost their landmark in the bundle adjustment after the
-    loop are left out. Landmarks outside the view of the matched keyframe are left out, too.
+    After a loop is closed, the inlier features of the query keyframe observe landmarks around the
+    matched keyframe. If the matched keyframe itself does not observe such a landmark, the landmark
+    is projected into its image. The result leaves out features that lost their landmark in the
+    bundle adjustment after the loop. It also leaves out landmarks that lie outside the image of the
+    matched keyframe.
 
     Args:
         map_: the map after the correction of the loop.
@@ -56,8 +57,8 @@ def loop_matches(
         camera: the camera of both keyframes.
 
     Returns:
-        ``(N, 2)`` float64 pixels in the image of the query, and ``(N, 2)`` float64 pixels in the
-        image of the match.
+        Two ``(N, 2)`` float64 arrays with the same N landmarks, in pixels: the positions in the
+        image of the query keyframe, and the positions in the image of the matched keyframe.
     """
     assert edge.features is not None
     a, of_match = map_.arrays, map_.rows(edge.match)
@@ -96,8 +97,8 @@ def spread(xy: NDArray[np.float64], most: int) -> NDArray[np.int64]:
 def draw_picture(picture: LoopPicture) -> bytes:
     """Draw a closed loop as a JPEG.
 
-    The earlier image is on the left, and the image that closed the loop is on the right. Each match
-    is a line.
+    The earlier image is on the left, and the image that closed the loop is on the right. A line
+    connects the two positions of each landmark.
     """
     left, scale = _panel(picture.match_jpeg)
     right, _ = _panel(picture.query_jpeg)
@@ -132,7 +133,7 @@ def _panel(jpeg: bytes) -> tuple[NDArray[np.uint8], float]:
 
 
 def _label(canvas: NDArray, text: str, left: int) -> None:
-    """Write a text into the upper left corner of a panel."""
+    """Write a text into the upper left corner of one of the two images of a picture."""
     font, size, margin = cv2.FONT_HERSHEY_SIMPLEX, 0.5, 7
     (width, height), _ = cv2.getTextSize(text, font, size, 1)
     right, bottom = left + width + 2 * margin, height + 2 * margin

@@ -1,4 +1,4 @@
-"""Small images of keyframes for the report, which show a sample of the run and the closed loops."""
+"""Keeps small images of some keyframes for the report, and pictures of the closed loops."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Moment:
 class MomentRecorder(Recorder):
     """Keeps the images of at most 96 keyframes, which are spread evenly over the run.
 
-    Whenever there are more images, every second image is dropped.
+    Whenever there are more than 96 images, every second image is dropped.
     """
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class MomentRecorder(Recorder):
         self._n_keyframes = 0
 
     def keyframe(self, result: TrackResult, image: Image, xy: NDArray, tracked: NDArray) -> None:
-        """Keep a small image of a keyframe (`vslam.run.recorder.Recorder.keyframe`)."""
+        """Keep a small image of a keyframe. Overrides `vslam.run.recorder.Recorder.keyframe`."""
         if self._n_keyframes % self._every == 0:
             if len(self.moments) == _MOST:
                 self.moments = self.moments[::2]
@@ -102,11 +102,11 @@ class LoopPictureRecorder(Recorder):
         self._camera: Camera | None = None
 
     def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None:
-        """Store the camera of the run (`vslam.run.recorder.Recorder.begin`)."""
+        """Store the camera of the run. Overrides `vslam.run.recorder.Recorder.begin`."""
         self._camera = camera
 
     def keyframe(self, result: TrackResult, image: Image, xy: NDArray, tracked: NDArray) -> None:
-        """Keep a small image of a keyframe (`vslam.run.recorder.Recorder.keyframe`)."""
+        """Keep a small image of a keyframe. Overrides `vslam.run.recorder.Recorder.keyframe`."""
         if len(self._jpegs) == _MOST_LOOP_IMAGES:
             self._jpegs = dict(list(self._jpegs.items())[::2])
         s = _LOOP_SCALE
@@ -115,7 +115,7 @@ class LoopPictureRecorder(Recorder):
         self._jpegs[result.index] = jpeg.tobytes()
 
     def loops(self, edges: Collection[LoopEdge], map_: Map) -> None:
-        """Add pictures of newly closed loops (`vslam.run.recorder.Recorder.loops`)."""
+        """Add pictures of newly closed loops. Overrides `vslam.run.recorder.Recorder.loops`."""
         assert self._camera is not None
         for edge in edges:
             if not edge.accepted or map_.sessions[edge.match] != map_.scalars.session:

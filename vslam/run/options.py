@@ -22,8 +22,8 @@ class RunOptions(SourceOptions):
     In the file ``run.json``, all paths are absolute.
 
     Attributes:
-        plugins: the package of each plug-in that the other options use. It is set only in
-            ``run.json``.
+        plugins: name of the package of each plug-in that the run uses. This attribute is set only
+            when the options are read from ``run.json``.
     """
 
     perturb: str = "none"

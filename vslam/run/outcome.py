@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 
 def alignment_of(sensor: str) -> str:
-    """Return how trajectories of a sensor are aligned with the ground truth.
+    """Return the kind of transformation that aligns trajectories with the ground truth.
 
-    It is ``sim3`` for a monocular trajectory, whose scale is arbitrary, and ``se3`` for all other
-    trajectories.
+    The kind depends on the sensor. It is ``sim3`` for a monocular camera, because the scale of its
+    trajectory is arbitrary. It is ``se3`` for all other sensors.
     """
     return "sim3" if sensor == "mono" else "se3"
 
@@ -39,14 +39,14 @@ class RunOutcome:
         trajectory: final pose of every processed frame, including lost frames. If there is no
             complete map, these are the poses at the time of tracking.
         keyframes: final poses of the keyframes.
-        tracks: result of tracking each frame.
+        tracks: result of tracking each processed frame.
         warnings: problems of the images and of the stereo rig that the run detected, as sentences.
         skipped: a message for each frame whose images could not be read.
         latency_ms: milliseconds from the arrival of each tracked frame until its pose is known, in
             a real-time run.
         wall_s, cpu_s: wall and CPU seconds from reading the first frame until the last frame is
-            tracked and mapped. If several detectors are compared, this is the time for all of them
-            together.
+            tracked and mapped. If several detectors are compared, these are the times for all
+            detectors together.
         step_s: wall seconds of the run with this detector alone. This time includes tracking,
             waiting for mapping, and completing the map at the end. It excludes reading images and
             extracting features.
@@ -54,8 +54,8 @@ class RunOutcome:
         peak_memory_mb: peak memory of the process, in MB.
         n_landmarks, n_keyframes: size of the final map.
         map: the final map. None for a trajectory from another system, or if mapping failed.
-        truth_alignment: transformation from the frame of the continued map to the frame of its
-            ground truth. None if it is unknown.
+        truth_alignment: transformation from the world frame of the map that the run continued to
+            the world frame of the ground truth of this map. None if it is unknown.
         in_map: ``(N,)`` bool, True for frames that were tracked in the map that the run continued,
             or in sub-maps that are joined to this map by loops. None for a run that started a new
             map.
@@ -63,15 +63,17 @@ class RunOutcome:
             only localised in the map.
         loops: accepted and rejected loop candidates, in the order of the decisions.
         corrections: corrections of the map by the accepted loops, in order.
-        keyframe_frames: ``(K,)`` int64, the frame of this run that became each keyframe, including
-            culled keyframes. It is -1 for keyframes of earlier drives.
-        n_submaps: number of sub-maps that were started, including the first map. It is 0 if the run
-            has no keyframe.
+        keyframe_frames: ``(K,)`` int64, for each keyframe the index of the frame of this run that
+            became the keyframe. Culled keyframes are included. The index is -1 for keyframes of
+            earlier drives.
+        n_submaps: number of sub-maps that the run started, including the first map. The number is 0
+            if the run has no keyframe.
         gps_track: the georeferenced drive. None if the run has no GPS.
         interrupted: the reason why the run ended early, such as "Ctrl-C" or a truncated file. None
             if the run did not end early.
-        compared: the outcomes of the detectors of ``settings.compare`` on the same frames, without
-            their maps. It is empty for a resumed run.
+        compared: the outcome of each loop detector in ``settings.compare``. These detectors
+            processed the same frames. Their outcomes contain no maps. The tuple is empty for a
+            resumed run.
     """
 
     settings: RunOptions
@@ -136,7 +138,7 @@ def causal_trajectory(tracks: list[TrackResult]) -> Trajectory:
 def odometry_trajectory(tracks: list[TrackResult]) -> Trajectory:
     """Return the pose of each frame from odometry (``TrackResult.T_odom_camera``).
 
-    These poses never jump.
+    These poses never jump, because corrections of the map do not change them.
     """
     known = [track for track in tracks if track.T_odom_camera is not None]
     times = np.array([track.timestamp for track in known], np.float64)

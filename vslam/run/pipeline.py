@@ -1,4 +1,4 @@
-"""Runs of SLAM on a sequence or stream. Frames are prepared, tracked in order and recorded."""
+"""Runs SLAM on a sequence or stream. Frames are prepared, tracked in order and recorded."""
 
 from __future__ import annotations
 
@@ -60,30 +60,31 @@ def run_sequence(
 ) -> RunOutcome:
     """Run SLAM over a whole sequence, or over a stream until it ends.
 
-    A frame that cannot be read is skipped. It gets a predicted pose, counts as lost and is listed
-    in the outcome. A frame that is dropped in a real-time run gets an interpolated pose.
+    A frame that cannot be read is skipped. This frame gets a predicted pose, counts as lost and is
+    listed in the outcome. A frame that is dropped in a real-time run gets an interpolated pose.
 
-    The run ends early after Ctrl-C, when the source ends unexpectedly, or when a part of the run
-    fails, such as a detector of another package. After Ctrl-C, the current frame is completed
-    first. All results obtained so far are kept. If mapping failed, the map is incomplete. The
-    outcome then contains no map, and the poses are those at the time of tracking.
+    The run ends early after Ctrl-C, when the source ends unexpectedly, or when a component fails,
+    for example the loop detector of a plug-in. After Ctrl-C, the current frame is completed first.
+    All results obtained so far are kept. If mapping failed, the map is incomplete. The outcome then
+    contains no map, and the poses are those at the time of tracking.
 
-    The detectors of ``settings.compare`` run on the same frames as the main detector. Therefore,
-    images are read and features are extracted only once. Each detector has its own map. From this
-    map, only the trajectory, the tracking results and the loops are kept. If one detector fails,
-    the others continue. A resumed run continues without these detectors, because their maps were
-    not saved.
+    The loop detectors in ``settings.compare`` process the same frames as the main detector.
+    Therefore, images are read and features are extracted only once. Each detector has its own map.
+    At the end, only the trajectory, the tracking results and the loops of each detector are kept.
+    If one detector fails, the other detectors continue. A resumed run continues without these
+    detectors, because their maps were not saved.
 
     Args:
         autosave: saves the state of the run at intervals.
-        resume: the saved state of an unfinished run. This run continues at the next frame. Its
-            outcome covers both parts.
-        slam: the result of ``begin`` for the same settings. With None, this function calls
+        resume: the saved state of an interrupted run. The run continues at the frame after this
+            state. The outcome covers the frames before and after the interruption.
+        slam: the result of ``begin`` for the same settings. If it is None, this function calls
             ``begin``.
 
     Raises:
-        InputError: before the first frame, the images cannot be read or are not the images of the
-            resumed run, or ``begin`` fails. Errors after the first frame end the run early instead.
+        InputError: the images cannot be read, the images are not those of the resumed run, or
+            ``begin`` fails. Only errors before the first frame raise an exception. Later errors end
+            the run early.
     """
     cv2.setNumThreads(1)  # the thread pool already uses all cores
     slam = slam or begin(sequence.camera, settings, None if resume is None else resume.map)
@@ -150,9 +151,10 @@ def run_sequence(
 
 
 def _compared(camera: Camera, settings: RunOptions) -> list[_Run]:
-    """Begin the runs of the detectors of ``settings.compare``.
+    """Begin a run for each loop detector in ``settings.compare``.
 
-    They use the shipped weights, because ``settings.weights`` belongs to the main detector.
+    These detectors use the shipped weights, because ``settings.weights`` belongs to the main
+    detector.
     """
     common: dict[str, object] = {"weights": None, "compare": ()}
     each = [settings.model_copy(update={**common, "detector": name}) for name in settings.compare]
@@ -160,7 +162,7 @@ def _compared(camera: Camera, settings: RunOptions) -> list[_Run]:
 
 
 class _Run:
-    """The SLAM of one detector and its results.
+    """The SLAM system of one loop detector, and the results of its run.
 
     For a resumed run, the results include the part before the interruption.
 
@@ -214,7 +216,7 @@ class _Run:
 
     @contextmanager
     def recording_failure(self, what: str) -> Iterator[None]:
-        """Record an exception of the block as the failure of this run.
+        """If the block raises an exception, record it as the failure of this run.
 
         The results obtained so far are kept.
         """
@@ -224,7 +226,7 @@ class _Run:
             self.fail(what, error)
 
     def trajectory(self) -> Trajectory:
-        """Return the pose of each processed frame, according to the present map."""
+        """Return the pose of each processed frame, according to the current map."""
         # A step that failed may have added a pose without a result.
         return self.slam.trajectory().select(np.arange(len(self.tracks)))
 
@@ -246,7 +248,7 @@ class _Run:
         return result
 
     def _add_latency(self, arrived: float, _: TrackResult) -> None:
-        """In a real-time run, record the time from the arrival of a frame until its pose."""
+        """In a real-time run, record the time between the arrival and the pose of a frame."""
         if self.settings.realtime:
             self.latency_ms.append(1e3 * (time.perf_counter() - arrived))
 
@@ -285,10 +287,10 @@ def _record_frame(
     played: Played[PreparedFrame],
     n_recorded: int,
 ) -> int:
-    """Record a frame, and also the map if mapping is not changing it.
+    """Record a frame. The map is also recorded, unless a mapping job is changing it.
 
     Returns:
-        The new number of recorded loops.
+        The number of loops that have been recorded so far.
     """
     recorder.frame(result)
     images = None if played.prepared is None else played.prepared.images
@@ -304,10 +306,10 @@ def _following(frames: Iterator[TimedFrame], before: NDArray[np.float64]) -> Ite
     """Yield the frames after the first N frames, which were tracked before the run was resumed.
 
     Args:
-        before: ``(N,)`` times of the tracked frames.
+        before: ``(N,)`` timestamps of the frames that were tracked before the interruption.
 
     Raises:
-        InputError: the first N frames of the source have other times.
+        InputError: the timestamps of the first N frames of the source differ from ``before``.
     """
     for index, timestamp in enumerate(before.tolist()):
         frame = next(frames, None)
@@ -386,13 +388,13 @@ def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
 
 
 def _source_warnings(source: Source, settings: RunOptions) -> list[str]:
-    """Return warnings about images that were left out, and about the calibration."""
+    """Return warnings about images that were left out, and about an implausible calibration."""
     left_out = source.pairing.warnings() if source.pairing is not None else []
     return [*left_out, *calibration_warnings(source.camera, settings.calib, source.name)]
 
 
 def _map_warnings(slam: Slam, camera: Camera) -> list[str]:
-    """Return warnings about problems of the stereo rig that the map reveals."""
+    """Return warnings about problems of the stereo rig that are measured in the final map."""
     try:
         residuals = measure_rig(slam.map, camera)
         return delay_warnings(slam.rig.delay, camera) or residual_warnings(residuals, camera)
@@ -405,11 +407,12 @@ def _with_earlier(
 ) -> tuple[list[LoopEdge], list[LoopCorrection], NDArray[np.int64]]:
     """Return the loops and corrections of a whole run, including the part before it was resumed.
 
-    Loops of the earlier part refer to frames instead of keyframes. Each of these frames gets a
-    keyframe number after the numbers of the keyframes in the map.
+    The loops of the part before the interruption refer to frames instead of keyframes. Therefore,
+    each of these frames is given a new keyframe number. The new numbers begin after the last
+    keyframe number of the map.
 
     Returns:
-        The loops, the corrections, and the frame of each keyframe number.
+        The loops, the corrections, and the index of the frame that belongs to each keyframe number.
     """
     frames = _frames_of_this_run(slam.map)
     if not before.loops:
@@ -430,15 +433,15 @@ def _with_earlier(
 def begin(camera: Camera, settings: RunOptions, saved: Path | None = None) -> Slam:
     """Create the ``Slam`` of a run.
 
-    It begins a new map, or continues in the map ``settings.map_file``.
+    The ``Slam`` begins a new map, or continues the map in the file ``settings.map_file``.
 
     Args:
         saved: the map file of an interrupted run. The ``Slam`` continues after the last frame of
             this run.
 
     Raises:
-        InputError: the map does not exist or was made with another camera, detector or image
-            pyramid, or the weights cannot be read.
+        InputError: the map does not exist, the map was made with a different camera, detector or
+            image pyramid, or the weights cannot be read.
     """
     config, threads = settings.thresholds, settings.threads
     late = not settings.realtime  # in real time, no network may be loaded during the drive
@@ -455,10 +458,10 @@ def begin(camera: Camera, settings: RunOptions, saved: Path | None = None) -> Sl
 
 
 def require_camera(map_file: Path, camera: Camera) -> None:
-    """Check that a map was made with a camera.
+    """Check that a map was made with the given camera.
 
     Raises:
-        InputError: the map was made with another camera, or there is no such map.
+        InputError: the map was made with a different camera, or there is no such map.
     """
     of_map = made_with(map_file).camera
     if not same_camera(of_map, camera):
@@ -492,7 +495,7 @@ def _record_loops(recorder: Recorder, slam: Slam, n_recorded: int) -> int:
     """Record all loops except the first ``n_recorded`` loops, which are already recorded.
 
     Returns:
-        The new number of recorded loops.
+        The number of loops that have been recorded so far.
     """
     if len(slam.loops) > n_recorded:
         recorder.loops(slam.loops[n_recorded:], slam.map)

@@ -1,4 +1,4 @@
-"""Preparation of frames before tracking: decoding, perturbation and feature extraction.
+"""Prepares frames before tracking: decoding, perturbation and feature extraction.
 
 A few frames are prepared in advance. Each frame is prepared independently of the other frames.
 Therefore, the result does not depend on the number of threads. In a real-time run, a frame is
@@ -35,11 +35,11 @@ _AHEAD = 2  # number of frames that are prepared in advance, for each thread
 
 @dataclass(frozen=True)
 class Played(Generic[T]):
-    """A frame that has arrived.
+    """A frame that has arrived, either prepared or dropped.
 
     Attributes:
         timestamp: seconds.
-        prepared: the prepared frame. None if the frame was dropped.
+        prepared: the prepared frame. None if the frame was dropped because a newer frame arrived.
         arrived: time of arrival, measured with ``time.perf_counter``.
     """
 
@@ -63,7 +63,7 @@ def play(
 ) -> Iterator[Played[T]]:
     """Play frames in real time. If several frames are waiting, only the newest frame is prepared.
 
-    One frame is prepared while the previous frame is being used. Therefore, a frame waits for at
+    One frame is prepared while the caller uses the previous frame. Therefore, a frame waits for at
     most one other frame. Dropped frames are not kept in memory.
 
     Args:
@@ -71,16 +71,16 @@ def play(
             timestamps.
         prepare: function that prepares a frame after its arrival, in a separate thread. Its first
             argument is the number of frames that arrived earlier, including dropped frames.
-        threads: number of threads. With 1, a frame is prepared only after the previous frame has
-            been used.
+        threads: number of threads. If it is 1, a frame is prepared only after the previous frame
+            has been used.
         live: whether each frame arrives when ``frames`` yields it, regardless of its timestamp.
 
     Yields:
         Every frame in order. Dropped frames come directly before the frame that replaced them.
 
     Raises:
-        Exception: ``prepare`` or ``frames`` raised an exception. It is raised after all earlier
-            frames have been yielded.
+        Exception: ``prepare`` or ``frames`` raised this exception. The exception is passed on after
+            all earlier frames have been yielded.
     """
     free = threading.Semaphore(min(threads, 2))
     mailbox = _Mailbox()
@@ -169,9 +169,9 @@ class _Mailbox:
             self._changed.wait_for(lambda: not self._first or self.stopped)
 
     def take(self) -> tuple[list[float], _Arrival | None]:
-        """Return the times of the dropped frames, and the newest frame.
+        """Return the timestamps of the dropped frames, and the newest frame.
 
-        After the last frame, None takes the place of the newest frame.
+        After the last frame, the method returns None instead of a frame.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._newest or self._ended or self.stopped)
@@ -182,14 +182,15 @@ class _Mailbox:
             return dropped, newest
 
     def wait_until(self, when: float) -> None:
-        """Sleep until a time of ``time.perf_counter``, or until ``stop`` is called."""
+        """Sleep until ``time.perf_counter`` reaches a value, or until ``stop`` is called."""
         with self._changed:
             self._changed.wait_for(lambda: self.stopped, max(0.0, when - time.perf_counter()))
 
     def end(self, error: Exception | None) -> None:
-        """Announce that there are no more frames.
+        """Announce that no more frames will arrive.
 
-        ``error`` is the exception that ended the frames, or None.
+        ``error`` is the exception that was raised while frames were read. It is None if all frames
+        were read.
         """
         with self._changed:
             self._ended, self.error = True, error
@@ -208,7 +209,7 @@ class PreparedFrame:
 
     Attributes:
         images: the images and their features. None if the frame cannot be read.
-        stage_ms: milliseconds that reading and extraction took.
+        stage_ms: milliseconds that reading the images and extracting the features took.
         problem: the reason why the frame cannot be read. None if it can be read.
         dropped: whether the frame is missing because a perturbation dropped it.
     """
@@ -231,7 +232,8 @@ def at_their_times(
 ) -> Iterator[Played[PreparedFrame]]:
     """Yield prepared frames in order, each with its time of arrival.
 
-    In real time, a frame arrives at its timestamp. Otherwise, all frames arrive at the start.
+    In a real-time run, a frame arrives at its timestamp. In other runs, all frames count as arrived
+    at the start of the run.
 
     Args:
         workers: threads that prepare frames and extract features in advance.

@@ -1,8 +1,8 @@
 """The progress of a run: the data that the report needs about the frames processed so far.
 
-The data are arrays in a file. An interrupted run leaves this file next to its map. A resumed run
-continues from both files. Each tracked frame is appended to the arrays, so saving the progress only
-copies them.
+The data are stored as arrays in a file. An interrupted run leaves this file next to its map file. A
+resumed run continues from both files. Each tracked frame is appended to the arrays, so saving the
+progress only copies them.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ class TrackTable:
         return self.rows[:, _POSE]
 
     def until(self, frames: int) -> TrackTable:
-        """Return the results of the first ``frames`` frames."""
+        """Return a table with the results of the first ``frames`` frames."""
         return replace(self, rows=self.rows[:frames], stage_ms=self.stage_ms[:frames])
 
     def results(self) -> list[TrackResult]:
-        """Return the result of each frame as tracking returned it."""
+        """Convert the rows of the table back to the tracking results of the frames."""
         return [
             _track(index, row, dict(zip(self.stages, ms, strict=True)))
             for index, (row, ms) in enumerate(zip(self.rows, self.stage_ms.tolist(), strict=True))
@@ -78,7 +78,7 @@ class TrackLog:
         self._n = len(before)
 
     def append(self, track: TrackResult) -> None:
-        """Append the tracking result of the next frame."""
+        """Append the tracking result of the next frame to the table."""
         self._rows.extend(track.T_wc.ravel())
         self._rows.extend((
             track.timestamp, _STATES.index(track.state), track.n_features, track.n_stereo,
@@ -113,7 +113,7 @@ class Progress:
         skipped: a message for each frame whose images could not be read.
         latency_ms: milliseconds from the arrival of each tracked frame until its pose is known, in
             a real-time run.
-        wall_s, cpu_s: wall and CPU time of the frames, in seconds.
+        wall_s, cpu_s: wall and CPU time in which the frames were processed, in seconds.
         loops: loops between frames of the run, with frame numbers in place of keyframe ids. The
             number -1 stands for a keyframe of an earlier drive.
         corrections: corrections of the map by the accepted loops, with frame numbers in place of
@@ -129,7 +129,7 @@ class Progress:
     corrections: list[LoopCorrection] = field(default_factory=list)
 
     def until(self, frames: int) -> Progress:
-        """Return the progress after the first ``frames`` frames."""
+        """Return the part of the progress that covers the first ``frames`` frames."""
         return replace(
             self,
             tracks=self.tracks.until(frames),
@@ -210,7 +210,7 @@ def write_progress(path: Path, progress: Progress) -> None:
 
 
 def read_progress(path: Path) -> Progress:
-    """Read a file that ``write_progress`` wrote.
+    """Read the progress of a run from a file that ``write_progress`` wrote.
 
     Raises:
         InputError: the file is missing, damaged or from another version.

@@ -1,4 +1,4 @@
-"""The recording of a run for the Rerun viewer.
+"""Records a run for the Rerun viewer.
 
 A recording can be replayed later with ``rerun recording.rrd``, or shown live during the run.
 
@@ -66,7 +66,7 @@ _STATE_COLORS = {TrackingState.OK: _GREEN, TrackingState.WEAK: _AMBER, TrackingS
 
 @dataclass(frozen=True)
 class _Pace:
-    """How often data are sent to the recording.
+    """Settings that determine how often data are sent to the recording.
 
     Attributes:
         frames: number of frames in a batch.
@@ -91,7 +91,7 @@ class Recorder:
     """
 
     def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None:
-        """Log the data that does not change during a run.
+        """Log the data that do not change during a run.
 
         This method is called once, before the first frame.
 
@@ -110,30 +110,30 @@ class Recorder:
         Args:
             result: the result of tracking the frame that became the keyframe.
             image: ``(H, W)`` uint8 left image.
-            xy: ``(N, 2)`` float32 positions of its features in pixels.
+            xy: ``(N, 2)`` float32 positions of the features of the image, in pixels.
             tracked: ``(N,)`` bool, whether each feature is an inlier match of a landmark.
         """
 
     def map(self, map_: Map) -> None:
         """Log the map if enough keyframes were added since it was last logged.
 
-        This method is called after a frame. No mapping job is running at this time.
+        This method is called after ``frame``, while no mapping job is running.
         """
 
     def loops(self, edges: Collection[LoopEdge], map_: Map) -> None:
-        """Log new loops, which may have been accepted or rejected.
+        """Log new loop candidates, both accepted and rejected.
 
-        This method is called after ``frame``. No mapping job is running at this time.
+        This method is called after ``frame``, while no mapping job is running.
 
         Args:
-            edges: the loops since the last call.
-            map_: the map, which has already been corrected by these loops.
+            edges: the loop candidates that were accepted or rejected since the last call.
+            map_: the map, which has already been corrected by the accepted loops.
         """
 
     def finish(self, trajectory: Trajectory, map_: Map | None) -> None:
         """Log the final trajectory and the map, if there is a map.
 
-        All pending data are written, and the file is closed.
+        All pending data are written, and the recording is closed.
         """
 
 
@@ -179,7 +179,8 @@ class Viewer:
     """A viewer that has been started.
 
     Attributes:
-        address: URL of the page that shows the viewer. It is empty for a window.
+        address: URL of the page that shows the viewer. The address is empty if the viewer is a
+            window.
         sink: the rerun object to which a recording is sent.
     """
 
@@ -303,12 +304,13 @@ class RerunRecorder(Recorder):
       ``untracked`` are the keypoints;
     - ``world/landmarks``, ``world/keyframes``: the map. It is recorded every 25 keyframes, after
       each loop and at the end;
-    - ``world/loops/accepted``: green lines, which are shown from the loop to the end;
-    - ``world/loops/rejected``: faint red lines, which are shown for 20 frames;
+    - ``world/loops/accepted``: a green line for each accepted loop. It is shown from the closing of
+      the loop until the end;
+    - ``world/loops/rejected``: a faint red line for each rejected loop. It is shown for 20 frames;
     - ``loops/images``: the two images of a closed loop with their matches, shown until the next
       loop;
-    - ``world/ground_truth``: the ground truth, which does not change;
-    - ``world/trajectory``: the final trajectory up to the frame shown;
+    - ``world/ground_truth``: the whole ground truth, shown in every frame;
+    - ``world/trajectory``: the final trajectory up to the frame that is shown;
     - ``points/*``: numbers of keypoints in every frame;
     - ``stage_ms/*``: milliseconds of each stage for every frame;
     - ``state``: changes of the tracking state;
@@ -319,10 +321,10 @@ class RerunRecorder(Recorder):
 
     A recording that cannot be written never ends a run. Rerun writes in its own thread and reports
     errors only at a later flush, and this flush may never return. Therefore, the recording ends
-    with a warning in the log when the disk has less than 64 MB left. Everything recorded before is
-    in the file. The recording also ends with a warning if a flush fails, if a flush takes longer
-    than 5 s, or if the viewer was closed. In these cases, the last message in the file may be
-    incomplete.
+    with a warning in the log when the disk has less than 64 MB left. Everything that was recorded
+    before this point is in the file. The recording also ends with a warning if a flush fails, if a
+    flush takes longer than 5 s, or if the viewer was closed. In these cases, the last message in
+    the file may be incomplete.
     """
 
     def __init__(self, target: Path | Viewer, pictures: Sequence[LoopPicture] = ()) -> None:
@@ -470,7 +472,8 @@ class RerunRecorder(Recorder):
     def _log_trajectory(self, trajectory: Trajectory) -> None:
         """Log the final trajectory, so that it grows during the replay.
 
-        The part up to each of a hundred frames is logged.
+        The trajectory is logged at a hundred frames. At each frame, the part up to this frame is
+        logged.
         """
         import rerun as rr
 
@@ -506,7 +509,10 @@ class RerunRecorder(Recorder):
     def _log_lines(
         self, name: str, edges: list[LoopEdge], map_: Map, color: tuple[int, ...]
     ) -> None:
-        """Log a line between the two keyframes of each loop whose query keyframe is in the map."""
+        """Log a line for each loop whose query keyframe is in the map.
+
+        The line connects the two keyframes of the loop.
+        """
         import rerun as rr
 
         ends = [(edge.match, edge.query) for edge in edges if edge.query >= 0]
@@ -518,7 +524,7 @@ class RerunRecorder(Recorder):
     def _log_pictures(self) -> None:
         """Log the pictures of new loops.
 
-        If there are several pictures, the last picture stays visible.
+        If there are several new pictures, the last of these pictures stays visible.
         """
         import rerun as rr
 

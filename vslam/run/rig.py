@@ -1,4 +1,4 @@
-"""Detection of problems of a stereo rig during a run, and warnings about them for the report."""
+"""Detects problems of a stereo rig during a run, and warns about these problems in the report."""
 
 from __future__ import annotations
 
@@ -34,12 +34,13 @@ _SUSPECT_DELAY_S, _SUSPECT_OFFSET_PX = 0.4e-3, 0.2
 
 @dataclass(frozen=True)
 class RigResiduals:
-    """Systematic errors of the columns in the right images, estimated from the final map.
+    """Systematic errors in the columns of features in right images, estimated from the final map.
 
     Attributes:
         delay_s: apparent delay of the right image relative to the left image, in seconds. It causes
-            residuals that are proportional to the image speed. NaN if the camera hardly moved.
-        offset_px: constant error of all disparities, in pixels.
+            residuals that are proportional to the speed of a feature in the image. The value is NaN
+            if the camera hardly moved.
+        offset_px: constant error in all disparities, in pixels.
     """
 
     delay_s: float
@@ -49,8 +50,8 @@ class RigResiduals:
 def measure_rig(map_: Map, camera: Camera) -> RigResiduals | None:
     """Estimate the delay of the right image and the offset of the disparities.
 
-    Both are estimated from the stereo residuals of a map. The result is None if there are too few
-    observations or if the camera is not a stereo camera.
+    The delay and the offset are estimated from the stereo residuals of a map. The result is None if
+    there are too few observations or if the camera is not a stereo camera.
     """
     if camera.sensor != "stereo" or map_.n_keyframes < 3:
         return None
@@ -81,17 +82,17 @@ def measure_rig(map_: Map, camera: Camera) -> RigResiduals | None:
 def fit(
     residual: NDArray[np.float64], speed: NDArray[np.float64], disparity: NDArray[np.float64]
 ) -> tuple[float, float, float]:
-    """Fit a delay, an offset and a relative error of the disparity to residuals of stereo columns.
+    """Fit a delay, an offset and a relative error in the disparity to residuals in right images.
 
     The fit minimises the Huber loss.
 
     Args:
-        residual: ``(N,)`` measured minus predicted columns, in pixels.
-        speed: ``(N,)`` image speeds in pixels per second.
-        disparity: ``(N,)`` disparities in pixels.
+        residual: ``(N,)`` measured minus predicted columns of features in right images, in pixels.
+        speed: ``(N,)`` horizontal speeds of these features in the image, in pixels per second.
+        disparity: ``(N,)`` disparities of these features, in pixels.
 
     Returns:
-        The delay in seconds, the offset in pixels, and the relative error of the disparity.
+        The delay in seconds, the offset in pixels, and the relative error in the disparity.
     """
     A = np.stack([speed, np.ones_like(speed), disparity], axis=1)
     x = np.zeros(3)
@@ -127,7 +128,8 @@ def calibration_warnings(camera: Camera, calib: Sequence[Path], name: str) -> li
 
     Args:
         camera: the calibrated camera.
-        calib: the files of ``--calib``. It is empty if the calibration belongs to the data set.
+        calib: the files that ``--calib`` names. The list is empty if the calibration belongs to the
+            data set.
         name: name of the sequence.
     """
     source = ", ".join(map(str, calib)) or f"the calibration of {name}"
@@ -138,7 +140,8 @@ def delay_warnings(delay: SideDelay, camera: Camera) -> list[str]:
     """Return a warning if the measured delay of the right camera differs from the calibrated delay.
 
     Args:
-        delay: the delay that was measured from the rows of stereo matches.
+        delay: the delay of the right camera that was measured from the row differences of stereo
+            matches.
     """
     if not delay.is_wrong:
         return []
@@ -154,7 +157,7 @@ def delay_warnings(delay: SideDelay, camera: Camera) -> list[str]:
 
 
 def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
-    """Return a warning if stereo residuals show a delay or a constant error of the disparities.
+    """Return a warning if stereo residuals show a delay or a constant error in the disparities.
 
     The delay is the delay of the right camera relative to the left camera.
     """
@@ -179,9 +182,9 @@ def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
 
 
 def rig_warnings(sides: ComparedSides) -> list[str]:
-    """Return warnings about a camera with bad images.
+    """Return warnings about a camera whose images are black or too dark.
 
-    These are black images, and images that are darker than those of the other camera.
+    Images are too dark if they are clearly darker than the images of the other camera.
     """
     warnings = []
     for side, other, black in (

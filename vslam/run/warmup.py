@@ -1,11 +1,11 @@
-"""Compilation of all kernels before the first frame, so that it does not slow down the run.
+"""Compiles all kernels before the first frame, so that compilation does not slow down the run.
 
-Compilation takes most of the time of a first run. A process compiles one kernel at a time, because
-Numba holds a lock. Therefore, two processes share the work through Numba's cache. They run
-``python -m vslam.run.warmup first`` and ``python -m vslam.run.warmup second``. The process of the
-run then calls ``EVERYTHING``, which loads the compiled kernels. This process compiles only missing
-kernels, so it does not need the memory of the compiler. Later runs load a kernel when they first
-call it.
+In the first run on a machine, compilation takes most of the time. A process compiles one kernel at
+a time, because Numba holds a lock. Therefore, two processes share the work through Numba's cache.
+These processes run ``python -m vslam.run.warmup first`` and ``python -m vslam.run.warmup second``.
+The process of the run then calls ``EVERYTHING``, which loads the compiled kernels. This process
+compiles only missing kernels, so it does not need the memory of the compiler. Later runs load a
+kernel when they first call it.
 
 When you add kernels, add a function that calls them to the entry of ``COMPILE_SHARES`` that takes
 less time. If ``run_everything`` does not call the kernels, add this function to ``EVERYTHING`` as
@@ -16,12 +16,12 @@ commands show how long each share takes:
         time NUMBA_CACHE_DIR=$(mktemp -d) python -m vslam.run.warmup $share
     done
 
-Monocular runs need no further kernels, because their initialisation and their similarities use
-NumPy.
+Monocular runs need no further kernels. Their initialisation, and the similarity transformations of
+their loops, are computed with NumPy.
 
-A kernel that both processes need is compiled by the process that calls it first. Both must call it
-with the same types, because two processes can write to Numba's cache safely only if they write the
-same signature.
+A kernel that both processes need is compiled by the process that calls it first. Both processes
+must call the kernel with the same types, because two processes can write to Numba's cache safely
+only if they write the same signature.
 """
 
 from __future__ import annotations
@@ -87,10 +87,11 @@ def compile_kernels(*, processes: int = 2, load: bool = False) -> None:
     Nothing is done if all kernels have been compiled.
 
     Args:
-        processes: number of processes. With 1, or on a single core, no other process is started.
-        load: load compiled kernels and GTSAM now, which takes 0.3 s. Real-time runs need this,
-            because no frame may wait. Otherwise, each kernel is loaded at its first call, which
-            takes 2 ms.
+        processes: number of processes that compile. If it is 1, or if there is a single core, no
+            other process is started.
+        load: if True, compiled kernels and GTSAM are loaded now, which takes 0.3 s. Real-time runs
+            need this, because no frame may wait. If False, each kernel is loaded at its first call,
+            which takes 2 ms.
     """
     if load:
         load_optimiser()
@@ -140,8 +141,8 @@ def cached(kernel: tuple[ModuleType, str]) -> tuple[Path, list[Path]]:
 def compile_shares() -> None:
     """Compile each of ``COMPILE_SHARES`` in its own process, and wait for both processes.
 
-    If a process fails, the caller must compile the kernels of this process. An exception such as
-    Ctrl-C ends both processes.
+    If a process fails, its kernels are not compiled, and the caller must compile them. An exception
+    such as Ctrl-C ends both processes.
     """
     # The executable of a frozen application is not Python.
     if not sys.executable or getattr(sys, "frozen", False):
@@ -269,7 +270,10 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
 
 
 def compile_recognition() -> None:
-    """Compile detection, verification and relocalisation by comparing a keyframe with itself."""
+    """Compile loop detection, verification and relocalisation.
+
+    For this purpose, a keyframe is compared with itself.
+    """
     config = Config()
     map_, features = map_synthetic(1)
     verify(map_, LoopCandidate(0, 0, 1.0), CAMERA, config.verification)

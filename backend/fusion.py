@@ -62,7 +62,7 @@ def fuse_loop(
     """Fuse the landmarks on one side of a loop with the landmarks on the other side, after the loop
     was corrected (section VII-D of the ORB-SLAM paper).
 
-    First, the pairs of features and landmarks that loop verification matched are fused. Then the
+    Loop verification has matched features with landmarks. These pairs are fused first. Then the
     landmarks of each side are projected into the keyframes of the other side.
 
     Args:

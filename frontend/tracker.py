@@ -100,7 +100,7 @@ class Tracker:
     itself.
 
     Attributes:
-        status: what is known about the position of the camera.
+        status: whether the last frame was tracked or lost, or no frame has been tracked yet.
         last: the last frame that was tracked; None before a frame was tracked.
         lost_frames: number of frames that were lost since the frame ``last``.
     """

@@ -216,7 +216,7 @@ def track_local_map(
     Args:
         frame: receives the pose and the matches.
         window: search radius at octave 0, pixels; None uses ``context.local_window``.
-        patches: patches of the landmarks that can be aligned.
+        patches: patches of those landmarks whose matches can be aligned.
 
     Returns:
         Number of matches, number of inliers, and ``(V,)`` int32 ids of the landmarks that should be

@@ -37,7 +37,7 @@ _DEPTHS_AGREE = 0.15  # largest relative difference in depth between two landmar
 
 
 class LearnedTrials:
-    """Chooses the loop candidates that are verified using learned local descriptors.
+    """Chooses which loop candidates are verified. Learned local descriptors verify them.
 
     Verification with learned descriptors takes forty times as long as verification with ORB
     descriptors, so only a few candidates are tried.

@@ -136,8 +136,8 @@ def match_keyframes(
     """Match the descriptors of two keyframes. Only features that observe landmarks are used.
 
     Returns:
-        Two arrays: the ``(N,)`` rows of the matched features of each keyframe in the observation
-        arrays of the map.
+        Two ``(N,)`` arrays, one for each keyframe. Entry i of an array refers to the keyframe's
+        feature of match i, as a row of the map's observation arrays.
     """
     a = map_.arrays
     rows_q, rows_m = (

@@ -1,4 +1,4 @@
-"""Opens the map of a drive, resumes a drive, and collects the content of a map file."""
+"""Opens the map of a drive, resumes a drive, and collects the data that a map file stores."""
 
 from __future__ import annotations
 

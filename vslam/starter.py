@@ -102,7 +102,7 @@ class Starter:
         """Try to begin a map or sub-map with a frame that was not tracked.
 
         Returns:
-            The start of the map, or None if it is not possible yet.
+            The frame or frames with which the map begins, or None if it cannot begin yet.
         """
         if self._context.camera.monocular:
             return self._offer_monocular(frame)

@@ -45,8 +45,8 @@ def ou_walk(
     Args:
         deviation: stationary standard deviation. The process begins in the stationary state.
         rng: random generator, from which one normal number is drawn for each step.
-        jumps: increasing times in seconds at which the process is redrawn with 1.5 times the
-            deviation.
+        jumps: increasing times in seconds. At each of these times, the value is drawn anew, from a
+            normal distribution with 1.5 times the deviation.
     """
     decay = exp(-STEP_S / _TIME_CONSTANT_S)
     spread = (1.0 - decay**2) ** 0.5

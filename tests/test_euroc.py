@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from vslam.datasets import open_sequence
 from vslam.datasets.association import poses_at
-from vslam.datasets.euroc import open_euroc, open_raw_euroc
+from vslam.datasets.euroc import _pair, open_euroc, open_raw_euroc
 from vslam.datasets.perturbation import Perturbation
 from vslam.errors import InputError, UnreadableImageError
 from vslam.geometry import se3_exp
@@ -140,6 +140,23 @@ def test_frames_without_a_partner_are_left_out(root, corridor, caplog):
     np.testing.assert_array_equal(sequence.read(2)[0], corridor.left[4])
     np.testing.assert_array_equal(sequence.read(2)[1], corridor.right[4])
     np.testing.assert_allclose(sequence.ground_truth, corridor.T_wc[[1, 2, 4]], atol=1e-9)
+
+
+@pytest.mark.parametrize(("late", "paired"), [(5_000_000, 6), (5_000_001, 0)])
+def test_partners_are_at_most_five_milliseconds_apart(late, paired):
+    times = 1_403_715_273_262_142_976 + 50_000_000 * np.arange(6)
+    sides = [Path("cam0"), Path("cam1")]
+    if paired:
+        assert len(_pair(sides, [times, times + late])) == paired
+    else:
+        with pytest.raises(InputError, match="none of its 6 images"):
+            _pair(sides, [times, times + late])
+
+
+def test_a_right_image_is_the_partner_of_one_left_image():
+    left = 1_403_715_273_262_142_976 + 4_000_000 * np.arange(3)
+    paired = _pair([Path("cam0"), Path("cam1")], [left, left[1:2] + 1_000_000])
+    assert paired.tolist() == [[1, 0]]  # the nearest one
 
 
 def test_no_partners_at_all(root):

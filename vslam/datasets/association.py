@@ -35,9 +35,10 @@ def associate(
     The closest pairs are formed first, and each time is used at most once.
 
     Args:
-        first: ``(N,)`` seconds, increasing.
-        second: ``(M,)`` seconds, increasing.
-        max_difference: upper limit in seconds of the difference between the two times of a pair.
+        first: ``(N,)`` times, increasing.
+        second: ``(M,)`` times, increasing, in the same unit.
+        max_difference: upper limit of the difference between the two times of a pair, in the same
+            unit.
 
     Returns:
         Two arrays that describe the P pairs: ``(P,)`` increasing indices into ``first``, and

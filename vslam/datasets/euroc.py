@@ -163,8 +163,8 @@ def _pair(cameras: list[Path], times: list[NDArray[np.int64]]) -> NDArray[np.int
     """
     if len(times) == 1:
         return np.arange(len(times[0]))[:, None]
-    left, right = (1e-9 * (side - times[0][0]) for side in times)
-    pairs = np.column_stack(associate(left, right, _MOST_APART_NS * 1e-9))
+    left, right = ((side - times[0][0]).astype(np.float64) for side in times)  # exact nanoseconds
+    pairs = np.column_stack(associate(left, right, _MOST_APART_NS + 1))
     if not len(pairs):
         raise InputError(
             f"{cameras[1]}: none of its {len(right)} images has the time of an image in "

@@ -96,14 +96,17 @@ class FrameImages:
     def start_corners(self, workers: Workers) -> None:
         """Start computing ``corners`` in another thread, before the corners are needed."""
         if self._started is None:
-            self._image_map = partial(workers.map, urgency=Urgency.CORNERS)
-            self._started = workers.submit(self._find_corners, Urgency.CORNERS)
+            in_parallel = partial(workers.map, urgency=Urgency.CORNERS)
+            find = partial(self._find_corners, in_parallel)
+            self._started = workers.submit(find, Urgency.CORNERS)
 
     @cached_property
     def corners(self) -> Corners:
         """The features that a corner detector finds, and their stereo matches. The first access
         reads the second image (right image or depth image)."""
-        return self._find_corners() if self._started is None else self._started.result()
+        if self._started is None:
+            return self._find_corners(self._image_map)
+        return self._started.result()
 
     @cached_property
     def extracted(self) -> Extracted:
@@ -124,13 +127,13 @@ class FrameImages:
             image = np.array(self._second, np.uint8)  # a copy, because the caller owns the image
         return image if self.mask is None else self.mask.filled(image)
 
-    def _find_corners(self) -> Corners:
+    def _find_corners(self, image_map: ImageMap) -> Corners:
         try:
             self._second = self._read_second()
         except UnreadableImageError as error:
             self.problem = str(error)
         found = find_corners(
-            self.left, self._second, self._context, self._image_map, self.mask, self.pyramid
+            self.left, self._second, self._context, image_map, self.mask, self.pyramid
         )
         self.sides = found.sides
         return found

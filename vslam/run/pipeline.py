@@ -101,8 +101,8 @@ def run_sequence(
             for played in at_their_times(
                 frames,
                 slam.context,
-                settings,
                 slam.workers,
+                realtime=settings.realtime,
                 live=sequence.live,
                 begin=len(main.tracks),
                 next_extraction=lambda: slam.next_extraction,

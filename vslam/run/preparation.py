@@ -25,7 +25,6 @@ from vslam.errors import DroppedFrameError, UnreadableImageError
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.masks import Mask
 from vslam.frontend.tracking import TrackingContext
-from vslam.run.options import RunOptions
 from vslam.workers import Job, Urgency, Workers
 
 T = TypeVar("T")
@@ -223,9 +222,9 @@ class PreparedFrame:
 def at_their_times(
     frames: Iterator[TimedFrame],
     context: TrackingContext,
-    settings: RunOptions,
     workers: Workers,
     *,
+    realtime: bool,
     live: bool,
     begin: int = 0,
     next_extraction: Callable[[], int] = lambda: -1,
@@ -237,22 +236,24 @@ def at_their_times(
 
     Args:
         workers: threads that prepare frames and extract features in advance.
+        realtime: whether this is a real-time run.
+        live: see ``play``.
         begin: index of the first frame.
         next_extraction: function that returns ``Slam.next_extraction``. This is the index of the
             frame whose features will be needed next. These features are extracted in advance.
     """
-    if settings.realtime:
+    if realtime:
         with ThreadPoolExecutor(2, "side") as pool:
-            image_map = map if settings.threads == 1 else pool.map
+            image_map = map if workers.threads == 1 else pool.map
 
             def prepare(number: int, frame: TimedFrame) -> PreparedFrame:
                 prepared = prepare_frame(frame, context, image_map)
                 is_due = 0 <= next_extraction() <= begin + number
-                if prepared.images is not None and is_due and settings.threads > 1:
+                if prepared.images is not None and is_due and workers.threads > 1:
                     prepared.images.start_corners(workers)
                 return prepared
 
-            yield from play(frames, prepare, settings.threads, live=live)
+            yield from play(frames, prepare, workers.threads, live=live)
         return
     start = time.perf_counter()
     ahead = prepared_frames(frames, context, workers, begin, next_extraction)

@@ -1,8 +1,9 @@
 """Threads that run the jobs of a pipeline. A thread that waits for a job runs other jobs meanwhile.
 
-On two cores, the main thread and one worker share all work. There are never more busy threads than
-cores, and no thread is idle while a job is queued. Jobs start in order of ``Urgency``. The result
-of a job must not depend on when the job runs or on which thread runs it.
+With two threads, the main thread and one worker share the jobs, and neither is idle while a job is
+queued. Jobs start in order of ``Urgency``. The result of a job must not depend on when the job runs
+or on which thread runs it. Global bundle adjustment takes seconds and would delay the other jobs.
+It is therefore not such a job, but has its own thread (``vslam/closing.py``).
 """
 
 from __future__ import annotations

@@ -104,7 +104,7 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
 
 
 def is_cut_off(data: bytes) -> bool:
-    """Return whether a PNG file ends before the stated end of one of its chunks.
+    """Return whether a PNG file is truncated, so that one of its chunks is incomplete.
 
     libpng would allocate the stated length, up to 2 GB, before it reads the chunk.
     """

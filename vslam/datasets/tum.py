@@ -5,8 +5,8 @@ FOLDER/depth.txt           the same for the depth images
 FOLDER/groundtruth.txt     optional: t tx ty tz qx qy qz qw
 FOLDER/calibration.yaml    optional: calibration of the camera (docs/howto/cameras.md)
 
-If there is no calibration, the name of the folder must contain the name of one of TUM's cameras:
-freiburg1, freiburg2 or freiburg3.
+If the folder has no calibration, its name must contain freiburg1, freiburg2 or freiburg3. This part
+of the name tells which of TUM's cameras recorded the images.
 """
 
 from __future__ import annotations

@@ -133,7 +133,7 @@ def _panel(jpeg: bytes) -> tuple[NDArray[np.uint8], float]:
 
 
 def _label(canvas: NDArray, text: str, left: int) -> None:
-    """Write a text into the upper left corner of one of the two images of a picture."""
+    """Draw a label in the upper left corner of the left or the right image of a loop picture."""
     font, size, margin = cv2.FONT_HERSHEY_SIMPLEX, 0.5, 7
     (width, height), _ = cv2.getTextSize(text, font, size, 1)
     right, bottom = left + width + 2 * margin, height + 2 * margin

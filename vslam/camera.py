@@ -43,16 +43,13 @@ class Camera:
         fx, fy: focal lengths in pixels.
         cx, cy: principal point of the left camera in pixels.
         baseline: distance from the left to the right camera in metres. It is 0 for a single camera.
-            A map that is built with a single camera has an arbitrary unit of length instead of
-            metres (``backend/two_views.py``). An RGB-D camera has no right camera. For an RGB-D
-            camera, this value describes the accuracy of the depth: a stereo pair with this baseline
-            would measure depth equally accurately (``frontend/depth.py``).
+            For an RGB-D camera, it describes the accuracy of the depth: a stereo pair with this
+            baseline would measure depth equally accurately (``frontend/depth.py``).
         width, height: image size in pixels.
         depth: whether the second image of a frame is a depth image instead of a right image. The
             depth image holds the depth of each pixel of the left image.
-        right_delay: seconds from the exposure of the left image of a pair to the exposure of the
-            right image. It is negative if the right image is exposed first, and 0 if both cameras
-            share a trigger.
+        right_delay: seconds from the exposure of the left image to the exposure of the right image.
+            It is negative if the right image is exposed first.
 
     Raises:
         ValueError: a size or focal length is not positive, the baseline is negative, or the
@@ -70,11 +67,6 @@ class Camera:
     right_delay: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check that the numbers of the camera are possible.
-
-        Raises:
-            ValueError: a number is impossible. The message says which number.
-        """
         size = f"{self.width}x{self.height}"
         if not (self.width > 0 and self.height > 0):
             raise ValueError(f"the image size {size} must be positive")
@@ -125,10 +117,7 @@ class Camera:
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:
-        """The parameters of the camera as an array, which kernels use.
-
-        The array is ``(6,)`` float64 ``[fx, fy, cx, cy, bf, disparity_weight]``.
-        """
+        """``(6,)`` float64 ``[fx, fy, cx, cy, bf, disparity_weight]``, the input of kernels."""
         return np.array([self.fx, self.fy, self.cx, self.cy, self.bf, DISPARITY_WEIGHT])
 
     def project(self, p_c: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -164,8 +153,7 @@ def calibration_doubts(camera: Camera) -> list[str]:
     """Return the reasons why a calibration is implausible.
 
     Each reason is one sentence without a full stop. The list is empty if the calibration is
-    plausible. A camera can have such a calibration. More often, however, the calibration belongs to
-    different images.
+    plausible. An implausible calibration usually belongs to different images.
     """
     off_centre = principal_point_doubt((camera.cx, camera.cy), (camera.width, camera.height))
     doubts = [off_centre] if off_centre else []
@@ -200,11 +188,7 @@ def principal_point_doubt(principal: tuple[float, float], size: tuple[int, int])
 
 
 def _cause(across: float, down: float) -> str:
-    """Return the probable cause of an implausible principal point.
-
-    Args:
-        across, down: the principal point as fractions of the image's width and height.
-    """
+    """Guess why a principal point is implausible. It is given in fractions of the image size."""
     if min(across, down) <= 0.0 or not 1 / _SAME_RATIO < across / down < _SAME_RATIO:
         return "check the order of its numbers, and whether the images were cropped or turned"
     ratio = across + down  # it is 1 if the principal point is in the middle
@@ -234,11 +218,7 @@ Made = TypeVar("Made")
 
 
 class ImageMap(Protocol):
-    """The type of functions that, like ``map``, apply a given function to each image of a frame.
-
-    The built-in ``map`` processes one image after the other. The ``map`` of a thread pool processes
-    the images in parallel. Both return the same results in the same order.
-    """
+    """Applies a function to each image of a frame, like the ``map`` of Python or a thread pool."""
 
     def __call__(
         self, function: Callable[[Given], Made], images: Iterable[Given], /

@@ -48,11 +48,10 @@ class LoopClosing:
     Attributes:
         detector: proposes loop candidates.
         verifier: decides which candidates are loops.
-        edges: the outcome of every loop candidate so far, in the order in which the outcomes were
-            recorded.
-        corrections: for each loop that was closed in this run, how the loop corrected the map.
-        closed: the loop edges of all closed loops. Their translations are in the current unit of
-            the map. The loops of a loaded map come first.
+        edges: the outcome of every loop candidate so far, in order.
+        corrections: how each loop that was closed in this run corrected the map.
+        closed: all closed loops, in the current unit of the map. The loops of a loaded map come
+            first.
         problems: one sentence for each step of loop closing that failed. Such a failure leaves the
             map unchanged.
     """
@@ -130,14 +129,11 @@ class LoopClosing:
         return LoopSearch(edges)
 
     def state(self) -> ClosingState:
-        """Return the state of loop closing for a checkpoint.
-
-        The state does not include the loop detector or the images.
-        """
+        """Return the state for a checkpoint, without the loop detector and the images."""
         return ClosingState(self._consistency.state(), self.verifier.state(), self._followed)
 
     def restore(self, state: ClosingState) -> None:
-        """Continue loop closing from a state that the method ``state`` returned."""
+        """Restore a state that the method ``state`` returned."""
         self._consistency.restore(state.consistency)
         self.verifier.restore(state.verifier)
         self._followed = state.followed
@@ -151,7 +147,7 @@ class LoopClosing:
         """Record that an old keyframe became the reference keyframe instead of a new keyframe.
 
         The result of the global bundle adjustment is merged after a certain number of keyframes. A
-        reused keyframe counts towards this number in the same way as a new keyframe.
+        reused keyframe also counts towards this number.
 
         Args:
             keyframe: id of the newest keyframe.
@@ -203,10 +199,9 @@ class LoopClosing:
 
     @contextmanager
     def _failure_reported(self, what: str) -> Iterator[None]:
-        """Log an exception of the ``with`` block and add it to ``problems``.
+        """Log an exception of the ``with`` block and add it to ``problems``, but do not raise it.
 
-        The exception is not raised again. This context manager is used for steps that leave the map
-        unchanged when they fail.
+        The block must leave the map unchanged when it fails.
         """
         try:
             yield
@@ -220,9 +215,8 @@ class LoopClosing:
         """Solve the pose graph with a verified loop.
 
         Returns:
-            The loop edge with the outcome, to be recorded in ``edges``, and the verified loop with
-            its correction. The second value is None if the loop contradicts the other edges of the
-            graph.
+            The edge with its outcome, and the loop that can be closed. The loop is None if it
+            contradicts the other edges of the graph.
         """
         start = time.perf_counter()
         solution = self._solution(map_, edge, Hypothesis.PREDICTED)
@@ -233,7 +227,6 @@ class LoopClosing:
         return replace(edge, reason="closed"), _Loop(edge, solution, start)
 
     def _close(self, map_: Map, loop: _Loop) -> None:
-        """Correct the map using a loop that ``_solve`` accepted."""
         edge, solution = loop.edge, loop.solution
         if self._global is not None:  # its snapshot does not contain this loop
             self._global.cancel()
@@ -265,7 +258,6 @@ class LoopClosing:
         )
 
     def _correct(self, map_: Map, solution: Solution) -> None:
-        """Move the keyframes and their landmarks to the poses of a solution."""
         keyframes = solution.graph.keyframes
         if self._camera.monocular:
             growth = move_keyframes_similarly(map_, keyframes, solution.S_wc)
@@ -297,10 +289,7 @@ def _superseded(candidate: LoopCandidate) -> LoopEdge:
 
 @dataclass(frozen=True)
 class _Loop:
-    """A verified loop, and the correction of the map that it causes.
-
-    ``start`` is the time (``perf_counter``) at which the computation of the correction started.
-    """
+    """A verified loop and its correction. ``start`` is when solving began (``perf_counter``)."""
 
     edge: LoopEdge
     solution: Solution

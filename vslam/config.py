@@ -768,10 +768,7 @@ class Config(Section):
     @model_validator(mode="before")
     @classmethod
     def _nest(cls, given: Any) -> Any:
-        """Move thresholds that are given by dotted names into their sections.
-
-        Thresholds with the names of older versions are renamed.
-        """
+        """Move thresholds with dotted names into their sections, and update old names."""
         if not isinstance(given, dict):
             return given
         nested = {name: value for name, value in given.items() if "." not in str(name)}
@@ -882,7 +879,6 @@ def checked(model: type[_Model], given: object, where: str, what: str) -> _Model
 
 
 def _fault(model: type[BaseModel], error: ValidationError, what: str) -> str:
-    """Describe the first error of a validation."""
     first = error.errors()[0]
     place = [str(name) for name in first["loc"]]
     if first["type"] == "json_invalid":
@@ -898,10 +894,7 @@ def _fault(model: type[BaseModel], error: ValidationError, what: str) -> str:
 
 
 def _without_section(model: type[BaseModel], place: list[str]) -> str:
-    """Suggest the full name of a key that was given without its section.
-
-    The suggestion is empty if no section has this key.
-    """
+    """Suggest the full name of a key that was given without its section, if a section has it."""
     sections = [section for section in model.model_fields if place[-1] in _keys(model, [section])]
     if len(place) > 1 or not sections:
         return ""
@@ -909,10 +902,7 @@ def _without_section(model: type[BaseModel], place: list[str]) -> str:
 
 
 def _keys(model: type[BaseModel], place: list[str]) -> list[str]:
-    """Return the names of the keys in the section of ``model`` at ``place``.
-
-    The list is empty if there is no section at ``place``.
-    """
+    """Return the names of the keys in the section of ``model`` at ``place``, if there is one."""
     for name in place:
         field = model.model_fields.get(name)
         if field is None or not isinstance(field.annotation, type):

@@ -18,8 +18,8 @@ class InputError(Exception):
 class UnreadableImageError(InputError):
     """One image of a sequence cannot be decoded or has the wrong size.
 
-    During a run, the frame is reported, skipped and counted. If this happens before the first frame
-    of a run, the run ends with an error.
+    A run reports this frame, skips it and counts it as lost. If the first image of a sequence is
+    unreadable, the sequence cannot be opened.
     """
 
     def __init__(self, path: Path, why: str) -> None:
@@ -28,17 +28,16 @@ class UnreadableImageError(InputError):
 
 
 class DroppedFrameError(UnreadableImageError):
-    """A perturbation dropped this frame. During a run, the frame counts as dropped, not as lost."""
+    """A perturbation dropped this frame. The frame counts as dropped, not as lost."""
 
     def __init__(self, frame: int) -> None:
         super().__init__(Path(f"frame {frame}"), "dropped by --perturb")
 
 
 class BrokenSourceError(InputError):
-    """A video, bag or camera ended early. The file was cut off, or the device was unplugged.
+    """A video, bag or camera ended early: the file was cut off, or the device was unplugged.
 
-    During a run, the results for the frames before this point are kept. The run fails only if there
-    are no such frames.
+    A run keeps the results of the frames before this point. It fails only if there are none.
     """
 
 

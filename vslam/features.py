@@ -46,10 +46,7 @@ class Pyramid:
 
 @inline
 def level_of(pixels, offsets, shapes, level):
-    """Return one level of a pyramid as an ``(h, w)`` image. Kernels call this function.
-
-    The arguments are the attributes of ``Pyramid``, and the index of the level.
-    """
+    """Return level ``level`` of a ``Pyramid`` as an ``(h, w)`` image, inside a kernel."""
     height, width = shapes[level]
     start = offsets[level]
     return pixels[start : start + height * width].reshape(height, width)
@@ -119,9 +116,9 @@ class Extracted:
         features: the N features that were extracted from the image of ``side``.
         pyramid: the pyramid of this image. None if matches in this image are not refined to
             sub-pixel accuracy.
-        row_offset: ``(N,)`` float32 pixels. The row offset is the row of the stereo match in the
-            right image minus the row of the feature in the left image. It is NaN for a feature
-            whose row offset was not measured. None if no row offset was measured.
+        row_offset: ``(N,)`` float32, row of the stereo match in the right image minus row of the
+            feature in the left image, in pixels. NaN where it was not measured, or None if it was
+            not measured for any feature.
         side: the camera whose image was used. Features are extracted from the right image only if
             the left image is black. In this case, no feature has a stereo match.
     """
@@ -133,7 +130,7 @@ class Extracted:
 
     @classmethod
     def nothing(cls) -> Extracted:
-        """Return a feature-extraction result without features, for a frame without images."""
+        """Return a result without features, for a frame without images."""
         return cls(Features.none())
 
 
@@ -228,7 +225,8 @@ class FeatureGrid(NamedTuple):
 def build_grid(xy, columns, rows):
     """Sort features at ``(N, 2)`` positions into grid cells by counting sort.
 
-    The cells are numbered row by row.
+    Returns:
+        ``start`` (int64) and ``items`` (int32) of ``FeatureGrid``.
     """
     n = len(xy)
     cell = np.empty(n, np.int64)
@@ -271,7 +269,7 @@ class TrackResult:
         timestamp: seconds.
         T_wc: ``(4, 4)`` float64 pose (camera to world) at the time of tracking. Later bundle
             adjustments improve this pose. ``Slam.trajectory()`` returns the improved poses.
-        state: how the frame was tracked: OK, WEAK, LOST or DROPPED.
+        state: how the frame was tracked.
         n_features: number of features that were extracted from the left image. It is 0 if the frame
             was tracked by patches.
         n_stereo: number of features with a stereo match.
@@ -282,10 +280,8 @@ class TrackResult:
         relocalised: whether the pose was found by relocalisation, which searches the whole map.
         stage_ms: wall time of each stage of the pipeline, in milliseconds.
         T_odom_camera: ``(4, 4)`` pose from odometry, which drifts but never jumps. It is the
-            identity at the first frame. None in results that were read from files of older
-            versions.
-        uncertainty: covariances of the pose. None in results that were read from files of older
-            versions.
+            identity at the first frame. None in files of older versions.
+        uncertainty: covariances of the pose. None in files of older versions.
     """
 
     index: int

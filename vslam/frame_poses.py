@@ -33,7 +33,7 @@ class KeyframePoses(Protocol):
         ...
 
     def unit_scale(self, keyframe: int) -> float:
-        """Factor by which loop closures have scaled lengths near a keyframe since it was added.
+        """Return the factor by which loop closures have scaled lengths near a keyframe.
 
         It is 1 in metric maps.
         """
@@ -81,11 +81,10 @@ class FramePoses:
     """
 
     def __init__(self, keyframes: KeyframePoses, before: FrameTable | None = None) -> None:
-        """Begin an empty list of poses, or continue the list of an earlier part of the same drive.
+        """Begin an empty list of poses.
 
         Args:
-            keyframes: the current poses of the keyframes.
-            before: poses of the earlier frames. None if there are no earlier frames.
+            before: poses of the earlier frames of the same drive, which come first in the list.
         """
         self._keyframes = keyframes
         self._n = 0 if before is None else len(before.timestamp)

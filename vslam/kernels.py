@@ -5,14 +5,10 @@ threads of the pipeline run kernels in parallel. ``error_model="numpy"`` and fus
 the only relaxations of floating-point arithmetic. Sums are not re-associated. Therefore, a result
 never depends on how a loop was vectorised.
 
-Before Numba looks into its cache, it prepares for compilation. It imports support for everything
-that it can compile, which takes 0.25 s of CPU time. For each kernel, it also imports the modules of
-all functions that the kernel calls. Finally, it parses the code that would be needed to inline the
-kernel into another kernel. A run that finds all kernels in the cache needs none of these steps.
-``_KernelCache`` skips these steps until a kernel must be compiled. Therefore, it loads kernels in a
-fifth of the time. The files of ``_KernelCache`` have Numba's format. The class relies on internals
-of Numba. With releases of Numba for which the class was not tested, Numba's own cache is used
-instead.
+Before Numba looks into its cache, it prepares for compilation. A run that finds all kernels in the
+cache does not need this. ``_KernelCache`` therefore prepares only when a kernel must be compiled,
+and loads kernels in a fifth of the time. It relies on internals of Numba. With releases of Numba
+for which it was not tested, Numba's own cache is used instead.
 
 A cache problem never ends a run. A power cut can truncate a cache file, and loading such a file
 would abort Python. Truncated files are detected by a checksum, and their kernels are compiled
@@ -58,10 +54,6 @@ _OPTIONS: dict[str, Any] = {
 
 
 class _KernelFormat(CompileResultCacheImpl):
-    """Defines which parts of a kernel are written to its cache file, and how these parts are
-    loaded.
-    """
-
     def reduce(self, compiled: Any) -> tuple[Any, ...]:
         *parts, environments = super().reduce(compiled)
         # Only the constants of an environment are needed, because kernels use no Python objects.
@@ -87,10 +79,7 @@ def _no_bitcode() -> bytes:
 
 
 def _parsed(library: Any, bitcode: bytes) -> Any:
-    """Return the LLVM module of a loaded kernel.
-
-    The module is parsed only when another kernel inlines the kernel.
-    """
+    """Parse the LLVM module of a loaded kernel, which is needed only to inline the kernel."""
     if library._shared_module is None:
         module = llvm.parse_bitcode(bitcode)
         library.codegen._engine._load_defined_symbols(module)
@@ -100,7 +89,7 @@ def _parsed(library: Any, bitcode: bytes) -> Any:
 
 @cache
 def _warn(message: str) -> None:
-    """Log a message, but only once."""
+    """Log a message once in each process."""
     _log.warning(message)
 
 
@@ -133,8 +122,6 @@ def _checksum(code: bytes) -> bytes:
 
 
 class _KernelCache(FunctionCache):
-    """The Numba cache of one kernel."""
-
     _impl_class = _KernelFormat
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -179,7 +166,6 @@ def _use_temporary_cache() -> None:
 
 
 def _cached(function: Callable[..., Any], options: dict[str, Any]) -> Any:
-    """Compile a function with Numba and attach the cache."""
     made = numba.njit(**options)(function)
     if not isinstance(made, Dispatcher):  # NUMBA_DISABLE_JIT is set
         return made
@@ -200,10 +186,7 @@ def _enable_cache(dispatcher: Any, function: Callable[..., Any]) -> None:
 
 
 def kernel(function: Function) -> Function:
-    """Decorate a function as a kernel, which Numba compiles on its first call.
-
-    All kernels have the same compiler options. The compiled code is kept in the cache.
-    """
+    """Decorate a function as a kernel, which Numba compiles on its first call and then caches."""
     return cast(Function, _cached(function, _OPTIONS))
 
 
@@ -245,10 +228,8 @@ def trailing_zeros(typing_context, value):
 def borrowed(typing_context, array):
     """Return the same array without reference counting.
 
-    The result is valid while a caller holds the original array.
-
-    Numba counts a reference whenever an array is passed to another function. This atomic operation
-    takes longer than the call of a small function.
+    The result is valid while a caller holds the original array. Counting a reference takes longer
+    than calling a small function.
     """
 
     def generate(context, builder, signature, arguments):

@@ -22,9 +22,9 @@ class LoopCandidate:
         similarity: similarity of the two images according to learned local descriptors.
             Verification using these descriptors is tried only for similar images. None if the
             similarity was not computed.
-        promising: whether the candidate is verified even if the consistency test rejects it.
         proposed_by: name of the detector that proposed the candidate. Several names are joined by
             ``+``.
+        promising: whether the candidate is verified even if the consistency test rejects it.
     """
 
     query: int
@@ -96,12 +96,10 @@ class LoopEdge:
         reason: str = "",
         matched_by: Literal["orb", "learned"] = "orb",
     ) -> LoopEdge:
-        """Create a loop edge from a candidate. The edge has no relative pose.
+        """Create the edge, without a relative pose, of a candidate that was not accepted.
 
         Args:
-            candidate: a candidate that was rejected or has not been verified yet.
             reason: why the candidate was rejected. Empty if it has not been verified yet.
-            matched_by: the kind of descriptors that were matched, "orb" or "learned".
         """
         return cls(
             candidate.query,
@@ -155,10 +153,7 @@ class LoopCorrection:
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Concatenate N ranges of integers.
-
-    Range i begins at ``first[i]`` and contains ``count[i]`` integers.
-    """
+    """Concatenate N ranges of integers. Range i has ``count[i]`` integers from ``first[i]`` up."""
     before = np.cumsum(count) - count
     return np.arange(int(count.sum()), dtype=np.int64) + np.repeat(first - before, count)
 
@@ -218,9 +213,10 @@ class DetectorMemory:
 class ResembledPlace:
     """A place that recent keyframes resembled.
 
-    The place consists of the keyframe that a loop candidate matched, and of the keyframes that are
-    covisible with it. ``length`` is the number of consecutive keyframes that resembled the place.
-    ``age`` is the number of keyframes since the last keyframe that resembled the place.
+    Attributes:
+        keyframes: the keyframe that a loop candidate matched, and its covisible keyframes.
+        length: number of consecutive keyframes that resembled the place.
+        age: number of keyframes since the last of these keyframes.
     """
 
     keyframes: frozenset[int]

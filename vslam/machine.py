@@ -90,11 +90,8 @@ def keep_memory() -> None:
     """Let the C library keep large freed blocks for the next frame's images.
 
     By default, the C library returns these blocks to the system, which must clear each page again.
-    Returning the blocks caused 150,000 page faults in 216 frames of KITTI and took 1/30 of the CPU
-    time. In addition, this function makes all threads share one arena, which saves 40 MB compared
-    with one arena for each thread.
-
-    The function does nothing if the C library is not glibc.
+    This takes 1/30 of the CPU time. In addition, this function makes all threads share one arena,
+    which saves 40 MB. It does nothing if the C library is not glibc.
     """
     import ctypes
 
@@ -106,10 +103,7 @@ def keep_memory() -> None:
 
 
 def give_back_memory() -> None:
-    """Return to the system the unused memory that ``keep_memory`` retained.
-
-    The function does nothing if the C library is not glibc.
-    """
+    """Return the unused memory that ``keep_memory`` retained to the system (glibc only)."""
     import ctypes
 
     with suppress(OSError, AttributeError):
@@ -137,10 +131,7 @@ class StageClock:
     last: float = field(default_factory=time.perf_counter)
 
     def lap(self, stage: str) -> None:
-        """Add the time since the previous call of ``lap`` to the time of a stage.
-
-        The first call measures the time since the clock was created.
-        """
+        """Add the time since the last call, or since the clock was created, to a stage."""
         now = time.perf_counter()
         self.ms[stage] = self.ms.get(stage, 0.0) + 1e3 * (now - self.last)
         self.last = now

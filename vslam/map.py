@@ -1,15 +1,13 @@
 """The map: keyframes, landmarks and observations as a structure of arrays.
 
-A *row* is one keypoint of one keyframe: it is one row of the arrays that hold keypoints. The rows
-of a keyframe are consecutive. A row also stores the observation that the keypoint makes.
-``landmark[row]`` is the landmark that the keypoint observes. The rows that observe the same
-landmark form a linked list, in which ``next_row`` is the next row. Covisibility is not stored. It
-is counted from the rows when it is needed. The use of arrays instead of objects follows DPVO's
-PatchGraph.
+A *row* is one keypoint of one keyframe. The rows of a keyframe are consecutive. ``landmark[row]``
+is the landmark that the keypoint observes. The rows that observe the same landmark form a linked
+list, in which ``next_row`` is the next row. Covisibility is not stored. It is counted from the rows
+when it is needed. The use of arrays instead of objects follows DPVO's PatchGraph.
 
 Culled keyframes and landmarks stay in the arrays and are marked as culled. A landmark that was
 merged into another landmark counts as culled. Ids of keyframes are never reused. Ids of landmarks
-change only when culled landmarks are dropped. A full array grows by half its size.
+change only when culled landmarks are dropped.
 
 Each array is called a column. To add a column, declare it in ``Arrays`` or ``KeyframeTable`` with
 an empty array of its dtype and shape as the default. The new column is then grown, copied, saved
@@ -44,8 +42,7 @@ class Arrays(NamedTuple):
 
     Attributes:
         T_cw: ``(K, 4, 4)`` f8, pose of each keyframe.
-        first_row: ``(K + 1,)`` i8, row (index) of the first keypoint of each keyframe in the arrays
-            of keypoints.
+        first_row: ``(K + 1,)`` i8, row of the first keypoint of each keyframe.
         keyframe_alive: ``(K,)`` bool, False for a culled keyframe.
         xyz: ``(L, 3)`` f8, position of each landmark in the world frame.
         normal: ``(L, 3)`` f8, mean viewing direction of each landmark.
@@ -57,8 +54,8 @@ class Arrays(NamedTuple):
         found: ``(L,)`` i4, number of frames in which the landmark was found.
         landmark_alive: ``(L,)`` bool, False for a culled or merged landmark.
         merged_into: ``(L,)`` i4, the landmark that this landmark was merged into.
-        head: ``(L,)`` i4, row (index) of the first keypoint that observes the landmark. This
-            keypoint begins a linked list.
+        head: ``(L,)`` i4, row of the first keypoint in the linked list of keypoints that observe
+            the landmark.
         n_observations: ``(L,)`` i4, number of observations. A stereo observation counts twice
             (ORB-SLAM2).
         xy: ``(R, 2)`` f4, position of each keypoint in pixels.
@@ -69,8 +66,7 @@ class Arrays(NamedTuple):
         descriptor: ``(R, 4)`` u8, 256-bit descriptor of each keypoint.
         keyframe: ``(R,)`` i4, the keyframe that the keypoint belongs to.
         landmark: ``(R,)`` i4, the landmark that the keypoint observes.
-        next_row: ``(R,)`` i4, row (index) of the next keypoint in the linked list of keypoints that
-            observe the same landmark.
+        next_row: ``(R,)`` i4, row of the next keypoint in this linked list.
         certainty: ``(R,)`` u1, ratio of two variances: the variance of a keypoint position without
             sub-pixel alignment, divided by the variance of ``xy``.
     """
@@ -121,10 +117,9 @@ class KeyframeTable(NamedTuple):
             since it was added. It is always 1 in metric maps.
         T_c_parent: ``(K, 4, 4)`` f8, pose of a culled keyframe relative to its parent. It is the
             identity while the keyframe is alive.
-        restart: ``(K,)`` u1, nonzero if mapping restarted at this keyframe after the camera was
-            lost. Such a keyframe is the root of a sub-map. The value is ``PREDICTED`` if the pose
-            of the keyframe relative to its parent was predicted. It is ``UNPREDICTED`` if the speed
-            of the camera was unknown, so that no prediction was possible.
+        restart: ``(K,)`` u1, nonzero if the keyframe is the first keyframe of a sub-map, which
+            begins after the camera was lost. The value is ``PREDICTED`` if the pose of the keyframe
+            relative to its parent was predicted, and ``UNPREDICTED`` if it is unknown.
     """
 
     timestamp: NDArray[np.float64] = np.zeros(0)
@@ -174,11 +169,7 @@ class Map:
     """
 
     def __init__(self, scales: NDArray[np.float64]) -> None:
-        """Create an empty map.
-
-        Args:
-            scales: ``(levels,)`` scale factor of each level of the image pyramid.
-        """
+        """Create an empty map. ``scales`` are the ``(levels,)`` scales of the image pyramid."""
         self.scales = scales
         self.n_keyframes = 0
         self.n_landmarks = 0
@@ -212,10 +203,7 @@ class Map:
 
     @property
     def unit_scale(self) -> NDArray[np.float64]:
-        """``(n_keyframes,)`` view of ``KeyframeTable.unit_scale``.
-
-        It is the factor by which loop closures have scaled lengths near each keyframe.
-        """
+        """``(n_keyframes,)`` view of ``KeyframeTable.unit_scale``."""
         return self.keyframes.unit_scale[: self.n_keyframes]
 
     @property
@@ -255,12 +243,10 @@ class Map:
         """Append a keyframe without observations, and return its id.
 
         Args:
-            features: the N features of the keyframe.
             T_cw: ``(4, 4)`` pose of the keyframe.
             timestamp: seconds.
             frame: index of the frame that becomes the keyframe.
-            certainty: ``(N,)`` variance of a keypoint without sub-pixel alignment, divided by the
-                variance of each feature. One number applies to all features.
+            certainty: ``Arrays.certainty`` of each feature, or of all features.
         """
         k, n = self.n_keyframes, len(features)
         self._reserve_keyframes(1)
@@ -298,7 +284,6 @@ class Map:
         Args:
             xyz: ``(N, 3)`` positions in the world frame.
             descriptors: ``(N, 4)`` descriptors.
-            keyframe: the keyframe that sees the landmarks.
         """
         n, start = len(xyz), self.n_landmarks
         self._reserve(LANDMARK_FIELDS, start, n)
@@ -314,10 +299,7 @@ class Map:
         return np.arange(start, start + n, dtype=np.int32)
 
     def columns(self) -> dict[str, NDArray]:
-        """Return views of all arrays of the map by name, without unused capacity.
-
-        These are the arrays of ``Arrays`` and ``KeyframeTable``.
-        """
+        """Return views of all ``Arrays`` and of the ``KeyframeTable``, without unused capacity."""
         of_arrays = {
             name: getattr(self.arrays, name)[:size]
             for fields, size in (
@@ -334,10 +316,7 @@ class Map:
     def with_columns(self, columns: dict[str, NDArray]) -> Map:
         """Create a map with the given arrays and the scalars of this map.
 
-        The arrays are not copied.
-
-        Args:
-            columns: the arrays under the names that ``columns()`` returns.
+        The arrays are not copied. Their names are the names that ``columns()`` returns.
         """
         other = copy.copy(self)
         other.arrays = Arrays(**{name: columns[name] for name in Arrays._fields})
@@ -364,8 +343,6 @@ class Map:
     def drop_culled_landmarks(self) -> NDArray[np.int32]:
         """Remove culled landmarks, and renumber the other landmarks in their order.
 
-        Most landmarks are culled within a few keyframes of their creation.
-
         Returns:
             ``(n_landmarks,)`` new id of each old landmark, or -1 if it was culled. A landmark that
             was merged into another landmark has the new id of that landmark (``resolve``).
@@ -383,7 +360,7 @@ class Map:
         return new_id[resolved]
 
     def rows(self, keyframe: int) -> slice:
-        """Return the range of indices of a keyframe's keypoints in the arrays of the map."""
+        """Return the rows of a keyframe's keypoints."""
         first = self.arrays.first_row
         return slice(int(first[keyframe]), int(first[keyframe + 1]))
 

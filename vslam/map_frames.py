@@ -131,8 +131,8 @@ def drop_culled_landmarks(map_: Map, frames: Sequence[Frame]) -> None:
 def has_more_points(map_: Map, keyframe: int, frame: Frame) -> bool:
     """Return whether the far stereo points of a keyframe have not been mapped yet.
 
-    This is the case if three conditions are met. The keyframe is the first keyframe of a map or
-    sub-map. No other keyframe follows it. ``frame`` is the frame that became this keyframe.
+    This is the case if the keyframe begins a map or sub-map, no keyframe follows it, and ``frame``
+    is the frame that became this keyframe.
     """
     begins = keyframe == 0 or keyframe in map_.restarts
     return begins and keyframe == map_.n_keyframes - 1 and map_.frames[keyframe] == frame.index
@@ -145,12 +145,10 @@ def observe_keyframe(frame: Frame, map_: Map, keyframe: int) -> None:
 
 
 def update_landmarks(frame: Frame, map_: Map) -> None:
-    """Update the landmarks of a frame after the map has changed.
+    """Update the ids and positions of a frame's landmarks after the map has changed.
 
-    The ids of merged landmarks are replaced, and the ids of culled landmarks become -1.
-    ``frame.xyz`` is set to the current positions of the landmarks.
-
-    If two tracked landmarks were merged, only the first of the two features keeps the landmark.
+    The ids of culled landmarks become -1. If two tracked landmarks were merged, only the first of
+    the two features keeps the landmark.
     """
     arrays = map_.arrays
     ids = resolve(arrays, frame.landmark)
@@ -163,11 +161,7 @@ def update_landmarks(frame: Frame, map_: Map) -> None:
 
 
 def count_shared_landmarks(map_: Map, frame: Frame) -> NDArray[np.int64]:
-    """Count the landmarks that each keyframe shares with a frame.
-
-    Returns:
-        ``(n_keyframes,)`` numbers of shared landmarks.
-    """
+    """Count the landmarks that each of ``(n_keyframes,)`` keyframes shares with a frame."""
     a, n = map_.arrays, map_.n_keyframes
     _, rows = gather_observations(a, frame.landmark[frame.landmark >= 0], np.arange(n))
     return np.bincount(a.keyframe[rows], minlength=n)
@@ -188,10 +182,10 @@ class OldPlace(NamedTuple):
 
 
 def find_old_place(map_: Map, frame: Frame, known_after_s: float) -> OldPlace | None:
-    """Find the old place that shares the most landmarks with a frame.
+    """Find the old keyframe that shares the most landmarks with a frame.
 
-    Only keyframes that are at least ``known_after_s`` seconds old are considered. The result is
-    None if none of these keyframes shares a landmark with the frame.
+    A keyframe is old if it was added at least ``known_after_s`` seconds ago or on an earlier drive.
+    The result is None if no old keyframe shares a landmark with the frame.
     """
     young = map_.sessions == map_.scalars.session
     young &= map_.timestamps > frame.timestamp - known_after_s
@@ -215,7 +209,6 @@ def in_first_part(map_: Map, closed: Sequence[LoopEdge], frames: FrameTable) -> 
     This part includes all sub-maps that are joined to it by closed loops.
 
     Args:
-        closed: the closed loops.
         frames: the poses of N frames, relative to keyframes.
 
     Returns:

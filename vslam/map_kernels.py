@@ -2,7 +2,7 @@
 
 ``a`` is the ``Arrays`` of the map (vslam/map.py). A row is one keypoint of one keyframe. The rows
 that observe a landmark form a linked list, which begins at ``head`` and continues through
-``next_row``. Adding, removing and merging observations changes only such lists.
+``next_row``.
 """
 
 from __future__ import annotations
@@ -36,8 +36,7 @@ def count_shared(a, keyframe, n_keyframes):
 def link(a, row, landmark):
     """Record that a keypoint observes a landmark.
 
-    ``row`` is the index of the keypoint in the arrays of the map. The keypoint must not observe a
-    landmark yet.
+    The keypoint in row ``row`` must not observe a landmark yet.
     """
     a.landmark[row] = landmark
     a.next_row[row] = a.head[landmark]
@@ -47,21 +46,16 @@ def link(a, row, landmark):
 
 @kernel
 def link_many(a, rows, landmarks):
-    """Record which landmark each of N keypoints observes.
-
-    ``rows`` are the ``(N,)`` indices of the keypoints in the arrays of the map. None of these
-    keypoints may observe a landmark yet.
-    """
+    """Call ``link`` for each of ``(N,)`` rows and landmarks."""
     for i in range(len(rows)):
         link(a, rows[i], landmarks[i])
 
 
 @kernel
 def unlink(a, row):
-    """Remove the observation of a landmark by a keypoint.
+    """Remove the observation by the keypoint in row ``row``.
 
-    ``row`` is the index of the keypoint in the arrays of the map. If the landmark has no
-    observations left, it is culled.
+    A landmark without observations is culled.
     """
     landmark = a.landmark[row]
     if a.head[landmark] == row:
@@ -102,9 +96,7 @@ def detach_keyframe(a, keyframe):
 
 @kernel
 def observed_by(a, landmark, keyframe):
-    """Return the row of the keypoint with which a keyframe observes a landmark, or -1. The row is
-    the index of the keypoint in the arrays of the map.
-    """
+    """Return the row of the keypoint with which a keyframe observes a landmark, or -1."""
     row = a.head[landmark]
     while row >= 0:
         if a.keyframe[row] == keyframe:
@@ -118,10 +110,9 @@ def merge_landmarks(a, loser, winner):
     """Move the observations of landmark ``loser`` to landmark ``winner``.
 
     A keyframe that observes both landmarks keeps only its observation of ``winner``.
-
-    Indices are cast to int64, because the other callers of ``link`` and ``observed_by`` pass this
-    type. Therefore, both kernels are compiled only once.
     """
+    # The other callers of link() and observed_by() pass int64. With the same type, both kernels are
+    # compiled only once.
     row = np.int64(a.head[loser])
     while row >= 0:
         following = np.int64(a.next_row[row])
@@ -326,9 +317,8 @@ def gather_observations(a, landmarks, index):
     Only keyframes with ``index[keyframe] >= 0`` are considered.
 
     Returns:
-        ``(P + 1,)`` int64 offsets, and the rows (indices) of the keypoints in the arrays of the
-        map, sorted by landmark. The rows of landmark i begin at ``offsets[i]`` and end before
-        ``offsets[i + 1]``.
+        ``(P + 1,)`` int64 offsets, and the int64 rows of the keypoints, sorted by landmark. The
+        rows of landmark i begin at ``offsets[i]`` and end before ``offsets[i + 1]``.
     """
     first = np.zeros(len(landmarks) + 1, np.int64)
     for i in range(len(landmarks)):

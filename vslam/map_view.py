@@ -59,15 +59,10 @@ NO_LANDMARKS = LocalMap(
 
 @dataclass(frozen=True)
 class MapView:
-    """A copy of the parts of the map that tracking reads.
-
-    The copy is made when a result of local mapping is merged.
-
-    The default values describe an empty map.
+    """A copy of the parts of the map that tracking reads. The default values describe an empty map.
 
     Attributes:
-        reference: the keyframe that frames are tracked against. The poses of frames are relative to
-            it. It is usually the newest keyframe.
+        reference: the keyframe that frames are tracked against. It is usually the newest keyframe.
         T_reference: ``(4, 4)`` pose ``T_cw`` of the reference keyframe.
         unit_scale: factor by which loop closures have scaled lengths near the reference keyframe
             since it was added. It is 1 in metric maps.
@@ -99,7 +94,6 @@ def view_of(
     Args:
         local: the landmarks of the keyframe and of its covisible keyframes.
         patches: image patches of those landmarks that the newest keyframes observe.
-        monocular: whether the camera is monocular.
     """
     living = map_.living_keyframes()
     if monocular and map_.restarts:

@@ -3,8 +3,7 @@
 ``Mapper`` owns the map. A job in another thread maps each keyframe. A *merge* then makes the result
 of this job visible to tracking. The merge happens at a fixed frame index, regardless of how long
 the job takes. Between two merges, tracking reads a ``MapView``, which is a copy of parts of the map
-made at the last merge. A method that needs the merged map first performs the merge. A merge also
-updates the poses and landmarks of the frames that were given to ``Mapper.hold``.
+made at the last merge. A method that needs the merged map first performs the merge.
 
 After the merge, the other thread searches for a loop at the keyframe. If a loop is found, it is
 closed before the map is changed again.
@@ -75,8 +74,6 @@ class Mapper:
         """Create the mapper of a new or continued map.
 
         Args:
-            context: camera, thresholds and pyramid scales.
-            closing: searches for loops at new keyframes and closes them.
             rig: corrects frames, and receives the disparity offset of the map.
             workers: threads that run mapping jobs, one at a time, and searches for loops.
             map_: map to continue in. None begins an empty map.
@@ -148,8 +145,7 @@ class Mapper:
     def unit_scale(self, keyframe: int) -> float:
         """Return the factor by which loop closures have scaled lengths near a keyframe.
 
-        The factor covers all loop closures since the keyframe was added. While a mapping job runs,
-        only the factor of the reference keyframe is available.
+        While a mapping job runs, only the factor of the reference keyframe is available.
         """
         if not self._is_merged and keyframe == self.view.reference:
             return self.view.unit_scale
@@ -167,10 +163,9 @@ class Mapper:
     # The schedule
 
     def hold(self, *frames: Frame | None) -> None:
-        """Choose the frames that are updated when a merge changes the map.
+        """Choose the frames whose pose, landmarks and twist each merge updates.
 
-        The poses, landmarks and twists of these frames are updated. Frames from an earlier call of
-        this method are no longer updated.
+        They replace the frames of an earlier call.
         """
         self._held = tuple(frame for frame in frames if frame is not None)
 
@@ -178,12 +173,10 @@ class Mapper:
         """Prepare the next frame for tracking.
 
         If a merge is due at the index of the frame, the merge is performed. The columns of the
-        frame in the right image are corrected by the measured offset and delay of the rig.
-
-        Until this method is called again, merges update ``frame`` and ``last``.
+        frame in the right image are corrected by the measured offset and delay of the rig. Until
+        the next call, merges update ``frame`` and ``last``.
 
         Args:
-            frame: the next frame, which has not been tracked yet.
             last: the last tracked frame. None if no frame has been tracked.
             twist: ``(6,)`` twist of the points relative to the camera, per second. None if it is
                 unknown.
@@ -215,11 +208,13 @@ class Mapper:
         self._counts.add(visible, found)
 
     def merge_if_due(self, frame: int) -> None:
-        """Make the result of the mapping job visible to tracking if the job is old enough.
+        """Make the result of the mapping job visible to tracking, if this is due at a frame.
 
-        This is the case if the frame is at least ``merge_after_frames`` newer than the last
-        keyframe. If the frame is at least ``_CLOSE_AFTER_FRAMES`` newer than the last keyframe, a
-        loop that was found at this keyframe is closed.
+        It is due ``merge_after_frames`` frames after the last keyframe. Ten frames after this
+        keyframe, a loop that was found at it is closed.
+
+        Args:
+            frame: index of the frame.
         """
         age = frame - self.last_frame
         if age >= self._config.keyframes.merge_after_frames:
@@ -230,8 +225,7 @@ class Mapper:
     def merge(self) -> Map:
         """Make the result of the mapping job visible to tracking, and return the map.
 
-        This method waits for the running mapping job. After the merge, it waits for the search for
-        loops.
+        This method waits for the mapping job and for the search for loops.
 
         Raises:
             RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
@@ -261,13 +255,11 @@ class Mapper:
         return map_
 
     def _start_search(self) -> None:
-        """Start the search for loops at the keyframe that was mapped last."""
         if self._next_search is not None:
             self._search = self._shared.start_reading(self._next_search)
             self._next_search = None
 
     def _merge_mapping(self) -> None:
-        """Make the result of the last mapping job visible to tracking."""
         if not self._is_merged:
             self._wait_for_mapping()
             self._is_merged = True
@@ -346,17 +338,12 @@ class Mapper:
         return len(new) > 0
 
     def begin(self, start: TwoViewStart, twist: Callable[[], Matrix | None]) -> None:
-        """Begin a monocular map or sub-map with two keyframes.
-
-        The second keyframe is the newest frame.
-
-        The newest frame gets the twist between the two views, and tracks all landmarks that it
-        observes.
+        """Begin a monocular map or sub-map with two keyframes. The second is the newest frame.
 
         Args:
-            twist: function that is called after the merge. It returns the ``(6,)`` twist of the
-                camera before it was lost, per second, or None if this twist is unknown. The twist
-                determines the unit of a sub-map.
+            twist: function that is called after the merge. It returns the ``(6,)`` twist per second
+                before the camera was lost, or None if this twist is unknown. The twist determines
+                the unit of a sub-map.
         """
         with self._changing() as map_:
             start = start.at_speed(twist(), self._config.initialization.max_rescaling)
@@ -372,11 +359,7 @@ class Mapper:
             start.second.twist = start.twist
 
     def find_old_place(self, frame: Frame) -> OldPlace | None:
-        """Find a place that was mapped some time ago and to which the frame has returned.
-
-        Returns:
-            The place, or None if there is none (``map_frames.find_old_place``).
-        """
+        """Find a place that was mapped some time ago and to which the frame has returned."""
         return find_old_place(self._settle(), frame, self._config.keyframes.known_after_s)
 
     def use_existing_keyframe(self, place: OldPlace, frame: PlacedFrame) -> None:
@@ -420,10 +403,7 @@ class Mapper:
         )
 
     def restore(self, state: MapperState) -> None:
-        """Restore a state that the method ``state`` returned.
-
-        The map must be the map that was saved together with this state.
-        """
+        """Restore a state, given the map that was saved together with it."""
         self.last_frame, self.last_timestamp = state.last_frame, state.last_timestamp
         for patches in state.patches:
             self._patches.add(patches)
@@ -456,7 +436,6 @@ class Mapper:
             drop_culled_landmarks(map_, (*self._held, frame))
 
     def _set_newest(self, keyframe: int, frame: Frame) -> None:
-        """Record that a frame became the newest keyframe, and make it the reference keyframe."""
         map_ = self.map
         self._patches.remember(frame, keyframe, map_.scales)
         self.last_frame, self.last_timestamp = frame.index, frame.timestamp
@@ -492,9 +471,5 @@ class Mapper:
         self._closing.merge_adjustment_if_due(map_, keyframe)
 
     def _start(self, job: Callable[[Map], None]) -> None:
-        """Start a mapping job.
-
-        Until the merge, tracking continues with the current view of the map.
-        """
         self._shared.start(job)
         self._is_merged = False

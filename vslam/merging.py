@@ -96,8 +96,7 @@ def join(
     The joined map has the world frame of the first map.
 
     Args:
-        memory: an empty loop detector of the same kind as the detector of the maps, and the store
-            of its images.
+        memory: an empty loop detector of the same kind as that of the maps, and its image store.
 
     Returns:
         The joined map, and the loops that were closed between the two maps. None if no loop was

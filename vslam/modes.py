@@ -29,10 +29,7 @@ class Mode:
 
     @property
     def due(self) -> int:
-        """Index of the frame that is planned to become a keyframe.
-
-        It is -1 if no keyframe is planned.
-        """
+        """Index of the frame that is planned to become a keyframe, or -1."""
         return -1
 
     def begin(self, frame: PlacedFrame) -> bool:
@@ -55,10 +52,9 @@ class Mode:
         return False
 
     def map_far_points(self) -> bool:
-        """Map the far stereo points of the last frame if it began a map or sub-map.
+        """Map the far stereo points of the last frame if this frame began a map or sub-map.
 
-        This method is called if the frame directly after the first keyframe of a map or sub-map was
-        lost. For later keyframes, all far points are already mapped.
+        Call this method if the new frame cannot be tracked.
 
         Returns:
             True if points were added, so that tracking can be tried again.
@@ -167,8 +163,6 @@ class MapBuilding(Mode):
     def _match_features(self, frame: PlacedFrame) -> bool:
         """Match the features of a frame that was tracked by patches.
 
-        Only a frame with matched features can become a keyframe.
-
         Returns:
             False if the features do not match the map. The frame is then left unchanged.
         """
@@ -182,10 +176,6 @@ class MapBuilding(Mode):
         return False
 
     def state(self) -> PolicyState | None:
-        """Return the state of the keyframe policy for a checkpoint.
-
-        The result is None while the start of a monocular map waits for its second frame.
-        """
         return None if self.starter.is_waiting else self.policy.state()
 
     def restore(self, state: PolicyState) -> None:

@@ -65,10 +65,9 @@ class PoseUncertainty:
     offset: Matrix = field(default_factory=lambda: np.zeros(6))
 
     def numbers(self) -> NDArray[np.float64]:
-        """Return all values of this object as a ``(49,)`` array, so that they can be saved.
+        """Return ``local``, ``drift``, ``offset`` and ``n_keyframes`` as a ``(49,)`` array.
 
-        The array holds the upper triangles of ``local`` and ``drift``, row by row. ``offset`` and
-        ``n_keyframes`` follow. ``of_numbers`` is the inverse function.
+        The array holds the upper triangles of the two covariances. ``of_numbers`` is the inverse.
         """
         return np.array([*self.local[_UPPER], *self.drift[_UPPER], *self.offset, self.n_keyframes])
 
@@ -135,8 +134,7 @@ def _symmetric(matrix: Matrix) -> Matrix:
 def _growth(n: int) -> float:
     """Return the factor by which correlation increases the variance of a sum of n steps.
 
-    The factor is 1 for independent steps. The steps are an AR(1) process (Hamilton, Time Series
-    Analysis, 1994, 7.2).
+    The steps are an AR(1) process (Hamilton, Time Series Analysis, 1994, 7.2).
     """
     if n == 0:
         return 1.0

@@ -137,10 +137,7 @@ def find_plugins(group: str) -> dict[str, PlugIn]:
 
 
 def packages_of(names: Collection[str]) -> dict[str, str]:
-    """Return the package, with its version, of each plug-in in ``names``.
-
-    Names that do not belong to a plug-in are left out.
-    """
+    """Return the package and version of each plug-in in ``names``. Other names are left out."""
     found = {name: plugin for group in KINDS for name, plugin in find_plugins(group).items()}
     return {name: " and ".join(found[name].packages) for name in names if name in found}
 

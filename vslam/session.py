@@ -108,8 +108,7 @@ class Session:
     def stored_map(self, drive: str) -> StoredMap:
         """Return the map in the form in which it is stored in a file.
 
-        It contains a checkpoint if a checkpoint is possible now. The arrays of the map are not
-        copied.
+        It contains a checkpoint if ``state`` can return one. The arrays of the map are not copied.
 
         Args:
             drive: source of the images of the current drive, such as "kitti 06".
@@ -129,14 +128,11 @@ class Session:
         )
 
     def state(self) -> Checkpoint | None:
-        """Return the state of all parts between two frames.
+        """Return the state of all parts between two frames, or None if this is not possible now.
 
-        The result is None if no checkpoint is possible now.
-
-        A checkpoint is impossible before the first frame is tracked and when the run only
-        localises. It is also impossible while a keyframe is being mapped, while a monocular map
-        begins, while a verified loop is waiting to be closed, and during a global bundle
-        adjustment.
+        It is not possible before the first frame is tracked, or if the run only localises. It is
+        also not possible while a keyframe is being mapped, a monocular map begins, a verified loop
+        is waiting to be closed, or a global bundle adjustment is running.
         """
         tracker, policy = self.tracker.state(), self.mode.state()
         if tracker is None or policy is None:
@@ -154,10 +150,7 @@ class Session:
         )
 
     def restore(self, state: Checkpoint) -> None:
-        """Restore the state of all parts.
-
-        The map must be the map that was stored together with ``state``.
-        """
+        """Restore the state of all parts, given the map that was stored together with it."""
         self.mapper.restore(state.mapper)
         self.mode.restore(state.policy)
         self.closing.restore(state.closing)
@@ -181,9 +174,8 @@ class Session:
     def resume(self) -> None:
         """If ``resume=True`` was passed to ``open_map``, continue the drive after its last frame.
 
-        If the map was saved with a checkpoint, the results are identical to the results of an
-        uninterrupted run. Without a checkpoint, tracking continues from the last pose and speed. If
-        ``resume=True`` was not passed, nothing is done.
+        With a checkpoint, the results are identical to those of an uninterrupted run. Without a
+        checkpoint, tracking continues from the last pose and speed.
         """
         frames = self.opened.frames
         if frames is None:

@@ -81,10 +81,9 @@ class SharedMap:
 
     @contextmanager
     def _invalidated_on_error(self) -> Iterator[None]:
-        """Make every later access to the map raise an error if the ``with`` block raises an
-        exception.
+        """If the ``with`` block raises an exception, make every later access to the map raise one.
 
-        The reason is that an exception may leave the map incomplete.
+        The map may then be incomplete.
         """
         try:
             yield

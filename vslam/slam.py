@@ -43,7 +43,7 @@ from vslam.workers import Workers
 
 
 def _ignore(result: TrackResult) -> None:
-    """Do nothing with a result. This function is the default of ``on_pose``."""
+    """The default of ``on_pose``."""
 
 
 class Slam:
@@ -56,10 +56,9 @@ class Slam:
     >>> slam.trajectory().T_wc
     >>> slam.save(path)
 
-    ``Slam.load(path)`` reads the saved map, and SLAM continues in this map. The camera is
-    relocalised in this map, and new places are added. If relocalisation fails, a new sub-map
-    begins. A loop may join this sub-map to the map later. With ``localize=True``, the map is not
-    changed.
+    ``Slam.load(path)`` continues in the saved map. The camera is relocalised in this map, and new
+    places are added. If relocalisation fails, a new sub-map begins, which a loop may join to the
+    map later. With ``localize=True``, the map is not changed.
 
     Attributes:
         context: camera, thresholds and pyramid scales, for ``FrameImages``.
@@ -93,17 +92,16 @@ class Slam:
             detector: proposes loop candidates, and places for relocalisation. It is an object or a
                 name (``vslam.loopclosure.registry``). ``both`` combines the capsule network with
                 the bag of words. ``none`` closes no loops.
-            threads: number of threads. With 1, a keyframe is mapped when its result is needed,
-                instead of in parallel with tracking. The results do not depend on this number.
+            threads: number of threads. The results do not depend on this number.
             images: store of the keyframe images, from which learned descriptors are computed. These
                 descriptors verify loops where ORB fails. None verifies loops with ORB only. This
                 argument is used only if ``detector`` is an object.
-            start: a map to continue in. The map must have been made with the same camera, detector
-                and pyramid, and is changed in place. ``Slam.load`` reads such a map from a file.
+            start: a map to continue in, which is changed in place. It must have been made with the
+                same camera, detector and pyramid. ``Slam.load`` reads such a map from a file.
             localize: only track in the map ``start``, without changing it.
-            resume: continue the last drive of the map ``start``. Otherwise, a new drive begins,
-                whose timestamps are independent of earlier drives. The poses equal those of an
-                uninterrupted drive only if the map was saved with ``resumable=True``.
+            resume: continue the last drive of the map ``start`` instead of beginning a new drive.
+                The poses equal those of an uninterrupted drive only if the map was saved with
+                ``resumable=True``.
 
         Raises:
             ValueError: the map cannot be continued. The message gives the reason in a few words.
@@ -219,9 +217,9 @@ class Slam:
             timestamp: seconds. It must be later than the timestamp of the last call.
             mask: ``(H, W)`` uint8 or bool. It is 0 where the left image must not be used, for
                 example where it shows the hood of the car. None uses the whole image.
-            on_pose: function that is called with the result as soon as the pose is known, because
-                inserting a keyframe takes much longer than tracking. At this time, ``is_keyframe``
-                may not be decided yet. Exceptions of this function are passed on.
+            on_pose: function that is called with the result as soon as the pose is known, before a
+                keyframe is inserted. ``is_keyframe`` may not be decided yet. Exceptions of this
+                function are passed on.
 
         Raises:
             ValueError: the images have the wrong size or type, or the timestamp is not finite or
@@ -243,17 +241,14 @@ class Slam:
         stage_ms: dict[str, float] | None = None,
         on_pose: Callable[[TrackResult], None] = _ignore,
     ) -> TrackResult:
-        """Track images that were prepared in advance, for example in another thread.
-
-        Apart from this, the method does the same as ``step``.
+        """Do the same as ``step`` with images that were prepared in advance.
 
         Args:
             images: the images, which are not copied. Do not write to them afterwards.
             timestamp: seconds. It must be later than the timestamp of the last call.
             stage_ms: wall time of the stages before this call, in milliseconds. It is included in
                 the result.
-            on_pose: function that is called with the result as soon as the pose is known
-                (``step``).
+            on_pose: as in ``step``.
         """
         frame = self._next_frame(Extracted.nothing(), timestamp, None)
         frame.source, frame.pyramid, frame.coarse = images, images.pyramid, images.coarse
@@ -267,12 +262,10 @@ class Slam:
         image: Image | None = None,
         stage_ms: dict[str, float] | None = None,
     ) -> TrackResult:
-        """Track a frame whose features were extracted in advance (``FrameImages.extracted``).
-
-        Apart from this, the method does the same as ``step``.
+        """Do the same as ``step`` with features that were extracted in advance.
 
         Args:
-            extracted: the features.
+            extracted: the features (``FrameImages.extracted``).
             timestamp: seconds. It must be later than the timestamp of the last call.
             image: ``(H, W)`` uint8, the image of the features, for loop detectors that need it. It
                 is not copied. Do not write to it afterwards.
@@ -309,7 +302,6 @@ class Slam:
         return result_of(frame, found, is_keyframe, clock.ms, self._odometry)
 
     def _begin_map(self, frame: Frame, clock: StageClock) -> Found:
-        """Try to begin the map with a frame."""
         self.rig.extract(frame, self._tracker.twist)
         clock.lap("extract")
         self._follow(frame, frame.T_cw, None)
@@ -355,13 +347,7 @@ class Slam:
         return mapper.append_pose(frame, tracked=True, near=found.keyframe)
 
     def _update_map(self, frame: PlacedFrame, found: Found) -> bool:
-        """Update the map with a frame.
-
-        Afterwards, choose the next frame whose features are extracted in advance.
-
-        Returns:
-            Whether the frame became a keyframe.
-        """
+        """Update the map and ``next_extraction``. Return whether the frame became a keyframe."""
         by_patches = frame.source is not None
         if found.is_lost:
             is_keyframe = self._mode.begin_after_loss(frame)
@@ -409,12 +395,10 @@ class Slam:
         self._odometry.move(T_now_last, elapsed, covariance, of_offset)
 
     def resume_odometry(self, last: TrackResult) -> None:
-        """Continue the odometry of a resumed drive.
+        """Continue ``T_odom_camera`` and its uncertainty after a drive was resumed.
 
-        This is needed if the map was saved without the state of tracking.
-
-        ``T_odom_camera`` and its uncertainty continue from ``last``. Without this call, the
-        odometry starts at the identity, with no uncertainty.
+        This is needed only if the map was saved without the state of tracking. Without this call,
+        the odometry then starts at the identity, with no uncertainty.
 
         Args:
             last: the last result of the drive before it was resumed.
@@ -422,10 +406,7 @@ class Slam:
         self._session.resume_odometry(last)
 
     def finish(self) -> None:
-        """Complete all mapping.
-
-        Afterwards, the map and the trajectory do not change until the next step.
-        """
+        """Complete all mapping. The map and trajectory then do not change until the next step."""
         self._mapper.finish()
 
     def _next_frame(self, extracted: Extracted, timestamp: float, image: Image | None) -> Frame:
@@ -452,9 +433,7 @@ class Slam:
 
     @property
     def truth_alignment(self) -> TruthAlignment | None:
-        """The transformation from the loaded map to the frame of a ground truth. None if it is
-        unknown.
-        """
+        """The transformation from the loaded map to the frame of a ground truth, if known."""
         return self._session.opened.truth_alignment
 
     @property
@@ -498,9 +477,8 @@ class Slam:
         return keyframe_trajectory(self.map)
 
     def in_map(self) -> NDArray[np.bool_]:
-        """Determine which frames were tracked in the first part of the map. Returns ``(N,)`` bool.
+        """Return an ``(N,)`` bool array, True for frames that were tracked in the first sub-map.
 
-        The first part of the map contains the first keyframe and the sub-maps that closed loops
-        have joined to it.
+        Sub-maps that closed loops have joined to the first sub-map count as part of it.
         """
         return in_first_part(self.map, self._closing.closed, self._mapper.frames.table())

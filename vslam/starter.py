@@ -23,8 +23,7 @@ class TwoViewStart:
     """The start of a monocular map or sub-map from two frames.
 
     Attributes:
-        first, second: the two frames. The pose of the first frame is the pose at which the map
-            begins.
+        first, second: the two frames. The map begins at the pose of the first frame.
         T_2_1: ``(4, 4)``, maps points from the camera of the first frame to the camera of the
             second frame.
         features: two ``(N,)`` int64 arrays with the indices of the matched features in the first
@@ -50,14 +49,12 @@ class TwoViewStart:
     def at_speed(self, twist: Matrix | None, max_rescaling: float) -> TwoViewStart:
         """Scale the start of a sub-map to the speed that the camera had before it was lost.
 
-        The translation between the two frames, and the points, are scaled. The unit of the sub-map
-        is then approximately the unit of the map before the loss.
+        The unit of the sub-map is then approximately the unit of the map before the loss.
 
         Args:
-            twist: ``(6,)`` twist of the camera per second before it was lost. None if it is
-                unknown.
-            max_rescaling: largest scale factor. If the factor is larger than this number or smaller
-                than the inverse of this number, nothing is scaled.
+            twist: ``(6,)`` twist per second before the camera was lost. None if it is unknown.
+            max_rescaling: nothing is scaled if the factor is larger than this number or smaller
+                than its inverse.
         """
         if twist is None:
             return self
@@ -89,13 +86,11 @@ class Starter:
 
     @property
     def is_waiting(self) -> bool:
-        """Whether a first frame of a monocular map is kept until a second frame forms a pair with
-        it.
-        """
+        """Whether the first frame of a monocular map is waiting for a second frame."""
         return self._first is not None
 
     def reset(self) -> None:
-        """Discard the kept first frame of a monocular map, if there is one."""
+        """Discard the waiting first frame of a monocular map, if there is one."""
         self._first = None
 
     def offer(self, frame: PlacedFrame) -> Start | None:

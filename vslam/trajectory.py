@@ -221,9 +221,9 @@ def write_euroc(path: Path | str, trajectory: Trajectory) -> None:
 def quaternions(R: NDArray[np.float64]) -> NDArray[np.float64]:
     """Convert ``(N, 3, 3)`` rotations to ``(N, 4)`` float64 quaternions x, y, z, w with w >= 0.
 
-    The results are bit-identical to the results of ``scipy.spatial.transform.Rotation``. SciPy is
-    not used, because importing it takes longer than writing all files of a run. A matrix that
-    deviates from a rotation by more than 1e-12 is replaced by the nearest rotation.
+    The results are bit-identical to those of SciPy's ``Rotation``. SciPy is not used, because
+    importing it takes longer than writing all files of a run. A matrix that deviates from a
+    rotation by more than 1e-12 is replaced by the nearest rotation.
     """
     error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3))
     off = (error > 1e-12 + 1e-5 * np.eye(3)).any(axis=(1, 2))

@@ -29,19 +29,14 @@ ARCHIVE_ERRORS = (
     EOFError, ValueError, KeyError, RuntimeError, OverflowError, zlib.error,
     zipfile.BadZipFile, zipfile.LargeZipFile,
 )  # fmt: skip
-"""Exceptions that NumPy, zipfile and zlib raise for a file that cannot be read as an archive of
-arrays.
-
-The file may be another kind of file, it may be damaged or encrypted, or its compression method may
-be unsupported.
-"""
+"""Exceptions that NumPy, zipfile and zlib raise for a file that is not an archive of arrays, is
+damaged or encrypted, or has an unknown compression method."""
 
 
 def limit_images() -> None:
     """Make OpenCV reject images whose header declares more than ``MOST_PIXELS`` pixels.
 
-    OpenCV reads this limit when it is imported. Therefore, call this function before OpenCV is
-    imported.
+    Call this function before OpenCV is imported, because OpenCV reads the limit at import.
     """
     os.environ.setdefault(_OPENCV_LIMIT, str(MOST_PIXELS))
 
@@ -100,8 +95,7 @@ def read_json(array: NDArray[Any]) -> Any:
 def require_memory(path: Path, what: str) -> None:
     """Check that unpacking an archive will not take too much memory.
 
-    The unpacked archive must not be far larger than the archive itself, and must fit into the free
-    memory. Files that are not archives are accepted.
+    Files that are not archives are accepted.
 
     Raises:
         InputError: the unpacked archive would be too large.

@@ -50,24 +50,18 @@ class Workers:
         weakref.finalize(self, _stop, queue, self._started)
 
     def submit(self, work: Callable[[], T], urgency: Urgency) -> Job[T]:
-        """Queue a function. The result of the function is available from the returned job."""
+        """Queue a function. The returned job gives its result."""
         return self._queue.add(work, urgency)
 
     def map(
         self, function: Callable[[Given], T], items: Iterable[Given], urgency: Urgency
     ) -> Iterator[T]:
-        """Apply a function to each item, in parallel.
-
-        The results are in the order of the items, as with the built-in ``map``.
-        """
+        """Apply a function to each item, in parallel. The results keep the order of the items."""
         jobs = [self.submit(partial(function, item), urgency) for item in items]
         return (job.result() for job in jobs)
 
     def refuse_fork(self) -> None:
-        """Raise a RuntimeError in a forked process.
-
-        A fork does not inherit the worker threads.
-        """
+        """Raise a RuntimeError in a forked process, which does not inherit the worker threads."""
         if self._started and os.getpid() != self._process:
             raise RuntimeError(
                 "this Slam was created before the process was forked, which does not copy its "
@@ -120,8 +114,6 @@ class Job(Generic[T]):
 
 
 class _Thread(threading.local):
-    """The state of one thread, as stored by the queue."""
-
     runs_job = False
 
 
@@ -189,7 +181,6 @@ class _Queue:
         job.error, job.is_done = CancelledError(), True
 
     def _can_help(self) -> bool:
-        """Return whether this thread can run a job while it waits for another job."""
         return bool(self._jobs) and not self._thread.runs_job
 
     def _take(self, job: Job[Any] | None = None) -> Job[Any]:

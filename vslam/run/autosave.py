@@ -41,10 +41,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Unfinished:
-    """The saved state of an interrupted run.
-
-    It consists of a map file, and of the progress of the run up to the same frame.
-    """
+    """The saved state of an interrupted run: a map file, and the progress up to the same frame."""
 
     map: Path
     progress: Progress
@@ -68,8 +65,8 @@ def lock_run(folder: Path) -> Iterator[None]:
 def find_unfinished(folder: Path) -> Unfinished:
     """Read the saved state of an interrupted run, from which the run can be resumed.
 
-    When the run is resumed, the frames after the saved state are tracked again. The poses of these
-    frames are removed from ``trajectory_online.tum``.
+    The resumed run tracks the frames after the saved state again. Therefore, this function removes
+    the poses of these frames from ``trajectory_online.tum``.
 
     Raises:
         InputError: nothing was saved, or a file is damaged.
@@ -96,20 +93,15 @@ class Autosave:
     """Interface for saving a run at intervals. This base class saves nothing."""
 
     def frame(self, result: TrackResult) -> None:
-        """Append the pose of a tracked frame to the trajectory file.
-
-        This method is called for every frame in order.
-        """
+        """Append the pose of a frame to the trajectory file. Call this for every frame in order."""
 
     def offer(self, slam: Slam, progress: Callable[[], Progress]) -> None:
-        """Save the run if the next save is due. This method is called after ``frame``."""
+        """Save the run if the next save is due. Call this after ``frame``."""
 
     def close(self, slam: Slam, progress: Callable[[], Progress], *, resumable: bool) -> None:
         """End the saving of a run.
 
         Args:
-            slam: the SLAM system of the run.
-            progress: function that returns the progress of the run.
             resumable: whether the run ended early with a complete map, so that it can be resumed.
         """
 
@@ -128,9 +120,7 @@ class FolderAutosave(Autosave):
         """Prepare to save the state of a run.
 
         Args:
-            folder: the folder of the run.
-            seconds: seconds between two saved maps. If the run is killed, it loses at most the work
-                of this interval. If the value is 0, no map is saved.
+            seconds: seconds between two saved maps. If the value is 0, no map is saved.
             drive: name of the drive in the map file.
         """
         self._folder, self._seconds, self._drive = folder, seconds, drive
@@ -205,10 +195,7 @@ class FolderAutosave(Autosave):
 
 
 def remove_autosave(folder: Path) -> None:
-    """Remove partly written files, and the files that are needed only to resume a run.
-
-    Call this function after the results have been written.
-    """
+    """Remove the files that are needed only to resume a run, and partly written ones."""
     for name in (MAP, PROGRESS):
         (folder / name).unlink(missing_ok=True)
         for part in folder.glob(f".{name}.*.part"):

@@ -91,8 +91,7 @@ def _in_map(
 
     Args:
         T_kw: ``(K, 4, 4)`` poses of the keyframes.
-        scale: ``(K,)`` factors. The translations from each keyframe to its frames are multiplied by
-            the factor of the keyframe. If it is None, the translations do not change.
+        scale: ``(K,)`` factors by which the translations from a keyframe to its frames are scaled.
     """
     T_ck = table.T_c_reference.copy()
     if scale is not None:
@@ -109,9 +108,8 @@ def _positions(
 ) -> tuple[Positions, NDArray[np.float64]]:
     """Return the GPS fixes that were measured between two tracked frames, and the datum.
 
-    For each fix, the positions of the camera and the antenna are interpolated at the time of the
-    fix. Both positions are given in the frame of a keyframe. This keyframe is the reference
-    keyframe of the last tracked frame before the fix.
+    The positions of camera and antenna at the time of a fix are interpolated. They are given in the
+    frame of the reference keyframe of the last frame before the fix.
     """
     at = np.searchsorted(table.timestamp, fixes.times, "right") - 1
     at[fixes.times == table.timestamp[-1]] -= 1

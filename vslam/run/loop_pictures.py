@@ -45,16 +45,12 @@ def loop_matches(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the positions of landmarks in the images of both keyframes of a closed loop.
 
-    After a loop is closed, the inlier features of the query keyframe observe landmarks around the
-    matched keyframe. If the matched keyframe itself does not observe such a landmark, the landmark
-    is projected into its image. The result leaves out features that lost their landmark in the
-    bundle adjustment after the loop. It also leaves out landmarks that lie outside the image of the
-    matched keyframe.
+    A landmark that the matched keyframe does not observe is projected into its image. If it lies
+    outside this image, it is left out.
 
     Args:
         map_: the map after the correction of the loop.
         edge: an accepted loop.
-        camera: the camera of both keyframes.
 
     Returns:
         Two ``(N, 2)`` float64 arrays with the same N landmarks, in pixels: the positions in the
@@ -75,11 +71,7 @@ def loop_matches(
 
 
 def spread(xy: NDArray[np.float64], most: int) -> NDArray[np.int64]:
-    """Choose points that cover the image evenly, by farthest-point sampling.
-
-    Args:
-        xy: ``(N, 2)`` points.
-        most: largest number of points to choose.
+    """Choose at most ``most`` of ``(N, 2)`` points, evenly spread, by farthest-point sampling.
 
     Returns:
         The indices of the chosen points.
@@ -133,7 +125,6 @@ def _panel(jpeg: bytes) -> tuple[NDArray[np.uint8], float]:
 
 
 def _label(canvas: NDArray, text: str, left: int) -> None:
-    """Draw a label in the upper left corner of the left or the right image of a loop picture."""
     font, size, margin = cv2.FONT_HERSHEY_SIMPLEX, 0.5, 7
     (width, height), _ = cv2.getTextSize(text, font, size, 1)
     right, bottom = left + width + 2 * margin, height + 2 * margin

@@ -60,7 +60,6 @@ class MomentRecorder(Recorder):
         self._n_keyframes = 0
 
     def keyframe(self, result: TrackResult, image: Image, xy: NDArray, tracked: NDArray) -> None:
-        """Keep a small image of a keyframe. Overrides `vslam.run.recorder.Recorder.keyframe`."""
         if self._n_keyframes % self._every == 0:
             if len(self.moments) == _MOST:
                 self.moments = self.moments[::2]
@@ -88,9 +87,9 @@ def _moment(
 class LoopPictureRecorder(Recorder):
     """Keeps a small image of each keyframe, and the data for a picture of each closed loop.
 
-    A loop has no picture if the image of its earlier keyframe was not kept. Images of earlier
-    drives are not available. If a run was resumed, images from before the interruption are not
-    available either. In a very long run, only every second image is kept.
+    A loop has no picture if the image of its earlier keyframe was not kept. This is the case for
+    images of earlier drives, for images from before a run was resumed, and for every second image
+    of a very long run.
 
     Attributes:
         pictures: pictures of the closed loops, in order.
@@ -102,11 +101,9 @@ class LoopPictureRecorder(Recorder):
         self._camera: Camera | None = None
 
     def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None:
-        """Store the camera of the run. Overrides `vslam.run.recorder.Recorder.begin`."""
         self._camera = camera
 
     def keyframe(self, result: TrackResult, image: Image, xy: NDArray, tracked: NDArray) -> None:
-        """Keep a small image of a keyframe. Overrides `vslam.run.recorder.Recorder.keyframe`."""
         if len(self._jpegs) == _MOST_LOOP_IMAGES:
             self._jpegs = dict(list(self._jpegs.items())[::2])
         s = _LOOP_SCALE
@@ -115,7 +112,6 @@ class LoopPictureRecorder(Recorder):
         self._jpegs[result.index] = jpeg.tobytes()
 
     def loops(self, edges: Collection[LoopEdge], map_: Map) -> None:
-        """Add pictures of newly closed loops. Overrides `vslam.run.recorder.Recorder.loops`."""
         assert self._camera is not None
         for edge in edges:
             if not edge.accepted or map_.sessions[edge.match] != map_.scalars.session:

@@ -76,8 +76,7 @@ def resumed_options(folder: Path) -> RunOptions:
 
     Raises:
         InputError: ``run.json`` cannot be read, a plug-in of the run is not installed, or the
-            folder contains a symbolic link. Through such a link, the run would write outside the
-            folder.
+            folder contains a symbolic link, through which the run would write outside the folder.
     """
     for path in folder.rglob("*"):
         if path.is_symlink():

@@ -22,11 +22,7 @@ if TYPE_CHECKING:
 
 
 def alignment_of(sensor: str) -> str:
-    """Return the kind of transformation that aligns trajectories with the ground truth.
-
-    The kind depends on the sensor. It is ``sim3`` for a monocular camera, because the scale of its
-    trajectory is arbitrary. It is ``se3`` for all other sensors.
-    """
+    """Return the kind of alignment with the ground truth: ``sim3`` for monocular, else ``se3``."""
     return "sim3" if sensor == "mono" else "se3"
 
 
@@ -45,35 +41,28 @@ class RunOutcome:
         latency_ms: milliseconds from the arrival of each tracked frame until its pose is known, in
             a real-time run.
         wall_s, cpu_s: wall and CPU seconds from reading the first frame until the last frame is
-            tracked and mapped. If several detectors are compared, these are the times for all
-            detectors together.
-        step_s: wall seconds of the run with this detector alone. This time includes tracking,
-            waiting for mapping, and completing the map at the end. It excludes reading images and
-            extracting features.
+            tracked and mapped. Compared detectors are included.
+        step_s: wall seconds that tracking and mapping with this detector took, without reading
+            images and extracting features.
         startup_s: seconds from the start of the process to the first frame.
         peak_memory_mb: peak memory of the process, in MB.
         n_landmarks, n_keyframes: size of the final map.
         map: the final map. None for a trajectory from another system, or if mapping failed.
-        truth_alignment: transformation from the world frame of the map that the run continued to
-            the world frame of the ground truth of this map. None if it is unknown.
-        in_map: ``(N,)`` bool, True for frames that were tracked in the map that the run continued,
-            or in sub-maps that are joined to this map by loops. None for a run that started a new
-            map.
+        truth_alignment: if the run continued a map, the transformation from the world frame of this
+            map to the world frame of its ground truth. None if it is unknown.
+        in_map: if the run continued a map, ``(N,)`` bool, True for frames that were tracked in this
+            map, or in sub-maps that loops have joined to it. None for a new map.
         stored: the map with all data that a later run needs to continue this map. None if the run
             only localised in the map.
         loops: accepted and rejected loop candidates, in the order of the decisions.
         corrections: corrections of the map by the accepted loops, in order.
-        keyframe_frames: ``(K,)`` int64, for each keyframe the index of the frame of this run that
-            became the keyframe. Culled keyframes are included. The index is -1 for keyframes of
-            earlier drives.
-        n_submaps: number of sub-maps that the run started, including the first map. The number is 0
-            if the run has no keyframe.
+        keyframe_frames: ``(K,)`` int64, index of the frame of this run that became each keyframe.
+            Culled keyframes are included. The index is -1 for keyframes of earlier drives.
+        n_submaps: number of sub-maps, including the first map. 0 if the map has no keyframe.
         gps_track: the georeferenced drive. None if the run has no GPS.
-        interrupted: the reason why the run ended early, such as "Ctrl-C" or a truncated file. None
-            if the run did not end early.
-        compared: the outcome of each loop detector in ``settings.compare``. These detectors
-            processed the same frames. Their outcomes contain no maps. The tuple is empty for a
-            resumed run.
+        interrupted: the reason why the run ended early, such as "Ctrl-C" or a truncated file.
+        compared: the outcome of each loop detector in ``settings.compare``, without its map. The
+            tuple is empty for a resumed run.
     """
 
     settings: RunOptions
@@ -125,10 +114,9 @@ class RunOutcome:
 
 
 def causal_trajectory(tracks: list[TrackResult]) -> Trajectory:
-    """Return the pose of each frame at the time of tracking.
+    """Return the pose of each frame at the time of tracking, before corrections of the map.
 
-    Later corrections by bundle adjustment or loop closing are not included. A lost or dropped frame
-    has its predicted pose.
+    A lost or dropped frame has its predicted pose.
     """
     times = np.array([track.timestamp for track in tracks], np.float64)
     poses = [track.T_wc for track in tracks]
@@ -136,10 +124,7 @@ def causal_trajectory(tracks: list[TrackResult]) -> Trajectory:
 
 
 def odometry_trajectory(tracks: list[TrackResult]) -> Trajectory:
-    """Return the pose of each frame from odometry (``TrackResult.T_odom_camera``).
-
-    These poses never jump, because corrections of the map do not change them.
-    """
+    """Return the pose of each frame from odometry (``TrackResult.T_odom_camera``)."""
     known = [track for track in tracks if track.T_odom_camera is not None]
     times = np.array([track.timestamp for track in known], np.float64)
     poses = [track.T_odom_camera for track in known]

@@ -64,20 +64,16 @@ def run_sequence(
     listed in the outcome. A frame that is dropped in a real-time run gets an interpolated pose.
 
     The run ends early after Ctrl-C, when the source ends unexpectedly, or when a component fails,
-    for example the loop detector of a plug-in. After Ctrl-C, the current frame is completed first.
-    All results obtained so far are kept. If mapping failed, the map is incomplete. The outcome then
-    contains no map, and the poses are those at the time of tracking.
+    for example the loop detector of a plug-in. All results obtained so far are kept. If mapping
+    failed, the outcome contains no map, and the poses are those at the time of tracking.
 
-    The loop detectors in ``settings.compare`` process the same frames as the main detector.
-    Therefore, images are read and features are extracted only once. Each detector has its own map.
-    At the end, only the trajectory, the tracking results and the loops of each detector are kept.
-    If one detector fails, the other detectors continue. A resumed run continues without these
+    The loop detectors in ``settings.compare`` process the same frames. Each detector has its own
+    map. If one detector fails, the other detectors continue. A resumed run continues without these
     detectors, because their maps were not saved.
 
     Args:
-        autosave: saves the state of the run at intervals.
-        resume: the saved state of an interrupted run. The run continues at the frame after this
-            state. The outcome covers the frames before and after the interruption.
+        resume: the saved state of an interrupted run, after which the run continues. The outcome
+            covers the frames before and after the interruption.
         slam: the result of ``begin`` for the same settings. If it is None, this function calls
             ``begin``.
 
@@ -151,11 +147,7 @@ def run_sequence(
 
 
 def _compared(camera: Camera, settings: RunOptions) -> list[_Run]:
-    """Begin a run for each loop detector in ``settings.compare``.
-
-    These detectors use the shipped weights, because ``settings.weights`` belongs to the main
-    detector.
-    """
+    """Begin a run for each loop detector in ``settings.compare``, with its shipped weights."""
     common: dict[str, object] = {"weights": None, "compare": ()}
     each = [settings.model_copy(update={**common, "detector": name}) for name in settings.compare]
     return [_Run(begin(camera, one), one, Progress()) for one in each]
@@ -216,17 +208,13 @@ class _Run:
 
     @contextmanager
     def recording_failure(self, what: str) -> Iterator[None]:
-        """If the block raises an exception, record it as the failure of this run.
-
-        The results obtained so far are kept.
-        """
+        """If the block raises an exception, record it as the failure of this run."""
         try:
             yield
         except Exception as error:
             self.fail(what, error)
 
     def trajectory(self) -> Trajectory:
-        """Return the pose of each processed frame, according to the current map."""
         # A step that failed may have added a pose without a result.
         return self.slam.trajectory().select(np.arange(len(self.tracks)))
 
@@ -253,13 +241,12 @@ class _Run:
             self.latency_ms.append(1e3 * (time.perf_counter() - arrived))
 
     def finish(self) -> None:
-        """Complete all mapping of the run."""
         start = time.perf_counter()
         self.slam.finish()
         self.step_s += time.perf_counter() - start
 
     def seconds(self) -> tuple[float, float]:
-        """Wall and CPU time of all frames, in seconds."""
+        """Return the wall and CPU time of all frames, including those before an interruption."""
         wall, cpu = time.perf_counter() - self._wall, time.process_time() - self._cpu
         return self.before.wall_s + wall, self.before.cpu_s + cpu
 
@@ -287,11 +274,7 @@ def _record_frame(
     played: Played[PreparedFrame],
     n_recorded: int,
 ) -> int:
-    """Record a frame. The map is also recorded, unless a mapping job is changing it.
-
-    Returns:
-        The number of loops that have been recorded so far.
-    """
+    """Record a frame, and the map unless a job changes it. Return the number of recorded loops."""
     recorder.frame(result)
     images = None if played.prepared is None else played.prepared.images
     if result.is_keyframe and slam.frame is not None and images is not None:
@@ -328,10 +311,7 @@ def _outcome(
     seconds: tuple[float, float],
     interrupted: str | None,
 ) -> RunOutcome:
-    """Create the outcome of a run.
-
-    ``seconds`` are the wall time and the CPU time of all frames.
-    """
+    """Create the outcome of a run. ``seconds`` are the wall and CPU times of all frames."""
     keyframes = [track for track in run.tracks if track.is_keyframe]
     outcome = RunOutcome(
         settings=run.settings,
@@ -362,7 +342,6 @@ def _outcome(
 
 
 def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
-    """Add the results that need a complete map to the outcome of a run."""
     slam, settings, source = run.slam, run.settings, outcome.sequence
     loops, corrections, keyframe_frames = _with_earlier(run.before, slam)
     return replace(
@@ -407,9 +386,8 @@ def _with_earlier(
 ) -> tuple[list[LoopEdge], list[LoopCorrection], NDArray[np.int64]]:
     """Return the loops and corrections of a whole run, including the part before it was resumed.
 
-    The loops of the part before the interruption refer to frames instead of keyframes. Therefore,
-    each of these frames is given a new keyframe number. The new numbers begin after the last
-    keyframe number of the map.
+    The loops of this part refer to frames instead of keyframes. Therefore, each of these frames is
+    given a new keyframe number, after the keyframes of the map.
 
     Returns:
         The loops, the corrections, and the index of the frame that belongs to each keyframe number.
@@ -431,13 +409,10 @@ def _with_earlier(
 
 
 def begin(camera: Camera, settings: RunOptions, saved: Path | None = None) -> Slam:
-    """Create the ``Slam`` of a run.
-
-    The ``Slam`` begins a new map, or continues the map in the file ``settings.map_file``.
+    """Create the ``Slam`` of a run with a new map or with the map in ``settings.map_file``.
 
     Args:
-        saved: the map file of an interrupted run. The ``Slam`` continues after the last frame of
-            this run.
+        saved: the map file of an interrupted run, which is continued instead.
 
     Raises:
         InputError: the map does not exist, the map was made with a different camera, detector or
@@ -477,10 +452,7 @@ def _frames_of_this_run(map_: Map) -> NDArray[np.int64]:
 
 
 def _until_broken(frames: Iterator[TimedFrame], end_reasons: list[str]) -> Iterator[TimedFrame]:
-    """Yield the frames of a source until reading fails.
-
-    The reason for the failure is appended to ``end_reasons``.
-    """
+    """Yield the frames until reading fails. Append the reason for this to ``end_reasons``."""
     try:
         yield from frames
     except BrokenSourceError as error:
@@ -492,11 +464,7 @@ def _until_broken(frames: Iterator[TimedFrame], end_reasons: list[str]) -> Itera
 
 
 def _record_loops(recorder: Recorder, slam: Slam, n_recorded: int) -> int:
-    """Record all loops except the first ``n_recorded`` loops, which are already recorded.
-
-    Returns:
-        The number of loops that have been recorded so far.
-    """
+    """Record the loops after the first ``n_recorded``. Return the number of recorded loops."""
     if len(slam.loops) > n_recorded:
         recorder.loops(slam.loops[n_recorded:], slam.map)
     return len(slam.loops)

@@ -62,8 +62,7 @@ def play(
 ) -> Iterator[Played[T]]:
     """Play frames in real time. If several frames are waiting, only the newest frame is prepared.
 
-    One frame is prepared while the caller uses the previous frame. Therefore, a frame waits for at
-    most one other frame. Dropped frames are not kept in memory.
+    While the caller uses one frame, the next frame is prepared.
 
     Args:
         frames: frames to play. The first frame arrives at once. The other frames arrive at their
@@ -157,8 +156,7 @@ class _Mailbox:
     def put(self, arrival: _Arrival) -> None:
         """Replace the frame in the mailbox with a newer frame.
 
-        The first frame of a run must not be replaced. Therefore, after putting the first frame,
-        this method waits until the frame has been taken.
+        The first frame of a run must not be replaced. Therefore, wait until it has been taken.
         """
         with self._changed:
             if self._newest is not None:
@@ -168,7 +166,7 @@ class _Mailbox:
             self._changed.wait_for(lambda: not self._first or self.stopped)
 
     def take(self) -> tuple[list[float], _Arrival | None]:
-        """Return the timestamps of the dropped frames, and the newest frame.
+        """Wait for a frame. Return the timestamps of the dropped frames, and the newest frame.
 
         After the last frame, the method returns None instead of a frame.
         """
@@ -186,11 +184,7 @@ class _Mailbox:
             self._changed.wait_for(lambda: self.stopped, max(0.0, when - time.perf_counter()))
 
     def end(self, error: Exception | None) -> None:
-        """Announce that no more frames will arrive.
-
-        ``error`` is the exception that was raised while frames were read. It is None if all frames
-        were read.
-        """
+        """Announce that no more frames will arrive, because of ``error`` or at the regular end."""
         with self._changed:
             self._ended, self.error = True, error
             self._changed.notify_all()
@@ -239,8 +233,8 @@ def at_their_times(
         realtime: whether this is a real-time run.
         live: see ``play``.
         begin: index of the first frame.
-        next_extraction: function that returns ``Slam.next_extraction``. This is the index of the
-            frame whose features will be needed next. These features are extracted in advance.
+        next_extraction: function that returns ``Slam.next_extraction``, the index of a frame whose
+            features should be extracted in advance.
     """
     if realtime:
         with ThreadPoolExecutor(2, "side") as pool:
@@ -268,10 +262,7 @@ def prepared_frames(
     begin: int = 0,
     next_extraction: Callable[[], int] = lambda: -1,
 ) -> Iterator[tuple[float, PreparedFrame]]:
-    """Yield timestamps and prepared frames in order.
-
-    If there are several threads, some frames are prepared in advance.
-    """
+    """Yield timestamps and prepared frames in order. Several threads prepare frames in advance."""
     ahead: deque[tuple[float, Job[PreparedFrame]]] = deque()
     n_ahead = _AHEAD * workers.threads if workers.threads > 1 else 1
     requested = -1
@@ -301,8 +292,8 @@ def prepare_frame(
 ) -> PreparedFrame:
     """Read one frame and extract its features.
 
-    If tracking uses patches, it needs the right image and the features only for some frames. In
-    this case, the right image is not read and no features are extracted here.
+    Tracking by patches needs the right image and the features only for some frames. Therefore, only
+    the left image is read in this case.
     """
     start = time.perf_counter()
     try:

@@ -1,8 +1,7 @@
 """The progress of a run: the data that the report needs about the frames processed so far.
 
-The data are stored as arrays in a file. An interrupted run leaves this file next to its map file. A
-resumed run continues from both files. Each tracked frame is appended to the arrays, so saving the
-progress only copies them.
+An interrupted run leaves this data in a file next to its map file. A resumed run continues from
+both files.
 """
 
 from __future__ import annotations
@@ -34,10 +33,10 @@ class TrackTable:
     """Tracking results of N frames, in order.
 
     Attributes:
-        rows: ``(N, 82)`` float64. Each row describes one frame. It contains ``T_wc`` row by row,
-            then the timestamp, the state, the numbers of features, stereo features, matches and
-            inliers, and flags (1 for a keyframe, 2 for a relocalised frame). ``T_odom_camera`` row
-            by row and ``PoseUncertainty.numbers`` follow. Unknown numbers are NaN.
+        rows: ``(N, 88)`` float64, one row for each frame: ``T_wc`` row by row, the timestamp, the
+            state, the numbers of features, stereo features, matches and inliers, flags (1 for a
+            keyframe, 2 for a relocalised frame), ``T_odom_camera`` row by row, and
+            ``PoseUncertainty.numbers``. Unknown numbers are NaN.
         stages: names of the timed stages.
         stage_ms: ``(N, S)`` float64 milliseconds. NaN for a stage that a frame skipped.
     """
@@ -114,8 +113,8 @@ class Progress:
         latency_ms: milliseconds from the arrival of each tracked frame until its pose is known, in
             a real-time run.
         wall_s, cpu_s: wall and CPU time in which the frames were processed, in seconds.
-        loops: loops between frames of the run, with frame numbers in place of keyframe ids. The
-            number -1 stands for a keyframe of an earlier drive.
+        loops: loop candidates, with frame numbers in place of keyframe ids. The number -1 stands
+            for a keyframe of an earlier drive.
         corrections: corrections of the map by the accepted loops, with frame numbers in place of
             keyframe ids.
     """

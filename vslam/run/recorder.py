@@ -91,9 +91,7 @@ class Recorder:
     """
 
     def begin(self, camera: Camera, ground_truth: Trajectory | None) -> None:
-        """Log the data that do not change during a run.
-
-        This method is called once, before the first frame.
+        """Log the data that do not change during a run. Call this before the first frame.
 
         Args:
             camera: the camera of the images that are given to ``keyframe``.
@@ -102,10 +100,10 @@ class Recorder:
         """
 
     def frame(self, result: TrackResult) -> None:
-        """Log the result of tracking one frame. This takes 0.1 ms."""
+        """Log the result of tracking one frame."""
 
     def keyframe(self, result: TrackResult, image: Image, xy: NDArray, tracked: NDArray) -> None:
-        """Log the image and keypoints of a keyframe. This method is called after ``frame``.
+        """Log the image and keypoints of a keyframe. Call this after ``frame``.
 
         Args:
             result: the result of tracking the frame that became the keyframe.
@@ -117,24 +115,20 @@ class Recorder:
     def map(self, map_: Map) -> None:
         """Log the map if enough keyframes were added since it was last logged.
 
-        This method is called after ``frame``, while no mapping job is running.
+        Call this after ``frame``, while no mapping job is running.
         """
 
     def loops(self, edges: Collection[LoopEdge], map_: Map) -> None:
-        """Log new loop candidates, both accepted and rejected.
+        """Log loop candidates that were accepted or rejected since the last call.
 
-        This method is called after ``frame``, while no mapping job is running.
+        Call this after ``frame``, while no mapping job is running.
 
         Args:
-            edges: the loop candidates that were accepted or rejected since the last call.
             map_: the map, which has already been corrected by the accepted loops.
         """
 
     def finish(self, trajectory: Trajectory, map_: Map | None) -> None:
-        """Log the final trajectory and the map, if there is a map.
-
-        All pending data are written, and the recording is closed.
-        """
+        """Log the final trajectory and the map, if there is a map, and close the recording."""
 
 
 class SeveralRecorders(Recorder):
@@ -274,10 +268,9 @@ def _free_port(wanted: int) -> int:
 def _guarded(
     method: Callable[Concatenate[RerunRecorder, _P], None],
 ) -> Callable[Concatenate[RerunRecorder, _P], None]:
-    """Decorate a method of the recorder, so that an error in it does not end the run.
+    """Decorate a method so that an error in it ends the recording, but not the run.
 
-    If the method raises an error, the recording ends, and the error is not passed on. After the
-    recording has ended, the method does nothing.
+    After the recording has ended, the method does nothing.
     """
 
     @functools.wraps(method)
@@ -316,15 +309,13 @@ class RerunRecorder(Recorder):
     - ``state``: changes of the tracking state;
     - ``state/loops``: each loop, with the reason why it was accepted or rejected.
 
-    The world frame is the frame of the camera at the first frame of the run, with x right, y down
-    and z forward.
+    The world frame is that of the map, with x right, y down and z forward.
 
-    A recording that cannot be written never ends a run. Rerun writes in its own thread and reports
-    errors only at a later flush, and this flush may never return. Therefore, the recording ends
-    with a warning in the log when the disk has less than 64 MB left. Everything that was recorded
-    before this point is in the file. The recording also ends with a warning if a flush fails, if a
-    flush takes longer than 5 s, or if the viewer was closed. In these cases, the last message in
-    the file may be incomplete.
+    A recording that cannot be written never ends a run. Rerun reports write errors only at a later
+    flush, which may never return. Therefore, the recording ends with a warning in the log when the
+    disk has less than 64 MB left. It also ends with a warning if a flush fails, if a flush takes
+    longer than 5 s, or if the viewer was closed. In these cases, the last message in the file may
+    be incomplete.
     """
 
     def __init__(self, target: Path | Viewer, pictures: Sequence[LoopPicture] = ()) -> None:
@@ -334,8 +325,8 @@ class RerunRecorder(Recorder):
         warning is logged and nothing is recorded.
 
         Args:
-            pictures: list of pictures of closed loops to record. Another recorder, which is called
-                before this recorder, appends the pictures to this list.
+            pictures: pictures of closed loops. Another recorder, which is called before this one,
+                appends them to this list during the run.
         """
         import rerun as rr
 
@@ -470,11 +461,7 @@ class RerunRecorder(Recorder):
         self._close()
 
     def _log_trajectory(self, trajectory: Trajectory) -> None:
-        """Log the final trajectory, so that it grows during the replay.
-
-        The trajectory is logged at a hundred frames. At each frame, the part up to this frame is
-        logged.
-        """
+        """At each of a hundred frames, log the trajectory up to this frame, so that it grows."""
         import rerun as rr
 
         n = len(trajectory)
@@ -509,10 +496,7 @@ class RerunRecorder(Recorder):
     def _log_lines(
         self, name: str, edges: list[LoopEdge], map_: Map, color: tuple[int, ...]
     ) -> None:
-        """Log a line for each loop whose query keyframe is in the map.
-
-        The line connects the two keyframes of the loop.
-        """
+        """Log a line between the keyframes of each loop, unless the query is a lost frame."""
         import rerun as rr
 
         ends = [(edge.match, edge.query) for edge in edges if edge.query >= 0]
@@ -522,10 +506,6 @@ class RerunRecorder(Recorder):
         self._recording.log(f"world/loops/{name}", lines)
 
     def _log_pictures(self) -> None:
-        """Log the pictures of new loops.
-
-        If there are several new pictures, the last of these pictures stays visible.
-        """
         import rerun as rr
 
         new = self._pictures[self._n_pictures :]

@@ -48,10 +48,9 @@ class RigResiduals:
 
 
 def measure_rig(map_: Map, camera: Camera) -> RigResiduals | None:
-    """Estimate the delay of the right image and the offset of the disparities.
+    """Estimate the delay of the right image and the offset of the disparities from a map.
 
-    The delay and the offset are estimated from the stereo residuals of a map. The result is None if
-    there are too few observations or if the camera is not a stereo camera.
+    The result is None if there are too few observations, or if the camera is not a stereo camera.
     """
     if camera.sensor != "stereo" or map_.n_keyframes < 3:
         return None
@@ -103,7 +102,7 @@ def fit(
 
 
 def _twists(map_: Map) -> NDArray[np.float64]:
-    """Return the velocity of the camera at each keyframe as ``(K, 6)`` twists.
+    """Return ``(K, 6)`` twists of the points relative to the camera at each keyframe, per second.
 
     A twist is NaN if the neighbouring keyframes are too far apart in time. Drives are treated
     separately, because each drive has its own clock.
@@ -127,22 +126,15 @@ def calibration_warnings(camera: Camera, calib: Sequence[Path], name: str) -> li
     """Return warnings about an implausible calibration.
 
     Args:
-        camera: the calibrated camera.
-        calib: the files that ``--calib`` names. The list is empty if the calibration belongs to the
-            data set.
-        name: name of the sequence.
+        calib: the files that ``--calib`` names. If there are none, the calibration belongs to the
+            sequence with the name ``name``.
     """
     source = ", ".join(map(str, calib)) or f"the calibration of {name}"
     return [f"{source}: {doubt}." for doubt in calibration_doubts(camera)]
 
 
 def delay_warnings(delay: SideDelay, camera: Camera) -> list[str]:
-    """Return a warning if the measured delay of the right camera differs from the calibrated delay.
-
-    Args:
-        delay: the delay of the right camera that was measured from the row differences of stereo
-            matches.
-    """
+    """Return a warning if the measured delay of the right camera is not the calibrated delay."""
     if not delay.is_wrong:
         return []
     known = camera.right_delay
@@ -157,10 +149,7 @@ def delay_warnings(delay: SideDelay, camera: Camera) -> list[str]:
 
 
 def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
-    """Return a warning if stereo residuals show a delay or a constant error in the disparities.
-
-    The delay is the delay of the right camera relative to the left camera.
-    """
+    """Return a warning if stereo residuals show a delay or a constant error in the disparities."""
     if found is None:
         return []
     warnings = []
@@ -182,10 +171,7 @@ def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
 
 
 def rig_warnings(sides: ComparedSides) -> list[str]:
-    """Return warnings about a camera whose images are black or too dark.
-
-    Images are too dark if they are clearly darker than the images of the other camera.
-    """
+    """Return warnings about a camera whose images are black, or darker than those of the other."""
     warnings = []
     for side, other, black in (
         ("left", "right", sides.n_black_left),

@@ -107,11 +107,7 @@ def compile_kernels(*, processes: int = 2, load: bool = False) -> None:
 
 
 def is_cold() -> bool:
-    """Return whether kernels must be compiled before a run.
-
-    This is the case if one of ``COLD_PROBES`` is missing in Numba's cache or is older than its
-    source.
-    """
+    """Return whether one of ``COLD_PROBES`` is missing in the cache or older than its source."""
     return any(
         all(index.stat().st_mtime < source.stat().st_mtime for index in indexes)
         for source, indexes in map(cached, COLD_PROBES)
@@ -121,8 +117,8 @@ def is_cold() -> bool:
 def mark_warm() -> None:
     """Update the dates of the cached kernels, so that ``is_cold`` accepts them as compiled.
 
-    This is needed if only the date of a source file has changed, for example by switching branches.
-    Numba then keeps the cached kernel.
+    If only the date of a source file has changed, for example by switching branches, Numba keeps
+    the cached kernel and its date.
     """
     for _, indexes in map(cached, COLD_PROBES):
         for index in indexes:
@@ -230,9 +226,8 @@ def compile_local_mapping() -> None:
 def map_synthetic(keyframes: int) -> tuple[Map, Features]:
     """Build the map of a camera that moves sideways past a cloud of points. No images are needed.
 
-    Every keyframe observes all points. The first half of the points have a stereo match. The other
-    points must be triangulated. ``redundant_ratio`` is so small that a single landmark makes a
-    keyframe redundant. Therefore, the fourth insertion culls a keyframe.
+    Half of the points have a stereo match. The other points must be triangulated. The thresholds
+    are such that the fourth insertion culls a keyframe.
 
     Returns:
         The map and the features of the last keyframe.
@@ -270,10 +265,7 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
 
 
 def compile_recognition() -> None:
-    """Compile loop detection, verification and relocalisation.
-
-    For this purpose, a keyframe is compared with itself.
-    """
+    """Compile loop detection, verification and relocalisation."""
     config = Config()
     map_, features = map_synthetic(1)
     verify(map_, LoopCandidate(0, 0, 1.0), CAMERA, config.verification)

@@ -188,7 +188,7 @@ def principal_point_doubt(principal: tuple[float, float], size: tuple[int, int])
 
 
 def _cause(across: float, down: float) -> str:
-    """Guess why a principal point is implausible. It is given in fractions of the image size."""
+    """Guess why a principal point, given in fractions of the image size, is implausible."""
     if min(across, down) <= 0.0 or not 1 / _SAME_RATIO < across / down < _SAME_RATIO:
         return "check the order of its numbers, and whether the images were cropped or turned"
     ratio = across + down  # it is 1 if the principal point is in the middle

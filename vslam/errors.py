@@ -37,7 +37,8 @@ class DroppedFrameError(UnreadableImageError):
 class BrokenSourceError(InputError):
     """A video, bag or camera ended early: the file was cut off, or the device was unplugged.
 
-    A run keeps the results of the frames before this point. It fails only if there are none.
+    A run keeps the results of the frames before this point, and fails only if there are no such
+    frames.
     """
 
 

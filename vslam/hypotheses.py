@@ -132,8 +132,7 @@ def _aligned(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
 
 
 def _aligned_similarities(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
-    """Compute initial ``S_wc`` under the hypothesis that the lost monocular camera was carried
-    away.
+    """Compute initial poses ``S_wc`` under the hypothesis that a monocular camera was carried away.
 
     The sub-map at one end of the loop is moved to the pose that the loop implies. This sub-map is
     also scaled to the unit of length of the other sub-map, so its poses become similarities.

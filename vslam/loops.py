@@ -153,7 +153,10 @@ class LoopCorrection:
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Concatenate N ranges of integers. Range i has ``count[i]`` integers from ``first[i]`` up."""
+    """Concatenate N ranges of integers.
+
+    Range i begins at ``first[i]`` and contains ``count[i]`` integers.
+    """
     before = np.cumsum(count) - count
     return np.arange(int(count.sum()), dtype=np.int64) + np.repeat(first - before, count)
 

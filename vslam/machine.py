@@ -103,7 +103,7 @@ def keep_memory() -> None:
 
 
 def give_back_memory() -> None:
-    """Return the unused memory that ``keep_memory`` retained to the system (glibc only)."""
+    """Give the unused memory that ``keep_memory`` retained back to the system (glibc only)."""
     import ctypes
 
     with suppress(OSError, AttributeError):

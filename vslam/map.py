@@ -42,7 +42,7 @@ class Arrays(NamedTuple):
 
     Attributes:
         T_cw: ``(K, 4, 4)`` f8, pose of each keyframe.
-        first_row: ``(K + 1,)`` i8, row of the first keypoint of each keyframe.
+        first_row: ``(K + 1,)`` i8, index of the first keypoint of each keyframe.
         keyframe_alive: ``(K,)`` bool, False for a culled keyframe.
         xyz: ``(L, 3)`` f8, position of each landmark in the world frame.
         normal: ``(L, 3)`` f8, mean viewing direction of each landmark.
@@ -54,8 +54,7 @@ class Arrays(NamedTuple):
         found: ``(L,)`` i4, number of frames in which the landmark was found.
         landmark_alive: ``(L,)`` bool, False for a culled or merged landmark.
         merged_into: ``(L,)`` i4, the landmark that this landmark was merged into.
-        head: ``(L,)`` i4, row of the first keypoint in the linked list of keypoints that observe
-            the landmark.
+        head: ``(L,)`` i4, index of the first keypoint that observes the landmark.
         n_observations: ``(L,)`` i4, number of observations. A stereo observation counts twice
             (ORB-SLAM2).
         xy: ``(R, 2)`` f4, position of each keypoint in pixels.
@@ -66,7 +65,7 @@ class Arrays(NamedTuple):
         descriptor: ``(R, 4)`` u8, 256-bit descriptor of each keypoint.
         keyframe: ``(R,)`` i4, the keyframe that the keypoint belongs to.
         landmark: ``(R,)`` i4, the landmark that the keypoint observes.
-        next_row: ``(R,)`` i4, row of the next keypoint in this linked list.
+        next_row: ``(R,)`` i4, index of the next keypoint that observes the same landmark.
         certainty: ``(R,)`` u1, ratio of two variances: the variance of a keypoint position without
             sub-pixel alignment, divided by the variance of ``xy``.
     """
@@ -360,7 +359,7 @@ class Map:
         return new_id[resolved]
 
     def rows(self, keyframe: int) -> slice:
-        """Return the rows of a keyframe's keypoints."""
+        """Return the range of indices of a keyframe's keypoints in ``Arrays``."""
         first = self.arrays.first_row
         return slice(int(first[keyframe]), int(first[keyframe + 1]))
 
@@ -437,9 +436,7 @@ class Map:
         return np.flatnonzero(self.arrays.keyframe_alive[: self.n_keyframes])
 
     def living_landmarks(self) -> NDArray[np.int64]:
-        """Return the ids of the landmarks that were neither culled nor merged into another
-        landmark.
-        """
+        """Return the ids of the landmarks that were not culled or merged into another landmark."""
         return np.flatnonzero(self.arrays.landmark_alive[: self.n_landmarks])
 
 

@@ -34,9 +34,9 @@ def count_shared(a, keyframe, n_keyframes):
 
 @kernel
 def link(a, row, landmark):
-    """Record that a keypoint observes a landmark.
+    """Record that a keypoint observes a landmark. It must not observe a landmark yet.
 
-    The keypoint in row ``row`` must not observe a landmark yet.
+    ``row`` is the index of the keypoint in ``Arrays``.
     """
     a.landmark[row] = landmark
     a.next_row[row] = a.head[landmark]
@@ -46,16 +46,20 @@ def link(a, row, landmark):
 
 @kernel
 def link_many(a, rows, landmarks):
-    """Call ``link`` for each of ``(N,)`` rows and landmarks."""
+    """Record which landmark each of N keypoints observes. None may observe a landmark yet.
+
+    ``rows`` are the ``(N,)`` indices of the keypoints in ``Arrays``.
+    """
     for i in range(len(rows)):
         link(a, rows[i], landmarks[i])
 
 
 @kernel
 def unlink(a, row):
-    """Remove the observation by the keypoint in row ``row``.
+    """Remove the observation of a landmark by a keypoint.
 
-    A landmark without observations is culled.
+    ``row`` is the index of the keypoint in ``Arrays``. If the landmark has no observations left, it
+    is culled.
     """
     landmark = a.landmark[row]
     if a.head[landmark] == row:
@@ -96,7 +100,7 @@ def detach_keyframe(a, keyframe):
 
 @kernel
 def observed_by(a, landmark, keyframe):
-    """Return the row of the keypoint with which a keyframe observes a landmark, or -1."""
+    """Return the index in ``Arrays`` of a keyframe's keypoint that observes a landmark, or -1."""
     row = a.head[landmark]
     while row >= 0:
         if a.keyframe[row] == keyframe:
@@ -223,20 +227,14 @@ def refresh_landmarks(a, landmarks, scales):
 
 @kernel
 def predict_octave(distance, farthest, log_scale, levels):
-    """Predict the pyramid level at which a landmark at a given distance is detected (ORB-SLAM,
-    V-D).
-    """
+    """Predict the pyramid level at which a landmark is detected (ORB-SLAM, V-D)."""
     level = int(np.ceil(np.log(farthest / distance) / log_scale))
     return min(max(level, 0), levels - 1)
 
 
 @kernel
 def collect_landmarks(a, keyframes, n_landmarks):
-    """Return the sorted ids of the landmarks that at least one of the keyframes observes.
-
-    Returns:
-        ``(N,)`` int32.
-    """
+    """Return the ``(N,)`` int32 ids of all landmarks that the keyframes observe, sorted."""
     seen = np.zeros(n_landmarks, np.bool_)
     for keyframe in keyframes:
         for row in range(a.first_row[keyframe], a.first_row[keyframe + 1]):
@@ -317,8 +315,9 @@ def gather_observations(a, landmarks, index):
     Only keyframes with ``index[keyframe] >= 0`` are considered.
 
     Returns:
-        ``(P + 1,)`` int64 offsets, and the int64 rows of the keypoints, sorted by landmark. The
-        rows of landmark i begin at ``offsets[i]`` and end before ``offsets[i + 1]``.
+        ``(P + 1,)`` int64 offsets, and the int64 indices of the keypoints in ``Arrays``, sorted by
+        landmark. The indices of landmark i begin at ``offsets[i]`` and end before ``offsets[i +
+        1]``.
     """
     first = np.zeros(len(landmarks) + 1, np.int64)
     for i in range(len(landmarks)):

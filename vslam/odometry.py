@@ -13,8 +13,8 @@ correlated steps (a first-order autoregressive process).
 
 A stereo camera adds a third part. The disparity offset of the camera is estimated during the drive
 (``backend/disparity_offset.py``). Because of an error in this estimate, all estimated motions are
-too long or too short by the same factor. The random steps of the drift partly cancel each other. An
-error in the disparity offset does not cancel, because it affects all motions in the same way.
+too long or too short by the same factor. Unlike the random steps of the drift, these errors do not
+partly cancel each other.
 
 A covariance describes the error ``xi = [v, w]`` of a pose, in metres and radians, in the frame of
 the camera. If ``T_cw`` is the estimated pose, the true pose is ``exp(xi) T_cw``. The covariance

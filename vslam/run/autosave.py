@@ -1,12 +1,11 @@
 """Saves the state of a run at intervals, so that a killed run loses at most a minute of work.
 
-The pose of each tracked frame is appended to ``trajectory_online.tum`` as a line. At intervals, the
-map is copied between two frames, if possible while no keyframe is being mapped. A thread then
-writes two files. ``autosave_progress.npz`` contains the data that the report needs about the frames
-processed so far. ``autosave.npz`` contains the map and is an ordinary map file. Each file replaces
-the previous version atomically. If a run is killed between these two writes, the saved progress
-contains a few frames more than the saved map. When the run is resumed, these frames are tracked
-again.
+The pose of each frame is appended to ``trajectory_online.tum`` as a line. At intervals, the map is
+copied between two frames, if possible while no keyframe is being mapped. A thread then writes two
+files. ``autosave_progress.npz`` contains the data that the report needs about the frames processed
+so far. ``autosave.npz`` contains the map and is an ordinary map file. If a run is killed between
+these two writes, the saved progress contains a few frames more than the saved map. When the run is
+resumed, these frames are tracked again.
 """
 
 from __future__ import annotations

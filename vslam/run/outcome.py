@@ -132,7 +132,7 @@ def odometry_trajectory(tracks: list[TrackResult]) -> Trajectory:
 
 
 def ground_truth_of(source: Source) -> Trajectory | None:
-    """Return the poses of all frames that have ground truth. None if no frame has ground truth."""
+    """Return the poses of all frames with ground truth. None if the source has no ground truth."""
     if source.ground_truth is None:
         return None
     known = np.flatnonzero(np.isfinite(source.ground_truth).all((1, 2)))

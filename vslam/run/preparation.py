@@ -262,7 +262,10 @@ def prepared_frames(
     begin: int = 0,
     next_extraction: Callable[[], int] = lambda: -1,
 ) -> Iterator[tuple[float, PreparedFrame]]:
-    """Yield timestamps and prepared frames in order. Several threads prepare frames in advance."""
+    """Yield timestamps and prepared frames in order.
+
+    If there are several threads, some frames are prepared in advance.
+    """
     ahead: deque[tuple[float, Job[PreparedFrame]]] = deque()
     n_ahead = _AHEAD * workers.threads if workers.threads > 1 else 1
     requested = -1

@@ -296,9 +296,8 @@ class RerunRecorder(Recorder):
     - ``world/camera/image``: images of keyframes at half size. Its children ``tracked`` and
       ``untracked`` are the keypoints;
     - ``world/landmarks``, ``world/keyframes``: the map. It is recorded every 25 keyframes, after
-      each loop and at the end;
-    - ``world/loops/accepted``: a green line for each accepted loop. It is shown from the closing of
-      the loop until the end;
+      loops and at the end;
+    - ``world/loops/accepted``: a green line for each closed loop;
     - ``world/loops/rejected``: a faint red line for each rejected loop. It is shown for 20 frames;
     - ``loops/images``: the two images of a closed loop with their matches, shown until the next
       loop;

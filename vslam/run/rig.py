@@ -171,7 +171,7 @@ def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
 
 
 def rig_warnings(sides: ComparedSides) -> list[str]:
-    """Return warnings about a camera whose images are black, or darker than those of the other."""
+    """Return warnings about a camera whose images are black or darker than the other camera's."""
     warnings = []
     for side, other, black in (
         ("left", "right", sides.n_black_left),

@@ -168,10 +168,7 @@ def calibration_doubts(camera: Camera) -> list[str]:
 
 
 def principal_point_doubt(principal: tuple[float, float], size: tuple[int, int]) -> str:
-    """Return the reason why a principal point is implausible.
-
-    The reason is one sentence without a full stop. The result is an empty string if the principal
-    point is plausible.
+    """Return the reason why a principal point is implausible, or an empty string.
 
     Args:
         principal: column and row of the principal point in pixels.
@@ -229,8 +226,7 @@ def check_images(left: Image, second: Image | DepthImage | None, camera: Camera)
     """Check that the images of a frame match a camera.
 
     Raises:
-        ValueError: the sizes, the types or the number of the images are wrong. The message says
-            what is wrong.
+        ValueError: the sizes, the types or the number of the images are wrong.
     """
     other = "depth" if camera.depth else "right"
     if left is None:
@@ -267,7 +263,7 @@ def check_mask(mask: NDArray[np.uint8] | NDArray[np.bool_], camera: Camera) -> N
     """Check that a mask of the left image matches a camera.
 
     Raises:
-        ValueError: the size or type of the mask is wrong. The message says what is wrong.
+        ValueError: the size or type of the mask is wrong.
     """
     if mask.shape != (expected := (camera.height, camera.width)):
         raise ValueError(

@@ -832,7 +832,7 @@ def thresholds_in_words(changed: Mapping[str, Any], most: int = 3) -> str:
 
     Args:
         changed: thresholds by dotted name.
-        most: maximum number of thresholds that are listed. The other thresholds are only counted.
+        most: greatest number of thresholds that are listed. The others are only counted.
     """
     words = [f"{name}={value}" for name, value in changed.items()]
     more = [f"{len(words) - most} more in config.json"] if len(words) > most else []
@@ -843,8 +843,6 @@ def read_json(model: type[_Model], path: Path, what: str) -> _Model:
     """Read a JSON file of thresholds or settings. Keys that the file omits keep their defaults.
 
     Args:
-        model: the class that describes the values and their ranges.
-        path: the file.
         what: the name of the content in error messages, such as ``configuration``.
 
     Raises:
@@ -862,7 +860,6 @@ def checked(model: type[_Model], given: object, where: str, what: str) -> _Model
     """Check thresholds or settings. Values that are left out keep their defaults.
 
     Args:
-        model: the class that describes the values and their ranges.
         given: JSON as bytes, a dictionary, or a model, which is returned unchanged.
         where: the file or argument that the values come from, for error messages.
         what: the name of the values in error messages, such as ``thresholds``.

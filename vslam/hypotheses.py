@@ -1,10 +1,9 @@
 """The pose graph of a loop under two hypotheses about how the camera moved while it was lost.
 
-After tracking is lost, a new sub-map begins. The pose of the sub-map in the map is only predicted.
-Under the first hypothesis, the camera moved about as predicted, and the prediction is a measurement
-with a known error. Under the second hypothesis, the camera was carried to an unknown place (a
-"kidnapped robot"), and the prediction is worthless. Each loop is tested under the first hypothesis.
-If the loop is inconsistent, it is tested under the second hypothesis.
+After tracking is lost, a new sub-map begins, whose pose in the map is only predicted. Under the
+first hypothesis, the camera moved about as predicted, and the prediction is a measurement with a
+known error. Under the second hypothesis, the camera was carried to an unknown place (a "kidnapped
+robot"), and the prediction is worthless.
 """
 
 from __future__ import annotations
@@ -84,8 +83,7 @@ def solve(
     Args:
         closed: loops that were closed before, in the current unit of the map.
         edge: the new loop, whose relative pose is known.
-        monocular: whether the map is monocular. For a monocular map, similarities are optimised
-            instead of rigid motions, because its scale drifts.
+        monocular: optimise similarities instead of rigid motions, because the scale drifts.
     """
     predicted = hypothesis is Hypothesis.PREDICTED
     graph = essential_graph(map_, [*closed, edge], config, driven=predicted)

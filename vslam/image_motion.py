@@ -1,7 +1,4 @@
-"""Image velocities of points in a rectified stereo pair.
-
-The velocities are used to correct columns in the right image if the right camera exposes later than
-the left camera.
+"""Image velocities of points in a rectified stereo pair whose right camera exposes later.
 
 The velocities follow Longuet-Higgins and Prazdny (Proc. R. Soc. B, 1980), eq. 2.9 to 2.11, for the
 point (x z, y z, z) in the frame of the left camera. The paper uses the motion of the camera. Here,
@@ -24,11 +21,7 @@ _ROUNDS = 3  # rounds of a fixed-point iteration: speed and disparity depend on 
 def rays(
     xy: NDArray[np.float32], camera: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the normalised image coordinates of ``(N, 2)`` pixels of the left image.
-
-    Returns:
-        ``(N,)`` x and ``(N,)`` y.
-    """
+    """Return the ``(N,)`` normalised image coordinates x and y of ``(N, 2)`` pixels."""
     u, v = xy.astype(np.float64).T
     return (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
 
@@ -36,12 +29,9 @@ def rays(
 def row_speeds(
     x: NDArray[np.float64], y: NDArray[np.float64], inverse_depth: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the derivative of the row velocity of image points with respect to the twist.
+    """Return ``(N, 6)`` derivatives of row velocities by the twist, in focal lengths.
 
     The row velocity of a point is the same in both images.
-
-    Returns:
-        ``(N, 6)`` derivatives, in focal lengths.
     """
     zero = np.zeros_like(x)
     return np.column_stack([zero, inverse_depth, -y * inverse_depth, -1.0 - y * y, x * y, x])
@@ -53,10 +43,9 @@ def column_speeds(
     inverse_depth: NDArray[np.float64],
     baseline: float,
 ) -> NDArray[np.float64]:
-    """Return the derivative of the column velocity in the right image with respect to the twist.
+    """Return ``(N, 6)`` derivatives of column velocities in the right image by the twist.
 
-    Returns:
-        ``(N, 6)``, in focal lengths.
+    They are given in focal lengths.
     """
     zero, right = np.zeros_like(x), x - baseline * inverse_depth
     return np.column_stack(

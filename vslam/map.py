@@ -157,12 +157,9 @@ def _grown(array: NDArray, capacity: int) -> NDArray:
 
 
 class Map:
-    """A map that can grow. Callers must ensure that only one thread writes it at a time.
+    """A map that can grow. Only one thread may write it at a time.
 
     Attributes:
-        arrays: the arrays that kernels use.
-        keyframes: the other data of keyframes.
-        scalars: numbers that describe the map as a whole.
         n_keyframes, n_landmarks: number of keyframes and landmarks, including culled ones.
         n_rows: number of keypoints of all keyframes.
     """
@@ -275,14 +272,16 @@ class Map:
     def add_landmarks(
         self, xyz: NDArray[np.float64], descriptors: NDArray[np.uint64], keyframe: int
     ) -> NDArray[np.int32]:
-        """Append landmarks that a keyframe sees first, and return their ``(N,)`` ids.
+        """Append landmarks without observations, which ``keyframe`` sees first.
 
-        The new landmarks have no observations. They must be linked to keypoints before the map is
-        used again.
+        They must be linked to keypoints before the map is used again.
 
         Args:
             xyz: ``(N, 3)`` positions in the world frame.
             descriptors: ``(N, 4)`` descriptors.
+
+        Returns:
+            ``(N,)`` ids of the landmarks.
         """
         n, start = len(xyz), self.n_landmarks
         self._reserve(LANDMARK_FIELDS, start, n)
@@ -395,8 +394,7 @@ class Map:
     def cull_keyframe(self, keyframe: int) -> None:
         """Cull a keyframe and remove its observations. Its children become children of its parent.
 
-        Children that have been culled earlier also get the new parent. Therefore, no parent is a
-        culled keyframe.
+        This includes children that have been culled earlier, so no parent is a culled keyframe.
         """
         a, table, parents = self.arrays, self.keyframes, self.parents
         parent = parents[keyframe]
@@ -410,11 +408,9 @@ class Map:
         a.keyframe_alive[keyframe] = False
 
     def begin_submap(self, keyframe: int, parent: int, *, predicted: bool) -> None:
-        """Record that mapping restarted at a keyframe, which begins a sub-map.
+        """Record that a keyframe begins a sub-map, and its parent in the spanning tree.
 
         Args:
-            keyframe: the first keyframe of the sub-map.
-            parent: its parent in the spanning tree.
             predicted: whether the pose of the keyframe relative to its parent was predicted.
         """
         self.keyframes.parent[keyframe] = parent

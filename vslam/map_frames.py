@@ -31,18 +31,14 @@ from vslam.trajectory import Trajectory
 def add_frame(
     map_: Map, frame: Frame, certainty: NDArray[np.uint8] | int, reference: int, *, predicted: bool
 ) -> int:
-    """Add a frame to the map as a keyframe.
+    """Add a frame, with the landmarks that it tracks, to the map as a keyframe. Return its id.
 
-    The keyframe observes the landmarks that the frame tracks. A frame that tracks no landmark of
-    another keyframe begins a sub-map.
+    A frame that tracks no landmark of another keyframe begins a sub-map.
 
     Args:
         certainty: ``(N,)`` certainty of the features of the frame (``Arrays.certainty``).
-        reference: the parent of the keyframe if it begins a sub-map.
-        predicted: whether the pose of the keyframe was predicted, if the keyframe begins a sub-map.
-
-    Returns:
-        The id of the keyframe.
+        reference: if the keyframe begins a sub-map, its parent.
+        predicted: if the keyframe begins a sub-map, whether its pose was predicted.
     """
     keyframe = map_.add_keyframe(
         frame.refined_features(), frame.T_cw, frame.timestamp, frame.index, certainty
@@ -62,7 +58,7 @@ def add_two_views(map_: Map, start: TwoViewStart, reference: int) -> tuple[int, 
     """Add the first two keyframes of a monocular map or sub-map, and their common landmarks.
 
     Args:
-        reference: the parent of the first keyframe if it begins a sub-map.
+        reference: if the first keyframe begins a sub-map, its parent.
 
     Returns:
         The ids of the two keyframes.
@@ -98,12 +94,7 @@ class LandmarkCounts:
         self._found: list[NDArray[np.int32]] = []
 
     def add(self, visible: NDArray[np.int32], found: NDArray[np.int32]) -> None:
-        """Add the landmarks of a frame.
-
-        Args:
-            visible: ``(N,)`` ids of the landmarks that the frame should have seen.
-            found: ``(M,)`` ids of the landmarks that the frame found.
-        """
+        """Add ``(N,)`` landmarks that a frame should have seen, and ``(M,)`` that it found."""
         self._visible.append(visible)
         self._found.append(found)
 
@@ -117,10 +108,7 @@ class LandmarkCounts:
 
 
 def drop_culled_landmarks(map_: Map, frames: Sequence[Frame]) -> None:
-    """Remove the culled landmarks from the map.
-
-    The other landmarks are renumbered in the map and in ``frames``.
-    """
+    """Remove culled landmarks. Renumber the other landmarks in the map and in ``frames``."""
     new_id = map_.drop_culled_landmarks()
     for frame in {id(frame): frame for frame in frames}.values():
         tracked = frame.landmark >= 0
@@ -204,15 +192,9 @@ def keyframe_trajectory(map_: Map) -> Trajectory:
 
 
 def in_first_part(map_: Map, closed: Sequence[LoopEdge], frames: FrameTable) -> NDArray[np.bool_]:
-    """Determine which frames were tracked in the part of the map that contains the first keyframe.
+    """Return an ``(N,)`` bool array, True for frames that were tracked in the first sub-map.
 
-    This part includes all sub-maps that are joined to it by closed loops.
-
-    Args:
-        frames: the poses of N frames, relative to keyframes.
-
-    Returns:
-        ``(N,)`` bool, True for frames that were tracked in this part.
+    Sub-maps that closed loops have joined to the first sub-map count as part of it.
     """
     if not map_.n_keyframes:
         return frames.tracked

@@ -126,15 +126,11 @@ class Mapper:
 
     @property
     def map(self) -> Map:
-        """The map.
-
-        Raises:
-            RuntimeError: a keyframe is being mapped, or its mapping failed.
-        """
+        """The map. Raises a RuntimeError if a keyframe is being mapped, or its mapping failed."""
         return self._shared.map
 
     def keyframe_pose(self, keyframe: int) -> Matrix:
-        """Return the pose ``T_cw`` that a keyframe had at the last merge.
+        """Return the pose ``T_cw`` of a keyframe.
 
         While a mapping job runs, only the pose of the reference keyframe is available.
         """
@@ -152,11 +148,7 @@ class Mapper:
         return float(self.map.unit_scale[keyframe])
 
     def trajectory(self) -> Trajectory:
-        """Return the pose of every frame (``FramePoses.trajectory``).
-
-        Raises:
-            RuntimeError: a keyframe is being mapped, or its mapping failed.
-        """
+        """Return the pose of every frame (``FramePoses.trajectory``)."""
         self.map  # noqa: B018 (raises if it cannot be read)
         return self.frames.trajectory()
 
@@ -199,12 +191,7 @@ class Mapper:
         return PlacedFrame(frame)
 
     def count(self, visible: NDArray[np.int32], found: NDArray[np.int32]) -> None:
-        """Count the landmarks that a frame should have seen, and the landmarks that it found.
-
-        Args:
-            visible: ``(N,)`` ids of the landmarks that the frame should have seen.
-            found: ``(M,)`` ids of the landmarks that the frame found.
-        """
+        """Count ``(N,)`` landmarks that a frame should have seen, and ``(M,)`` that it found."""
         self._counts.add(visible, found)
 
     def merge_if_due(self, frame: int) -> None:
@@ -226,21 +213,15 @@ class Mapper:
         """Make the result of the mapping job visible to tracking, and return the map.
 
         This method waits for the mapping job and for the search for loops.
-
-        Raises:
-            RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
         """
         self._merge_mapping()
         return self.complete()
 
     def complete(self) -> Map:
-        """Wait for the running mapping job and for the search for loops, and return the map.
+        """Wait for the mapping job and for the search for loops, and return the map.
 
-        The result of the mapping job does not become visible to tracking. Therefore, calling this
-        method does not change any result.
-
-        Raises:
-            RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
+        The result of the mapping job does not become visible to tracking. Therefore, this method
+        does not change the trajectory.
         """
         map_ = self._wait_for_mapping()
         self._start_search()
@@ -289,12 +270,10 @@ class Mapper:
     def insert(self, frame: PlacedFrame, *, predicted: bool = True) -> None:
         """Make the newest frame a keyframe, map its stereo points and start its mapping job.
 
-        The frame then tracks all landmarks that its features observe, including new landmarks. A
-        frame that shares no landmark with the map begins a sub-map.
+        A frame that shares no landmark with the map begins a sub-map.
 
         Args:
-            predicted: whether the pose of the frame was predicted. This value matters only if the
-                frame begins a sub-map.
+            predicted: if the frame begins a sub-map, whether its pose was predicted.
         """
         with self._changing() as map_:
             self._make_room(map_, frame)
@@ -321,8 +300,8 @@ class Mapper:
         Nothing is done if ``frame`` is not such a keyframe, or if another keyframe follows it.
 
         ORB-SLAM2 (III-B) maps all points from the start. However, the calibration error of a stereo
-        pair biases far points and therefore the first poses. Far points are added only when they
-        are needed. This is the case at high speed, when close points leave the view within a frame.
+        pair biases far points and therefore the first poses. Far points are needed only at high
+        speed, when close points leave the view within a frame.
 
         Returns:
             Whether points were added.
@@ -385,10 +364,7 @@ class Mapper:
         self.rig.offset_sigma = offset_sigma(known.offset_information, self._config.stereo)
 
     def refer_to_nearest(self, frame: Frame) -> None:
-        """Make the keyframe that shares the most landmarks with a frame the reference keyframe.
-
-        This follows ORB-SLAM, section V-D.
-        """
+        """Refer to the keyframe that shares the most landmarks with a frame (ORB-SLAM, V-D)."""
         shared = count_shared_landmarks(self.merge(), frame)
         best = int(np.argmax(shared))
         if shared[best] and best != self.reference:
@@ -418,19 +394,15 @@ class Mapper:
 
     @contextmanager
     def _changing(self) -> Iterator[Map]:
-        """Yield the merged map for changes.
-
-        If the ``with`` block raises an exception, the map becomes unusable.
-        """
+        """Yield the merged map for changes. An exception in the block makes the map unusable."""
         self._settle()
         with self._shared.change() as map_:
             yield map_
 
     def _make_room(self, map_: Map, frame: Frame) -> None:
-        """Drop culled landmarks from the map if there are many.
+        """Drop culled landmarks if there are many, unless a global bundle adjustment is running.
 
-        The ids of the other landmarks then change. A global bundle adjustment refers to landmarks
-        by id, so nothing is dropped while it runs.
+        Dropping changes the ids of the other landmarks, to which the adjustment refers.
         """
         if not self._closing.is_adjusting and map_.many_culled_landmarks:
             drop_culled_landmarks(map_, (*self._held, frame))
@@ -449,10 +421,10 @@ class Mapper:
             self._move(frame, before)
 
     def _move(self, frame: Frame, before: MapView) -> None:
-        """Update the pose of a frame after a merge has changed the map.
+        """Update a frame after a merge has changed the map.
 
-        If the pose of the frame has been recorded, the frame moves with the keyframe that this pose
-        is relative to. Otherwise, the frame moves with the reference keyframe.
+        A frame whose pose has been recorded moves with its own reference keyframe. Any other frame
+        moves with the current reference keyframe.
         """
         growth = self.view.unit_scale / before.unit_scale
         self.rig.correct_offset(frame)

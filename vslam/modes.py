@@ -33,22 +33,11 @@ class Mode:
         return -1
 
     def begin(self, frame: PlacedFrame) -> bool:
-        """Try to begin a map or sub-map with a frame that has a pose but was not tracked.
-
-        Returns:
-            True if a map or sub-map was begun.
-        """
+        """Try to begin a map or sub-map with an untracked frame. Return whether it was begun."""
         return False
 
     def begin_after_loss(self, frame: PlacedFrame) -> bool:
-        """Try to begin a map or sub-map if the camera has been lost for enough frames.
-
-        Args:
-            frame: a frame that has a pose but was not tracked.
-
-        Returns:
-            True if a map or sub-map was begun.
-        """
+        """Do the same as ``begin``, but only if the camera has been lost for enough frames."""
         return False
 
     def map_far_points(self) -> bool:
@@ -62,16 +51,16 @@ class Mode:
         return False
 
     def update_map(self, frame: PlacedFrame, found: Found) -> bool:
-        """Count the landmarks that a tracked frame saw, and insert it as a keyframe if needed.
+        """Count the landmarks of a tracked frame. Insert it as a keyframe if it shows new points.
 
         Returns:
-            True if the frame was inserted as a keyframe.
+            Whether the frame was inserted as a keyframe.
         """
         self._mapper.refer_to_nearest(frame)
         return False
 
     def state(self) -> PolicyState | None:
-        """Return the state of the mode for a checkpoint. None if no checkpoint is possible now."""
+        """Return the state for a checkpoint, or None if no checkpoint is possible now."""
         return None
 
     def restore(self, state: PolicyState) -> None:

@@ -1,8 +1,7 @@
 """Odometry: poses that drift but never jump, and the uncertainty of each pose.
 
 The pose of the camera in the map jumps when a loop is closed or the camera is relocalised. The
-controller of a robot needs poses that do not jump. Therefore, ROS also has the frame ``odom`` (REP
-105). A pose in this frame follows the motion from frame to frame, and drifts.
+controller of a robot needs poses that do not jump, in the frame that ROS calls ``odom`` (REP 105).
 
 The error of a pose has two parts. The *local* error is the error of the camera pose relative to the
 landmarks around the camera. It is independent in every frame. The *drift* is the error of these

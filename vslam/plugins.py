@@ -1,8 +1,7 @@
 """Loop detectors, readers and perturbations that other packages provide as entry points.
 
-docs/howto/plugins.md explains how to write a plug-in. Plug-ins are found in the metadata of
-packages. A package is imported only when its plug-in is used, so a broken package does not affect
-other runs.
+docs/howto/plugins.md explains how to write a plug-in. A package is imported only when its plug-in
+is used, so a broken package does not affect other runs.
 """
 
 from __future__ import annotations
@@ -34,8 +33,8 @@ class PlugIn:
     Attributes:
         group: the group of entry points, which is one of `KINDS`.
         name: the name on the command line.
-        packages: all packages that provide a plug-in of this name, with versions. It is an error to
-            use a plug-in whose name more than one package provides.
+        packages: all packages that provide a plug-in of this name, with versions. If there are
+            several, the plug-in cannot be used.
         entry_point: the entry point of the first package.
     """
 
@@ -90,11 +89,7 @@ class PlugIn:
             ) from error
 
     def _line(self, error: Exception) -> str:
-        """Return the file name and line of the package's code at which an error occurred.
-
-        If the error was raised by other code, this is the line that called the other code. The
-        result is empty if the traceback does not contain the package.
-        """
+        """Return the last line of the package's own code in the traceback of an error, if any."""
         package = self.entry_point.module.partition(".")[0]
         lines = [
             f"; {Path(frame.f_code.co_filename).name}, line {line}"
@@ -111,14 +106,7 @@ def reason(error: Exception) -> str:
 
 
 def find_plugins(group: str) -> dict[str, PlugIn]:
-    """Find the plug-ins of all installed packages.
-
-    Args:
-        group: the group of entry points, which is one of `KINDS`.
-
-    Returns:
-        The plug-ins by name, sorted alphabetically.
-    """
+    """Find the plug-ins of all installed packages in one of the groups `KINDS`, sorted by name."""
     found: dict[str, PlugIn] = {}
     for package, entry_point in _entry_points(group):
         name = entry_point.name

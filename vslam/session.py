@@ -162,10 +162,7 @@ class Session:
         self.rig.mark_corrected(self.tracker.restore(state.tracker, xyz))
 
     def resume_odometry(self, last: TrackResult) -> None:
-        """Continue the odometry of a resumed drive after its last frame.
-
-        Nothing is done if the odometry has already been restored from a checkpoint.
-        """
+        """Continue the odometry of a resumed drive, unless a checkpoint has restored it."""
         T_odom_camera, uncertainty = last.T_odom_camera, last.uncertainty
         if T_odom_camera is None or uncertainty is None or self.opened.checkpoint is not None:
             return

@@ -68,13 +68,7 @@ class SharedMap:
 
     @contextmanager
     def change(self) -> Iterator[Map]:
-        """Wait for the running job, if there is one, and yield the map for changes.
-
-        If the running job fails, its exception is raised unchanged.
-
-        Raises:
-            RuntimeError: an earlier job failed, or this process is a fork.
-        """
+        """Do the same as ``wait``, and yield the map for changes."""
         map_ = self.wait()
         with self._invalidated_on_error():
             yield map_

@@ -329,10 +329,7 @@ class Slam:
         return tracked, T_predicted
 
     def _record_pose(self, frame: Frame, found: Found, T_predicted: Matrix) -> PlacedFrame:
-        """Record the pose of a frame and advance the odometry.
-
-        A lost frame gets the predicted pose.
-        """
+        """Record the pose of a frame, or the predicted pose if it is lost. Advance the odometry."""
         mapper, tracker = self._mapper, self._tracker
         if found.is_lost:
             frame.T_cw = T_predicted
@@ -359,10 +356,7 @@ class Slam:
         return is_keyframe
 
     def skip(self, timestamp: float, *, dropped: bool = False) -> TrackResult:
-        """Add a frame without images at the predicted pose.
-
-        The state of the frame is LOST, or DROPPED if there was no time to process its images.
-        """
+        """Add a frame without images at the predicted pose. Its state is LOST or DROPPED."""
         frame = self._next_frame(Extracted.nothing(), timestamp, None)
         frame.T_cw = self._tracker.predict(timestamp, self._mapper.frames, self._mapper.view)
         self._follow(frame, frame.T_cw, None)
@@ -466,10 +460,7 @@ class Slam:
         return self._closing.corrections
 
     def trajectory(self) -> Trajectory:
-        """Return the pose of every frame according to the current map.
-
-        The poses of lost frames are interpolated between the tracked frames before and after them.
-        """
+        """Return the pose of every frame. The poses of lost frames are interpolated."""
         return self._mapper.trajectory()
 
     def keyframe_trajectory(self) -> Trajectory:

@@ -73,10 +73,8 @@ def read_table(
     """Read a text file of numbers. Blank lines and lines that begin with ``#`` are skipped.
 
     Args:
-        path: file to read.
         columns: the allowed numbers of columns. All lines must have the same number of columns.
         what: the content of a line, for error messages, such as "a pose".
-        max_rows: stop reading after this many rows.
 
     Returns:
         ``(N, C)`` float64 with N >= 1, all finite.
@@ -143,9 +141,8 @@ def read_trajectory(path: Path | str, timestamps: NDArray[np.float64] | None = N
     """Read a KITTI (12 columns) or TUM (8 columns) trajectory.
 
     Args:
-        path: file to read.
-        timestamps: ``(N,)`` seconds, the timestamps of the poses of a KITTI file. With None, the
-            frame numbers are used. A TUM file contains its timestamps, so this argument is ignored.
+        timestamps: ``(N,)`` timestamps in seconds of the poses of a KITTI file. None uses the frame
+            numbers. A TUM file contains timestamps, so this argument is ignored.
 
     Raises:
         InputError: the file is malformed, the numbers of poses and timestamps differ, a rotation is

@@ -1,9 +1,8 @@
 """Threads that run the jobs of a pipeline. A thread that waits for a job runs other jobs meanwhile.
 
-With two threads, the main thread and one worker share the jobs, and neither is idle while a job is
-queued. Jobs start in order of ``Urgency``. The result of a job must not depend on when the job runs
-or on which thread runs it. Global bundle adjustment takes seconds and would delay the other jobs.
-It is therefore not such a job, but has its own thread (``vslam/closing.py``).
+Jobs start in order of ``Urgency``. The result of a job must not depend on when the job runs or on
+which thread runs it. Global bundle adjustment would delay the other jobs by seconds. It therefore
+has its own thread (``vslam/closing.py``).
 """
 
 from __future__ import annotations

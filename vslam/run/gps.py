@@ -29,13 +29,11 @@ class GpsTrack:
         geodetic: ``(N, 3)`` latitude and longitude (degrees) and altitude (m) of the frames.
         datum: ``(3,)`` latitude, longitude and altitude of the origin of the ENU frame. The origin
             is the first GPS fix.
-        visual: ``(N, 3)`` positions of the frames in ENU, estimated without GPS. A single
-            transformation aligns all of these positions with the fixes.
+        visual: ``(N, 3)`` positions of the frames in ENU without GPS, aligned as a whole.
         fixes: ``(M, 3)`` positions of the antenna in ENU. Only fixes that were measured between two
             tracked frames are included.
         antenna: ``(3,)`` position of the antenna in the frame of the camera, in metres.
-        anchored: the poses of the keyframes in ENU, and the fixes from which these poses were
-            computed.
+        anchored: the poses of the keyframes in ENU, and the fixes that were used.
     """
 
     trajectory: Trajectory

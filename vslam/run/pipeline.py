@@ -195,10 +195,7 @@ class _Run:
         return True
 
     def fail(self, what: str, error: Exception) -> None:
-        """Record a failure that ends the run.
-
-        Only the first failure is kept, because it may have caused later failures.
-        """
+        """Record a failure that ends the run. Only the first failure is kept."""
         if self._failure is not None:
             return
         if sys.flags.dev_mode:
@@ -288,9 +285,6 @@ def _record_frame(
 def _following(frames: Iterator[TimedFrame], before: NDArray[np.float64]) -> Iterator[TimedFrame]:
     """Yield the frames after the first N frames, which were tracked before the run was resumed.
 
-    Args:
-        before: ``(N,)`` timestamps of the frames that were tracked before the interruption.
-
     Raises:
         InputError: the timestamps of the first N frames of the source differ from ``before``.
     """
@@ -367,13 +361,11 @@ def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
 
 
 def _source_warnings(source: Source, settings: RunOptions) -> list[str]:
-    """Return warnings about images that were left out, and about an implausible calibration."""
     left_out = source.pairing.warnings() if source.pairing is not None else []
     return [*left_out, *calibration_warnings(source.camera, settings.calib, source.name)]
 
 
 def _map_warnings(slam: Slam, camera: Camera) -> list[str]:
-    """Return warnings about problems of the stereo rig that are measured in the final map."""
     try:
         residuals = measure_rig(slam.map, camera)
         return delay_warnings(slam.rig.delay, camera) or residual_warnings(residuals, camera)
@@ -472,10 +464,7 @@ def _record_loops(recorder: Recorder, slam: Slam, n_recorded: int) -> int:
 
 @contextmanager
 def _stop_on_interrupt() -> Iterator[threading.Event]:
-    """Set an event at the first Ctrl-C, so that the current frame can be completed.
-
-    A second Ctrl-C ends the program at once.
-    """
+    """Set an event at the first Ctrl-C. A second Ctrl-C ends the program at once."""
     interrupted = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield interrupted

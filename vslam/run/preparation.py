@@ -229,8 +229,6 @@ def at_their_times(
     at the start of the run.
 
     Args:
-        workers: threads that prepare frames and extract features in advance.
-        realtime: whether this is a real-time run.
         live: see ``play``.
         begin: index of the first frame.
         next_extraction: function that returns ``Slam.next_extraction``, the index of a frame whose

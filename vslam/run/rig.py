@@ -81,9 +81,7 @@ def measure_rig(map_: Map, camera: Camera) -> RigResiduals | None:
 def fit(
     residual: NDArray[np.float64], speed: NDArray[np.float64], disparity: NDArray[np.float64]
 ) -> tuple[float, float, float]:
-    """Fit a delay, an offset and a relative error in the disparity to residuals in right images.
-
-    The fit minimises the Huber loss.
+    """Fit a delay, an offset and a disparity error to residuals in right images (Huber loss).
 
     Args:
         residual: ``(N,)`` measured minus predicted columns of features in right images, in pixels.

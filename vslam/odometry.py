@@ -31,10 +31,10 @@ from numpy.typing import NDArray
 
 from vslam.geometry import Matrix, inverse, orthonormalised
 
-# The computed covariance of the drift is multiplied by the first number. The second number is the
-# correlation of consecutive steps of the drift. Both were tuned on three rendered drives so that
-# the squared errors over intervals of 1 s and 10 s match the covariances. They were tested on other
-# drives (docs/research/uncertainty.md).
+# DRIFT multiplies the computed covariance of the drift. CORRELATION is the correlation of
+# consecutive steps of the drift. Both were tuned on three rendered drives so that the squared
+# errors over intervals of 1 s and 10 s match the covariances. They were tested on other drives
+# (docs/research/uncertainty.md).
 DRIFT, CORRELATION = 1.4, 0.4
 # Standard deviations of the acceleration of a lost camera, in m/s^2 and rad/s^2.
 ACCELERATION, TURNING = 2.0, 1.0

@@ -40,11 +40,9 @@ from vslam.trajectory import Trajectory
 _log = logging.getLogger(__name__)
 _P = ParamSpec("_P")
 
-# The budget is 50 MB for 1,000 frames. Such a run has about 350 keyframes of 1241x376 pixels and
-# 2,000 features. Their images take about 11 MB, the keypoints 6 MB, 14 maps 5 MB, and the data of
-# all frames 0.3 MB. In addition, a map is recorded after each loop, but at most for one in ten
-# keyframes. This adds up to 35 x 0.36 = 13 MB. The pictures of these loops add up to 35 x 0.1 = 4
-# MB.
+# The budget is 50 MB for 1,000 frames, of which about 350 are keyframes of 1241x376 pixels with
+# 2,000 features. The images take about 11 MB, the keypoints 6 MB, and 14 maps 5 MB. Further maps,
+# which are recorded after loops, take up to 13 MB, and the pictures of these loops up to 4 MB.
 _IMAGE_SCALE = 0.5
 _JPEG_QUALITY = 75
 _MAX_POINTS_PER_MAP = 30_000  # except for the last map, which is complete
@@ -382,8 +380,7 @@ class RerunRecorder(Recorder):
             log(f"points/{name}", rr.SeriesLines(colors=[color], names=[name]))
         log("world/trajectory", rr.LineStrips3D.from_fields(colors=[_BLUE], radii=[-1.0]))
         if ground_truth is not None and len(ground_truth):
-            # Move the ground truth from the world frame of the data set to the world frame of the
-            # run.
+            # Move the ground truth to the world frame of the run.
             T_wc = np.linalg.inv(ground_truth.T_wc[0]) @ ground_truth.T_wc
             log("world/ground_truth", _path(T_wc, _GREY))
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from vslam.geometry import Matrix
 from vslam.kernels import inner_kernel
 
-# Limits of the squared error of an inlier, divided by its variance: the 95 % quantiles of chi-square
-# with 2 and 3 degrees of freedom (ORB-SLAM2, III-C).
+# Limits of the squared error of an inlier, divided by its variance. They are the 95 % quantiles of
+# chi-square with 2 and 3 degrees of freedom (ORB-SLAM2, III-C).
 CHI2_MONO = 5.991
 CHI2_STEREO = 7.815
 

@@ -19,6 +19,7 @@ from vslam.frontend.tracking import (
     track_descriptors,
     track_local_map,
     track_motion,
+    track_sudden_motion,
 )
 from vslam.geometry import Matrix, inverse, orthonormalised, se3_exp, se3_log, transform
 from vslam.map_view import MapView
@@ -287,18 +288,19 @@ class Tracker:
         If the motion is known, the frame is tracked against the last frame, using the predicted
         pose. If the motion is unknown or tracking against the last frame fails, the frame is
         tracked against the reference keyframe. If that fails too and the motion is known,
-        ``_track_predicted`` is called.
+        ``_track_predicted`` is called. The last attempt assumes that the motion has changed
+        suddenly since the last frame.
         """
         if self.last is None and self.status is not TrackerStatus.RESUMED:
             return 0
         if self.last is not None and self.last.twist is not None:
             n_matches, n_inliers = track_motion(frame, self.last, T_cw, self._context)
-            if self._moves_as_predicted(n_matches, n_inliers):
+            if self._is_trusted(n_matches, n_inliers, self._config.tracking.min_inlier_ratio):
                 return n_inliers
         n_inliers = track_descriptors(frame, view.reference_landmarks, T_cw, self._context)
         if n_inliers >= self._config.tracking.min_inliers_frame or self.twist is None:
             return n_inliers
-        return self._track_predicted(frame, T_cw, view)
+        return self._track_predicted(frame, T_cw, view) or self._track_sudden_motion(frame, T_cw)
 
     def _track_predicted(self, frame: Frame, T_cw: Matrix, view: MapView) -> int:
         """Match all landmarks of the local map near their predicted image positions. Returns the
@@ -313,14 +315,24 @@ class Tracker:
         n_matches, n_inliers, _ = track_local_map(
             frame, view.local_landmarks, self._context, window, view.patches
         )
-        if self._moves_as_predicted(n_matches, n_inliers):
+        if self._is_trusted(n_matches, n_inliers, self._config.tracking.min_inlier_ratio):
             return n_inliers
         frame.drop_matches()
         return 0
 
-    def _moves_as_predicted(self, n_matches: int, n_inliers: int) -> bool:
-        config = self._config.tracking
-        return n_inliers >= max(config.min_inliers_motion, config.min_inlier_ratio * n_matches)
+    def _track_sudden_motion(self, frame: Frame, T_cw: Matrix) -> int:
+        """Track a frame against the last frame if the motion has changed suddenly since then.
+        Returns the number of inliers, or 0 if no trustworthy pose was found."""
+        if self.last is None or self.status is not TrackerStatus.TRACKING:
+            return 0
+        n_matches, n_inliers = track_sudden_motion(frame, self.last, T_cw, self._context)
+        if self._is_trusted(n_matches, n_inliers, self._config.tracking.sudden_min_inlier_ratio):
+            return n_inliers
+        frame.drop_matches()
+        return 0
+
+    def _is_trusted(self, n_matches: int, n_inliers: int, min_ratio: float) -> bool:
+        return n_inliers >= max(self._config.tracking.min_inliers_motion, min_ratio * n_matches)
 
     def _is_doubtful(self, frame: Frame, n_inliers: int, view: MapView, frames: FramePoses) -> bool:
         """Return whether a frame is doubtful. A frame is doubtful if it has so few inliers that its

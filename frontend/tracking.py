@@ -26,6 +26,7 @@ from vslam.frontend.matching import (
     search_windows,
 )
 from vslam.frontend.orb import scale_factors
+from vslam.frontend.pnp import ransac_pose
 from vslam.frontend.pose import offset_effect, optimise_pose, pose_covariance
 from vslam.geometry import Matrix, compose, inverse, transform
 from vslam.map_view import LocalMap
@@ -103,7 +104,73 @@ def track_motion(
     Returns:
         Number of matches, and number of inliers of the pose optimisation.
     """
-    config, camera = context.config.tracking, context.camera
+    config = context.config.tracking
+    matches, inliers = 0, 0
+    for widening in (1.0, 2.0, 4.0):
+        window = widening * context.motion_window
+        matches = _match_previous(frame, previous, T_cw, context, window)
+        if matches < config.min_inliers_motion:
+            continue
+        inliers = refine(frame, T_cw, context)
+        if inliers >= config.min_inliers_motion:
+            break
+    return matches, inliers
+
+
+def track_sudden_motion(
+    frame: Frame, previous: Frame, T_cw: NDArray[np.float64], context: TrackingContext
+) -> tuple[int, int]:
+    """Track a frame against the points of the previous frame, although the predicted pose is wrong.
+
+    In a sudden turn, optimisation that starts at the predicted pose does not find the pose.
+    Therefore, the pose is first estimated by P3P inside RANSAC.
+
+    Args:
+        frame: receives the pose and the matches.
+        T_cw: ``(4, 4)`` predicted pose of the left camera (world to camera).
+
+    Returns:
+        Number of matches, and number of inliers of the pose optimisation.
+    """
+    config, sampling = context.config.tracking, context.config.relocalization
+    least = config.min_inliers_motion
+    matches = _match_previous(frame, previous, T_cw, context, config.sudden_window)
+    if matches < least:
+        return matches, 0
+    matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
+    T_camera_w, inlier = ransac_pose(
+        frame.xyz[matched],
+        *observations(frame, matched, context),
+        context.camera.intrinsics,
+        np.uint64(frame.index),
+        least,
+        sampling.max_draws,
+        sampling.confidence,
+    )
+    if np.count_nonzero(inlier) < least:
+        return matches, 0
+    frame.drop_matches(matched[~inlier])
+    frame.set_camera_pose(T_camera_w)
+    return matches, refine(frame, frame.T_cw, context)
+
+
+def _match_previous(
+    frame: Frame,
+    previous: Frame,
+    T_cw: NDArray[np.float64],
+    context: TrackingContext,
+    window: float,
+) -> int:
+    """Match the points of the previous frame near their projections, and return the number of
+    matches.
+
+    If there are at least ``tracking.min_inliers_motion`` matches, they replace the matches of the
+    frame.
+
+    Args:
+        window: search radius at octave 0, in pixels.
+    """
+    camera = context.camera
     points, source = trackable_points(previous, context)
     before = previous.features
     octave = before.octave[source].astype(np.int64)
@@ -119,27 +186,20 @@ def track_motion(
         low, high = octave, np.full_like(octave, len(context.scales))
     elif advance < -camera.baseline < 0.0:
         low, high = np.zeros_like(octave), octave
-    matches, inliers = 0, 0
-    for widening in (1.0, 2.0, 4.0):
-        radius = np.where(ahead, context.motion_window * widening * context.scales[octave], 0.0)
-        feature, point = _search(
-            frame,
-            Projections(uvr, radius, low, high, before.descriptors[source].view(np.uint64)),
-            np.ones(len(frame.features), np.bool_),
-            context,
-            1.0,
-        )
-        keep = consistent_orientation(before.angle[source[point]], frame.features.angle[feature])
-        feature, point = feature[keep], point[keep]
-        matches = len(feature)
-        if matches < config.min_inliers_motion:
-            continue
+    radius = np.where(ahead, window * context.scales[octave], 0.0)
+    feature, point = _search(
+        frame,
+        Projections(uvr, radius, low, high, before.descriptors[source].view(np.uint64)),
+        np.ones(len(frame.features), np.bool_),
+        context,
+        1.0,
+    )
+    keep = consistent_orientation(before.angle[source[point]], frame.features.angle[feature])
+    feature, point = feature[keep], point[keep]
+    if len(feature) >= context.config.tracking.min_inliers_motion:
         frame.drop_matches()
         frame.match(feature, previous.landmark[source[point]], points[point])
-        inliers = refine(frame, T_cw, context)
-        if inliers >= config.min_inliers_motion:
-            break
-    return matches, inliers
+    return len(feature)
 
 
 def trackable_points(

@@ -65,7 +65,7 @@ def require_detector(name: str, weights: Path | None = None, option: str = "--de
         raise InputError("--weights: the detector 'none' has no weights; leave the option out.")
     elif weights is not None and not weights.is_file():
         raise InputError(
-            f"--weights {weights}: no such file; name a vocabulary file (.npz or .txt)."
+            f"--weights {weights}: no such file; give a vocabulary file (.npz or .txt)."
         )
 
 

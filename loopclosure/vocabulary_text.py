@@ -135,7 +135,7 @@ def _read_header(path: Path, header: bytes) -> tuple[int, int]:
     except ValueError:
         raise InputError(
             f"{path}: line 1 is not 'k L scoring weighting' in whole numbers; "
-            "name a vocabulary in DBoW2's text format."
+            "give a vocabulary in DBoW2's text format."
         ) from None
     if not (2 <= branching <= MAX_BRANCHING and 1 <= levels <= MAX_LEVELS):
         raise InputError(

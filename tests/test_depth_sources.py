@@ -174,7 +174,7 @@ def test_topics_of_bags_with_depth(corridor, depths, calib, tmp_path):
     assert not opened(bag, calib, topics=COLOUR, sensor="mono").camera.depth
     assert opened(bag, calib, topics=f"{COLOUR},{DEPTH}").camera.depth
     refused("choose topics with --topics COLOUR,DEPTH; image topics are", bag, calib, sensor="rgbd")
-    refused(f"{DEPTH} holds depth; name the topic", bag, calib, topics=f"{DEPTH},{COLOUR}")
+    refused(f"{DEPTH} holds depth; give the topic", bag, calib, topics=f"{DEPTH},{COLOUR}")
     refused("encoding 'mono8' is not depth; known are 16UC1", bag, calib,
             topics=f"{COLOUR},/infra/image_raw", sensor="rgbd")  # fmt: skip
     other = write_bag(tmp_path / "s.bag", "ros1", {**two, DEPTH: small}, STAMPS[:2])

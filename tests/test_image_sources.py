@@ -134,7 +134,7 @@ def test_fabmap_ground_truth_must_fit_and_hold_something(tmp_path):
 
 
 def test_a_loop_matrix_that_is_not_there(tmp_path):
-    with pytest.raises(InputError, match="no such file; name the loop matrix"):
+    with pytest.raises(InputError, match="no such file; give the loop matrix"):
         read_loop_matrix(tmp_path / "none.mat")
 
 

@@ -119,7 +119,7 @@ def test_other_files_are_refused_in_one_sentence(tmp_path, imagenet):
     state = imagenet_state()
     del state["_blocks.5._bn1.bias"]
     torch.save(state, imagenet)
-    with pytest.raises(InputError, match=r"lite0\.pth: has the layers of another network; name"):
+    with pytest.raises(InputError, match=r"lite0\.pth: has the layers of another network; give"):
         extractor.load_imagenet(imagenet)
     state = imagenet_state()
     state["_blocks.5._project_conv.weight"] = torch.zeros(3, 3, 1, 1)

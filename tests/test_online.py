@@ -328,7 +328,7 @@ def test_a_drive_is_measured_before_and_after_verification_and_reported(tmp_path
         (["--protocol", "online", "--detectors", "magic"], "--detectors magic: unknown"),
         (["--protocol", "online", "--data", "town:demo"], "--protocol online needs drives"),
         (["--window", "30s"], "--window: only for --protocol online"),
-        (["--detectors", "bow", "--weights", "bow=x"], "x: no such file; name a vocabulary"),
+        (["--detectors", "bow", "--weights", "bow=x"], "x: no such file; give a vocabulary"),
     ],
 )
 def test_command_refuses_in_one_sentence(arguments, said, tmp_path, monkeypatch):

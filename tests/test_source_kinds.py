@@ -49,7 +49,7 @@ def test_folders(tmp_path, file, dataset):
 
 
 def test_what_is_not_known_is_told_what_was_looked_for(tmp_path):
-    with pytest.raises(InputError, match="the folder is empty; name another one"):
+    with pytest.raises(InputError, match="the folder is empty; give another one"):
         detect_dataset(str(tmp_path))
     (tmp_path / "1.png").touch()
     with pytest.raises(InputError, match="a single image; name its folder"):
@@ -59,7 +59,7 @@ def test_what_is_not_known_is_told_what_was_looked_for(tmp_path):
         detect_dataset(str(tmp_path))
     for word in ("sequences", "mav0", "rgb.txt", "metadata.yaml", "left/", "video"):
         assert word in str(caught.value)
-    with pytest.raises(InputError, match=r"notes.txt: not images; name a folder"):
+    with pytest.raises(InputError, match=r"notes.txt: not images; give a folder"):
         detect_dataset(str(tmp_path / "notes.txt"))
     (tmp_path / "notes.txt").rename(tmp_path / "drive.tar.gz")
     with pytest.raises(InputError, match="an archive; unpack it"):

@@ -13,7 +13,7 @@ from vslam.features import Features, TrackingState
 from vslam.frame_poses import FramePoses
 from vslam.frontend.frame import Frame
 from vslam.frontend.tracker import Found, Tracker, TrackerStatus, judge
-from vslam.frontend.tracking import TrackingContext
+from vslam.frontend.tracking import TrackingContext, track_motion
 from vslam.geometry import se3_exp
 from vslam.map_view import MapView
 
@@ -253,6 +253,40 @@ def test_a_prediction_with_a_small_share_of_inliers_is_not_trusted(last_saw, n_w
     features.xy[30 : 30 + n_wrong, 1] += np.where(np.arange(n_wrong) % 2, 6.0, -6.0)
     features = select(features, 30 + n_wrong)
     assert drive.track(frame_of(features, 2, 0.2), view).is_lost != found_again
+
+
+@pytest.mark.parametrize(("pixels", "found_again"), [(90, True), (110, False)])
+def test_a_frame_after_a_sudden_turn_is_tracked_from_the_last_frame(pixels, found_again):
+    """Optimisation that starts at the predicted pose fails, because the turn is too large."""
+    drive, view = Drive.of_two_frames(), POINTS.view(nearest=NOTHING)
+    frame, T_predicted = drive.next_frame(), ahead(0.0, pixels / CAMERA.fx) @ at(2)
+    assert track_motion(drive.next_frame(), drive.tracker.last, T_predicted, CONTEXT)[1] == 0
+    found = drive.track(frame, view, T_predicted)
+    assert found.is_lost != found_again
+    if found_again:
+        np.testing.assert_allclose(frame.T_cw, at(2), atol=1e-4)
+
+
+@pytest.mark.parametrize(("n_wrong", "found_again"), [(140, True), (150, False)])
+def test_a_sudden_turn_needs_a_large_share_of_inliers(n_wrong, found_again):
+    """The wrong matches are scattered, so that no pose agrees with many of them."""
+    drive, view = Drive.of_two_frames(), POINTS.view(nearest=NOTHING)
+    features = POINTS.see(at(2))
+    away = np.random.default_rng(0).uniform(-30.0, 30.0, (n_wrong, 2)).astype(np.float32)
+    features.xy[:n_wrong] += away
+    features.u_right[:n_wrong] += away[:, 0]
+    frame = frame_of(features, 2, 0.2)
+    found = drive.track(frame, view, ahead(0.0, 60 / CAMERA.fx) @ at(2))
+    assert found.is_lost != found_again
+    if found_again:
+        np.testing.assert_allclose(frame.T_cw, at(2), atol=1e-4)
+
+
+def test_after_a_lost_frame_no_sudden_turn_is_expected():
+    drive, view = Drive.of_two_frames(), POINTS.view(nearest=NOTHING)
+    T_predicted = ahead(0.0, 60 / CAMERA.fx) @ at(3)
+    drive.lose(2)
+    assert drive.track(drive.next_frame(), view, T_predicted).is_lost
 
 
 def test_without_a_speed_there_is_no_prediction_to_look_near():

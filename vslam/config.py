@@ -227,6 +227,12 @@ class TrackingConfig(Section):
     predicted_window: float = Field(7.0, gt=0)
     """Replaces `local_window` for a frame that could be matched with neither the previous frame nor
     the reference keyframe, in pixels at octave 0. [own]"""
+    sudden_window: float = Field(100.0, gt=0)
+    """Search radius if the motion has changed so suddenly that a frame would be LOST, in pixels at
+    octave 0. The pose is then found by RANSAC among the matches with the previous frame. [own]"""
+    sudden_min_inlier_ratio: float = Field(0.4, ge=0, le=1)
+    """At least this fraction of the matches in `sudden_window` must be inliers, so that the camera
+    is not tracked against a moving object. [own]"""
     local_keyframes: int = Field(80, ge=1)
     """Upper bound of the number of keyframes in the local map. The keyframes that share the most
     landmarks with the reference keyframe are chosen. [OS1 V-D, customary]"""

@@ -39,8 +39,8 @@ class Pyramid:
 
     def level(self, index: int) -> NDArray[np.uint8]:
         """Return a view of one pyramid level as an ``(h, w)`` image."""
-        height, width = self.shapes[index]
-        start = self.offsets[index]
+        height, width = self.shapes[index].tolist()
+        start = int(self.offsets[index])
         return self.pixels[start : start + height * width].reshape(height, width)
 
 

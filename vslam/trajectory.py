@@ -11,6 +11,7 @@ Each line holds one pose:
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -228,29 +229,30 @@ def quaternions(R: NDArray[np.float64]) -> NDArray[np.float64]:
         U, _, Vt = np.linalg.svd(R[off])
         R = R.copy()
         R[off] = U @ Vt
-    diagonal = R[:, [0, 1, 2], [0, 1, 2]]
-    trace = diagonal[:, 0] + diagonal[:, 1] + diagonal[:, 2]
-    # Dividing by the largest of the four components preserves precision (Markley, Journal of
-    # Guidance, Control and Dynamics, 2008).
-    largest = np.argmax(np.column_stack([diagonal, trace]), axis=1)
-    q = np.empty((len(R), 4))
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        of_i = largest == i
-        A = R[of_i]
-        q[of_i, i] = 1.0 - trace[of_i] + 2.0 * A[:, i, i]
-        q[of_i, j] = A[:, j, i] + A[:, i, j]
-        q[of_i, k] = A[:, k, i] + A[:, i, k]
-        q[of_i, 3] = A[:, k, j] - A[:, j, k]
-        rest = largest == 3
-        q[rest, i] = R[rest, k, j] - R[rest, j, k]
-    q[rest, 3] = 1.0 + trace[rest]
-    x, y, z, w = q.T
-    q /= np.sqrt(x * x + y * y + z * z + w * w)[:, None]
+    return np.array([_quaternion(one) for one in R.tolist()]).reshape(-1, 4)
+
+
+def _quaternion(R: list[list[float]]) -> list[float]:
+    """Convert a rotation. A run converts each pose on its own, so this is no array operation.
+
+    Dividing by the largest of the four components preserves precision (Markley, Journal of
+    Guidance, Control and Dynamics, 2008).
+    """
+    diagonal = [R[0][0], R[1][1], R[2][2]]
+    trace = diagonal[0] + diagonal[1] + diagonal[2]
+    largest = max(range(4), key=[*diagonal, trace].__getitem__)
+    q = [R[2][1] - R[1][2], R[0][2] - R[2][0], R[1][0] - R[0][1], 1.0 + trace]
+    if largest < 3:
+        i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
+        q[3] = R[k][j] - R[j][k]
+        q[i] = 1.0 - trace + 2.0 * R[i][i]
+        q[j] = R[j][i] + R[i][j]
+        q[k] = R[k][i] + R[i][k]
+    norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     # Two quaternions describe a half turn. The quaternion whose first non-zero number is positive
     # is chosen.
-    first = np.where(q[:, 0] != 0, q[:, 0], np.where(q[:, 1] != 0, q[:, 1], q[:, 2]))
-    return np.where(((q[:, 3] < 0) | ((q[:, 3] == 0) & (first < 0)))[:, None], -q, q)
+    sign = next((x for x in (q[3], *q[:3]) if x), 1.0)
+    return [-x / norm if sign < 0 else x / norm for x in q]
 
 
 def _poses_of_rows(path: Path | str, rows: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -46,7 +46,7 @@ def read_fabmap(folder: Path, truth: str = "", side: str = "left") -> list[Image
     path = named or next(iter(sorted(folder.glob("*.mat"))), None)
     if path is None:
         raise InputError(
-            f"{folder}: no ground-truth matrix; name one with fabmap:DIR[truth=FILE.mat]."
+            f"{folder}: no ground-truth matrix; give one with fabmap:DIR[truth=FILE.mat]."
         )
     loops = read_loop_matrix(path)
     n = len(loops)
@@ -54,7 +54,7 @@ def read_fabmap(folder: Path, truth: str = "", side: str = "left") -> list[Image
         files = files[0 if side == "left" else 1 :: 2]
     if n != len(files):
         raise InputError(
-            f"{path}: the matrix has {n} rows, but {folder} has {len(files)} images; name the "
+            f"{path}: the matrix has {n} rows, but {folder} has {len(files)} images; give the "
             "matrix of this collection."
         )
     relation = np.where(loops | loops.T, SAME, DIFFERENT).astype(np.int8)

@@ -16,7 +16,7 @@ from vslam.loopclosure.siamese.images import Fit, Size, read_grey, to_size
 SAME, UNKNOWN, DIFFERENT = 1, 0, -1
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".ppm", ".pgm"}
 _NO_TRUTH = (
-    "{}: contains no ground truth (a square matrix with at least one match); name the loop matrix "
+    "{}: contains no ground truth (a square matrix with at least one match); give the loop matrix "
     "of these images."
 )
 
@@ -124,7 +124,7 @@ def read_loop_matrix(path: Path) -> NDArray[np.bool_]:
     from scipy.io.matlab import MatReadError
 
     if not path.is_file():
-        raise InputError(f"{path}: no such file; name the loop matrix of these images.")
+        raise InputError(f"{path}: no such file; give the loop matrix of these images.")
     try:
         content = loadmat(path)
     except (OSError, ValueError, TypeError, NotImplementedError, MatReadError) as error:

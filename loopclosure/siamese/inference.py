@@ -22,7 +22,7 @@ FORMAT, NAME, ABOUT, COMPARISON = "vslam", "name", "about", "comparison"
 VERSION = "1"  # value of FORMAT
 _NO_RUNTIME = "learned loop detectors need ONNX Runtime: pip install onnxruntime."
 _FOREIGN = "not a network of this version of vslam"
-_FIX = "write one with 'vslam export onnx', or name another file"
+_FIX = "write one with 'vslam export onnx', or give another file"
 
 
 class OnnxNetwork:
@@ -155,7 +155,7 @@ def open_network(name: str, weights: Path | None = None) -> OnnxNetwork:
     path = find_weights(name, weights)
     network = OnnxNetwork(path)
     if network.name != name:
-        raise InputError(f"{path}: weights of {network.name}, not of {name}; name another file.")
+        raise InputError(f"{path}: weights of {network.name}, not of {name}; give another file.")
     return network
 
 
@@ -181,7 +181,7 @@ def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
         given = model if isinstance(model, bytes) else model.read_bytes()
     except OSError as error:
         raise InputError(
-            f"{path}: the weights cannot be read ({error.strerror}); name another file."
+            f"{path}: the weights cannot be read ({error.strerror}); give another file."
         ) from error
     if path.parent != SHIPPED:
         _check_limits(path, given)
@@ -193,7 +193,7 @@ def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
     try:
         session = onnxruntime.InferenceSession(given, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises a dozen types
-        raise InputError(f"{path}: not a readable ONNX file; name another file.") from error
+        raise InputError(f"{path}: not a readable ONNX file; give another file.") from error
     if [one.name for one in session.get_inputs()][:1] != [first_input]:
         raise InputError(f"{path}: {_FOREIGN}; {_FIX}.")
     return session

@@ -48,7 +48,7 @@ class LocalDescriptors:
         metadata = session.get_modelmeta().custom_metadata_map
         if metadata.get(FORMAT) != VERSION or metadata.get(NAME) != "local":
             raise InputError(
-                f"{self._path}: not the local descriptors of this version of vslam; name another "
+                f"{self._path}: not the local descriptors of this version of vslam; give another "
                 "file."
             )
         return session

@@ -33,7 +33,7 @@ def find_weights(name: str, weights: Path | None = None) -> Path:
     path = weights or SHIPPED / f"{name}.onnx"
     if not path.exists():
         raise InputError(
-            f"--weights {path}: no such file; name the .onnx file of a trained network."
+            f"--weights {path}: no such file; give the .onnx file of a trained network."
         )
     if path.suffix == ".safetensors":
         raise InputError(

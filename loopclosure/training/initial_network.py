@@ -80,14 +80,14 @@ def starting_network(
         extractor = network.branch.extractor
         if not isinstance(extractor, LiteExtractor):
             raise InputError(
-                f"{weights}: this network can only start from a .safetensors file; name one."
+                f"{weights}: this network can only start from a .safetensors file; give one."
             )
         extractor.load_imagenet(weights)
         return network, settings, about
     network, _ = load_network(weights)
     if network.name != settings.network:
         raise InputError(
-            f"{weights}: has weights of {network.name}, not of {settings.network}; name another "
+            f"{weights}: has weights of {network.name}, not of {settings.network}; give another "
             "file."
         )
     fitted = _fitted(network, settings)

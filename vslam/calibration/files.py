@@ -91,7 +91,7 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
         lines += ["right:", *_camera_lines(calibration.right)]
         lines += ["T_left_right:  # maps points of the right camera to the left one; metres"]
         lines += [f"  - {row}" for row in calibration.T_left_right.tolist()]
-    write_file(path, "\n".join(lines) + "\n", "name another file with --out")
+    write_file(path, "\n".join(lines) + "\n", "give another file with --out")
 
 
 def _camera_lines(model: CameraModel) -> list[str]:
@@ -110,6 +110,6 @@ def _in_folder(folder: Path) -> list[Path]:
         if found:
             return found
     raise InputError(
-        f"{folder}: there is no calibration in this folder; name the file, or those of both "
+        f"{folder}: there is no calibration in this folder; give the file, or those of both "
         "cameras."
     )

@@ -157,7 +157,7 @@ def read_ros(documents: Sequence[Document], size: Size | None) -> Calibration:
     if P[0, 3] == 0 and "P" in left and left.matrix("P", 3, 4)[0, 3] != 0:
         raise InputError(
             f"{_sources(documents)}: the sides seem swapped, because the baseline is in the "
-            "projection matrix of the first camera instead of the second; name the left camera "
+            "projection matrix of the first camera instead of the second; give the left camera "
             "first, with --topics or --calib."
         )
     T_left_right = _unrectified(left.matrix("R", 3, 3), right.matrix("R", 3, 3), P, right.source)

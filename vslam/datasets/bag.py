@@ -97,7 +97,7 @@ def open_bag(
     """
     path = Path(path)
     if not path.exists():
-        raise InputError(f"{path}: no such file; name a bag with --data.")
+        raise InputError(f"{path}: no such file; give a bag with --data.")
     with _opened(path) as bag:
         chosen, depth = _choose_topics(path, bag, topics, sensor)
         tolerance = _tolerance(depth)
@@ -234,7 +234,7 @@ def read_fixes_of_bag(path: Path) -> NDArray[np.float64]:
     rows = np.array(fixes, np.float64).reshape(-1, 7)
     rows = rows[np.isfinite(rows[:, 1:4]).all(axis=1)]
     if not len(rows):
-        raise InputError(f"{path}: no message of {topics[0]} is a fix; name another file.")
+        raise InputError(f"{path}: no message of {topics[0]} is a fix; give another file.")
     if not rows[:, 0].all():
         raise InputError(
             f"{path}: the fixes of {topics[0]} have no time stamps (header.stamp is 0); record "
@@ -380,7 +380,7 @@ def _choose_topics(
         raise InputError(f"--topics {','.join(topics)}: names one topic twice; {listed}.")
     if topics[0] in with_depth:
         raise InputError(
-            f"--topics {','.join(topics)}: {topics[0]} holds depth; name the topic of the images "
+            f"--topics {','.join(topics)}: {topics[0]} holds depth; give the topic of the images "
             "first."
         )
     depth = n == 2 and (sensor == "rgbd" or (sensor is None and topics[1] in with_depth))

@@ -67,10 +67,10 @@ def detect_dataset(data: str) -> str:
         raise InputError(f"{data}: an archive; unpack it and name the folder with --data.")
     if path.is_file() and path.suffix.lower() in _TEXTS:
         raise InputError(
-            f"{data}: not images; name a folder of images, a video or a bag with --data."
+            f"{data}: not images; give a folder of images, a video or a bag with --data."
         )
     if path.is_dir() and not any(path.iterdir()):
-        raise InputError(f"{data}: the folder is empty; name another one with --data.")
+        raise InputError(f"{data}: the folder is empty; give another one with --data.")
     if path.exists():
         kind = _kind_of(path)
         if kind is not None:
@@ -83,7 +83,7 @@ def detect_dataset(data: str) -> str:
     if data.isdecimal():
         return "camera"
     raise InputError(
-        f"{data}: no such file or folder; with --data, name a data set, a folder of images, a "
+        f"{data}: no such file or folder; with --data, give a data set, a folder of images, a "
         "video, a bag, the number of a camera or a URL."
     )
 

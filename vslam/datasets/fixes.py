@@ -93,7 +93,7 @@ def read_fixes(path: Path, antenna: Sequence[float] | None = None) -> Fixes:
             f"--gps {path}: pymap3d is not installed; pip install 'vslam[gps]'."
         ) from error
     if not path.exists():
-        raise InputError(f"--gps {path}: no such file or folder; name a CSV file, a bag or oxts.")
+        raise InputError(f"--gps {path}: no such file or folder; give a CSV file, a bag or oxts.")
     if path.suffix in _BAGS or (path / "metadata.yaml").is_file():
         rows = read_fixes_of_bag(path)
     elif path.is_dir():
@@ -218,7 +218,7 @@ def _read_oxts(folder: Path) -> NDArray[np.float64]:
     """
     files = sorted((folder / "data").glob("*.txt"))
     if not files:
-        raise InputError(f"--gps {folder}: no data/*.txt; name the folder oxts of KITTI raw.")
+        raise InputError(f"--gps {folder}: no data/*.txt; give the folder oxts of KITTI raw.")
     path = folder / "timestamps.txt"
     try:
         stamps = [line.strip().replace(" ", "T") for line in path.read_text().splitlines()]

@@ -304,7 +304,7 @@ def first_frames(source: Source) -> Source:
     except BrokenSourceError as error:
         problem = str(error).rstrip(".")
     if not frames:
-        raise InputError(f"{source.name}: {problem}; name another source.")
+        raise InputError(f"{source.name}: {problem}; give another source.")
     return replace(source, stored=tuple(frames), play=None, live=False)
 
 

@@ -161,7 +161,7 @@ def _find_sides(
 ) -> tuple[list[Path], bool]:
     """Find the folders of the first and second images, and whether the second images are depth."""
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; name a folder of images with --data.")
+        raise InputError(f"{folder}: no such folder; give a folder of images with --data.")
     if right is not None and depth is not None:
         raise InputError(f"--depth {depth}: contradicts --right; leave one of them out.")
     for second in (right, depth):
@@ -179,7 +179,7 @@ def _find_sides(
         pairs = ", ".join(" and ".join(names) for names in kinds)
         first, option = ("colour", "--depth") if sensor == "rgbd" else ("left", "--right")
         raise InputError(
-            f"{folder}: found no pairs of images in {pairs}{_near_miss(folder)}; name the folder "
+            f"{folder}: found no pairs of images in {pairs}{_near_miss(folder)}; give the folder "
             f"of the {first} images with --data and the other folder with {option}, or run with "
             "--sensor mono."
         )
@@ -211,7 +211,7 @@ def _sorted_images(folder: Path) -> dict[str, Path]:
     """
     images = list_images(folder)
     if not images:
-        raise InputError(f"{folder}: no images in this folder; name another.")
+        raise InputError(f"{folder}: no images in this folder; give another.")
 
     def by_number(stem: str) -> list[tuple[str, int]]:
         return [(text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", stem)]

@@ -38,7 +38,7 @@ def with_masks(source: Source, path: Path, *, start: int = 0, every: int = 1) ->
             the images, or it hides all pixels. The other masks are checked when they are read.
     """
     if not path.exists():
-        raise InputError(f"--mask {path}: no such file or folder; name a mask or a folder of them.")
+        raise InputError(f"--mask {path}: no such file or folder; give a mask or a folder of them.")
     find = _masks_in(source, path) if path.is_dir() else _one_mask(source, path)
 
     def masked(index: int, frame: TimedFrame) -> TimedFrame:
@@ -57,7 +57,7 @@ def _one_mask(source: Source, path: Path) -> Callable[[str | None, int], ReadMas
 def _masks_in(source: Source, folder: Path) -> Callable[[str | None, int], ReadMask]:
     files = list_images(folder)
     if not files:
-        raise InputError(f"--mask {folder}: holds no masks; name a folder with one for each image.")
+        raise InputError(f"--mask {folder}: holds no masks; give a folder with one for each image.")
     _read(source, next(iter(files.values())))
     by_number = {int(stem): file for stem, file in files.items() if stem.isdecimal()}
 

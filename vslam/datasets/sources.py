@@ -163,7 +163,7 @@ def open_raw(options: SourceOptions) -> RawSource:
         )  # fmt: skip
     if dataset not in SOURCES:
         raise InputError(
-            f"{o.data}: {dataset} is already calibrated; name a video, a bag, folders of images or "
+            f"{o.data}: {dataset} is already calibrated; give a video, a bag, folders of images or "
             "EuRoC's layout with images of a calibration board."
         )
     monocular = o.sensor == "mono" or (dataset != "bag" and not o.side_by_side)
@@ -238,11 +238,11 @@ def _calibration(
         if dataset == "images" and (folder / "calib.txt").is_file():
             raise InputError(
                 f"{options.data}: a sequence of KITTI; open it with --data {folder.parent.parent} "
-                f"--seq {folder.name}, or name a calibration with --calib."
+                f"--seq {folder.name}, or give a calibration with --calib."
             )
         where = ", and no camera_info in the bag" if dataset == "bag" else ""
         raise InputError(
-            f"--calib: no calibration{where}; name a file with the cameras' focal lengths, "
+            f"--calib: no calibration{where}; give a file with the cameras' focal lengths, "
             "centres, distortion and, for two cameras, baseline (docs/howto/cameras.md)."
         )
     return own

@@ -154,5 +154,5 @@ def _calibration(folder: Path, calib: Several[Path | str], size: tuple[int, int]
             return Calibration(model, source=f"TUM's camera {name}")
     raise InputError(
         f"{folder}: the camera is unknown (no {', '.join(_CAMERAS)} in its name, no {CALIBRATION});"
-        " name a calibration with --calib."
+        " give a calibration with --calib."
     )

@@ -195,7 +195,7 @@ def _play(
 
 def _open(path: Path) -> Capture:
     if not path.is_file():
-        raise InputError(f"{path}: no such file; name a video with --data.")
+        raise InputError(f"{path}: no such file; give a video with --data.")
     capture = open_capture(str(path))
     if capture is None:
         raise InputError(
@@ -240,7 +240,7 @@ def open_camera(device: str, *, side_by_side: bool = False, monocular: bool = Fa
     if not decoded:
         capture.release()
         raise InputError(
-            f"camera {name}: returns no image; close other programs that use it, or name another "
+            f"camera {name}: returns no image; close other programs that use it, or give another "
             "camera."
         )
     return RawSource(
@@ -285,7 +285,7 @@ def _open_device(number: int) -> Capture:
     if (_DEVICES / f"video{number}").exists():
         raise InputError(
             f"camera {number}: the device is busy or not a camera; close other programs that use "
-            "it, or name another number with --data."
+            "it, or give another number with --data."
         )
     there = sorted(path.name.removeprefix("video") for path in _DEVICES.glob("video*"))
     choice = f"there are {', '.join(there)}" if there else "no camera is connected"

@@ -87,35 +87,11 @@ def evaluate_trajectory(
         InputError: the alignment is unknown, the trajectories have no common frames, or the camera
             hardly moves in them.
     """
-    from evo import EvoException
-    from evo.core.metrics import APE, RPE, PoseRelation
-    from evo.core.trajectory import PoseTrajectory3D
-
-    if alignment not in _EVO_FLAGS:
-        raise InputError(
-            f"--align {alignment}: unknown alignment; choose one of {', '.join(_EVO_FLAGS)}."
-        )
-    estimate, ground_truth = _associate(estimate, ground_truth)
-    reference, aligned = (
-        PoseTrajectory3D(poses_se3=list(t.T_wc), timestamps=t.timestamps)
-        for t in (ground_truth, estimate)
-    )
-    try:
-        on_one_line = alignment != "none" and _align(aligned, reference, alignment == "sim3")
-        ape = APE(PoseRelation.translation_part)
-        ape.process_data((reference, aligned))
-        rpe_m, rpe_deg = RPE(PoseRelation.translation_part), RPE(PoseRelation.rotation_angle_deg)
-        for rpe in (rpe_m, rpe_deg):
-            rpe.process_data((reference, aligned))
-    except EvoException as error:
-        raise InputError(
-            f"{counted(len(estimate), 'frame')} with too little motion to compare; the camera must "
-            "move between two frames."
-        ) from error
-
-    T_wc_aligned = np.array(aligned.poses_se3)
-    errors = np.asarray(ape.error)
-    t_rel, r_rel = kitti_drift(T_wc_aligned, ground_truth.T_wc) or (None, None)
+    estimate, aligned, reference, on_one_line = _aligned_pair(estimate, ground_truth, alignment)
+    errors = _position_errors(aligned, reference)
+    rpe_m, rpe_deg = _relative_errors(aligned, reference)
+    T_wc_aligned, T_wc_true = np.array(aligned.poses_se3), np.array(reference.poses_se3)
+    t_rel, r_rel = kitti_drift(T_wc_aligned, T_wc_true) or (None, None)
     return Evaluation(
         frames=len(errors),
         alignment=alignment,
@@ -126,12 +102,83 @@ def evaluate_trajectory(
         ate_max_m=float(errors.max()),
         errors_m=errors,
         T_wc_aligned=T_wc_aligned,
-        distances_m=path_length(ground_truth.T_wc),
-        rpe_m=_rmse(np.asarray(rpe_m.error)),
-        rpe_deg=_rmse(np.asarray(rpe_deg.error)),
+        distances_m=path_length(T_wc_true),
+        rpe_m=_rmse(rpe_m),
+        rpe_deg=_rmse(rpe_deg),
         t_rel_percent=t_rel,
         r_rel_deg_per_100m=r_rel,
     )
+
+
+def ate_rmse(estimate: Trajectory, ground_truth: Trajectory, alignment: str = "se3") -> float:
+    """Compute only the ATE of ``evaluate_trajectory``, in metres.
+
+    Raises:
+        InputError: see ``evaluate_trajectory``.
+    """
+    _, aligned, reference, _ = _aligned_pair(estimate, ground_truth, alignment)
+    return _rmse(_position_errors(aligned, reference))
+
+
+def _aligned_pair(
+    estimate: Trajectory, ground_truth: Trajectory, alignment: str
+) -> tuple[Trajectory, Any, Any, bool]:
+    """Find the common frames of two trajectories, and align the estimate with the ground truth.
+
+    Returns:
+        The estimate at the common frames, the aligned estimate and the ground truth at these frames
+        as evo's trajectories, and whether the positions lie on one line.
+    """
+    from evo import EvoException
+    from evo.core.trajectory import PoseTrajectory3D
+
+    if alignment not in _EVO_FLAGS:
+        raise InputError(
+            f"--align {alignment}: unknown alignment; choose one of {', '.join(_EVO_FLAGS)}."
+        )
+    estimate, ground_truth = _associate(estimate, ground_truth)
+    aligned, reference = (
+        PoseTrajectory3D(poses_se3=list(t.T_wc), timestamps=t.timestamps)
+        for t in (estimate, ground_truth)
+    )
+    too_still = InputError(
+        f"{counted(len(estimate), 'frame')} with too little motion to compare; the camera must "
+        "move between two frames."
+    )
+    if len(estimate) < 2:
+        raise too_still
+    try:
+        on_one_line = alignment != "none" and _align(aligned, reference, alignment == "sim3")
+    except EvoException as error:
+        raise too_still from error
+    return estimate, aligned, reference, on_one_line
+
+
+def _position_errors(aligned: Any, reference: Any) -> NDArray[np.float64]:
+    """Return the distances between the positions of two evo trajectories, ``(N,)`` metres."""
+    from evo.core.metrics import APE, PoseRelation
+
+    ape = APE(PoseRelation.translation_part)
+    ape.process_data((reference, aligned))
+    return np.asarray(ape.error)
+
+
+def _relative_errors(
+    aligned: Any, reference: Any
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the errors of the motion from one frame to the next.
+
+    Returns:
+        ``(N - 1,)`` metres and ``(N - 1,)`` degrees.
+    """
+    from evo.core.metrics import RPE, PoseRelation
+    from scipy.spatial.transform import Rotation
+
+    rpe = RPE(PoseRelation.translation_part)
+    rpe.process_data((reference, aligned))
+    # A second RPE of evo would compute the same motions again, and convert one rotation at a time.
+    rotations = Rotation.from_matrix(np.array(rpe.E)[:, :3, :3])
+    return np.asarray(rpe.error), np.degrees(rotations.magnitude())
 
 
 def _align(estimate: Any, reference: Any, with_scale: bool) -> bool:

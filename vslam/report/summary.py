@@ -16,7 +16,7 @@ from vslam.config import changed_thresholds
 from vslam.errors import InputError
 from vslam.evaluation.loops import LoopEvaluation, evaluate_loops
 from vslam.evaluation.map_alignment import error_in_map
-from vslam.evaluation.trajectories import Evaluation, evaluate_trajectory
+from vslam.evaluation.trajectories import Evaluation, ate_rmse, evaluate_trajectory
 from vslam.features import TrackingState, TrackResult
 from vslam.geometry import inverses
 from vslam.loops import LoopCorrection
@@ -185,8 +185,7 @@ def causal_ate(outcome: RunOutcome) -> float | None:
     if ground_truth is None or not outcome.tracks:
         return None
     try:
-        given = causal_trajectory(outcome.tracks)
-        return evaluate_trajectory(given, ground_truth, outcome.alignment).ate_rmse_m
+        return ate_rmse(causal_trajectory(outcome.tracks), ground_truth, outcome.alignment)
     except InputError:
         return None
 
@@ -252,7 +251,7 @@ def gps_figures(outcome: RunOutcome) -> GpsFigures | None:
     ate, ground_truth = None, outcome.ground_truth
     if ground_truth is not None:
         with suppress(InputError):
-            ate = evaluate_trajectory(track.trajectory, ground_truth, "se3").ate_rmse_m
+            ate = ate_rmse(track.trajectory, ground_truth, "se3")
     latitude, longitude, altitude = track.datum.tolist()
     right, down, ahead = track.antenna.tolist()
     return GpsFigures(

@@ -119,6 +119,6 @@ def writing(cache: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise InputError(
-            f"{cache}: cannot be written ({error.strerror}); name another folder with "
+            f"{cache}: cannot be written ({error.strerror}); give another folder with "
             "$VSLAM_CACHE, or with --out of vslam synth."
         ) from error

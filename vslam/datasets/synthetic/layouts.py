@@ -114,13 +114,13 @@ def write_side_by_side(sequence: Source, path: Path) -> Path:
         calibration.write_text(_pair_calibration(camera))
     except OSError as error:
         raise InputError(
-            f"{calibration}: cannot be written ({error.strerror}); name another file."
+            f"{calibration}: cannot be written ({error.strerror}); give another file."
         ) from error
     size = (2 * camera.width, camera.height)
     fourcc = cv2.VideoWriter.fourcc(*"FFV1")
     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, fps, size, isColor=False)
     if not writer.isOpened():
-        raise InputError(f"{path}: cannot be written as a video; name a file like town.mkv.")
+        raise InputError(f"{path}: cannot be written as a video; give a file like town.mkv.")
     try:
         for index in range(len(sequence)):
             left, right = sequence.read(index)

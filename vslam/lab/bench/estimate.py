@@ -90,7 +90,7 @@ def check_disk(needed: Estimate, out: Path) -> None:
     if needed.kept + needed.scratch > free:
         raise InputError(
             f"{out}: the grid needs {size(needed.kept + needed.scratch)} of disk space, but only "
-            f"{size(free)} are free; free some space or name a folder on another disk with --out."
+            f"{size(free)} are free; free some space or give a folder on another disk with --out."
         )
 
 

@@ -208,14 +208,14 @@ def prepare(out: Path, data: str) -> None:
             note.write_text(f"{data}\n")
         if (known := note.read_text().strip()) != data:
             raise InputError(
-                f"{out}: contains runs on {known}, not on {data}; name another folder with --out."
+                f"{out}: contains runs on {known}, not on {data}; give another folder with --out."
             )
         for folder in (out / _PARTS).glob("*"):
             if not (folder.name.isdecimal() and psutil.pid_exists(int(folder.name))):
                 shutil.rmtree(folder, ignore_errors=True)
     except OSError as error:
         raise InputError(
-            f"{out}: cannot be written ({error.strerror}); name another folder with --out."
+            f"{out}: cannot be written ({error.strerror}); give another folder with --out."
         ) from error
 
 

@@ -320,6 +320,7 @@ def test_earlier_loops_get_keyframes_of_their_own():
     loops, corrections, frames = _with_earlier(progress, Slam(open_camera(), threads=1))
     assert [(frames[loop.query], frames[loop.match]) for loop in loops] == [(1, 0), (2, -1)]
     assert frames[corrections[0].edge.query] == 1
+    assert frames[corrections[0].keyframes].tolist() == [0, 1]
 
 
 def open_camera():

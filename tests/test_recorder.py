@@ -10,6 +10,7 @@ import subprocess
 import sys
 import textwrap
 from collections import namedtuple
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -182,6 +183,21 @@ def test_poses_keep_their_orientation(recording: Path) -> None:
 def test_ground_truth_starts_where_the_estimate_does(recording: Path) -> None:
     (strip,) = rows(recording, "world/ground_truth")[0]["LineStrips3D:strips"]
     np.testing.assert_allclose(strip[0], [0.0, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(strip[-1], _pose(FRAMES - 1)[:3, 3], atol=1e-4)
+
+
+def test_a_later_ground_truth_starts_at_the_estimate_of_its_first_frame(tmp_path: Path) -> None:
+    recorder = RerunRecorder(tmp_path / "late.rrd")
+    times, poses = 0.1 * np.arange(FRAMES), np.array([_pose(frame) for frame in range(FRAMES)])
+    offset = np.eye(4)
+    offset[:3, 3] = [100.0, 0.0, 50.0]
+    recorder.begin(CAMERA, Trajectory(times[38:], offset @ poses[38:]))  # frames 40 to 43 are lost
+    for frame in range(FRAMES):
+        result = _result(frame)
+        recorder.frame(replace(result, state=TrackingState.LOST) if frame < 44 else result)
+    recorder.finish(Trajectory(times, poses), None)
+    (strip,) = rows(tmp_path / "late.rrd", "world/ground_truth")[0]["LineStrips3D:strips"]
+    np.testing.assert_allclose(strip[0], _pose(38)[:3, 3], atol=1e-4)
     np.testing.assert_allclose(strip[-1], _pose(FRAMES - 1)[:3, 3], atol=1e-4)
 
 
@@ -390,6 +406,16 @@ def test_a_window_without_a_display_is_refused(monkeypatch):
     monkeypatch.setattr(sys, "platform", "linux")
     with pytest.raises(InputError, match="--view native: there is no display here"):
         open_viewer("native")
+
+
+def test_a_viewer_that_does_not_answer_is_ended(monkeypatch):
+    viewer = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(recorder_module, "_start_viewer", lambda port, words: viewer)
+    monkeypatch.setattr(recorder_module, "_VIEWER_STARTS_S", 0.1)
+    with pytest.raises(InputError, match="the viewer does not start here"):
+        open_viewer("native")
+    assert viewer.wait(5.0) != 0
 
 
 def test_a_viewer_that_cannot_be_started_is_refused(monkeypatch):

@@ -224,7 +224,8 @@ class LoopClosing:
             solution = self._solution(map_, edge, Hypothesis.KIDNAPPED)
         if not solution.verdict.consistent:
             return replace(edge, accepted=False, reason=solution.verdict.reason), None
-        return replace(edge, reason="closed"), _Loop(edge, solution, start)
+        closed = replace(edge, reason="closed")
+        return closed, _Loop(closed, solution, start)
 
     def _close(self, map_: Map, loop: _Loop) -> None:
         edge, solution = loop.edge, loop.solution
@@ -240,7 +241,6 @@ class LoopClosing:
         self._correct(map_, solution)
         fuse_loop(map_, edge, query_side, match_side, self._camera, self._config)
         adjust_locally(map_, edge.query, self._camera, self._config)
-        edge = replace(edge, reason="closed")
         seconds = time.perf_counter() - loop.start
         self.corrections.append(LoopCorrection(edge, keyframes, before, solution.T_cw, seconds))
         self._consistency.reset()  # the correction has moved the places that it remembers

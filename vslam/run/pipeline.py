@@ -378,8 +378,8 @@ def _with_earlier(
 ) -> tuple[list[LoopEdge], list[LoopCorrection], NDArray[np.int64]]:
     """Return the loops and corrections of a whole run, including the part before it was resumed.
 
-    The loops of this part refer to frames instead of keyframes. Therefore, each of these frames is
-    given a new keyframe number, after the keyframes of the map.
+    The loops and corrections of this part refer to frames instead of keyframes. Therefore, each of
+    these frames is given a new keyframe number, after the keyframes of the map.
 
     Returns:
         The loops, the corrections, and the index of the frame that belongs to each keyframe number.
@@ -388,6 +388,7 @@ def _with_earlier(
     if not before.loops:
         return slam.loops, slam.corrections, frames
     named = {end for loop in before.loops for end in (loop.query, loop.match)}
+    named.update(*(one.keyframes.tolist() for one in before.corrections))
     extra = np.array(sorted(named), np.int64)
     number = {frame: len(frames) + k for k, frame in enumerate(extra.tolist())}
 
@@ -396,7 +397,14 @@ def _with_earlier(
         return replace(loop, query=query, match=number[loop.match])
 
     loops = [renamed(loop) for loop in before.loops]
-    corrections = [replace(one, edge=renamed(one.edge)) for one in before.corrections]
+    corrections = [
+        replace(
+            one,
+            edge=renamed(one.edge),
+            keyframes=np.array([number[frame] for frame in one.keyframes.tolist()], np.int64),
+        )
+        for one in before.corrections
+    ]
     return loops + slam.loops, corrections + slam.corrections, np.concatenate([frames, extra])
 
 

@@ -210,6 +210,7 @@ def open_viewer(kind: str) -> Viewer:
     deadline = time.monotonic() + _VIEWER_STARTS_S
     while not (_listens(port) and (not page_port or _listens(page_port))):
         if viewer.poll() is not None or time.monotonic() > deadline:
+            viewer.kill()
             raise InputError(f"--view {kind}: the viewer does not start here; run without --view.")
         time.sleep(0.05)
     uri = f"rerun+http://127.0.0.1:{port}/proxy"
@@ -343,6 +344,7 @@ class RerunRecorder(Recorder):
         self._pictures = pictures
         self._n_pictures = 0  # number of pictures recorded so far
         self._hide_rejected_at: int | None = None  # index of a frame
+        self._ground_truth: Trajectory | None = None  # None after it was recorded
         try:
             # Otherwise, the time of logging would be the viewer's default timeline.
             self._recording.set_log_time_enabled(False)
@@ -379,10 +381,7 @@ class RerunRecorder(Recorder):
         for name, color in self._points.items():
             log(f"points/{name}", rr.SeriesLines(colors=[color], names=[name]))
         log("world/trajectory", rr.LineStrips3D.from_fields(colors=[_BLUE], radii=[-1.0]))
-        if ground_truth is not None and len(ground_truth):
-            # Move the ground truth to the world frame of the run.
-            T_wc = np.linalg.inv(ground_truth.T_wc[0]) @ ground_truth.T_wc
-            log("world/ground_truth", _path(T_wc, _GREY))
+        self._ground_truth = ground_truth
 
     @_guarded
     def frame(self, result: TrackResult) -> None:
@@ -394,6 +393,7 @@ class RerunRecorder(Recorder):
         if len(self._frames) >= self._pace.frames:
             self._send_frames()
         self._set_time(result)
+        self._record_ground_truth(result)
         if result.state != self._state:
             self._state = result.state
             text = f"{result.state} with {result.n_inliers} inliers"
@@ -455,6 +455,17 @@ class RerunRecorder(Recorder):
             self._log_map(map_, map_.n_landmarks)
         self._log_trajectory(trajectory)
         self._close()
+
+    def _record_ground_truth(self, result: TrackResult) -> None:
+        """Record the ground truth in the world frame of the run, at the first frame for which both
+        a true and an estimated pose are known."""
+        truth = self._ground_truth
+        if truth is None or result.state in (TrackingState.LOST, TrackingState.DROPPED):
+            return
+        for T_true in truth.T_wc[truth.timestamps == result.timestamp]:
+            T_wc = result.T_wc @ np.linalg.inv(T_true) @ truth.T_wc
+            self._recording.log("world/ground_truth", _path(T_wc, _GREY), static=True)
+            self._ground_truth = None
 
     def _log_trajectory(self, trajectory: Trajectory) -> None:
         """At each of a hundred frames, log the trajectory up to this frame, so that it grows."""

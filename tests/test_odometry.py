@@ -165,7 +165,7 @@ def test_the_drift_before_both_frames_does_not_count():
     model.keyframe()
     grown = relative_covariance(first, model.now, MOTION) - expected
     np.testing.assert_allclose(grown, DRIFT * some_covariance(2.0, 1), atol=1e-9)
-    assert (np.linalg.eigvalsh(model.now.covariance - first.near) > 0).all()
+    assert (np.linalg.eigvalsh(model.now.covariance - first.local) > 0).all()
 
 
 def test_a_pose_that_is_predicted_gets_less_sure_with_the_square_of_the_time():
@@ -200,13 +200,13 @@ def test_a_drive_gets_less_sure_where_it_is_lost_and_with_every_keyframe(corrido
     for k, left in enumerate(corridor.left):
         image = noise if k == 15 else left
         results.append(slam.step(image, corridor.right[k], corridor.timestamps[k]))
-    deviation = [np.sqrt(np.diag(result.uncertainty.near)[:3].sum()) for result in results]
+    deviation = [np.sqrt(np.diag(result.uncertainty.local)[:3].sum()) for result in results]
     assert results[15].state == TrackingState.LOST
     usual = np.array(deviation[2:15] + deviation[17:])
     assert deviation[15] > 2.0 * usual.max()
     assert 1e-4 < np.median(usual) < 0.05
     drift = [
-        np.trace(result.uncertainty.covariance - result.uncertainty.near) for result in results
+        np.trace(result.uncertainty.covariance - result.uncertainty.local) for result in results
     ]
     made = np.array([result.is_keyframe for result in results])
     assert (np.diff(drift)[made[1:]] > 0).all()
@@ -286,14 +286,14 @@ def test_the_tables_hold_deviations_and_both_covariances(tmp_path):
     write_covariances(tmp_path / "covariance.csv", tracks)
     with (tmp_path / "frames.csv").open(newline="") as file:
         first, second = csv.DictReader(file)
-    assert float(first["sigma_m"]) == pytest.approx(np.sqrt(np.trace(sure.near[:3, :3])), abs=1e-6)
+    assert float(first["sigma_m"]) == pytest.approx(np.sqrt(np.trace(sure.local[:3, :3])), abs=1e-6)
     assert float(first["drift_deg"]) == pytest.approx(
         np.degrees(np.sqrt(np.trace(sure.covariance[3:, 3:]))), abs=1e-6
     )
     assert second["sigma_m"] == second["drift_m"] == ""
     with (tmp_path / "covariance.csv").open(newline="") as file:
         (row,) = csv.DictReader(file)
-    assert float(row["local_y_rz"]) == pytest.approx(sure.near[1, 5], rel=1e-5)
+    assert float(row["local_y_rz"]) == pytest.approx(sure.local[1, 5], rel=1e-5)
     assert float(row["drive_x_x"]) == pytest.approx(sure.covariance[0, 0], rel=1e-5)
 
 

@@ -201,7 +201,7 @@ def test_covariances_are_those_of_errors_in_the_axes_of_ros():
     """
     rng = np.random.default_rng(0)
     near = np.diag([1.0, 4.0, 9.0, 0.01, 0.04, 0.09]) * 1e-6
-    local = near / PoseUncertainty(np.eye(6), np.zeros((6, 6)), 0).near[0, 0]
+    local = near / PoseUncertainty(np.eye(6), np.zeros((6, 6)), 0).local[0, 0]
     T_1 = AHEAD @ RIGHT_TURN
     T_2 = T_1 @ se3_exp(np.array([0.1, 0.0, 1.0, 0.0, 0.03, 0.0]))
     types = types_of_ros()

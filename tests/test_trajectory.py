@@ -107,6 +107,10 @@ def test_gaps_are_bridged_at_constant_velocity():
     bridged = bridge_gaps(Trajectory(times, guessed), known)
     np.testing.assert_allclose(bridged.T_wc[:4], T_wc[:4], atol=1e-12)
     np.testing.assert_array_equal(bridged.T_wc[4], np.eye(4))  # nothing known after it
+    known[0] = False  # nothing known before the second anchor
+    np.testing.assert_array_equal(
+        bridge_gaps(Trajectory(times, guessed), known).T_wc[:3], np.tile(T_wc[3], (3, 1, 1))
+    )
 
 
 def test_quaternions_are_those_of_scipy_to_the_last_bit():

@@ -179,7 +179,4 @@ class FramePoses:
         frames = self._frames.until(self._n)
         poses = [inverse(self.pose(k)) for k in range(self._n)]
         T_wc = np.array(poses, np.float64).reshape(-1, 4, 4)
-        if frames.tracked.any():
-            first = int(np.argmax(frames.tracked))
-            T_wc[:first] = T_wc[first]
         return bridge_gaps(Trajectory(frames.timestamp.copy(), T_wc), frames.tracked.copy())

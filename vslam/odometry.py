@@ -80,15 +80,10 @@ class PoseUncertainty:
         return cls(both[0], both[1], int(numbers[-1]), np.array(numbers[-7:-1]))
 
     @property
-    def near(self) -> Matrix:
-        """``(6, 6)`` covariance of the pose relative to the landmarks around the camera."""
-        return self.local
-
-    @property
     def covariance(self) -> Matrix:
         """``(6, 6)`` covariance of the pose relative to the start of the drive."""
         drift = DRIFT * _growth(self.n_keyframes) * self.drift
-        total: Matrix = self.near + drift + np.outer(self.offset, self.offset)
+        total: Matrix = self.local + drift + np.outer(self.offset, self.offset)
         return total
 
 

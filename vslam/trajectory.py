@@ -53,11 +53,13 @@ def bridge_gaps(trajectory: Trajectory, known: NDArray[np.bool_]) -> Trajectory:
     """Replace unknown poses by interpolating between known poses with constant velocity.
 
     Args:
-        known: ``(N,)`` bool, True for the poses to keep. Poses before the first known pose and
-            after the last known pose are kept as well.
+        known: ``(N,)`` bool, True for the poses to keep. Poses before the first known pose become
+            equal to it. Poses after the last known pose are kept as well.
     """
     T_wc, times = trajectory.T_wc.copy(), trajectory.timestamps
     anchors = np.flatnonzero(known)
+    if len(anchors):
+        T_wc[: anchors[0]] = T_wc[anchors[0]]
     for before, after in pairwise(anchors.tolist()):
         if after == before + 1:
             continue

@@ -80,7 +80,7 @@ class FramePose:
             stamp,
             result.T_wc if T is None else T,
             result.T_map_odom,
-            None if uncertainty is None else uncertainty.near,
+            None if uncertainty is None else uncertainty.local,
             None if uncertainty is None else uncertainty.covariance,
         )
 

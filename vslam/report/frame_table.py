@@ -46,7 +46,7 @@ def _sigmas(track: TrackResult) -> list[str]:
     if track.uncertainty is None:
         return [""] * len(_SIGMAS)
     deviations = []
-    for covariance in (track.uncertainty.near, track.uncertainty.covariance):
+    for covariance in (track.uncertainty.local, track.uncertainty.covariance):
         variances = np.diag(covariance)
         deviations += [np.sqrt(variances[:3].sum()), np.degrees(np.sqrt(variances[3:].sum()))]
     return [f"{deviation:.6f}" for deviation in deviations]
@@ -71,7 +71,7 @@ def write_covariances(path: Path, tracks: list[TrackResult]) -> None:
         )
         for track in tracks:
             if track.uncertainty is not None:
-                both = track.uncertainty.near, track.uncertainty.covariance
+                both = track.uncertainty.local, track.uncertainty.covariance
                 values = [f"{value:.6e}" for one in both for value in one[upper]]
                 table.writerow([f"{track.timestamp:.6f}", *values])
 

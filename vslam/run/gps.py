@@ -95,9 +95,6 @@ def _in_map(
     if scale is not None:
         T_ck[:, :3, 3] *= scale[table.reference, None]
     T_wc = inverses(T_ck @ T_kw[table.reference])
-    if table.tracked.any():
-        first = int(np.argmax(table.tracked))
-        T_wc[:first] = T_wc[first]
     return bridge_gaps(Trajectory(table.timestamp, T_wc), table.tracked)
 
 

@@ -1,8 +1,8 @@
 """Checks that an ONNX file from an untrusted source needs only limited time and memory.
 
 A graph of a few hundred bytes can loop forever or create tensors of any size, and ONNX Runtime sets
-no limits. The graphs of vslam use only a few dozen operators. In these graphs, the sizes of all
-tensors follow from the sizes of the inputs. Any other graph is refused before it is run.
+no limits. The graphs of vslam use only a few dozen operators, and the sizes of all tensors follow
+from the sizes of the inputs. Any other graph is refused before it is run.
 """
 
 from __future__ import annotations
@@ -119,8 +119,8 @@ def _shapes(model: ModelProto) -> dict[str, tuple[int, ...]]:
 
 
 def _compute_shapes(graph: GraphProto) -> None:
-    """Replace the nodes of a graph that compute shapes with their results. This is needed because
-    the shape inference of onnx does not evaluate divisions."""
+    """Replace the nodes that compute shapes with their results, because the shape inference of onnx
+    does not evaluate divisions."""
     known = {
         tensor.name: numpy_helper.to_array(tensor)
         for tensor in graph.initializer
@@ -145,11 +145,8 @@ def _compute_shapes(graph: GraphProto) -> None:
 
 
 def _products(node: NodeProto, shapes: dict[str, Any]) -> int:
-    """Count the multiplications of a convolution or a matrix product.
-
-    For other nodes, the result is 0, because they need only a few operations for each element of
-    their output.
-    """
+    """Count the multiplications of a convolution or a matrix product. The result is 0 for other
+    nodes, because they need only a few operations for each element of their output."""
     if node.op_type == "Conv":
         return math.prod(shapes[node.output[0]]) * math.prod(shapes[node.input[1]][1:])
     if node.op_type == "MatMul":

@@ -62,11 +62,8 @@ STRONG = Augmentation(
 def augment(
     image: NDArray[np.uint8], strength: Augmentation, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Apply random changes to an ``(H, W)`` uint8 image.
-
-    The changes are applied in the order in which an image is formed: viewpoint, occlusion,
-    lighting, lens, sensor, quantisation to 8 bits.
-    """
+    """Apply random changes to an ``(H, W)`` uint8 image, in the order in which an image is formed:
+    viewpoint, occlusion, lighting, lens, sensor, quantisation to 8 bits."""
     import cv2
 
     height, width = image.shape

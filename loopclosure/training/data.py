@@ -128,8 +128,8 @@ def divide(
     """Split the images into training and validation images. Images of the same unit, for example of
     the same stretch of road, are not split.
 
-    An image of a different unit may show the same place as a validation image, for example at the
-    end of a stretch of road. Such an image is used neither for training nor for validation.
+    An image of a training unit may show the same place as a validation image, for example at the
+    end of a stretch of road. Such an image is left out.
 
     Raises:
         InputError: there are too few images.
@@ -148,9 +148,8 @@ def divide(
 
 
 def validation_images(validation: NDArray[np.int64], most: int, seed: int) -> NDArray[np.int64]:
-    """Choose at most ``most`` of the ``(M,)`` validation images at random. If two training runs
-    have the same seed, they use the same images.
-    """
+    """Choose at most ``most`` of the ``(M,)`` validation images at random. The same seed gives the
+    same images."""
     if len(validation) <= most:
         return validation
     picked = np.random.default_rng([seed, 2]).choice(len(validation), most, replace=False)
@@ -246,8 +245,7 @@ def mine(
 
 
 def write_pairs(path: Path, collection: Collection, pairs: Pairs, seed: int) -> None:
-    """Write a list of image pairs as a CSV file with the columns a, b, same. The first line states
-    the seed.
+    """Write image pairs as a CSV file with the columns a, b, same. The first line states the seed.
 
     Raises:
         ResultsError: the file cannot be written.

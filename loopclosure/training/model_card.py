@@ -29,8 +29,7 @@ def describe(
     data: list[str],
     device: str,
 ) -> dict[str, Any]:
-    """Collect the contents of the model card: the information that is needed to judge or reproduce
-    the weights of a network."""
+    """Collect the information that is needed to judge or reproduce the weights of a network."""
     return {
         "network": network.name,
         "parameters": network.n_parameters(),

@@ -14,8 +14,7 @@ from vslam.loopclosure.training.branches import CapsuleShape
 
 class TrainSettings(BaseModel):
     """The settings of a training run. They are stored in the file ``settings.json``, and the option
-    ``--settings`` reads such a file.
-    """
+    ``--settings`` reads such a file."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

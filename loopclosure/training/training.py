@@ -71,8 +71,8 @@ class TrainingOutcome:
     """The result of a training run.
 
     Attributes:
-        finished: False if the training run was stopped early. In this case, the training run can be
-            continued by calling ``train`` with ``resume=True``.
+        finished: False if the training run was stopped early. It can be continued by calling
+            ``train`` with ``resume=True``.
         figures: validation metrics of the best network after calibration.
         progress: the progress of the training run, with the loss and the validation metrics of
             every epoch.
@@ -104,8 +104,6 @@ def train(
     checkpoints to a folder.
 
     Args:
-        collection: the images and their relations.
-        settings: settings of the training run.
         folder: output folder. The name of the file of weights is ``settings.network``.
         device: ``cpu`` or ``cuda``.
         threads: number of threads that augment images.
@@ -209,8 +207,6 @@ def calibrated(
 
 @dataclass(frozen=True)
 class _Training:
-    """A training run in progress: its data, the network, the optimiser and the progress."""
-
     collection: Collection
     settings: TrainSettings
     network: SiameseNetwork
@@ -223,7 +219,6 @@ class _Training:
 
     @property
     def steps(self) -> int:
-        """Number of steps in an epoch."""
         return max(1, self.settings.pairs // self.settings.batch)
 
     def step(self, pairs: Pairs) -> float:
@@ -277,7 +272,6 @@ class _Training:
         return to_tensor(np.stack(list(self.pool.map(augmented, jobs))))
 
     def pairs_of_epoch(self) -> Pairs:
-        """Draw the image pairs of the current epoch."""
         settings, network, images, hard = self.settings, self.network, self.images, None
         rng = np.random.default_rng([settings.seed, 4, self.progress.epoch])
         # There are no hard pairs in the first epoch, because random weights would not find any.
@@ -297,9 +291,7 @@ class _Training:
         )  # fmt: skip
 
     def end_epoch(self, validation: NDArray[np.int64], weights: Path) -> None:
-        """Validate the network after an epoch. If its weights are the best so far, they are written
-        to a file.
-        """
+        """Validate the network, and write its weights to a file if they are the best so far."""
         network, progress = self.network, self.progress
         augmentation = self.settings.augmentation
         figures = validate(network, self.collection, validation, augmentation, self.device)[0]
@@ -321,8 +313,7 @@ class _Training:
 
 
 def _optimiser(network: SiameseNetwork, settings: TrainSettings) -> torch.optim.Optimizer:
-    """Create an Adam optimiser with separate learning rates for the extractor and the head. Frozen
-    blocks are excluded."""
+    """Create an Adam optimiser with separate learning rates for the extractor and the head."""
     extractor = network.branch.extractor
     if isinstance(extractor, LiteExtractor):
         extractor.freeze(settings.frozen)
@@ -354,7 +345,6 @@ def open_device(name: str) -> torch.device:
 
 
 def _mixed_precision(settings: TrainSettings, device: torch.device) -> bool:
-    """Return whether the network computes in bfloat16."""
     supported = device.type == "cpu" or torch.cuda.is_bf16_supported()
     if settings.mixed_precision and not supported:
         raise InputError("mixed_precision: this GPU does not support bfloat16; leave it out.")

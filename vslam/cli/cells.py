@@ -141,9 +141,8 @@ class Cells:
     console: Console
 
     def grid(self, perturbations: Collection[str], seeds: int) -> list[Cell]:
-        """Return the cells of the benchmark's grid (``vslam.lab.bench.grid.make_grid``).
-
-        Each cell is one run of a system on a sequence, with a perturbation and a random seed.
+        """Return the runs of the benchmark. Each run is one system on one sequence, with a
+        perturbation and a random seed.
 
         Args:
             perturbations: the perturbations to apply to the sequences.
@@ -159,13 +158,14 @@ class Cells:
         )  # fmt: skip
 
     def prepare(self) -> None:
-        """Create the folder of the results (``vslam.lab.bench.execute.prepare``)."""
+        """Create the folder of the results."""
         from vslam.lab.bench.execute import prepare
 
         prepare(self.out, _identity(self.kind, self.given))
 
     def run(self, cells: Collection[Cell]) -> Generator[CellOutcome, None, None]:
-        """Perform some of the runs on this machine or on a cluster, and yield their outcomes."""
+        """Perform the given runs, and yield their outcomes. They are performed by Dask workers if
+        the option ``--scheduler`` was given, and otherwise on this machine."""
         if self.scheduler is not None:
             from vslam.lab.bench.cluster import run_on_cluster
 
@@ -242,10 +242,7 @@ def _absolute(given: SourceOptions) -> SourceOptions:
 
 
 def _words_of(given: SourceOptions) -> list[str]:
-    """Return the options of ``vslam run`` that describe the data.
-
-    Options that differ between the runs of a benchmark are left out.
-    """
+    """Return the options of ``vslam run`` that describe the data and are the same for all runs."""
     words = ["--side-by-side"] if given.side_by_side else []
     values = {
         "--right": given.right,
@@ -271,8 +268,7 @@ def _open_all(
 ) -> dict[str, Source]:
     """Open every sequence, so that missing data are reported before the first run.
 
-    This function renders synthetic sequences, so that parallel runs do not render the same
-    sequence.
+    Synthetic sequences are rendered here, so that parallel runs do not render the same sequence.
     """
     from vslam.datasets.sources import LIVE
     from vslam.lab.bench.grid import parse_sequences

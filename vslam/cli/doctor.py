@@ -76,10 +76,7 @@ def doctor(
 
 
 def _free(path: Path) -> Path:
-    """Return a path at which no file exists.
-
-    This is the given path if it is free. Otherwise, it is the first free path of ``doctor-2.html``,
-    ``doctor-3.html``, ...
-    """
+    """Return ``path`` if no file exists there, or else the first free path with a number, such as
+    ``doctor-2.html``."""
     numbered = (path.with_stem(f"{path.stem}-{n}") for n in count(2))
     return next(one for one in chain((path,), numbered) if not one.exists())

@@ -16,8 +16,6 @@ _THEME = Theme({"option": "bold cyan"})
 
 
 class _Options(RegexHighlighter):
-    """Highlights option names in descriptions."""
-
     highlights = [r"(?P<option>(?<![\w-])--[a-z][a-z-]*)"]  # noqa: RUF012  # as rich declares it
 
 

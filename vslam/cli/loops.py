@@ -176,7 +176,6 @@ def _require_writable(out: Path) -> None:
 
 
 def _write(out: Path, seed: int, **found: object) -> None:
-    """Write a report about the results obtained so far."""
     from vslam.lab.loopbench.report import write_report
     from vslam.lab.loopbench.schema import LoopsJson
     from vslam.machine import versions

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 
 def _with_plugins(names: tuple[str, ...], group: str) -> tuple[str, ...]:
-    """Return vslam's own names, followed by the names of plug-ins (docs/howto/plugins.md)."""
     return (*names, *(name for name in plugins.find_plugins(group) if name not in names))
 
 
@@ -303,10 +302,8 @@ _NAMES = {"SourceOptions": object}  # annotations whose types are slow to import
 def reads_source(
     *, without: tuple[str, ...] = ()
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Decorate a command that reads images.
-
-    The parameter ``given`` of the command is replaced by the options that describe the source of
-    the images.
+    """Decorate a command that reads images. The parameter ``given`` of the command is replaced with
+    the options that describe the source of the images.
 
     Args:
         without: names of the options to leave out.
@@ -360,9 +357,7 @@ def kind_of_source(options: SourceOptions) -> str:
 
 
 def read_thresholds(given: str | None) -> Config:
-    """Read the thresholds of ``--config``.
-
-    ``given`` is a file, a text with values, or None for the defaults.
+    """Read the thresholds of ``--config``: a file, or a text with values. None gives the defaults.
 
     Raises:
         InputError: the file cannot be read, or a name or value is not valid.
@@ -379,9 +374,8 @@ def read_thresholds(given: str | None) -> Config:
 
 
 def open_given(options: SourceOptions, console: Console) -> Source:
-    """Open the source that the options describe.
-
-    If a synthetic town must be rendered first, the progress is shown.
+    """Open the source that the options describe. If a synthetic town must be rendered first, the
+    progress is shown.
 
     Raises:
         InputError: there are no data to read, or they cannot be read.

@@ -88,10 +88,8 @@ def write_overview_of(
     baseline: str | None = None,
     quiet: bool,
 ) -> None:
-    """Write the report about finished runs.
-
-    Unless ``quiet``, the first tables of the report and its path are printed.
-    """
+    """Write the report about finished runs. Unless ``quiet``, its first tables and its path are
+    printed."""
     from vslam.cli.tables import show_sections
     from vslam.lab.overview.render import write_overview
     from vslam.lab.overview.versus import versus

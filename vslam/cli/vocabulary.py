@@ -136,10 +136,7 @@ def info(
 
 
 def _find(images: list[str]) -> list[Path]:
-    """Return the image files of all folders and glob patterns.
-
-    The files are sorted by name, and no file occurs twice.
-    """
+    """Return the image files of all folders and glob patterns, without repetitions."""
     import glob
 
     from vslam.datasets.image_files import is_image
@@ -160,10 +157,8 @@ def _find(images: list[str]) -> list[Path]:
 
 
 def _extract_all(paths: list[Path], config: OrbConfig) -> Iterator[NDArray[np.uint8] | None]:
-    """Yield the ORB descriptors of each image in order, as ``(n, 32)`` arrays.
-
-    None is yielded for an image that cannot be read.
-    """
+    """Yield the ``(n, 32)`` ORB descriptors of each image in order, or None if the image cannot be
+    read."""
     from concurrent.futures import ThreadPoolExecutor
 
     from vslam.datasets.image_files import read_grey

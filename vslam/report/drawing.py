@@ -1,8 +1,8 @@
 """The common style of the figures in reports, and functions that save figures as PNG and SVG.
 
 Every figure is drawn once, in the colours of a light theme. In the SVG, neutral colours are
-replaced by CSS variables. Therefore, a figure in the HTML page follows the light or dark theme of
-the reader.
+replaced with CSS variables, so that a figure in the HTML page follows the reader's light or dark
+theme.
 """
 
 from __future__ import annotations
@@ -114,11 +114,8 @@ def plain_ticks(axis: Axis) -> None:
 
 
 def draw(drawings: Iterable[Drawing]) -> list[page.Figure]:
-    """Save figures in the style of reports.
-
-    If ``drawings`` is a generator, it creates its figures while this function runs. Therefore,
-    these figures have the same style.
-    """
+    """Save figures in the style of reports. A figure has this style only if ``drawings`` is a
+    generator that creates the figure while this function runs."""
     # after_reset ignores the user's matplotlibrc. Therefore, equal runs give equal figures.
     with style.context(STYLE, after_reset=True):
         return [save(*drawing) for drawing in drawings]

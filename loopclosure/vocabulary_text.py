@@ -184,7 +184,6 @@ def _read_nodes(path: Path, lines: list[bytes]) -> NDArray[np.float64]:
 def _check_children(
     path: Path, parent: NDArray[np.int64], leaf: NDArray[np.bool_], branching: int
 ) -> None:
-    """Check that leaves have no children, and that other nodes have 1 to ``branching`` children."""
     n_children = np.bincount(parent[1:], minlength=len(parent))
     for wrong, fault in (
         (leaf & (n_children > 0), "is a leaf but has children"),

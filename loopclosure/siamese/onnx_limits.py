@@ -21,7 +21,7 @@ MOST_NUMBERS = 2**27
 MOST_PRODUCTS = 2**38
 """Maximum total number of multiplications in all convolutions and matrix products of a graph."""
 _MOST_NODES = 10_000
-_SMALL = 64  # tensors with more numbers cannot be shapes
+_SMALL = 64  # tensors with more elements cannot be shapes
 _SIDE = 512  # assumed size of each input dimension that the graph leaves open
 
 # The operators that the networks of vslam use. None of them contains another graph.

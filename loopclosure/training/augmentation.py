@@ -52,8 +52,8 @@ class Augmentation(BaseModel):
     mirror: bool = Field(True, description="Mirror both images of every second pair.")
 
 
-# Only changes in lighting and occlusion are stronger. Rendered pairs already differ in viewpoint.
-# The noise and blur of a camera average out at the resolution of the network.
+# Only changes in lighting and occlusion are stronger than by default. Rendered pairs already differ
+# in viewpoint. The noise and blur of a camera average out at the resolution of the network.
 STRONG = Augmentation(
     homography=0.08, shift=0.12, log_gain=0.5, bias=30.0, log_gamma=0.5, masks=3, mask_area=0.15,
 )  # fmt: skip

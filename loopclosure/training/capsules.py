@@ -89,9 +89,8 @@ def route(
             return c if present is None else c * present, b.new_ones(1)
         if present is not None:
             b.masked_fill_(~present, -torch.inf)
-        # Subtracting the maximum avoids overflow and does not change a softmax. Two reductions of
-        # one axis each are several times faster than one reduction of two axes that are not
-        # adjacent.
+        # Subtracting the maximum avoids overflow and does not change a softmax. Reducing one axis
+        # after the other is several times faster than reducing both axes at once.
         b -= b.amax(3, keepdim=True).amax(1, keepdim=True)
         e = torch.exp(b)
         return e, e.sum(3, keepdim=True).sum(1, keepdim=True)
@@ -158,8 +157,8 @@ class CapsuleLayer(nn.Module):
         super().__init__()
         kept = places if kept is None else kept
         self.iterations, self.over, self.places = iterations, over, places
-        # A mean over thousands of capsules is a short vector, and short outputs give no agreement.
-        # With half of this deviation, the couplings stay equal. With twice this deviation, a few
+        # A mean over thousands of capsules is a short vector. The deviation makes up for this. With
+        # half of this deviation, the couplings stay equal. With twice this deviation, a few
         # capsules get nearly all of the coupling.
         deviation = _DEVIATION * (types * places / size) ** 0.5 if over == "primary" else 1.0
         self.W = nn.Parameter(torch.randn(outputs, types, size, depth) * deviation)

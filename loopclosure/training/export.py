@@ -29,7 +29,7 @@ from vslam.loopclosure.training.siamese import SiameseNetwork, for_inference
 
 TOLERANCE = 1e-4  # largest accepted difference from torch in a descriptor of norm 1
 SIMILARITY_TOLERANCE = 0.02  # large: the square root magnifies rounding at distance 0
-_SMALL = 64  # half precision saves nothing for tensors with fewer numbers
+_SMALL = 64  # half precision saves nothing for tensors with fewer elements
 
 
 class _Embedding(nn.Module):

@@ -63,7 +63,7 @@ OnStep = Callable[[int, int, int, float], None]
 """Arguments: epoch, step, number of steps in the epoch, loss."""
 
 _CHECKPOINT_EVERY_S = 300.0
-_HEAD_RATE = 30.0  # factor for the scalars log a and log b: Adam's steps are too small for them
+_HEAD_RATE = 30.0  # factor for the learning rate of log a and log b, which need larger steps
 
 
 @dataclass(frozen=True)
@@ -313,7 +313,6 @@ class _Training:
 
 
 def _optimiser(network: SiameseNetwork, settings: TrainSettings) -> torch.optim.Optimizer:
-    """Create an Adam optimiser with separate learning rates for the extractor and the head."""
     extractor = network.branch.extractor
     if isinstance(extractor, LiteExtractor):
         extractor.freeze(settings.frozen)
@@ -327,7 +326,6 @@ def _optimiser(network: SiameseNetwork, settings: TrainSettings) -> torch.optim.
 
 
 def set_threads(threads: int) -> None:
-    """Set the number of threads that torch uses."""
     torch.set_num_threads(threads)
 
 

@@ -145,7 +145,6 @@ def calibrate(
 
 
 def _check_place(out: Path) -> None:
-    """Check that the calibration can be written to a file, before any work begins."""
     from vslam.calibration.documents import read_document
     from vslam.maps.new_output import require_place
 

@@ -65,7 +65,7 @@ def choose_systems(
     from vslam.loopclosure.registry import parse_weights, require_detector
 
     wanted = names_in(systems)
-    others = _others(wanted, given, python, vocabulary)
+    others = _command_templates(wanted, given, python, vocabulary)
     chosen = names_in(detectors) if "vslam" in wanted else []
     files = parse_weights(weights, chosen)
     for name in chosen or [""] * ("vslam" in wanted):
@@ -79,10 +79,9 @@ def choose_systems(
     return Systems(chosen, files, others)
 
 
-def _others(
+def _command_templates(
     wanted: list[str], given: Collection[str], python: Path | None, vocabulary: Path | None
 ) -> dict[str, str]:
-    """Return the command template of each other system, by name of the system."""
     from vslam.lab.stress import orbslam3
     from vslam.lab.stress.external import check_template
 
@@ -174,7 +173,7 @@ class Cells:
         from vslam.machine import available_cores
         from vslam.run.warmup import compile_kernels, is_cold
 
-        if cells and is_cold():  # once, not in each run
+        if cells and is_cold():  # compiled once here, not in each run
             self.console.announce("first run: compiling the kernels, about a minute ...")
             compile_kernels(processes=min(available_cores(), 2))
         return run_here(cells, self.options, self.jobs, self.out)
@@ -219,7 +218,8 @@ def open_cells(
     program = (sys.executable, "-m", "vslam.cli.child", "foreign")
     options = RunOptions(
         data=Path(given.data) if kind != "synthetic" else None,
-        config=read_thresholds(config).model_dump_json(indent=2) + "\n",  # as a run writes it
+        config=read_thresholds(config).model_dump_json(indent=2)
+        + "\n",  # in the form in which a run writes it
         threads=threads or max(1, min(available_cores() // jobs, 4)),
         scratch=None if scheduler else scratch_folder(out),
         others={name: (*program, name, command) for name, command in systems.others.items()},

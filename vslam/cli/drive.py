@@ -153,7 +153,6 @@ def _georeferenced(outcome: RunOutcome, fixes: Fixes) -> tuple[RunOutcome, str]:
 
 
 def _refuse_live_source(source: Source, resume: Path | None) -> None:
-    """Refuse to resume a run of a live camera, because its images cannot be read again."""
     if source.live and resume is not None:
         raise InputError(
             f"--resume {resume}: a run of a live camera cannot be resumed; continue its map with "

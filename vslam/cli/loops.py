@@ -164,7 +164,6 @@ def bench(
 
 
 def _require_writable(out: Path) -> None:
-    """Check before any work begins that the output folder can be written."""
     try:
         there = next(path for path in (out, *out.absolute().parents) if path.exists())
         with TemporaryFile(dir=there):

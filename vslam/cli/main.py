@@ -49,9 +49,6 @@ _UsageError: Any = typer.BadParameter.__base__  # typer does not export it
 
 
 class _Command(TyperCommand):
-    """A command with vslam's own help. If an option is wrong, the error message suggests a
-    correction."""
-
     def format_help(self, ctx: Any, formatter: Any) -> None:
         from vslam.cli.help import show_help
 
@@ -72,8 +69,6 @@ class _Command(TyperCommand):
 
 
 class _Group(TyperGroup):
-    """A group of commands with a common name, such as ``vslam map``, with vslam's own help."""
-
     def format_help(self, ctx: Any, formatter: Any) -> None:
         from vslam.cli.help import show_help
 
@@ -124,7 +119,7 @@ app = application(_GROUPS)
 
 
 def _treat_as_ctrl_c(signal_number: int, stack: FrameType | None) -> None:
-    """Treat SIGTERM as Ctrl-C. The operating system sends SIGTERM when the machine shuts down."""
+    """The operating system sends SIGTERM when the machine shuts down."""
     handler = signal.getsignal(signal.SIGINT)
     if not callable(handler):  # background jobs of a shell ignore Ctrl-C
         raise KeyboardInterrupt

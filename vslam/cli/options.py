@@ -165,7 +165,6 @@ def names_in(text: str) -> list[str]:
 
 
 def kitti_root() -> str:
-    """Return the default folder of the KITTI data."""
     return os.environ.get("KITTI_ROOT") or KITTI_ROOT
 
 
@@ -278,7 +277,6 @@ def _source_options(
         int | None, option(INPUT, "N", "Stop after N frames.", min=1, unset="all")
     ] = None,
 ) -> SourceOptions:
-    """Define the options that describe the source of the images."""
     from vslam.datasets.sources import SourceOptions
 
     if source is not None and data is not None:

@@ -69,7 +69,6 @@ def report(
 
 
 def serve_runs(folders: list[Path], port: int) -> None:
-    """Serve a page of the runs in some folders until Ctrl-C."""
     from vslam.lab.overview.serve import make_server
 
     with make_server(folders, port) as server:

@@ -26,7 +26,6 @@ def show_sections(sections: Iterable[Section]) -> None:
 
 
 def print_rows(rows: Rows) -> None:
-    """Print names and values in two columns."""
     show_sections([Section("", [Pairs(rows)])])
 
 

@@ -53,7 +53,7 @@ def train(
     is_text(out)  # refuses an unknown suffix before the work begins
     if not out.parent.is_dir():
         raise InputError(f"{out}: the folder {out.parent} does not exist; create it.")
-    paths = _find(images)
+    paths = _find_images(images)
     descriptors, unreadable = [], 0
     shown = Console(shown=not quiet)
     with shown.count_bar("images", len(paths)) as advance:
@@ -135,8 +135,7 @@ def info(
         typer.echo(f"{name:<10}{value}")
 
 
-def _find(images: list[str]) -> list[Path]:
-    """Return the image files of all folders and glob patterns, without repetitions."""
+def _find_images(images: list[str]) -> list[Path]:
     import glob
 
     from vslam.datasets.image_files import is_image

@@ -61,8 +61,8 @@ STYLE = {
     "ytick.color": LINE,
     "ytick.labelcolor": MUTED,
 }
-# Inches. Figures are so small that their text stays readable on a phone, which shrinks them to its
-# width.
+# Sizes in inches. Figures are small, so that their text stays readable on a phone, which shrinks
+# figures to the width of its screen.
 WIDTH, LOW, SQUARE = 4.6, 2.5, 5.4
 DOTS_PER_INCH = 200
 _LEGEND_CHARACTERS = 60  # number of characters that fit side by side

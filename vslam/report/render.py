@@ -171,7 +171,7 @@ def show(sections: Iterable[Section], console: Console) -> None:
                     if part.note:
                         say(part.note)
                 case Pairs() | Tiles():
-                    for line in _columns(part.rows):
+                    for line in _aligned_lines(part.rows):
                         console.out(line, highlight=False)
                 case Bullets():
                     for sentence in part.sentences:
@@ -182,8 +182,7 @@ def show(sections: Iterable[Section], console: Console) -> None:
                     say(part)
 
 
-def _columns(rows: Sequence[Row]) -> list[str]:
-    """Format rows as lines of text. Each column is as wide as its widest cell."""
+def _aligned_lines(rows: Sequence[Row]) -> list[str]:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()

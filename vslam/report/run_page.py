@@ -188,7 +188,7 @@ def detector_section(report: ReportJson) -> Section:
     """
     detectors = report.detectors
     if not detectors:
-        return Section("Detectors", [_left_out(report)])
+        return Section("Detectors", [_why_comparison_is_missing(report)])
     known = {
         name for _, name, _ in _COMPARED if any(getattr(one, name) is not None for one in detectors)
     }
@@ -211,8 +211,7 @@ def detector_section(report: ReportJson) -> Section:
     )
 
 
-def _left_out(report: ReportJson) -> str:
-    """Return the reason why a comparison of detectors that was requested is missing, or ""."""
+def _why_comparison_is_missing(report: ReportJson) -> str:
     if report.detectors or not report.compare:
         return ""
     return (

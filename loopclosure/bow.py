@@ -58,8 +58,8 @@ class BowDetector:
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
         """Find candidates for a keyframe that has been added.
 
-        Keyframes that are recent or covisible with the given keyframe are excluded. A candidate
-        scores at least as high as the covisible keyframe with the lowest score.
+        Keyframes that are recent or covisible with the given keyframe are excluded. The score of a
+        candidate is at least the lowest score among the covisible keyframes.
         """
         config = self.config
         entries = self._entries(keyframe)

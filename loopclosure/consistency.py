@@ -110,8 +110,8 @@ class LoopConsistency:
     def confirmed_by_earlier(
         self, map_: Map, camera: Camera, config: VerificationConfig
     ) -> Iterator[LoopEdge]:
-        """Yield verified loops that still wait for agreeing loops but are confirmed by an earlier
-        keyframe. The newest loop comes first.
+        """Some verified loops wait because too few other loops agree with them. Yield those that an
+        earlier keyframe confirms, newest first.
 
         An earlier keyframe confirms a loop if three conditions are met. The keyframe is covisible
         with the query of the loop. The keyframe can be verified at the same place as the query.

@@ -59,8 +59,8 @@ class LoopDetector(Protocol):
         ...
 
     def restore(self, memory: DetectorMemory) -> None:
-        """Load the data that the method ``memory`` of an identical detector returned. Then, ``add``
-        need not be called for these keyframes.
+        """Load the data that the method ``memory`` of an identical detector returned. This replaces
+        the calls of ``add`` for the keyframes in the data.
 
         Raises:
             ValueError: the data is damaged or comes from a different detector.

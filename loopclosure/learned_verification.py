@@ -35,7 +35,7 @@ _DEPTHS_AGREE = 0.15  # largest relative difference in depth between two landmar
 
 
 class LearnedTrials:
-    """Chooses the loop candidates that are worth a verification with learned local descriptors.
+    """Chooses the loop candidates for which verification with learned local descriptors is tried.
 
     This verification takes forty times as long as verification with ORB descriptors. Therefore,
     only the candidates that are most similar to the query are tried, and only if their similarity
@@ -218,8 +218,8 @@ def recognise(
 def observed_features(
     map_: Map, query: int, estimate: PoseEstimate, camera: Camera, config: LearnedMatchingConfig
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Pair features of the query image with landmarks whose predicted image positions coincide with
-    them.
+    """Pair features of the query image with landmarks at the same image position. The image
+    positions of landmarks are predicted from the estimated pose.
 
     If a feature already observes a landmark, the depths of both landmarks must agree. Otherwise, a
     corner of a car could be paired with a corner of the facade behind the car.

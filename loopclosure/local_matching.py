@@ -202,8 +202,8 @@ def _nearest(a, b):
 
 @inner_kernel
 def _interpolate(fine, x, y, out):
-    """Interpolate the descriptor at (x, y), in cells, bilinearly, and write it into ``out`` with
-    length 1. Returns False if the position is outside the image."""
+    """Interpolate the descriptor at the cell coordinates (x, y) bilinearly, normalise it to length
+    1, and write it into ``out``. Returns False if the position is outside the image."""
     rows, columns, channels = fine.shape
     if not (x >= 0.0 and y >= 0.0 and x <= columns - 1 and y <= rows - 1):
         return False

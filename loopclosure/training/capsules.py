@@ -58,8 +58,8 @@ def route(
     Returns:
         The output capsules ``v``, ``(N, J, D)``, and two arrays from which :func:`couplings`
         computes the coupling coefficients: the numerators ``e``, ``(N, T, J, P)``, and the
-        denominators ``total``, ``(N, 1, J, 1)`` or ``(1,)``. Dividing only the sums over P saves
-        five of six divisions.
+        denominators ``total``, ``(N, 1, J, 1)`` or ``(1,)``. The coefficients are not computed
+        here, because dividing only the sums over P needs a sixth of the divisions.
     """
     n, types, places, size = u.shape
     outputs, _, _, depth = W.shape

@@ -104,7 +104,7 @@ def train(
     checkpoints to a folder.
 
     Args:
-        folder: output folder. The name of the file of weights is ``settings.network``.
+        folder: output folder. The weights are written to ``<settings.network>.safetensors``.
         device: ``cpu`` or ``cuda``.
         threads: number of threads that augment images.
         resume: whether training continues from the checkpoint in the folder, if there is one.

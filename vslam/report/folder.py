@@ -139,8 +139,8 @@ class Results:
 
     @contextlib.contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Run the block as one part of the work. If the block raises an exception, the exception is
-        recorded and not passed on."""
+        """Run a ``with`` block as one part of the work. If the block raises an exception, the
+        exception is recorded and not passed on."""
         try:
             yield
         except Exception as error:

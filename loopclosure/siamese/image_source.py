@@ -64,11 +64,7 @@ class ImageSource:
         return to_size(self.grey(index), size, fit)
 
     def grey(self, index: int) -> NDArray[np.uint8]:
-        """Read an image as ``(H, W)`` uint8. It is undistorted, but not resized.
-
-        Raises:
-            UnreadableImageError: the image is missing or damaged.
-        """
+        """Read an image as ``(H, W)`` uint8. It is undistorted, but not resized."""
         image = read_grey(self.images[index], self.names[index])
         return image if self.calibration is None else undistorted(image, self.calibration)
 

@@ -34,9 +34,6 @@ class LocalDescriptors:
 
         Args:
             path: ONNX file of a network that maps an image to coarse and fine descriptors.
-
-        Raises:
-            InputError: there is no such file.
         """
         if not path.exists():
             fix = "install vslam again" if path == SHIPPED_LOCAL else "name another file"

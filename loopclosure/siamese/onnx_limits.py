@@ -89,12 +89,7 @@ def _check_nodes(model: ModelProto) -> None:
 
 def _shapes(model: ModelProto) -> dict[str, tuple[int, ...]]:
     """Infer the shapes of all tensors of a graph from the shapes of its inputs. Shapes that the
-    file states for other tensors are ignored.
-
-    Raises:
-        Exception: a shape does not follow from the shapes of the inputs, or a tensor has a type
-            that vslam does not use.
-    """
+    file states for other tensors are ignored."""
     graph = model.graph
     for value in graph.input:
         for length in value.type.tensor_type.shape.dim:

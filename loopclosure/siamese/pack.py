@@ -19,12 +19,7 @@ from vslam.untrusted import read_npz
 
 def write_pack(sources: list[ImageSource], path: Path, size: Size, fit: Fit) -> None:
     """Write the images and relations of image sources as one npz file (docs/howto/training.md). The
-    images are stored as JPEG files at the input size of a network.
-
-    Raises:
-        UnreadableImageError: an image is missing or damaged.
-        ResultsError: the file cannot be written.
-    """
+    images are stored as JPEG files at the input size of a network."""
     import cv2
 
     arrays: dict[str, NDArray] = {"count": np.array(len(sources))}

@@ -147,11 +147,7 @@ class CapsuleShape(BaseModel):
 
     def for_images_of(self, size: Size) -> CapsuleShape:
         """Adapt the shape to images of a different size. Each view still covers approximately the
-        same fraction of the width.
-
-        Raises:
-            InputError: the views become too narrow.
-        """
+        same fraction of the width."""
         view = None
         if self.view_width is not None:
             unit, width = self.cut_stride * (self.views - 1), size[1]

@@ -89,12 +89,7 @@ def refuse_test_data(sources: list[ImageSource]) -> None:
 
 
 def load(sources: list[ImageSource], size: Size, fit: Fit, threads: int = 2) -> Collection:
-    """Decode all images of all sources into memory. An image of 227x227 pixels takes 51 kB.
-
-    Raises:
-        InputError: there are no sources, or two sources have the same name.
-        UnreadableImageError: an image is missing or damaged.
-    """
+    """Decode all images of all sources into memory. An image of 227x227 pixels takes 51 kB."""
     names = [source.name for source in sources]
     if not sources:
         raise InputError("--data: name at least one source of images.")
@@ -130,9 +125,6 @@ def divide(
 
     An image of a training unit may show the same place as a validation image, for example at the
     end of a stretch of road. Such an image is left out.
-
-    Raises:
-        InputError: there are too few images.
     """
     rng = np.random.default_rng([seed, 1])
     units = np.unique(collection.unit)
@@ -245,11 +237,8 @@ def mine(
 
 
 def write_pairs(path: Path, collection: Collection, pairs: Pairs, seed: int) -> None:
-    """Write image pairs as a CSV file with the columns a, b, same. The first line states the seed.
-
-    Raises:
-        ResultsError: the file cannot be written.
-    """
+    """Write image pairs as a CSV file with the columns a, b, same. The first line states the
+    seed."""
     table = io.StringIO()
     table.write(f"# seed {seed}\n")
     rows = csv.writer(table, lineterminator="\n")

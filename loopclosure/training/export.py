@@ -144,11 +144,6 @@ def to_onnx(
 
 
 def write_onnx(model: onnx.ModelProto, path: Path, metadata: dict[str, str]) -> None:
-    """Write an ONNX graph with its metadata.
-
-    Raises:
-        ResultsError: the file cannot be written.
-    """
     helper.set_model_props(model, metadata)
     write_file(path, model.SerializeToString())
 

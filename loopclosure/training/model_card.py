@@ -62,11 +62,7 @@ def describe(
 
 def write_card(card: dict[str, Any], weights: Path) -> tuple[Path, Path]:
     """Write a model card as ``NAME.json`` and ``NAME.md`` next to the weights. Returns the paths of
-    both files.
-
-    Raises:
-        ResultsError: a file cannot be written.
-    """
+    both files."""
     figures = "".join(f"| {k} | {v:.4g} |\n" for k, v in card["validation"].items())
     sources = "".join(f"| {k} | {v} |\n" for k, v in card["sources"].items())
     text = (

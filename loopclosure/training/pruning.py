@@ -26,9 +26,6 @@ def mean_couplings(network: SiameseNetwork, batches: Iterable[Tensor]) -> Tensor
     Args:
         network: the network, which must be in eval mode.
         batches: batches of training images, ``(N, 3, H, W)`` each.
-
-    Raises:
-        InputError: there are no images.
     """
     branch = network.branch
     total, count = None, 0

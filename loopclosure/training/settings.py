@@ -122,9 +122,5 @@ PRESETS = {
 
 def load_settings(path: Path) -> TrainSettings:
     """Read the settings of a training run from a JSON file. Settings that are missing in the file
-    keep their defaults.
-
-    Raises:
-        InputError: the file is missing or not JSON, a key is unknown, or a value is out of range.
-    """
+    keep their defaults."""
     return read_json(TrainSettings, path, "settings")

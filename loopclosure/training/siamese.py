@@ -169,9 +169,6 @@ def build_network(name: str, shape: CapsuleShape | None = None) -> SiameseNetwor
     Args:
         name: one of ``NETWORKS``.
         shape: structure of the capsule branch. None gives the structure of Zhou and Sun (2025).
-
-    Raises:
-        InputError: the name is unknown.
     """
     if name not in NETWORKS:
         raise InputError(f"{name}: no such network; choose one of {', '.join(NETWORKS)}.")
@@ -187,9 +184,6 @@ def save_network(
 
     Args:
         half: whether the weights are stored in half precision, as for the weights that vslam ships.
-
-    Raises:
-        ResultsError: the file cannot be written.
     """
     tensors = {
         key: value.detach().half() if half and value.is_floating_point() else value.detach()

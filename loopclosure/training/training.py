@@ -193,11 +193,7 @@ def calibrated(
     weights: Path,
     device: torch.device,
 ) -> dict[str, float]:
-    """Calibrate a network and write its weights. Returns the validation metrics of the network.
-
-    Raises:
-        ResultsError: the file cannot be written.
-    """
+    """Calibrate a network and write its weights. Returns the validation metrics of the network."""
     _, score, same = validate(network, collection, validation, settings.augmentation, device)
     calibrate(network, score, same)
     figures = validate(network, collection, validation, settings.augmentation, device)[0]
@@ -352,11 +348,7 @@ def _mixed_precision(settings: TrainSettings, device: torch.device) -> bool:
 
 
 def write_log(path: Path, history: list[dict[str, float]]) -> None:
-    """Write the loss and the validation metrics of each epoch as a CSV file.
-
-    Raises:
-        ResultsError: the file cannot be written.
-    """
+    """Write the loss and the validation metrics of each epoch as a CSV file."""
     table = io.StringIO()
     rows = csv.DictWriter(table, list(history[0]), lineterminator="\n")
     rows.writeheader()

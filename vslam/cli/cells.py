@@ -56,12 +56,6 @@ def choose_systems(
     python: Path | None,
     vocabulary: Path | None,
 ) -> Systems:
-    """Return the systems that the options select.
-
-    Raises:
-        InputError: no system is selected, a system is unknown, or a file that a system needs is
-            missing.
-    """
     from vslam.loopclosure.registry import parse_weights, require_detector
 
     wanted = names_in(systems)
@@ -196,9 +190,6 @@ def open_cells(
     Args:
         seqs: list of sequences, such as "00-05" or "00,demo". None for data that has only one
             sequence.
-
-    Raises:
-        InputError: data are missing or cannot be used.
     """
     from vslam.lab.bench.execute import RunOptions, scratch_folder
     from vslam.machine import available_cores

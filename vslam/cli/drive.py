@@ -163,12 +163,7 @@ def _refuse_live_source(source: Source, resume: Path | None) -> None:
 def _unfinished(
     options: RunOptions, source: Source, resume: Path | None, lock: ExitStack
 ) -> Unfinished | None:
-    """Read the saved state of the run to resume. The result is None for a new run.
-
-    Raises:
-        InputError: there is no saved state, or the map to continue was made with a different
-            camera.
-    """
+    """Read the saved state of the run to resume. The result is None for a new run."""
     from vslam.run.autosave import find_unfinished, lock_run
     from vslam.run.pipeline import require_camera
 

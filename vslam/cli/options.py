@@ -343,11 +343,7 @@ def require_data(options: SourceOptions) -> None:
 
 
 def kind_of_source(options: SourceOptions) -> str:
-    """Return the kind of data that the options name, or detect it from the files.
-
-    Raises:
-        InputError: there are no data to read, or their kind is unknown.
-    """
+    """Return the kind of data that the options name, or detect it from the files."""
     from vslam.datasets.detection import detect_dataset
 
     require_data(options)
@@ -355,11 +351,8 @@ def kind_of_source(options: SourceOptions) -> str:
 
 
 def read_thresholds(given: str | None) -> Config:
-    """Read the thresholds of ``--config``: a file, or a text with values. None gives the defaults.
-
-    Raises:
-        InputError: the file cannot be read, or a name or value is not valid.
-    """
+    """Read the thresholds of ``--config``: a file, or a text with values. None gives the
+    defaults."""
     from vslam.config import Config, as_config, load_config
 
     if given is None:
@@ -373,11 +366,7 @@ def read_thresholds(given: str | None) -> Config:
 
 def open_given(options: SourceOptions, console: Console) -> Source:
     """Open the source that the options describe. If a synthetic town must be rendered first, the
-    progress is shown.
-
-    Raises:
-        InputError: there are no data to read, or they cannot be read.
-    """
+    progress is shown."""
     from vslam.datasets.sources import open_source
 
     require_data(options)

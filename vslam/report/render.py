@@ -40,9 +40,6 @@ def write_files(
     Args:
         files: text or bytes by file name, in the order in which they are written.
         fix: advice to the user, which is added to the error message.
-
-    Raises:
-        ResultsError: a file cannot be written.
     """
     for name, content in files.items():
         write_file(folder / name, content, fix)

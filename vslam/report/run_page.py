@@ -348,7 +348,6 @@ def option_rows(report: ReportJson) -> list[tuple[str, str]]:
 
 
 def machine_rows(report: ReportJson) -> list[tuple[str, str]]:
-    """Return rows that describe the machine, the packages and the time of the run."""
     machine = report.machine
     packages = {name: text for name, text in report.versions.items() if name != "python"}
     return [
